@@ -28,6 +28,7 @@ from solvers.distributed.driver import DEFAULT_MEMORY, collect
 from solvers.distributed.leaderless import note_without_driver
 from solvers.distributed.robust import SharedEstimate, estimate_by_robots
 from solvers.distributed.stages import (
+    AscentByRobots,
     CertifyByRobots,
     ClimbByRobots,
     ConsensusAlone,
@@ -57,6 +58,8 @@ from solvers.soc.soc import SOC
 from solvers.solution import Solution, choose_gauge, note_of
 from solvers.stages import (
     Answer,
+    AscentInOnePlace,
+    AscentOfTerms,
     FindCertificate,
     FindStart,
     GrowingAttempt,
@@ -518,7 +521,7 @@ def _solve_in_one_place(request: _Request) -> Solution:
     try:
         first_newton = _first_newton(pipeline, request.problem.graph)
         first = _plan_attempt(job, first_newton, pipeline.soc, request.start)
-        further = _plan_improvements(pipeline, job, plan, climb)
+        further = _plan_improvements(pipeline, job, plan, climb, AscentInOnePlace(job))
         answer = run_stages([*first, *further], Answer())
     except KeyboardInterrupt:  # between two loops: the loops answer it themselves
         if not monitor.poses_found:
@@ -537,9 +540,9 @@ def _solve_by_robots(request: _Request, robots: Partition | int) -> Solution:
     pipeline = request.pipeline
     problem = request.problem
     monitor = request.monitor
-    pipeline = replace(pipeline, growing=None, handedness=None)
+    pipeline = replace(pipeline, growing=None)
     if not pipeline.has_driver:
-        pipeline = replace(pipeline, second_try=False, staircase=None)
+        pipeline = replace(pipeline, second_try=False, staircase=None, handedness=None)
     partition = robots_of_solve(pipeline.soc, robots, problem.graph)
     settings = (
         pipeline.soc,
@@ -563,7 +566,8 @@ def _solve_by_robots(request: _Request, robots: Partition | int) -> Solution:
         climb = _plan_climb_by_robots(job, shared.without_checkpoints(), pipeline)
         try:
             first = plan(pipeline.soc, request.start)
-            further = _plan_improvements(pipeline, job, plan, climb)
+            ascent = AscentByRobots(shared.without_checkpoints(), problem, job.gap)
+            further = _plan_improvements(pipeline, job, plan, climb, ascent)
             answer = run_stages([*first, *further], Answer())
         except KeyboardInterrupt:
             if not job.stages:
@@ -632,7 +636,11 @@ def _choose_start(
 
 
 def _plan_improvements(
-    pipeline: Pipeline, job: Job, plan: Plan, climb: Sequence[PlannedStage]
+    pipeline: Pipeline,
+    job: Job,
+    plan: Plan,
+    climb: Sequence[PlannedStage],
+    ascent: AscentOfTerms,
 ) -> list[PlannedStage]:
     """Stages that follow the first attempt.
 
@@ -646,7 +654,7 @@ def _plan_improvements(
     if pipeline.staircase is not None:
         planned.append(ImproveBound(job, climb))
     if pipeline.handedness is not None:
-        planned.append(SeekHandednessTerms(job, pipeline.handedness))
+        planned.append(SeekHandednessTerms(job, pipeline.handedness, ascent))
     return planned
 
 

@@ -479,6 +479,38 @@ class ImproveBound:
         return replace(answer, certificate=highest)
 
 
+class AscentOfTerms(Protocol):
+    """Search for handedness terms that vanish at given poses: in one place, or by robots."""
+
+    @property
+    def suffix(self) -> str:
+        """What the name of a stage says after its method, where that runs in one place."""
+
+    def run(self, answer: Answer, search: HandednessSearch, Pi: Array | None = None) -> Answer:
+        """Return the same poses, with the better bound.
+
+        The ascent begins with the terms of the multipliers Pi, (pairs, 4, 4), or with none.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class AscentInOnePlace:
+    """`AscentOfTerms` without robots."""
+
+    job: Job
+    suffix: str = ""
+
+    def run(self, answer: Answer, search: HandednessSearch, Pi: Array | None = None) -> Answer:
+        """Return the same poses, with the better bound."""
+        job = self.job
+        problem = job.problem
+        poses = problem.at_best_translations(answer.current_poses)
+        terms, stage = search.run(problem, poses, job.monitor, Pi)
+        job.stages.append(stage)
+        judged = judge(problem, answer.current_poses, answer.current_certificate)
+        return replace(answer, certificate=with_terms(problem, judged, terms, poses))
+
+
 @dataclass(frozen=True, eq=False)
 class SeekHandednessTerms:
     """Handedness terms, where the certificate can still improve in space.
@@ -490,6 +522,7 @@ class SeekHandednessTerms:
 
     job: Job
     search: HandednessSearch
+    ascent: AscentOfTerms
 
     @property
     def name(self) -> str:
@@ -502,7 +535,7 @@ class SeekHandednessTerms:
         if job.problem.d == 2 or not self._is_open(answer):
             return answer
         try:
-            answer = self._with_terms(answer)
+            answer = self.ascent.run(answer, self.search)
             relaxation = self.search.relaxation(job.problem, job.gap)
             if relaxation is not None:
                 answer = self._with_hulls(answer, relaxation)
@@ -517,19 +550,6 @@ class SeekHandednessTerms:
         """Whether the certificate can improve, and there is time for it."""
         return answer.current_certificate.can_improve and not self.job.is_out_of_time
 
-    def _with_terms(self, answer: Answer, Pi: Array | None = None) -> Answer:
-        """The same poses, with the better bound, by terms that vanish there.
-
-        The ascent begins with those of the multipliers Pi, (pairs, 4, 4), or with none.
-        """
-        job = self.job
-        problem = job.problem
-        poses = problem.at_best_translations(answer.current_poses)
-        terms, stage = self.search.run(problem, poses, job.monitor, Pi)
-        job.stages.append(stage)
-        judged = judge(problem, answer.current_poses, answer.current_certificate)
-        return replace(answer, certificate=with_terms(problem, judged, terms, poses))
-
     def _with_hulls(self, answer: Answer, relaxation: HullLagrangian) -> Answer:
         """The better poses and the better bound of the answer and the relaxation with hulls."""
         job = self.job
@@ -538,7 +558,8 @@ class SeekHandednessTerms:
             if not self._is_open(answer):
                 break
             finished: Outcome[HullState] = job.monitor.run(relaxation, job.problem, start)
-            job.stages.append(stage_of_search(finished))
+            stage = stage_of_search(finished)
+            job.stages.append(replace(stage, name=stage.name + self.ascent.suffix))
             state = finished.state
             known = answer
             answer = self._better(answer, state)
@@ -546,7 +567,7 @@ class SeekHandednessTerms:
             has_moved = answer.poses is not known.poses
             if not (is_close or has_moved) or not self._is_open(answer):
                 break
-            answer = self._with_terms(answer, state.Pi)
+            answer = self.ascent.run(answer, self.search, state.Pi)
             if not is_close:
                 break
             start = state

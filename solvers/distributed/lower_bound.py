@@ -5,7 +5,7 @@ leaves out its rows. An elimination and a solve are two rounds; what crosses are
 right-hand sides, rows of S X on the separators with their errors, and a few sums.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,20 +24,14 @@ from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, BoolArray, stack_transposes
-from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import Interface
+from solvers.distributed.robots.handedness import report_terms, take_closed_form
 from solvers.distributed.robots.proof import ProofSums
-from solvers.distributed.robots.proof_orders import (
-    describe_with_terms,
-    fits_part,
-    move_proof,
-    prove_interior,
-    report_terms,
-)
-from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
+from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
+from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep, TermsAnswer
 from solvers.network.counted_pool import Count
 
 
@@ -55,8 +49,8 @@ class InterfaceProof:
 def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     """Return the bound at the current poses, as `central.best_bound` does in one place.
 
-    It is grounded without eta where that goes through, else the better form with the smallest eta
-    found.
+    It is grounded without eta where that goes through, with handedness terms in closed form where
+    it goes through with these, else the better form with the smallest eta found.
     """
     is_near_zero = driver.current.objective <= driver.current.rounding_level
     if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
@@ -67,51 +61,69 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     grounded = prove_grounded(driver, 0.0) if has_scale else None
     if grounded is not None and grounded.value > 0.0:
         return grounded
-    handed = _bound_with_terms(driver) if driver.d == 3 else None
-    if handed is not None:
-        return handed
-    if not has_scale:
+    if driver.d == 3:
+        described = driver.ask(take_closed_form, None, Count.PIGGYBACKED)
+        with_terms = _bound_with_terms(driver, diagonal_less_terms(driver, described))
+        if any(answer.num_pairs for answer in described) and with_terms is not None:
+            return with_terms
+    return _search_forms(driver, gap) if has_scale else central.NO_BOUND
+
+
+def best_bound_with_terms(driver: Driver, gap: float, less_terms: Array) -> LowerBound:
+    """Return the best bound of the cost less the robots' handedness terms.
+
+    The diagonal of M `less_terms` is that on the cover, ((d+1) g,).
+    """
+    grounded = _bound_with_terms(driver, less_terms)
+    if grounded is not None:
+        return grounded
+    if not (less_terms > 0.0).all():
         return central.NO_BOUND
+    found = _search_forms(driver, gap, less_terms)
+    return replace(found, terms=_collect_terms(driver)) if found.value > 0.0 else found
+
+
+def diagonal_less_terms(driver: Driver, described: Sequence[TermsAnswer]) -> Array:
+    """Diagonal of M less the robots' handedness terms, on the cover, ((d+1) g,)."""
+    return driver.gather_diagonal([answer.diagonal for answer in described])
+
+
+def _search_forms(driver: Driver, gap: float, less_terms: Array | None = None) -> LowerBound:
+    """Return the better of both forms of the bound, each with the smallest eta found."""
     count = driver.num_poses * driver.d
     smallest = central.smallest_shift(gap, driver.current.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     return central.search_forms(
-        partial(prove_with_eta, driver),
-        partial(prove_grounded, driver),
+        partial(prove_with_eta, driver, less_terms=less_terms),
+        partial(prove_grounded, driver, less_terms=less_terms),
         smallest,
         driver.current.objective,
         count,
     )
 
 
-def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
+def prove_with_eta(
+    driver: Driver, eta: float, less_terms: Array | None = None
+) -> LowerBound | None:
     """Bound F by tr(Lambda) - eta n d: one round.
 
-    None unless S + eta blockdiag(0, I) without a translation is positive definite.
+    None unless S + eta blockdiag(0, I) without a translation is positive definite. `less_terms` is
+    as in `eliminate_S`.
     """
-    proof = eliminate_S(driver, driver.rows_left_out(None), eta, central.UNGROUNDED_MARGIN)
+    proof = eliminate_S(driver, None, eta, central.UNGROUNDED_MARGIN, less_terms=less_terms)
     if proof is None:
         return None
     return central.bound_with_eta(proof.traces, eta, driver.num_poses * driver.d)
 
 
-def _bound_with_terms(driver: Driver) -> LowerBound | None:
-    """Bound grounded at a pose, of the cost less every robot's handedness terms, without eta.
-
-    The diagonal that rounding is measured by is that of M less the terms while this lasts.
-    """
-    described = driver.ask(describe_with_terms, None, Count.PIGGYBACKED)
-    if not any(answer.num_pairs for answer in described):
+def _bound_with_terms(driver: Driver, less_terms: Array) -> LowerBound | None:
+    """Bound grounded at a pose, of the cost less the robots' terms, without eta; None if not so."""
+    if not (less_terms > 0.0).all():
         return None
-    diagonal = driver.diagonal
-    driver.diagonal = driver.gather_diagonal([answer.diagonal for answer in described])
-    handed = None
-    if (driver.diagonal > 0.0).all():
-        handed = prove_grounded(driver, 0.0, with_terms=True)
-    driver.diagonal = diagonal
-    if handed is None or not handed.value > 0.0:
+    proven = prove_grounded(driver, 0.0, less_terms)
+    if proven is None or not proven.value > 0.0:
         return None
-    return replace(handed, terms=_collect_terms(driver))
+    return replace(proven, terms=_collect_terms(driver))
 
 
 def _collect_terms(driver: Driver) -> HandednessTerms:
@@ -126,23 +138,25 @@ def _collect_terms(driver: Driver) -> HandednessTerms:
     )
 
 
-def prove_grounded(driver: Driver, eta: float, with_terms: bool = False) -> LowerBound | None:
+def prove_grounded(
+    driver: Driver, eta: float, less_terms: Array | None = None
+) -> LowerBound | None:
     """Bound F grounded at the driver's pose; None unless S_r + eta blockdiag(0, I) is definite.
 
-    With terms, S is that of the cost less the handedness terms of every robot's edges.
+    `less_terms` is as in `eliminate_S`.
     """
     g = len(driver.cover)
-    fixed = driver.rows_left_out(driver.grounded_position)
+    position = driver.grounded_position
     X = _grounded_point(driver)
     proof = None
     share = FIRST_MARGIN
     while proof is None:
         if share < LEAST_MARGIN:
             return None
-        proof = eliminate_S(driver, fixed, eta, share, X, with_terms)
+        proof = eliminate_S(driver, position, eta, share, X, less_terms)
         share *= SHRINK
     free = np.ones(len(X), dtype=bool)
-    free[fixed] = False
+    free[driver.rows_left_out(position)] = False
     steps = [answer.step for answer in proof.answers if answer.step is not None]
     first = CoverProof(X, steps, _sum_up(driver, proof, X, steps, free))
     moved = central.move_until_settled(first, partial(_moved, driver, proof, free))
@@ -247,30 +261,38 @@ def _sum_up(
 
 def eliminate_S(
     driver: Driver,
-    fixed: IntArray,
+    position: int | None,
     eta: float,
     share: float,
     X: Array | None = None,
-    with_terms: bool = False,
+    less_terms: Array | None = None,
 ) -> InterfaceProof | None:
     """Eliminate S + eta blockdiag(0, I) less a share of its diagonal, once.
 
-    None when it is not shown to be positive definite. With X, rows on the cover, the robots begin a
-    proof there.
+    The pose at a position in the cover is left out, or without one the translation of pose 0. None
+    when the matrix is not shown to be positive definite. With X, rows on the cover, the robots
+    begin a proof there. With `less_terms`, the diagonal of M less the robots' handedness terms on
+    the cover, S is that of the cost less these terms.
     """
     g = len(driver.cover)
     d = driver.d
     space = driver.interface(1, d)
+    fixed = driver.rows_left_out(position)
     Lambda = driver.current.multipliers
     added = eta * np.eye(d) - Lambda
     columns = driver.rotation_rows.reshape(g, d)
-    diagonal = driver.diagonal.copy()
+    diagonal = (driver.diagonal if less_terms is None else less_terms).copy()
     diagonal[columns] += np.maximum(np.einsum("naa->na", added), 0.0)
     if not is_in_range(added, diagonal):
         return None
     is_fixed = np.zeros(len(diagonal), dtype=bool)
     is_fixed[fixed] = True
-    orders = _proof_orders(driver, eta, share, is_fixed, diagonal, X, with_terms)
+    is_grounded = position is not None
+    with_terms = less_terms is not None
+    orders = [
+        ProofOrder(eta, share, *rows, is_grounded, with_terms)
+        for rows in _rows_of_robots(driver, is_fixed, diagonal, X)
+    ]
     answers = driver.ask_each(prove_interior, orders)
     contributions = [answer.schur for answer in answers if answer.schur is not None]
     sizes = [answer.sizes for answer in answers if answer.sizes is not None]
@@ -289,21 +311,14 @@ def eliminate_S(
     return InterfaceProof(factor, (shift - lost) / OUTWARD, answers, Lambda, traces)
 
 
-def _proof_orders(
-    driver: Driver,
-    eta: float,
-    share: float,
-    is_fixed: BoolArray,
-    diagonal: Array,
-    X: Array | None,
-    with_terms: bool,
-) -> list[ProofOrder]:
-    """Orders to the robots, each with what it holds of the rows of the cover."""
+def _rows_of_robots(
+    driver: Driver, is_fixed: BoolArray, diagonal: Array, X: Array | None
+) -> Iterator[tuple[Array, Array, Array | None]]:
+    """What every robot holds of rows of the cover: which are left out, the diagonal, and X."""
     space = driver.interface(1, driver.d)
     fixed_rows = space.scatter(is_fixed.astype(float))
     diagonals = space.scatter(diagonal)
     points: Sequence[Array | None] = [None] * len(driver.robots_with_edges)
     if X is not None:
         points = space.scatter(X)
-    rows = zip(fixed_rows, diagonals, points, strict=True)
-    return [ProofOrder(eta, share, *of_robot, with_terms) for of_robot in rows]
+    return zip(fixed_rows, diagonals, points, strict=True)

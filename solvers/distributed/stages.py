@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, certify_with
+from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
@@ -21,13 +22,23 @@ from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import DEFAULT_MEMORY, Driver, collect
+from solvers.distributed.handedness import (
+    RobotsPoint,
+    begin_without_terms,
+    hand_out_terms,
+    return_to_best,
+)
 from solvers.distributed.leaderless import attempt_leaderless
-from solvers.distributed.lower_bound import best_bound_distributed
+from solvers.distributed.lower_bound import best_bound_distributed, best_bound_with_terms
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
+from solvers.distributed.robots.interior import Interior
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
+from solvers.handedness.ascent import AscentState
+from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.loop import RunMonitor
+from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
@@ -306,6 +317,46 @@ class ClimbByRobots:
             )
         )
         return Answer(dual_bound=climb.state.bound)
+
+
+@dataclass(frozen=True, eq=False)
+class AscentByRobots:
+    """`solvers.stages.AscentOfTerms` by a driver and robots, each with the terms of its edges."""
+
+    job: RobotJob
+    problem: PGOProblem
+    gap: float
+    suffix: str = ", in one place"
+
+    def run(self, answer: Answer, search: HandednessSearch, Pi: Array | None = None) -> Answer:
+        """Return the same poses, with the better bound."""
+        driver = self.job.driver
+        poses = answer.current_poses
+        driver.choose_cost(final=True)
+        driver.set_poses(poses)
+        driver.set_translations(driver.ask(Interior.translations, None, Count.PIGGYBACKED))
+        driver.describe(Count.PIGGYBACKED)
+        if Pi is None:
+            begin_without_terms(driver)
+        else:
+            hand_out_terms(driver, distinct_pairs(self.problem.graph), poses, Pi)
+        first = RobotsPoint.first(driver, search.ascent.num_eigenvalues)
+        outcome: Outcome[AscentState[RobotsPoint]] = self.job.monitor.run(search.ascent, first)
+        self.job.stages.append(stage_of_search(outcome))
+        bound = best_bound_with_terms(driver, self.gap, return_to_best(driver))
+        certificate = answer.current_certificate
+        if bound.value <= certificate.lower_bound:
+            return answer
+        with_terms = certify_with(
+            self.problem,
+            poses,
+            collect(driver)[1],
+            self.gap,
+            certificate.stationarity,
+            BoundSource.GIVEN,
+            bound,
+        )
+        return replace(answer, certificate=with_terms)
 
 
 @dataclass(frozen=True, eq=False)

@@ -222,7 +222,7 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
     eta that hardly makes Q - Lambda + eta I definite: the eigenvalue of its inverse is far above
     all others. The translations are the best ones.
     """
-    proof = eliminate_S(driver, driver.rows_left_out(None), eta, UNGROUNDED_MARGIN)
+    proof = eliminate_S(driver, None, eta, UNGROUNDED_MARGIN)
     assert proof is not None  # it has just been proven
     g = len(driver.cover)
     d = driver.d

@@ -6,6 +6,7 @@ the matrices P of pairs take sum_e B_e^T W_e B_e off it. Small graphs have it as
 large ones the lowest eigenvalues come from sparse factorisations, by inverse Lanczos.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,6 +31,7 @@ from solvers.handedness.ascent import derivative_of_minimum, nearest_semidefinit
 MOST_DENSE = 130  # poses up to which dense eigenvalues are faster
 _ACCURACY = 1e-3  # of sparse eigenvalues, relative to their distance from the shift
 _ROOM = 0.25  # of the smallest eigenvalue: how far below it the shift is put
+_LEAST_ROOM = 1e-9  # of the largest entry of M: the least such distance
 _GROWTH = 2.0  # of that distance, until the shifted matrix is positive definite
 _MOST_SHIFTS = 60
 
@@ -178,13 +180,10 @@ class HandedMatrix:
 
         A NotPositiveDefiniteError where no shift is found.
         """
-        scale = float(np.abs(self.problem.M.data).max())
-        distance = max(_ROOM * abs(expected), 1e-9 * scale)
-        for _ in range(_MOST_SHIFTS):
-            factor = self._factor(P, expected - distance)
+        for shift in shifts_below(expected, float(np.abs(self.problem.M.data).max())):
+            factor = self._factor(P, shift)
             if factor is not None:
-                return expected - distance, factor
-            distance *= _GROWTH
+                return shift, factor
         raise NotPositiveDefiniteError("no shift makes the certificate matrix positive definite")
 
     # Both.
@@ -214,6 +213,17 @@ class HandedMatrix:
         order = np.argsort(-inverted)
         z[self.free] = vectors[:, order].reshape(-1, 3, count)
         return Spectrum(shift + 1.0 / inverted[order], self.differences(z))
+
+
+def shifts_below(expected: float, scale: float) -> Iterator[float]:
+    """Shifts to try, ever farther below a smallest eigenvalue of a matrix with entries of a scale.
+
+    It may be about `expected`.
+    """
+    distance = max(_ROOM * abs(expected), _LEAST_ROOM * scale)
+    for _ in range(_MOST_SHIFTS):
+        yield expected - distance
+        distance *= _GROWTH
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
@@ -14,6 +15,7 @@ from solvers.distributed.robots.elimination import FrontFactor, HeldFront
 from solvers.distributed.robots.factors import Eliminated
 from solvers.distributed.robots.interior import Interior, InteriorState, interior_of
 from solvers.distributed.robots.proof import RobotProof
+from solvers.distributed.robots.records import RobotAscent
 from solvers.network.messages import Snapshot
 from solvers.network.serialization import deserialize, serialize
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
@@ -59,6 +61,8 @@ CLASSES = (
     AndersonShare,
     AndersonSums,
     RobotProof,
+    HandednessTerms,
+    RobotAscent,
     Eliminated,
     HeldFront,
     FrontFactor,

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
@@ -42,6 +43,7 @@ from solvers.distributed.robots.records import (
     ReducedTranslations,
     RescaleInterior,
     RightHandSide,
+    RobotAscent,
     TrialEvaluation,
 )
 from solvers.riemannian.newton_step import ModelOrder
@@ -70,6 +72,8 @@ class InteriorState:
     # whether the current cost is the one that is solved, not the one that SOC is run on
     is_final: bool = False
     weights: Array | None = None  # (k,): of its edges, in a robust solve
+    terms: HandednessTerms | None = None  # of its edges, for proofs with them
+    ascent: RobotAscent | None = None  # the search for such terms
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,30 +5,31 @@ from dataclasses import replace
 
 import numpy as np
 
-from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
 from pgo_models.certificates.rounding_errors import fits_to_rounding
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.elimination import row_sums, unpacked
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof import begin_proof, verify_interior
-from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep, TermsAnswer
+from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
 
 
 def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofAnswer]:
     """Eliminate S for a proof, and at a point begin one (`solvers.distributed.robots.proof`)."""
     problem = robot.tangent_problem
-    terms = handedness_terms(robot) if order.with_terms else None
+    terms = robot.state.terms if order.with_terms else None
+    lost = 0.0
     if terms is not None:
         problem = terms.taken_off(problem)
+        lost = terms.loss()
     factors = robot.factors
     Lambda = robot.multipliers()
     Lambda[robot.part.boundary] = 0.0  # those are the driver's
-    trace = _trace(problem, Lambda)
+    trace = _trace(problem, Lambda, lost)
     widths = (1, problem.d)
     cut = factors.cut(*widths)
     fixed = cut.boundary[order.fixed > 0]
-    if order.point is None and factors.grounds:
+    if not order.is_grounded and factors.grounds:
         fixed = np.append(fixed, 0)
     if not problem.has_translations:
         fixed = np.union1d(np.arange(problem.num_poses), fixed)
@@ -56,34 +57,6 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     return following, ProofAnswer(elimination.schur, sizes, trace, step)
 
 
-def handedness_terms(robot: Interior) -> HandednessTerms | None:
-    """Return the terms of the robot's edges in closed form, None where no edge needs one."""
-    if robot.problem.d == 2:
-        return None
-    return closed_form_terms(robot.tangent_problem, robot.state.poses)
-
-
-def describe_with_terms(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
-    """Count the handedness terms of the robot's edges; the diagonal of M less them."""
-    terms = handedness_terms(robot)
-    problem = robot.tangent_problem
-    num_pairs = 0
-    if terms is not None:
-        problem = terms.taken_off(problem)
-        num_pairs = terms.num_pairs
-    diagonal = problem.M.data[problem.diagonal_positions]
-    return robot, TermsAnswer(num_pairs, diagonal[robot.boundary_rows])
-
-
-def report_terms(robot: Interior, _: None) -> tuple[Interior, HandednessTerms | None]:
-    """Return the handedness terms of the robot's edges, with the numbers of the whole graph."""
-    terms = handedness_terms(robot)
-    if terms is None:
-        return robot, None
-    numbers = robot.part.poses
-    return robot, replace(terms, i=numbers[terms.i], j=numbers[terms.j])
-
-
 def fits_part(robot: Interior, _: None) -> tuple[Interior, bool]:
     """Whether every edge of the robot fits to its rounding at the poses."""
     return robot, fits_to_rounding(robot.problem, robot.state.poses)
@@ -97,11 +70,14 @@ def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
     return _evaluated(robot.with_changes(proof=moved))
 
 
-def _trace(problem: PGOProblem, Lambda: Array) -> float:
-    """Compute the robot's part of tr(Lambda), with the constant of its cost, rounded down."""
+def _trace(problem: PGOProblem, Lambda: Array, lost: float) -> float:
+    """Compute the robot's part of tr(Lambda), with the constant of its cost, rounded down.
+
+    What rounding can make of handedness terms is subtracted.
+    """
     constant, constant_error = problem.weights.constant
     diagonals = np.einsum("naa->na", Lambda).ravel()
-    return math.fsum([*diagonals, constant, -constant_error])
+    return math.fsum([*diagonals, constant, -constant_error, -lost])
 
 
 def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:

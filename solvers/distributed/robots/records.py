@@ -3,7 +3,9 @@
 Shapes are those of a robot with g boundary poses, and of vectors with w unknowns per pose.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.robots.proof import ProofSums
@@ -128,7 +130,38 @@ class ProofOrder:
     fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
     diagonal: Array  # ((d+1) g,): of S there, summed over robots, or more
     point: Array | None  # ((d+1) g, d): X there, where a proof begins
-    with_terms: bool = False  # whether S is that of the cost less handedness terms
+    is_grounded: bool  # whether a pose is left out, not the translation of pose 0 alone
+    with_terms: bool  # whether S is that of the cost less the robots' handedness terms
+
+
+@dataclass(frozen=True, eq=False)
+class RobotAscent:
+    """Where a robot is in an ascent of handedness terms, with the k pairs that its edges join."""
+
+    P: Array  # (k, 3, 3)
+    best: Array  # (k, 3, 3): the P that had the largest smallest eigenvalue
+    derivative: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    X: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (side, q): inverse iteration's
+
+
+@dataclass(frozen=True, eq=False)
+class VectorsOrder:
+    """A step of inverse iteration: the right-hand sides become X C, with the solution x."""
+
+    x: Array  # ((d+1) g, q): on the boundary
+    C: Array  # (q, q)
+
+
+@dataclass(frozen=True, eq=False)
+class VectorsAnswer:
+    """Vectors X of inverse iteration, of right-hand sides b.
+
+    Sums are over the rotations of the robot's interior.
+    """
+
+    b: Array  # ((d+1) g, q): X on the boundary, with the interior eliminated
+    energies: Array  # (q, q): X^T b
+    products: Array  # (q, q): X^T X
 
 
 @dataclass(frozen=True, eq=False)

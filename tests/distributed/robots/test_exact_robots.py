@@ -119,11 +119,9 @@ def test_what_a_driver_says_to_be_definite_is(
     problem = PGOProblem(varied_graph(seed, n, d), backend)
     poses = polish(problem, chordal_start(problem))
     with closing(driver_at(problem, cut(problem.graph, seed), poses)) as driver:
-        g = len(driver.cover)
         r = driver.grounded_position
-        fixed = columns_of(np.array([r]), g, (1, d))
         X = Poses(driver.current.R, driver.current.t).stacked()
-        proof = distributed_bound.eliminate_S(driver, fixed, 0.0, 1e-9, X)
+        proof = distributed_bound.eliminate_S(driver, r, 0.0, 1e-9, X)
         _, Lambda = collect(driver)
         rows = columns_of(driver.cover, n, (1, d))
         left_out = pose_rows(int(driver.cover[r]), n, d)
@@ -211,8 +209,7 @@ def test_every_term_of_the_errors_of_a_driver_s_elimination_is_there(
         monkeypatch.setattr(
             Interface, "rounding", lambda self, sizes, own, diagonal: 0.0 * diagonal
         )
-        fixed = driver.columns_of_pose_0(1).ravel()
-        found = distributed_bound.eliminate_S(driver, fixed, 1.0, 1e-13, None)
+        found = distributed_bound.eliminate_S(driver, None, 1.0, 1e-13)
         assert found is not None
         diagonal = driver.diagonal.copy()
         rows = driver.rotation_rows

@@ -1,0 +1,202 @@
+"""Handedness terms by robots: their spectra, what is handed out, and the bound are the central
+ones.
+"""
+
+import numpy as np
+import pytest
+from budget import examples
+from graphs import LOUD_NOISE, SEEDS, varied_graph
+from hypothesis import given, settings, strategies as st
+from robots import PARTITIONERS, Partitioner, driver_at, graph_of, metis
+
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
+from pgo_models.certificates.lower_bound import best_bound_with_terms
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from pgo_models.relaxations.rotation_hull import matrices_at
+from solvers.distributed import handedness
+from solvers.distributed.driver import Driver
+from solvers.distributed.lower_bound import best_bound_with_terms as best_bound_by_robots
+from solvers.distributed.robots import handedness as robot_orders
+from solvers.handedness.ascent import AscentState, HandednessAscent
+from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
+from solvers.loop import Outcome, run
+from solvers.network.counted_pool import Count
+from solvers.network.messages import restore, take_snapshot
+from solvers.pipeline import solve
+from solvers.result import Status
+from solvers.riemannian.polish import polish
+from solvers.studies.tightness import SweptScene, noisy_scene
+
+SIZES = st.integers(3, 12)
+
+
+def stationary(problem: PGOProblem) -> Poses:
+    return problem.at_best_translations(polish(problem, chordal_start(problem)))
+
+
+def loose(seed: int, n: int) -> tuple[PGOProblem, Poses]:
+    problem = PGOProblem(varied_graph(seed, n, 3, LOUD_NOISE), weighting=Weighting.ISOTROPIC)
+    return problem, stationary(problem)
+
+
+def random_multipliers(seed: int, count: int) -> Array:
+    roots = np.random.default_rng(seed).standard_normal((count, 4, 4))
+    return roots @ np.swapaxes(roots, 1, 2)
+
+
+def central_terms(problem: PGOProblem, poses: Poses, Pi: Array) -> HandednessTerms:
+    i, j = distinct_pairs(problem.graph).T
+    T = np.swapaxes(poses.R[i], 1, 2) @ poses.R[j]
+    return HandednessTerms.at(poses, i, j, matrices_at(T, Pi))
+
+
+def driver_with_terms(problem: PGOProblem, parts: Partition, poses: Poses, Pi: Array) -> Driver:
+    driver = driver_at(problem, parts, poses)
+    driver.describe(Count.PIGGYBACKED)
+    handedness.hand_out_terms(driver, distinct_pairs(problem.graph), poses, Pi)
+    return driver
+
+
+def collected_terms(driver: Driver) -> HandednessTerms:
+    found = [terms for terms in driver.ask(robot_orders.report_terms, None, Count.OFF) if terms]
+    fields = [np.concatenate([getattr(terms, name) for terms in found]) for name in "ijTP"]
+    return HandednessTerms(*fields)
+
+
+def matrix_of(problem: PGOProblem, terms: HandednessTerms) -> Array:
+    return np.asarray(terms.taken_off(problem).M.toarray())
+
+
+@settings(max_examples=examples(20))
+@given(seed=SEEDS, n=SIZES, partitioner=PARTITIONERS)
+def test_terms_that_are_handed_out_add_up_to_those_of_the_whole_graph(
+    seed: int, n: int, partitioner: Partitioner
+) -> None:
+    problem, poses = loose(seed, n)
+    parts = partitioner(problem.graph, seed)
+    Pi = random_multipliers(seed, len(distinct_pairs(problem.graph)))
+    driver = driver_with_terms(problem, parts, poses, Pi)
+    found = matrix_of(problem, collected_terms(driver))
+    expected = matrix_of(problem, central_terms(problem, poses, Pi))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_robots_with_edges_between_the_same_poses_share_the_terms() -> None:
+    graph = graph_of([(0, 1), (1, 2), (2, 3), (1, 2), (2, 1), (3, 0), (0, 2), (2, 0)], 3)
+    problem = PGOProblem(graph)
+    poses = stationary(problem)
+    Pi = random_multipliers(0, len(distinct_pairs(graph)))
+    expected = matrix_of(problem, central_terms(problem, poses, Pi))
+    for number in (1, 2, 4):
+        driver = driver_with_terms(problem, partition(graph, number), poses, Pi)
+        found = matrix_of(problem, collected_terms(driver))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+@settings(max_examples=examples(20))
+@given(seed=SEEDS, n=SIZES, partitioner=PARTITIONERS)
+def test_the_bound_with_terms_is_the_central_one(
+    seed: int, n: int, partitioner: Partitioner
+) -> None:
+    problem, poses = loose(seed, n)
+    Pi = 1e-3 * random_multipliers(seed, len(distinct_pairs(problem.graph)))
+    driver = driver_with_terms(problem, partitioner(problem.graph, seed), poses, Pi)
+    found = best_bound_by_robots(driver, 1e-6, handedness.return_to_best(driver))
+    central = best_bound_with_terms(
+        problem,
+        multipliers(problem, poses),
+        poses,
+        1e-6,
+        problem.objective(poses),
+        collected_terms(driver),
+    )
+    allowed = found.rounding + central.rounding
+    if not np.isnan(found.eta) and found.eta > 0.0:
+        # what an eta costs, grounded at another pose, is another figure
+        return
+    assert found.value == pytest.approx(central.value, rel=1e-9, abs=allowed)
+
+
+def ascents(
+    problem: PGOProblem, parts: Partition, poses: Poses, ascent: HandednessAscent
+) -> tuple[Outcome[AscentState[HandedPoint]], Outcome[AscentState[handedness.RobotsPoint]], Driver]:
+    """The same ascent in one place and by robots, grounded at the same pose."""
+    driver = driver_at(problem, parts, poses)
+    driver.describe(Count.PIGGYBACKED)
+    i, j = distinct_pairs(problem.graph).T
+    matrix = HandedMatrix(problem, multipliers(problem, poses), poses, i, j)
+    matrix.__dict__["ground"] = int(driver.cover[driver.grounded_position])
+    central = run(ascent, HandedPoint.first(matrix, None, ascent.num_eigenvalues))
+    handedness.begin_without_terms(driver)
+    by_robots = run(ascent, handedness.RobotsPoint.first(driver, ascent.num_eigenvalues))
+    return central, by_robots, driver
+
+
+@settings(max_examples=examples(10))
+@given(seed=SEEDS, n=SIZES, partitioner=PARTITIONERS)
+def test_an_ascent_begins_at_the_same_eigenvalues(
+    seed: int, n: int, partitioner: Partitioner
+) -> None:
+    problem, poses = loose(seed, n)
+    no_step = HandednessAscent(max_iterations=0, num_eigenvalues=4)
+    parts = partitioner(problem.graph, seed)
+    central, by_robots, _ = ascents(problem, parts, poses, no_step)
+    expected = central.state.smallest
+    scale = abs(expected) + 1e-6 * central.state.point.scale
+    assert by_robots.state.smallest == pytest.approx(expected, abs=1e-2 * scale)
+
+
+@pytest.mark.parametrize(("scene", "degrees"), [(SweptScene.CIRCLE, 70), (SweptScene.GRID, 60)])
+def test_an_ascent_by_robots_is_that_of_one_place(scene: SweptScene, degrees: float) -> None:
+    graph = noisy_scene(scene, np.deg2rad(degrees), np.random.default_rng(0))
+    problem = PGOProblem(graph)
+    poses = solve(problem).poses
+    poses = problem.at_best_translations(poses)
+    ascent = HandednessAscent(max_iterations=8)
+    central, by_robots, driver = ascents(problem, metis(graph, 3), poses, ascent)
+    # the eigenvalues above the smallest are known less well to either
+    np.testing.assert_allclose(by_robots.state.best, central.state.best, rtol=0.15, atol=1e-6)
+    assert by_robots.state.smallest > 0.3 * by_robots.state.best[0]
+    # the P of the best point come back
+    best = handedness.return_to_best(driver)
+    assert np.isfinite(best).all()
+    again = handedness.RobotsPoint.first(driver, ascent.num_eigenvalues)
+    assert again.values[0] == pytest.approx(by_robots.state.best[-1], rel=0.02, abs=1e-6)
+
+
+@pytest.mark.slow  # solves from end to end
+@pytest.mark.parametrize(
+    ("scene", "degrees", "seed"),
+    [(SweptScene.CIRCLE, 60, 0), (SweptScene.CIRCLE, 80, 2), (SweptScene.GRID, 60, 1)],
+)
+def test_robots_certify_what_the_relaxation_leaves_open(
+    scene: SweptScene, degrees: float, seed: int
+) -> None:
+    graph = noisy_scene(scene, np.deg2rad(degrees), np.random.default_rng(seed))
+    central = solve(graph)
+    solution = solve(graph, robots=4)
+    assert solution.is_certified
+    assert solution.status is Status.CONVERGED
+    assert solution.certificate.bound.terms is not None
+    assert solution.stages[-1].name == "HandednessAscent"
+    assert solution.lower_bound == pytest.approx(central.lower_bound, rel=1e-9)
+
+
+def test_the_state_of_an_ascent_survives_a_snapshot() -> None:
+    graph = noisy_scene(SweptScene.CIRCLE, np.deg2rad(70), np.random.default_rng(0))
+    problem = PGOProblem(graph)
+    poses = stationary(problem)
+    Pi = random_multipliers(0, len(distinct_pairs(graph)))
+    driver = driver_with_terms(problem, partition(graph, 3), poses, Pi)
+    before = best_bound_by_robots(driver, 1e-6, handedness.return_to_best(driver))
+    snapshots = driver.network.ask(take_snapshot, [None] * 3, Count.OFF)
+    handedness.begin_without_terms(driver)
+    driver.network.ask(restore, snapshots, Count.OFF)
+    after = best_bound_by_robots(driver, 1e-6, handedness.return_to_best(driver))
+    assert after.value == before.value
