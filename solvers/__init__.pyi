@@ -30,9 +30,10 @@ from solvers.network.ledger import Ledger as Ledger, Traffic as Traffic
 from solvers.network.messages import Worker as Worker
 from solvers.network.ray_engine import RayEngine as RayEngine
 from solvers.network.recovery import Recovery as Recovery
-from solvers.pipeline import Pipeline as Pipeline, solve as solve
+from solvers.pipeline import solve as solve
 from solvers.reporting.edge_fit import EdgeFit as EdgeFit
 from solvers.reporting.report import write_report as write_report
+from solvers.request import Pipeline as Pipeline
 from solvers.result import (
     History as History,
     Measurement as Measurement,

@@ -50,7 +50,7 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import Ledger
 from solvers.network.ray_engine import RayEngine
-from solvers.pipeline import Pipeline
+from solvers.request import Pipeline
 from solvers.result import OUT_OF_TIME, Record, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import Staircase

@@ -16,7 +16,8 @@ from pgo_models.problem.cholesky import factorize
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import OUT_OF_TIME
 from solvers.solution import Solution
 

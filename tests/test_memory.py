@@ -17,7 +17,7 @@ from pgo_models.errors import FileFormatError, MissingExtraError, PGOError, extr
 from pgo_models.files import LONGEST_OF_ALL, read_blocks, read_text
 from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum
 from pgo_models.memory import available_memory, check_memory, check_room
-from solvers.cli import explanations, options as cli_options
+from solvers.cli import explanations, generate_command, options as cli_options
 from solvers.reporting.graph_facts import memory_of_a_solve
 
 pytestmark = pytest.mark.slow  # solves under limits of memory, each in a process of its own
@@ -123,7 +123,7 @@ def test_a_scene_beyond_the_memory_is_refused_before_it_is_made(options, pgo_com
 def test_a_scene_takes_no_more_than_is_estimated_and_not_much_less(scene, d, tmp_path):
     def made() -> None:
         rng = np.random.default_rng(0)
-        graph = cli_options.chosen_scene(
+        graph = generate_command.chosen_scene(
             scene, rng, 3000, 1 if scene.value == "grid-world" else None, d, None, None
         )
         pgo.write_g2o(graph, tmp_path / "x.g2o")
@@ -133,7 +133,7 @@ def test_a_scene_takes_no_more_than_is_estimated_and_not_much_less(scene, d, tmp
     made()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    estimate = cli_options.memory_of_scene(scene, 3000, d)
+    estimate = generate_command.memory_of_scene(scene, 3000, d)
     assert estimate / 8 < peak < 2 * estimate
 
 

@@ -4,7 +4,6 @@ The projection is step (b) of the paper's Algorithm 1 (`algo1: SOC`), with det =
 """
 
 import numpy as np
-import scipy  # and scipy.spatial when it is used
 from numpy.typing import NDArray
 
 from pgo_models.errors import SettingError
@@ -235,12 +234,12 @@ def exp_map(w: Array) -> Array:
     if w.shape[-1] == 1:
         angle = w[..., 0]
         return _from_cosine_sine(np.cos(angle), np.sin(angle))
-    shape = (*w.shape, 3)
-    if w.size == 0:
-        return np.empty(shape)
-    vectors = _writable(w.reshape(-1, 3))
-    rotations = scipy.spatial.transform.Rotation.from_rotvec(vectors)
-    return np.asarray(rotations.as_matrix()).reshape(shape)
+    # Rodrigues' formula, with a the angle: cos(a) I + sin(a) / a hat(w) + (1 - cos(a)) / a^2 w w^T.
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    first_order = np.sinc(angle / np.pi)
+    second_order = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    outer = w[..., :, None] * w[..., None, :]
+    return np.asarray(np.cos(angle) * np.eye(3) + first_order * hat(w) + second_order * outer)
 
 
 def log_map(R: Array) -> Array:
@@ -272,23 +271,13 @@ def log_map(R: Array) -> Array:
         cosine = R[..., 0, 0] + R[..., 1, 1]
         angle = np.arctan2(sine, cosine)
         return angle[..., None]
-    shape = R.shape[:-1]
-    if R.size == 0:
-        return np.empty(shape)
-    matrices = _writable(R.reshape(-1, 3, 3))
-    rotations = scipy.spatial.transform.Rotation.from_matrix(matrices)
-    return np.asarray(rotations.as_rotvec()).reshape(shape)
-
-
-def _writable(A: Array) -> Array:
-    """Return the array, or a copy where it is read-only.
-
-    The arrays of poses are read-only, and SciPy 1.14 refuses such arrays. It refuses empty arrays,
-    too; callers treat these before.
-    """
-    if A.flags.writeable:
-        return A
-    return A.copy()
+    quaternions = quaternions_from_rotations(R.reshape(-1, 3, 3))
+    vector = quaternions[:, :3]
+    sine = np.linalg.norm(vector, axis=1)  # of half the angle, as w >= 0
+    half_angle = np.arctan2(sine, quaternions[:, 3])
+    is_zero = sine == 0.0
+    angle_by_sine = np.where(is_zero, 2.0, 2.0 * half_angle / np.where(is_zero, 1.0, sine))
+    return np.asarray(angle_by_sine[:, None] * vector).reshape(R.shape[:-1])
 
 
 def _check_ends(A: Array, *ends: tuple[int, ...]) -> None:
@@ -333,18 +322,35 @@ def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
 
 def rotations_from_quaternions(quaternions: Array) -> Array:
     """Rotations of (n, 4) quaternions (x, y, z, w), normalised first; none may be zero."""
-    if quaternions.size == 0:
-        return np.empty((0, 3, 3))
-    rotations = scipy.spatial.transform.Rotation.from_quat(_writable(quaternions))
-    return np.asarray(rotations.as_matrix()).reshape(-1, 3, 3)
+    norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    x, y, z, w = _columns(quaternions / norm)
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
+        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def quaternions_from_rotations(R: Array) -> Array:
-    """Unit quaternions (n, 4), ordered (x, y, z, w) with w >= 0, of (n, 3, 3) rotations."""
-    if R.size == 0:
-        return np.empty((0, 4))
-    rotations = scipy.spatial.transform.Rotation.from_matrix(_writable(R))
-    return np.asarray(rotations.as_quat(canonical=True)).reshape(-1, 4)
+    """Unit quaternions (n, 4), ordered (x, y, z, w) with w >= 0, of (n, 3, 3) rotations.
+
+    All of them are rows of 4 q q^T, whose entries are sums of those of R. The row with the largest
+    diagonal entry has the smallest rounding errors (Shepperd 1978).
+    """
+    products = np.empty((len(R), 4, 4))
+    diagonal = np.einsum("naa->na", R)
+    trace = diagonal.sum(axis=1)
+    products[:, range(3), range(3)] = 1.0 - trace[:, None] + 2.0 * diagonal
+    products[:, 3, 3] = 1.0 + trace
+    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        products[:, a, b] = products[:, b, a] = R[:, b, a] + R[:, a, b]
+        products[:, c, 3] = products[:, 3, c] = R[:, b, a] - R[:, a, b]
+    largest = np.argmax(np.einsum("naa->na", products), axis=1)
+    quaternions: Array = products[np.arange(len(R)), largest]
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    quaternions *= np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0)
+    return quaternions
 
 
 def orthogonality_error(R: Array) -> Array:

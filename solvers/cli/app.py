@@ -1,29 +1,133 @@
-"""The command `pgo`: solve, certify, info, generate, verify, and `solvers.cli.study_commands`.
+"""The command `pgo`: its commands and their helps, each imported from its module when it is run.
 
 Exit codes: 0 done; 1 bad input, one line on stderr; 2 not converged, the result written all the
 same; 3 not certified; 130, 143 and 129 after SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal
 closed), the best iterate written if there was one.
 """
 
+import gc
 import sys
-from typing import Annotated
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import wraps
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
 
-from solvers.cli.certify_command import certify_command
-from solvers.cli.generate_command import generate_command
-from solvers.cli.info_command import info_command
-from solvers.cli.shell import Commands, run_command
-from solvers.cli.solve_command import solve_command
-from solvers.cli.study_commands import compare_command, figures_command, tables_command
-from solvers.cli.verify_command import verify_command
-from solvers.reporting.versions import installed_version
+from solvers.cli.shell import CommandGroup, run_command
+from solvers.distribution import text_of_version
 
+
+@dataclass(frozen=True)
+class CommandOfModule:
+    """A command that has not been imported: MODULE:FUNCTION, and its help."""
+
+    place: str
+    help: str
+
+    @property
+    def short_help(self) -> str:
+        """First paragraph of the help."""
+        return self.help.partition("\n\n")[0]
+
+    def imported(self, name: str) -> Any:  # noqa: ANN401 - a command of click, which typer carries or imports
+        """The command, from its module."""
+        module, _, function = self.place.partition(":")
+        command = getattr(import_module(module), function)
+        app = typer.Typer(add_completion=False, rich_markup_mode=None)
+        app.command(name, help=self.help)(_with_garbage_collection(command))
+        return typer.main.get_command(app)
+
+
+def _with_garbage_collection(command: Callable[..., object]) -> Callable[..., object]:
+    """Wrap a command, before which `solvers.command` has turned the collector off."""
+
+    @wraps(command)
+    def run(**options: object) -> object:
+        gc.freeze()  # what has been imported stays
+        gc.enable()
+        return command(**options)
+
+    return run
+
+
+COMMANDS = {
+    "solve": CommandOfModule(
+        "solvers.cli.solve_command:solve_command",
+        "Solve a pose graph: poses, their cost, a proven lower bound on the optimum, and the gap.",
+    ),
+    "certify": CommandOfModule(
+        "solvers.cli.certify_command:certify_command",
+        "Judge poses from anywhere: how far their cost can be above the global optimum.",
+    ),
+    "info": CommandOfModule(
+        "solvers.cli.info_command:info_command",
+        "Show what a pose graph is made of, or what this installation has.",
+    ),
+    "generate": CommandOfModule(
+        "solvers.cli.generate_command:generate_command",
+        "Generate a scene with known truth, written beside it as NAME.truth.tum.",
+    ),
+    "verify": CommandOfModule(
+        "solvers.cli.verify_command:verify_command",
+        "Check the proof of a lower bound, trusting nobody: exact numbers, ball arithmetic.",
+    ),
+    "tables": CommandOfModule(
+        "solvers.cli.study_commands:tables_command",
+        "Run the paper's tables 1 to 4, row by row: its figures beside ours, with proven bounds.",
+    ),
+    "compare": CommandOfModule(
+        "solvers.cli.study_commands:compare_command",
+        "Run several methods on a graph and hold them against each other and a "
+        "proven bound.\n\n"
+        "The cost is F, with two precisions an edge, which all of these methods "
+        "minimise.",
+    ),
+    "figures": CommandOfModule(
+        "solvers.cli.study_commands:figures_command",
+        "Draw the paper's figures from new runs, as PNG and as interactive pages.",
+    ),
+}
+
+
+class ImportedCommands(Mapping[str, Any]):
+    """Commands by their names, each imported when it is looked up."""
+
+    def __getitem__(self, name: str) -> Any:  # noqa: ANN401 - as above
+        return COMMANDS[name].imported(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+
+class Commands(CommandGroup):
+    """The commands of `pgo`; lists and helps of all of them import none."""
+
+    def __init__(self, **settings: Any) -> None:  # noqa: ANN401 - passed on to typer
+        super().__init__(**settings)
+        self.commands: Any = ImportedCommands()
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401 - of click's Context
+        """Names of the commands, in the order of the help."""
+        return list(COMMANDS)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - as above
+        """Write the commands and their helps."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, command.short_help) for name, command in COMMANDS.items()])
+
+
+# Help is plain text: the boxes of rich take longer to import than the rest of the command line.
 app = typer.Typer(
     name="pgo",
     cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -34,17 +138,7 @@ def pgo(
 ) -> None:
     """Pose graph optimisation by splitting, with a certified distance to the global optimum."""
     if version:
-        typer.echo(f"pgo {installed_version()}")
-
-
-app.command("solve")(solve_command)
-app.command("certify")(certify_command)
-app.command("info")(info_command)
-app.command("generate")(generate_command)
-app.command("verify")(verify_command)
-app.command("tables")(tables_command)
-app.command("compare")(compare_command)
-app.command("figures")(figures_command)
+        typer.echo(text_of_version())
 
 
 def main(arguments: list[str] | None = None) -> None:

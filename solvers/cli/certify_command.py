@@ -17,12 +17,14 @@ from solvers.cli.inputs import GraphOptions, estimated_poses, graph_in_commands
 from solvers.cli.options import (
     CostOption,
     DropCouplingOption,
+    DropEdgeOption,
     GapOption,
     GraphArgument,
     InformationOption,
     ProofOption,
     RotationsOption,
     SkipUnknownOption,
+    UnitWeightsOption,
 )
 from solvers.cli.shell import (
     DONE,
@@ -32,7 +34,6 @@ from solvers.cli.shell import (
     save_then_show,
     wrapped,
 )
-from solvers.cli.study_commands import DropEdgeOption, UnitWeightsOption
 from solvers.reporting.versions import installed_versions
 from solvers.riemannian.certify import certify
 from solvers.solution import (
@@ -72,7 +73,7 @@ def certify_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Judge poses from anywhere: how far their cost can be above the global optimum."""
+    """Run `pgo certify`."""
     if out is not None and out.suffix.lower() != ".json":
         raise SettingError(f"cannot write {out}: a certificate is written as .json")
     for path in (out, proof):

@@ -1,5 +1,6 @@
 """`pgo generate`: a scene with known truth, in a g2o file or a folder with one file a robot."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -9,10 +10,23 @@ import typer
 
 from pgo_models.errors import SettingError, printable
 from pgo_models.graphs.g2o import MOST_SYMBOLS, symbol_ids, write_g2o, write_g2o_folder
+from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import (
+    MILD_NOISE,
+    NoiseModel,
+    circle,
+    grid,
+    random_geometric,
+    sphere,
+    victoria_park,
+)
 from pgo_models.graphs.trajectories import write_tum
-from solvers.cli.options import Scene, chosen_scene
+from pgo_models.memory import check_memory
+from solvers.cli.options import Scene
 from solvers.cli.shell import JsonOption, QuietOption, figures_of_facts, save_then_show, wrapped
+
+_PAPER_SCENES = {Scene.CIRCLE: circle, Scene.GRID: grid, Scene.SPHERE: sphere}
 
 
 def generate_command(
@@ -53,7 +67,7 @@ def generate_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Generate a scene with known truth, written beside it as NAME.truth.tum."""
+    """Run `pgo generate`."""
     if out.suffix.lower() not in ("", ".g2o"):
         raise SettingError(
             f"cannot write {out}: give a name that ends in .g2o, "
@@ -83,3 +97,87 @@ def _write_scene(graph: PoseGraph, out: Path, truth: Path) -> None:
         write_g2o_folder(graph, out)
     assert graph.truth is not None
     write_tum(graph.truth, truth)
+
+
+def chosen_scene(
+    scene: Scene,
+    rng: np.random.Generator,
+    poses: int | None,
+    robots: int | None,
+    d: int | None,
+    translation_noise: float | None,
+    rotation_noise: float | None,
+) -> PoseGraph:
+    """Scene with noise in metres and degrees.
+
+    A SettingError when noise is out of its range, or for an option that is part of the scene: all
+    of them in the paper's scenes, the number of robots in `random`.
+    """
+    _check_scene_options(
+        scene,
+        {
+            "--robots": robots,
+            "--poses": poses,
+            "--dimension": d,
+            "--translation-noise": translation_noise,
+            "--rotation-noise": rotation_noise,
+        },
+    )
+    if scene in _PAPER_SCENES:
+        return _PAPER_SCENES[scene](rng)
+    # Checked here, in degrees: an error of the scene would speak of radians.
+    if rotation_noise is not None and not 0 < rotation_noise < math.inf:
+        raise SettingError(f"--rotation-noise must be positive and finite, got {rotation_noise}")
+    if poses is None:
+        poses = 300 if scene is Scene.VICTORIA_PARK else 100
+    if robots is None:
+        robots = 4 if scene is Scene.GRID_WORLD else 1
+    d = 3 if d is None else d
+    num_poses = poses * robots
+    memory = memory_of_scene(scene, num_poses, d)
+    check_memory(memory, f"a scene of {num_poses} poses", "ask for fewer")
+    noise = _chosen_noise(translation_noise, rotation_noise)
+    if scene is Scene.VICTORIA_PARK:
+        return victoria_park(rng, num_poses=poses, noise=noise)
+    if scene is Scene.RANDOM:
+        return random_geometric(poses, rng, d=d, noise=noise)
+    return grid_world(robots, poses, rng, d=d, noise=noise)
+
+
+def _check_scene_options(scene: Scene, options: dict[str, float | None]) -> None:
+    """Raise a SettingError for an option that was given and is part of the scene."""
+    fixed: tuple[str, ...] = ("--robots",)
+    if scene is Scene.GRID_WORLD:
+        fixed = ()
+    elif scene is Scene.VICTORIA_PARK:
+        fixed = ("--robots", "--dimension")
+    elif scene in _PAPER_SCENES:
+        fixed = tuple(options)
+    for name in fixed:
+        if options[name] is not None:
+            raise SettingError(
+                f"{name} does nothing for {scene.value}, of which it is a part; leave it out"
+            )
+
+
+def _chosen_noise(translation_noise: float | None, rotation_noise: float | None) -> NoiseModel:
+    """Noise model of standard deviations in metres and degrees, mild unless given."""
+    translation_std = MILD_NOISE.translation_std
+    rotation_std = MILD_NOISE.rotation_std
+    if translation_noise is not None:
+        translation_std = translation_noise
+    if rotation_noise is not None:
+        rotation_std = float(np.deg2rad(rotation_noise))
+    return NoiseModel(translation_std, rotation_std)
+
+
+def memory_of_scene(scene: Scene, num_poses: int, d: int) -> float:
+    """Bytes that a scene takes while it is made and written, beside those of the program.
+
+    As measured at 20,000 and 100,000 poses. In the park every tree is compared with every pose.
+    """
+    per_pose = 4000.0 if d == 3 else 2000.0
+    memory = per_pose * num_poses
+    if scene is Scene.VICTORIA_PARK:
+        memory += 12.0 * num_poses**2
+    return memory

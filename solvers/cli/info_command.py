@@ -14,8 +14,8 @@ from pgo_models.graphs.g2o import write_g2o
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.separators import report_partition
 from solvers.cli.explanations import explained_by_its_graph
-from solvers.cli.inputs import indefinite_matrices, load_graph
-from solvers.cli.options import SkipUnknownOption, Split, SplitOption, chosen_partition
+from solvers.cli.inputs import chosen_partition, indefinite_matrices, load_graph
+from solvers.cli.options import SkipUnknownOption, Split, SplitOption
 from solvers.cli.shell import JsonOption, figures_of_facts, save_then_show, wrapped
 from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.versions import installation
@@ -54,7 +54,7 @@ def info_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what a pose graph is made of, or what this installation has."""
+    """Run `pgo info`."""
     targets: list[tuple[Path, Callable[[Path], object]]] = []
     if graph is None:
         if robots is not None or split is not None or out is not None:

@@ -14,6 +14,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate, places_of_edges
 from pgo_models.graphs.g2o import read_g2o_poses
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition, suited_partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     indefinite_edges,
@@ -26,7 +27,7 @@ from pgo_models.problem.cholmod import import_cvxopt
 from pgo_models.problem.kernels import take_buffers
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.cli.options import Cost
+from solvers.cli.options import Cost, Split
 
 Dropped = list[str] | None  # edges to leave out, by LINE or FILE:LINE
 
@@ -207,6 +208,22 @@ def indefinite_matrices(loaded: PoseGraph, graph: str, dropped: Dropped = None) 
         _, places = kept_edges(graph, dropped)
         place = places[int(np.argmax(is_indefinite))]
     return text_of_indefinite(loaded, is_indefinite, place)
+
+
+def chosen_partition(graph: PoseGraph, number: int | None, split: Split | None) -> Partition:
+    """Partition of the options, by default among as many robots as the file names.
+
+    Errors are those of `partition`, and a SettingError for a number that a split excludes.
+    """
+    if split is Split.SINGLETONS and number not in (None, graph.num_poses):
+        raise SettingError(
+            f"--split singletons makes {graph.num_poses} robots, got --robots {number}; "
+            "leave one out"
+        )
+    number = graph.num_robots if number is None else number
+    if split is None:
+        return suited_partition(graph, number)
+    return partition(graph, number, PartitionMethod[split.name])
 
 
 def with_times(graph: PoseGraph, path: Path | None) -> PoseGraph:

@@ -56,7 +56,7 @@ JsonOption = Annotated[
 ]
 
 
-class Commands(TyperGroup):
+class CommandGroup(TyperGroup):
     """Commands that raise a PGOError when they are interrupted; typer alone would exit silently."""
 
     def invoke(self, ctx: Any) -> object:  # noqa: ANN401 - of click's Context, which typer carries or imports

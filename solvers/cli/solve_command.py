@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -19,9 +19,8 @@ from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.style import is_picture
-from pgo_models.problem.marginals import write_covariances
 from pgo_models.problem.problem import PGOProblem
-from solvers.cli import options as choices
+from solvers.cli import choices
 from solvers.cli.explanations import (
     edge_fit_of_solution,
     explained_by_its_graph,
@@ -31,12 +30,19 @@ from solvers.cli.explanations import (
     with_covariances,
     with_places,
 )
-from solvers.cli.inputs import GraphOptions, check_outputs_differ, pose_named, with_times
+from solvers.cli.inputs import (
+    GraphOptions,
+    check_outputs_differ,
+    chosen_partition,
+    pose_named,
+    with_times,
+)
 from solvers.cli.options import (
     BackEndName,
     Cost,
     CostOption,
     DropCouplingOption,
+    DropEdgeOption,
     FirstStage,
     GapOption,
     GraphArgument,
@@ -46,8 +52,10 @@ from solvers.cli.options import (
     RotationsOption,
     Runner,
     SkipUnknownOption,
+    Split,
     SplitOption,
     Start,
+    UnitWeightsOption,
 )
 from solvers.cli.shell import (
     DONE,
@@ -59,16 +67,16 @@ from solvers.cli.shell import (
     save_then_show,
     wrapped,
 )
-from solvers.cli.study_commands import DropEdgeOption, UnitWeightsOption
-from solvers.distributed.checkpoint import Checkpoint
-from solvers.folder_solve import solve_folder
 from solvers.network.engine import Engine
-from solvers.pipeline import WARM_START, Pipeline, solve
+from solvers.pipeline import solve
 from solvers.progress_bars import JobBar
-from solvers.reporting.report import check_report, write_report
+from solvers.request import WARM_START, Pipeline
 from solvers.result import Status
 from solvers.soc.soc import SOC
 from solvers.solution import Solution, check_format, check_target
+
+if TYPE_CHECKING:
+    from solvers.distributed.checkpoint import Checkpoint
 
 _INDENT = 13  # columns of the labels of a solution
 
@@ -200,7 +208,7 @@ def solve_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve a pose graph: poses, their cost, a proven lower bound on the optimum, and the gap."""
+    """Run `pgo solve`."""
     given = _given_options(locals())
     source = GraphOptions(
         graph,
@@ -234,10 +242,10 @@ def solve_command(
         problem,
         stages.pipeline(place.method, place.partition, driver_memory),
         choices.chosen_start(problem, start),
-        robust=choices.ROBUST[robust] if robust is not None else None,
+        robust=choices.chosen_robust(robust),
         robots=place.partition if place.engine is not None else None,
         engine=place.engine,
-        checkpoint=Checkpoint(resume) if resume is not None else None,
+        checkpoint=network.checkpoint,
         anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
         verbose=verbose,
@@ -302,7 +310,7 @@ class RobotOptions:
     """Options about robots."""
 
     robots: int | None
-    split: choices.Split | None
+    split: Split | None
     engine: Runner | None
     address: str | None
     resume: Path | None
@@ -324,6 +332,15 @@ class RobotOptions:
         """Whether robots do without a driver."""
         return self.driver_memory == 0
 
+    @property
+    def checkpoint(self) -> "Checkpoint | None":
+        """The checkpoint of --resume."""
+        if self.resume is None:
+            return None
+        from solvers.distributed.checkpoint import Checkpoint
+
+        return Checkpoint(self.resume)
+
     def reads_own_files(self, graph: str) -> bool:
         """Whether the robots are on a Ray cluster, and each is to read its own file of a folder."""
         is_on_ray = self.engine is Runner.RAY or bool(self.address)
@@ -342,7 +359,7 @@ class RobotOptions:
         engine = choices.chosen_engine(method, self.engine, self.address, has_checkpoint)
         partition = None
         if self.is_given or method in (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS):
-            partition = choices.chosen_partition(graph, self.robots, self.split)
+            partition = chosen_partition(graph, self.robots, self.split)
         # Robots factor; the other back ends of CONSENSUS have all robots in one place.
         is_factorized = stages.r_step in (None, BackEndName.FACTORIZED)
         if partition is not None and engine is not None and is_factorized:
@@ -402,6 +419,8 @@ class Outputs:
     def check_pages(self) -> None:
         """Raise an error where report or covariances have a name of another format."""
         if self.report is not None:
+            from solvers.reporting.report import check_report
+
             check_report(self.report)
         if self.covariances is not None and self.covariances.suffix.lower() != ".csv":
             raise SettingError(f"cannot write {self.covariances}: covariances are written as .csv")
@@ -450,6 +469,8 @@ def _solve_own_files(
     outputs: Outputs,
 ) -> int:
     """Solve a folder whose files the robots read themselves; the exit code."""
+    from solvers.folder_solve import solve_folder
+
     method = choices.chosen_method(stages.method, None, True)
     pipeline = stages.pipeline(method, None, network.driver_memory)
     solution = solve_folder(
@@ -483,6 +504,8 @@ def _save_and_show(
     if outputs.report is not None:
 
         def save_report(path: Path) -> None:
+            from solvers.reporting.report import write_report
+
             has_covariances = outputs.covariances is not None
             reported = with_covariances(solution) if has_covariances else solution
             write_report(reported, path, source=command_source, fit=judged())
@@ -513,6 +536,8 @@ def _files_of_solution(
         ids = graph.pose_ids[named]
 
         def save_covariances(path: Path) -> None:
+            from pgo_models.problem.marginals import write_covariances
+
             has_translations = solution.problem.has_translations
             write_covariances(solution.marginals()[named], ids, path, has_translations)
 

@@ -12,6 +12,7 @@ from pgo_models.errors import PGOError, SettingError
 from pgo_models.files import check_writable
 from solvers.cli.explanations import explained_by_its_graph
 from solvers.cli.inputs import check_outputs_differ, load_graph
+from solvers.cli.options import DropEdgeOption, UnitWeightsOption
 from solvers.cli.shell import BROKEN_OFF, JsonOption, QuietOption, save_then_show, wrapped
 from solvers.reporting.result_table import check_table_format
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
@@ -26,20 +27,6 @@ DownloadOption = Annotated[
     bool,
     typer.Option(
         "--download", help="Download the benchmark graphs that are not here; each is checked."
-    ),
-]
-UnitWeightsOption = Annotated[
-    bool,
-    typer.Option(
-        "--unit-weights",
-        help="The cost is F with kappa = tau = 1, the weights of the paper's equation.",
-    ),
-]
-DropEdgeOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="LINE",
-        help="Leave out the edge on this line of the file (FILE:LINE); may be repeated.",
     ),
 ]
 TableOption = Annotated[
@@ -79,7 +66,7 @@ def tables_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the paper's tables 1 to 4, row by row: its figures beside ours, with proven bounds."""
+    """Run `pgo tables`."""
     check_outputs_differ({"--out": out, "--keep": keep})
     _check(out, check_table_format)
     check_writable(keep)
@@ -127,10 +114,7 @@ def compare_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run several methods on a graph and hold them against each other and a proven bound.
-
-    The cost is F, with two precisions an edge, which all of these methods minimise.
-    """
+    """Run `pgo compare`."""
     check_outputs_differ({"--out": out, "--plot": plot})
     _check(out, check_table_format)
     _check(plot, check_plot_format)
@@ -164,7 +148,7 @@ def figures_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the paper's figures from new runs, as PNG and as interactive pages."""
+    """Run `pgo figures`."""
     sets = _chosen(FigureSet, only, "figure")
     progress = False if quiet else None
     written, reasons = draw_paper_figures(out, sets, download=download, progress=progress)

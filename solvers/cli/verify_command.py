@@ -20,7 +20,7 @@ def verify_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check the proof of a lower bound, trusting nobody: exact numbers, ball arithmetic."""
+    """Run `pgo verify`."""
     from pgo_models.verification.verify import verify_proof  # needs the extra `verify`
 
     verification = verify_proof(locate(graph), proof, skip_unknown=skip_unknown)

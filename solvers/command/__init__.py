@@ -4,6 +4,7 @@ A signal that arrives during the import ends the command in one line. So does a 
 has the name of one of the packages and comes before it on the path, as with ROS.
 """
 
+import gc
 import os
 import re
 import signal
@@ -30,6 +31,12 @@ def main() -> None:
         signal.signal(number, _leave)
     for package, file in (("pgo_models", "errors.py"), ("solvers", "cli/app.py")):
         _check_not_hidden(package, file)
+    if sys.argv[1:] == ["--version"]:  # before anything that takes longer to import
+        from solvers.distribution import text_of_version
+
+        print(text_of_version())
+        return
+    gc.disable()  # until a command runs: importing makes many objects and no garbage
     run = _imported()
     try:
         run()

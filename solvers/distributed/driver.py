@@ -73,14 +73,13 @@ from solvers.distributed.robots.records import (
 )
 from solvers.distributed.robots.reweighting import reweigh
 from solvers.network.counted_pool import Count, CountedPool
-from solvers.network.engine import WorkerPool
+from solvers.network.engine import DEFAULT_MEMORY, WorkerPool
 from solvers.network.ledger import Ledger
 from solvers.network.messages import Snapshot, restore, take_snapshot
 from solvers.result import Measurement
 from solvers.soc.recursion_block import RecursionBlock
 from solvers.soc.subgraph import RobotSummary
 
-DEFAULT_MEMORY = 4e9
 Q = TypeVar("Q")
 A = TypeVar("A")
 InteriorOrder = Callable[[Interior, Q], tuple[Interior, A]]

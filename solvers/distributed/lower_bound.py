@@ -63,9 +63,10 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
         return grounded
     if driver.d == 3:
         described = driver.ask(take_closed_form, None, Count.PIGGYBACKED)
-        with_terms = _bound_with_terms(driver, diagonal_less_terms(driver, described))
-        if any(answer.num_pairs for answer in described) and with_terms is not None:
-            return with_terms
+        if any(answer.num_pairs for answer in described):
+            with_terms = _bound_with_terms(driver, diagonal_less_terms(driver, described))
+            if with_terms is not None:
+                return with_terms
     return _search_forms(driver, gap) if has_scale else central.NO_BOUND
 
 

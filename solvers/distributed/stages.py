@@ -21,7 +21,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
-from solvers.distributed.driver import DEFAULT_MEMORY, Driver, collect
+from solvers.distributed.driver import Driver, collect
 from solvers.distributed.handedness import (
     RobotsPoint,
     begin_without_terms,
@@ -39,7 +39,7 @@ from solvers.handedness.ascent import AscentState
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
-from solvers.network.engine import Engine
+from solvers.network.engine import DEFAULT_MEMORY, Engine
 from solvers.network.faults import Faults
 from solvers.result import OUT_OF_TIME, History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton

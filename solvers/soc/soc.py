@@ -37,7 +37,6 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import AndersonShare, AndersonSums, extrapolate, over_relax
-from solvers.soc.consensus import LocalConsensus
 from solvers.soc.r_step import JointStep, prepare_joint
 from solvers.soc.recursion_block import squared_residuals, stationary_B
 from solvers.soc.safeguard import Due, Steps, next_penalty
@@ -347,4 +346,8 @@ class SOC(SOCSettings):
 
     @property
     def _recursion(self) -> Any:  # noqa: ANN401 - each has a state of its own
-        return LocalConsensus(self) if self.is_split else Joint(self)
+        if not self.is_split:
+            return Joint(self)
+        from solvers.soc.consensus import LocalConsensus  # with robots, copies and links
+
+        return LocalConsensus(self)

@@ -20,7 +20,8 @@ from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.baselines.sweep_order import Sweep, schedule
 from solvers.loop import Solver, run
 from solvers.network.ledger import Ledger
-from solvers.pipeline import WARM_START, Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import WARM_START, Pipeline
 from solvers.result import OUT_OF_TIME, History, Record, Run, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase

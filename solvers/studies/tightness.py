@@ -15,7 +15,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, random_rotations
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
-from solvers.pipeline import Pipeline
+from solvers.request import Pipeline
 from solvers.studies.benchmark_runs import solve_whole
 
 

@@ -149,7 +149,8 @@ def test_names_between_commas_are_taken_once_and_blanks_do_not_count():
 
 def test_defaults_are_those_of_the_settings():
     tables, compare = (
-        inspect.signature(f).parameters for f in (cli.tables_command, cli.compare_command)
+        inspect.signature(f).parameters
+        for f in (study_commands.tables_command, study_commands.compare_command)
     )
     assert tables["seeds"].default == ReproductionSettings.num_seeds
     assert tables["robots"].default == compare["robots"].default == BenchmarkSettings.num_robots
@@ -157,6 +158,6 @@ def test_defaults_are_those_of_the_settings():
 
 
 def test_help_names_the_three():
-    names = {command.name for command in cli.app.registered_commands}
+    names = set(typer.main.get_command(cli.app).commands)
     assert {"tables", "compare", "figures"} <= names
     assert isinstance(cli.app, typer.Typer)

@@ -21,7 +21,8 @@ from pgo_models.problem.weighting import Weighting
 from solvers.convex.extended_newton import ExtendedNewton, kinks
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.loop import run
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.riemannian.newton import Newton
 from solvers.soc.penalty import MultiplierPenalty

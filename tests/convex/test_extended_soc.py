@@ -22,7 +22,8 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.convex.extended_soc import ExtendedSOC, ExtendedStep, with_priors
 from solvers.loop import run
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import Run, Status
 from solvers.robust.gnc import GNC
 from solvers.soc.penalty import MultiplierPenalty
@@ -322,9 +323,9 @@ def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refuse
     linear = ExtendedSOC(lambda unknown: ModelChange(terms=[cp.sum(unknown.t(0))]))
     with pytest.raises(SettingError, match="a term may be negative"):
         solve(problem(), Pipeline(soc=linear))
-    for begun in ("open_driver", "solve_robustly"):
+    for begun in ("shared_solve.open_driver", "robust_solves.robust_solve.solve_robustly"):
         monkeypatch.setattr(
-            f"solvers.pipeline.{begun}", lambda *_: pytest.fail("solved before it was refused")
+            f"solvers.{begun}", lambda *_: pytest.fail("solved before it was refused")
         )
     for setting in ({"robots": 2}, {"robust": GNC()}):
         name = next(iter(setting))

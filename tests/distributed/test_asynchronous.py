@@ -24,7 +24,8 @@ from solvers.loop import iterate, run
 from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults
 from solvers.network.ledger import Ledger
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import Record, Status
 from solvers.riemannian.polish import polish
 from solvers.soc.consensus import LocalConsensus, ask_all

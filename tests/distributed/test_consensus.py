@@ -36,7 +36,8 @@ from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots.interior import Interior
 from solvers.loop import iterate, run
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.soc import safeguard, separator_stiffness as stiffness
 from solvers.soc.anderson import Anderson

@@ -40,7 +40,8 @@ from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.stages import open_driver
 from solvers.network.engine import InProcess
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.soc.subgraph import split_graph
 from solvers.solution import Solution
 

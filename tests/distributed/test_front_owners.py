@@ -22,7 +22,8 @@ from solvers.distributed.robots.records import ALONG_TREE
 from solvers.distributed.stages import open_driver
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import DRIVER
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.solution import Solution
 
 OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result", "take_front")

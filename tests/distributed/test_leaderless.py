@@ -35,7 +35,8 @@ from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.network.ledger import DRIVER
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import Record, Status
 from solvers.riemannian.polish import polish
 from solvers.soc.consensus_robot import ConsensusRobot

@@ -29,7 +29,7 @@ from solvers.distributed.robots import climbing
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.stages import ClimbByRobots, NewtonByRobots, SOCByRobots
 from solvers.folder_solve import FolderSolution, solve_folder
-from solvers.pipeline import WARM_START
+from solvers.request import WARM_START
 from solvers.result import Status
 from solvers.soc.settings import Coupling
 from solvers.stages import Answer

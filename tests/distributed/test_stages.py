@@ -39,7 +39,8 @@ from solvers.distributed.lower_bound import best_bound_distributed, prove_with_e
 from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
-from solvers.pipeline import WARM_START, Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import WARM_START, Pipeline
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.polish import polish, relative_decrement

@@ -27,7 +27,8 @@ from solvers.distributed.stages import open_driver
 from solvers.loop import run
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import History, Measurement, Outcome, Record, Status
 from solvers.riemannian.polish import polish
 from solvers.soc.consensus_robot import ConsensusRobot

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from scipy.spatial.transform import Rotation
 
 from pgo_models.geometry import rotations
 from pgo_models.geometry.rotations import (
@@ -208,3 +209,20 @@ def test_stacking_holds_the_transposes(seed: int, count: int, d: int) -> None:
     for i in range(count):
         np.testing.assert_array_equal(Y[d * i : d * (i + 1)], A[i].T)
     np.testing.assert_array_equal(unstack_transposes(Y), A)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 20), st.floats(-15.0, 0.0))
+def test_turns_by_every_angle_agree_with_scipy(seed: int, count: int, exponent: float) -> None:
+    # Angles near 0 and near pi, where formulas of rotations lose digits.
+    rng = np.random.default_rng(seed)
+    axis = rng.standard_normal((count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    for angle in (10.0**exponent, np.pi - 10.0**exponent):
+        w = angle * axis
+        R = exp_map(w)
+        expected = Rotation.from_rotvec(w)
+        assert np.allclose(R, expected.as_matrix(), rtol=0.0, atol=1e-15 * 4)
+        agreement = np.abs(np.sum(quaternions_from_rotations(R) * expected.as_quat(), axis=1))
+        assert np.allclose(agreement, 1.0, rtol=0.0, atol=1e-15 * 4)
+        assert np.allclose(exp_map(log_map(R)), R, rtol=0.0, atol=1e-15 * 8)
+        assert (np.linalg.norm(log_map(R), axis=1) <= np.pi * (1.0 + 1e-15)).all()

@@ -29,7 +29,8 @@ from pgo_models.relaxations.rotation_hull import (
 from pgo_models.relaxations.solve_sdp import solve_relaxation
 from solvers.handedness.hull_lagrangian import AugmentedLagrangian, HullLagrangian
 from solvers.loop import iterate, run
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.studies.tightness import SweptScene, noisy_scene
 

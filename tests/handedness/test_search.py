@@ -21,7 +21,8 @@ from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor, iterate, run
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.riemannian.polish import polish
 from solvers.studies.tightness import SweptScene, noisy_lattice, noisy_scene

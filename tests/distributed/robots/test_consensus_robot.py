@@ -28,7 +28,8 @@ from solvers.distributed.robots.agent import begin_copies
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.network.ledger import DRIVER
-from solvers.pipeline import Pipeline, solve
+from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.penalty import MultiplierPenalty

@@ -1,0 +1,187 @@
+"""What the options of `pgo solve` stand for: pipelines, methods, engines and starts."""
+
+import os
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.cli.options import BackEndName, FirstStage, Robust, Runner, Start
+from solvers.network.engine import DEFAULT_MEMORY, Engine, InProcess
+from solvers.request import WARM_START, Pipeline
+from solvers.riemannian.newton import gauss_newton
+from solvers.soc.paper import PaperSOC
+from solvers.soc.r_step import RStep
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
+
+if TYPE_CHECKING:
+    from solvers.robust.consistency import PCM
+    from solvers.robust.gnc import GNC
+
+# Methods that driver and robots run.
+ON_ROBOTS = (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS, FirstStage.NEWTON)
+# Arguments of `pgo solve` that go with robots which load their own files.
+FOR_OWN_FILES = {
+    "graph",
+    "out",
+    "method",
+    "engine",
+    "address",
+    "driver_memory",
+    "gap",
+    "max_iterations",
+    "tolerance",
+    "time_limit",
+    "threads",
+    "verbose",
+    "quiet",
+}
+
+
+def chosen_pipeline(
+    method: FirstStage,
+    robots: Partition | None,
+    r_step: BackEndName | None,
+    gap: float,
+    max_iterations: int | None,
+    tolerance: float | None,
+    driver_memory: float | None = None,
+) -> Pipeline:
+    """Pipeline of the options of `pgo solve`.
+
+    The `robots` are those of CONSENSUS and PAPER; `driver_memory` is in GB. A SettingError when the
+    options do not go together.
+    """
+    if driver_memory is not None and method not in ON_ROBOTS:
+        raise SettingError(
+            f"--driver-memory is for methods that run on robots, got --method {method.value}"
+        )
+    memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory
+    if method is FirstStage.NEWTON:
+        _check_without_soc(r_step, max_iterations, tolerance)
+        return Pipeline(soc=None, gap=gap, driver_memory=memory)
+    if method is FirstStage.SUBSTRUCTURED and r_step not in (None, BackEndName.FACTORIZED):
+        raise SettingError(
+            f"--method substructured factors, got --r-step {r_step.value}; "
+            "use joint, consensus or paper"
+        )
+    soc = _default_soc(method, has_driver=memory > 0)
+    soc = replace(
+        soc,
+        robots=robots if method in (FirstStage.CONSENSUS, FirstStage.PAPER) else None,
+        r_step=RStep.FACTORIZED if r_step is None else RStep[r_step.name],
+        tolerance=soc.tolerance if tolerance is None else tolerance,
+        max_iterations=soc.max_iterations if max_iterations is None else max_iterations,
+    )
+    if isinstance(soc, PaperSOC):
+        return Pipeline(soc=soc, newton=gauss_newton(), gap=gap, driver_memory=memory)
+    coupling = None if method is FirstStage.JOINT else Coupling[method.name]
+    return Pipeline(soc=replace(soc, coupling=coupling), gap=gap, driver_memory=memory)
+
+
+def _check_without_soc(
+    r_step: BackEndName | None, max_iterations: int | None, tolerance: float | None
+) -> None:
+    """Raise a SettingError for an option of SOC, where the solve has none."""
+    options_of_soc = {
+        "--r-step": r_step,
+        "--max-iterations": max_iterations,
+        "--tolerance": tolerance,
+    }
+    for name, value in options_of_soc.items():
+        if value is not None:
+            raise SettingError(
+                f"{name} is for SOC, which --method newton leaves out; leave out one of the two"
+            )
+
+
+def _default_soc(method: FirstStage, has_driver: bool) -> SOC | PaperSOC:
+    """SOC of a method as it is unless options say something else.
+
+    Without a driver no Newton takes over, so that SOC goes to its own tolerance.
+    """
+    if method is FirstStage.PAPER:
+        return PaperSOC()
+    return WARM_START if has_driver else SOC()
+
+
+def chosen_method(method: FirstStage | None, robots: int | None, is_shared: bool) -> FirstStage:
+    """Method of a solve: the one asked for, else JOINT, or SUBSTRUCTURED for several robots.
+
+    `is_shared` says whether any option is about robots.
+    """
+    if method is FirstStage.JOINT and robots is not None and robots > 1:
+        raise SettingError(
+            f"--method joint has one robot, got --robots {robots}; use substructured or consensus"
+        )
+    if method is not None:
+        return method
+    return FirstStage.SUBSTRUCTURED if is_shared else FirstStage.JOINT
+
+
+def chosen_engine(
+    method: FirstStage, engine: Runner | None, address: str | None, checkpoint: bool
+) -> Engine | None:
+    """Engine of the options, or None where the method runs in one place.
+
+    A SettingError when the options do not go together.
+    """
+    if method not in ON_ROBOTS:
+        options = {"--engine": engine, "--address": address, "--resume": checkpoint}
+        asked = [name for name, value in options.items() if value]
+        if asked:
+            names = " or ".join(other.value for other in ON_ROBOTS)
+            raise SettingError(
+                f"{asked[0]} is for methods that run on robots, "
+                f"got --method {method.value}; use {names}"
+            )
+        return None
+    if address is not None and engine not in (None, Runner.RAY):
+        raise SettingError(
+            f"--address is that of a Ray cluster, got --engine {engine.value}; use --engine ray"
+        )
+    if engine is Runner.RAY or address is not None:
+        from solvers.network.ray_engine import RayEngine
+
+        return RayEngine(address=address)
+    num_threads = (os.cpu_count() or 1) if engine is Runner.THREADS else 1
+    return InProcess(threads=num_threads)
+
+
+def chosen_start(problem: PGOProblem, start: Start | None) -> Poses | None:
+    """Poses of a start; None leaves it to the method."""
+    graph = problem.graph
+    if start is Start.CHORDAL:
+        return chordal_start(problem)
+    if start is Start.TREE:
+        return spanning_tree_start(graph)
+    if start is Start.ODOMETRY:
+        return odometry_start(graph)
+    if start is Start.FILE:
+        if graph.initial is None:
+            raise SettingError(
+                f"{graph.name} has no VERTEX line for every pose; use --start chordal or tree"
+            )
+        return graph.initial
+    return None
+
+
+def chosen_robust(robust: Robust | None) -> "GNC | PCM | None":
+    """How wrong edges are found, of the option --robust."""
+    if robust is None:
+        return None
+    from solvers.robust.consistency import PCM
+    from solvers.robust.gnc import GNC
+    from solvers.robust.losses import RobustLoss
+
+    methods: dict[Robust, GNC | PCM] = {
+        Robust.GNC: GNC(),
+        Robust.GM: GNC(loss=RobustLoss.GEMAN_MCCLURE),
+        Robust.PCM: PCM(),
+        Robust.PCM_GNC: GNC(consistent=True),
+    }
+    return methods[robust]

@@ -1,0 +1,301 @@
+"""What a solve is asked for: the settings of its stages, and all else that `solve` is given."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from pgo_models.certificates.certificate import DEFAULT_GAP, judge
+from pgo_models.errors import SettingError, check_settings
+from pgo_models.geometry.arrays import whole_number
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from solvers.handedness.search import HandednessSearch
+from solvers.loop import RunMonitor
+from solvers.network.engine import DEFAULT_MEMORY, Engine
+from solvers.network.faults import Faults
+from solvers.network.ledger import Ledger
+from solvers.riemannian.newton import Newton
+from solvers.riemannian.prefixes import GrowingStart
+from solvers.riemannian.staircase import Staircase
+from solvers.soc.paper import PaperSOC
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC
+from solvers.solution import Solution, choose_gauge, note_of
+from solvers.stages import (
+    Answer,
+    AscentOfTerms,
+    GrowingAttempt,
+    ImproveBound,
+    Job,
+    Plan,
+    PlannedStage,
+    SecondAttempt,
+    SeekHandednessTerms,
+)
+
+if TYPE_CHECKING:  # what a solve in one place does not need
+    from solvers.distributed.checkpoint import Checkpoint
+    from solvers.robust.consistency import PCM
+    from solvers.robust.gnc import GNC
+
+# Relative residual from which Newton needs one or two factorisations, on all graphs tried.
+WARM_START_TOLERANCE = 5e-3
+WARM_START = SOC(tolerance=WARM_START_TOLERANCE, max_iterations=100)
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """Settings of a whole solve: which stages it has, and the settings of each.
+
+    The first stage is SOC, from which Newton takes over. Where the certificate is wider than the
+    relative `gap`, another attempt starts from prefixes of the graph that grow, and a second one
+    runs SOC to a fine tolerance and Newton again. The solve keeps the better poses and the better
+    bound. Where it is still wider, the staircase solves the
+    semidefinite relaxation from the best poses, and Newton starts from what it rounds to.
+
+    Parameters
+    ----------
+    soc : SOC, PaperSOC, ExtendedSOC or None
+        The first stage, whose tolerance says when Newton takes over. None goes from the start
+        straight to Newton. The default is `WARM_START`, a SOC with a coarse tolerance.
+    newton : Newton
+        The second stage, which goes down to rounding level.
+    gap : float
+        Relative gap to certify, (objective - lower_bound) / objective; positive.
+    growing : GrowingStart or None
+        The start of another attempt where the certificate of the first is wider than `gap`, of
+        solves in one place; None leaves it out.
+    second_try : bool
+        Whether a second attempt is made where the certificate is still wider.
+    staircase : Staircase or None
+        The next stage, where the certificate is still wider; None leaves it out.
+    handedness : HandednessSearch or None
+        The last stage, where the relaxation is not tight; None leaves it out.
+    faults : Faults, optional
+        What goes wrong between the robots of a CONSENSUS stage, which then does not wait
+        (`solvers.distributed.asynchronous`).
+    driver_memory : float
+        Bytes that the driver of a solve by robots may take with its fronts. A solve that needs more
+        is refused before it begins. 0 stands for no driver: CONSENSUS alone
+        (`solvers.distributed.leaderless`), which finds poses and no certificate.
+
+    Raises
+    ------
+    SettingError
+        When a setting is out of its range, or faults or no driver are asked for without a CONSENSUS
+        stage.
+
+    Examples
+    --------
+    >>> from pgo_models import load
+    >>> from solvers import solve
+    >>> pipeline = Pipeline(soc=SOC(tolerance=1e-4), gap=1e-8)
+    >>> [stage.name for stage in solve(load("grid"), pipeline).stages]
+    ['chordal start', 'SOC', 'Newton']
+    """
+
+    soc: SOC | PaperSOC | None = field(default_factory=lambda: WARM_START)
+    newton: Newton = field(default_factory=Newton)
+    gap: float = DEFAULT_GAP
+    growing: GrowingStart | None = field(default_factory=GrowingStart)
+    second_try: bool = True
+    staircase: Staircase | None = field(default_factory=Staircase)
+    handedness: HandednessSearch | None = field(default_factory=HandednessSearch)
+    faults: Faults | None = None
+    driver_memory: float = DEFAULT_MEMORY
+
+    def __post_init__(self) -> None:
+        # soc may also be an ExtendedSOC, which this module does not import.
+        check_settings(self, finite=["gap"], not_negative=["driver_memory"], of_any_type=["soc"])
+        is_consensus = (
+            isinstance(self.soc, SOC) and self.soc.effective_coupling is Coupling.CONSENSUS
+        )
+        if self.faults is not None and not is_consensus:
+            raise SettingError(
+                "faults are of messages between robots; "
+                "use SOC(robots=.., coupling=Coupling.CONSENSUS)"
+            )
+        if not self.has_driver and not is_consensus:
+            raise SettingError(
+                "without a driver robots run CONSENSUS alone; "
+                "take it (--method consensus), or give driver_memory"
+            )
+
+    @property
+    def has_driver(self) -> bool:
+        """Whether a solve by robots has a driver."""
+        return self.driver_memory > 0
+
+    def with_newton_alone(self, newton: Newton) -> Pipeline:
+        """The pipeline without all stages but a start, Newton and its certificate.
+
+        Parameters
+        ----------
+        newton : Newton
+            Settings of Newton.
+
+        Returns
+        -------
+        Pipeline
+            Gap, faults and memory of the driver are those of this one.
+        """
+        return replace(
+            self,
+            soc=None,
+            newton=newton,
+            growing=None,
+            second_try=False,
+            staircase=None,
+            handedness=None,
+        )
+
+    @property
+    def default_weighting(self) -> Weighting:
+        """Which cost of a graph is minimised unless another is given: its own, where it can be.
+
+        Robots without a driver run SOC alone, and an ExtendedSOC adds terms to F.
+        """
+        return (
+            Weighting.OWN if self.has_driver and not self.has_added_terms else Weighting.ISOTROPIC
+        )
+
+    @property
+    def has_added_terms(self) -> bool:
+        """Whether the first stage is an ExtendedSOC, which adds terms and constraints to F."""
+        return getattr(self.soc, "changer", None) is not None
+
+
+@dataclass(frozen=True, eq=False)
+class SolveRequest:
+    """What `solve` was asked for, once it is known to go together."""
+
+    problem: PGOProblem
+    pipeline: Pipeline
+    start: Poses | None
+    robust: GNC | PCM | None
+    robots: Partition | int | None
+    engine: Engine | None
+    checkpoint: Checkpoint | None
+    anchor: int | None
+    monitor: RunMonitor
+
+    def __post_init__(self) -> None:
+        if self.anchor is not None:
+            self._check_anchor(self.anchor)
+        if not isinstance(self.pipeline, Pipeline):
+            raise SettingError(
+                f"the pipeline is a {type(self.pipeline).__name__}; "
+                "give Pipeline(soc=SOC(..)), or run(SOC(..))"
+            )
+        if self.robots is None:
+            self._check_in_one_place()
+        self._check_driver()
+
+    def _check_anchor(self, anchor: int) -> None:
+        """Raise a SettingError unless the anchor is a pose with a rotation.
+
+        It cannot be combined with priors, which hold the frame themselves.
+        """
+        graph = self.problem.graph
+        num_poses = self.problem.num_poses
+        if not 0 <= whole_number(anchor, "anchor", SettingError) < num_poses:
+            raise SettingError(f"anchor is {anchor}; give a pose, 0 to {num_poses - 1}")
+        if anchor in graph.landmarks:
+            raise SettingError(
+                f"anchor is {anchor}, a landmark, which has no rotation; give a pose"
+            )
+        if graph.world is not None:
+            raise SettingError("an anchor cannot be combined with priors; leave out the anchor")
+
+    def _check_in_one_place(self) -> None:
+        """Raise a SettingError for what only a solve by robots has."""
+        if self.engine is not None or self.checkpoint is not None:
+            raise SettingError(
+                "engine and checkpoint are for solves by robots; "
+                "give robots, a number or a Partition"
+            )
+        if self.pipeline.faults is not None:
+            raise SettingError(
+                "faults are of messages between robots; give solve() the robots of SOC, too"
+            )
+        if self.pipeline.driver_memory != DEFAULT_MEMORY:
+            raise SettingError(
+                "driver_memory is for solves by robots; give solve() the robots, too"
+            )
+
+    def _check_driver(self) -> None:
+        """Raise a SettingError where the cost or a robust solve needs a driver, and has none."""
+        pipeline = self.pipeline
+        if not pipeline.has_driver and self.problem.convex_part is not self.problem:
+            raise SettingError(
+                "without a driver robots run SOC alone, "
+                "which needs a convex quadratic cost: F, not chi2"
+            )
+        is_plain = self.checkpoint is None and pipeline.has_driver and pipeline.faults is None
+        if self.robust is not None and not is_plain:
+            raise SettingError(
+                "a robust solve needs a driver without faults, "
+                "and writes no checkpoint; leave that out"
+            )
+
+
+def plan_improvements(
+    pipeline: Pipeline,
+    job: Job,
+    plan: Plan,
+    climb: Sequence[PlannedStage],
+    ascent: AscentOfTerms,
+) -> list[PlannedStage]:
+    """Stages that follow the first attempt.
+
+    They leave an answer as it is whose certificate has the gap that was asked for.
+    """
+    planned: list[PlannedStage] = []
+    if pipeline.growing is not None:
+        planned.append(GrowingAttempt(job, pipeline.growing, pipeline.newton))
+    if pipeline.second_try:
+        planned.append(SecondAttempt(job, plan, pipeline.soc))
+    if pipeline.staircase is not None:
+        planned.append(ImproveBound(job, climb))
+    if pipeline.handedness is not None:
+        planned.append(SeekHandednessTerms(job, pipeline.handedness, ascent))
+    return planned
+
+
+def solution_of(
+    request: SolveRequest,
+    job: Job,
+    answer: Answer,
+    ledger: Ledger | None = None,
+    robots: Partition | None = None,
+    missing: str = "",
+) -> Solution:
+    """Solution with the answer in the frame that was asked for.
+
+    `missing` says what its certificate lacks for want of a driver.
+    """
+    problem = request.problem
+    current = problem.seen_poses(answer.current_poses)
+    poses, frame, held = choose_gauge(current, problem.graph, request.anchor)
+    poses = problem.seen_poses(poses)  # a frame has an origin, too
+    # A frame far away rounds the poses: the certificate is of those that are returned.
+    certificate = judge(problem, poses, answer.current_certificate)
+    return Solution(
+        problem=problem,
+        poses=poses,
+        objective=certificate.objective,
+        certificate=certificate,
+        status=job.status,
+        stages=tuple(job.stages),
+        seconds=time.perf_counter() - request.monitor.began,
+        ledger=ledger,
+        robots=robots,
+        note=note_of(problem, certificate, missing),
+        frame=frame,
+        anchor=held,
+    )
