@@ -21,17 +21,20 @@ from pgo_models.certificates.certificate import BoundSource, Certificate, Verdic
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import NotPositiveDefiniteError, PGOError, SettingError
+from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.driver import CoverPoses
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.own_files import (
     READ_HERE,
     Answer as RobotAnswer,
+    OpenedFiles,
     keep_answer,
     move_answer,
     open_files,
@@ -81,8 +84,13 @@ class FolderSolution:
         What crossed the network.
     frame : str
         The frame of the poses that were written.
+    F : float
+        F of these poses, which is the cost unless that is chi2.
     seconds : float
         Wall time.
+    note : str
+        Why the cost is F and not chi2 where the files have matrices, or what a proof of chi2 needs;
+        or "".
     """
 
     name: str
@@ -91,7 +99,9 @@ class FolderSolution:
     stages: tuple[Stage, ...]
     ledger: Ledger
     frame: str
+    F: float
     seconds: float
+    note: str = ""
 
     @property
     def status(self) -> Status:
@@ -112,19 +122,28 @@ class FolderSolution:
             ("graph", graph),
             ("status", f"{self.status.name}: {self.status.value}"),
             *self.certificate.facts(),
+            *self._other_cost(),
+            ("note", self.note),
             ("frame", self.frame),
             ("seconds", f"{self.seconds:.3g}"),
             ("robots", robots),
-            ("cost", "F: robots that read their own files do not minimise chi2"),
             *self.ledger.facts(),
         ]
         return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
+
+    def _other_cost(self) -> list[tuple[str, str]]:
+        """F of the poses, where the cost is chi2."""
+        if self.certificate.weighting is Weighting.ISOTROPIC:
+            return []
+        F = rounded_up(self.F)
+        return [("F", f"{F} with two precisions an edge; the bound is on chi2 alone")]
 
 
 def solve_folder(
     folder: Path | str,
     pipeline: Pipeline | None = None,
     *,
+    weighting: Weighting = Weighting.OWN,
     engine: Engine | None = None,
     out: Path | str | None = None,
     callback: Callable[[Any, Record], bool | None] | None = None,
@@ -132,14 +151,14 @@ def solve_folder(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> FolderSolution:
-    """Solve and certify F of a folder with one g2o file a robot, each read by its robot alone.
+    """Solve and certify a folder with one g2o file a robot, each read by its robot alone.
 
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it. An
     edge between two robots may be in the file of either, or of both. Start, SOC, Newton,
-    certificate and staircase are those of `solve(.., robots=..)`; CONSENSUS, robust losses, chi2,
-    priors, landmarks and checkpoints need `solve`. A robot that is lost reads its file again, and
-    is sent again all that it had received. The frame is that of the first pose with a FIX line, or
-    else of the first pose of all, where its file has it.
+    certificate and staircase are those of `solve(.., robots=..)`. CONSENSUS, robust losses, priors,
+    landmarks, checkpoints and an ascent of handedness terms need `solve`. A robot that is lost
+    reads its file again, and is sent again all that it had received. The frame is that of the first
+    pose with a FIX line, or else of the first pose of all, where its file has it.
 
     Parameters
     ----------
@@ -148,6 +167,10 @@ def solve_folder(
         `load`. The calling process reads none of its files.
     pipeline : Pipeline, optional
         Settings of the stages; `Pipeline()` unless given.
+    weighting : Weighting
+        The cost: INFORMATION is chi2 of the files' information matrices, ISOTROPIC F, and OWN chi2
+        where it is another cost than F and no robot has an edge whose share of chi2 can be
+        negative.
     engine : Engine, optional
         Where the robots run: in this process unless given, else as a `RayEngine` says.
     out : Path or str, optional
@@ -164,7 +187,8 @@ def solve_folder(
     Raises
     ------
     SettingError
-        When the first stage is no SUBSTRUCTURED SOC that factors its subproblems.
+        When the first stage is no SUBSTRUCTURED SOC that factors its subproblems, or the weighting
+        is that of rotations alone.
     PGOError
         As of `solve`, and for files that cannot be read as of `read_g2o`.
 
@@ -177,14 +201,18 @@ def solve_folder(
     pipeline = pipeline if pipeline is not None else Pipeline()
     folder = locate(folder).absolute()
     _check_first_stage(pipeline.soc)
+    if weighting is Weighting.ROTATIONS:
+        raise SettingError(f"robots with files of their own solve for poses; {READ_HERE}")
     files = list(enumerate(g2o_files(folder)))
     if out is not None:
         check_g2o_folder(out, len(files))
     place = _place_of_robots(engine, len(files))
     stages: list[Stage] = []
-    driver, sizes = open_files(files, place, pipeline.driver_memory)
+    opened = open_files(files, place, pipeline.driver_memory, weighting)
+    driver = opened.driver
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
-        job = _FolderJob(folder.name, pipeline.gap, RobotJob(driver, journal, monitor))
+        shared = RobotJob(driver, journal, monitor)
+        job = _FolderJob(folder.name, pipeline.gap, opened.weighting, shared)
         try:
             job.run(pipeline)
         except NotPositiveDefiniteError as error:
@@ -195,7 +223,7 @@ def solve_folder(
             if job.best is None:
                 raise
             stages.append(Stage.interruption(job.best.objective))
-        frame = job.move_to_frame()
+        frame, F = job.move_to_frame()
         certificate = job.certificate
         if out is not None:
             write = partial(write_answer, Path(out).absolute())
@@ -203,12 +231,23 @@ def solve_folder(
     return FolderSolution(
         name=folder.name,
         certificate=certificate,
-        sizes=sizes,
+        sizes=opened.sizes,
         stages=tuple(stages),
         ledger=driver.network.ledger,
         frame=frame,
+        F=F,
+        note=_note(weighting, opened, certificate),
         seconds=time.perf_counter() - monitor.began,
     )
+
+
+def _note(weighting: Weighting, opened: OpenedFiles, certificate: Certificate) -> str:
+    """Why the cost is F where that was not asked for, or what a proof of chi2 needs; or ""."""
+    if weighting is Weighting.OWN and opened.has_indefinite:
+        return "the cost is F, as some information matrices are indefinite: chi2 can be negative"
+    if certificate.is_certified or not opened.driver.has_two_costs:
+        return ""
+    return f"smaller information matrices may prove more; for these {READ_HERE}"
 
 
 def _check_first_stage(soc: SOC | PaperSOC | None) -> None:
@@ -263,17 +302,23 @@ class _FolderJob:
 
     name: str
     gap: float
+    weighting: Weighting
     shared: RobotJob
     best: _Best | None = None
 
     def run(self, pipeline: Pipeline) -> None:
-        """Make attempts, and climb the staircase, until the certificate cannot improve."""
+        """Make attempts, and climb the staircase, until the certificate cannot improve.
+
+        The staircase is that of a cost on which SOC can run.
+        """
         self._attempt(pipeline.soc, pipeline.newton)
         stages = self.shared.stages
         if pipeline.second_try and stages[-1].status.is_success and self.certificate.can_improve:
             soc = pipeline.soc if pipeline.soc is not None else SOC()
             self._attempt(finer(soc), pipeline.newton)
-        if pipeline.staircase is None or stages[-1].status in OUT_OF_TIME:
+        if pipeline.staircase is None or self.shared.driver.has_two_costs:
+            return
+        if stages[-1].status in OUT_OF_TIME:
             return
         if self.certificate.can_improve:
             self._climb(replace(pipeline.staircase, gap=self.gap), pipeline.newton)
@@ -297,11 +342,12 @@ class _FolderJob:
             Lambda=no_poses.R,
             wanted_gap=self.gap,
             verdict=Verdict.TRIVIAL,
+            weighting=self.weighting,
         )
         return judge_cost(self.name, unjudged, best.objective, best.rounding)
 
-    def move_to_frame(self) -> str:
-        """Move the poses of the best answer to their frame, and return which that is.
+    def move_to_frame(self) -> tuple[str, float]:
+        """Move the poses of the best answer to their frame; return which that is, and F there.
 
         A frame far away rounds the poses, so that their cost is found anew: the certificate is of
         the poses that are written.
@@ -311,10 +357,10 @@ class _FolderJob:
         turn, shift, frame = _frame(best.robots)
         network = self.shared.driver.network
         parts = network.ask(move_answer, [(turn, shift)] * len(best.robots), Count.ROUND)
-        objective = math.fsum(part for part, _ in parts)
-        rounding = _sum_of_roundings([of_part for _, of_part in parts])
+        objective = math.fsum(part.cost for part in parts)
+        rounding = _sum_of_roundings([part.rounding for part in parts])
         self.best = replace(best, objective=objective, rounding=rounding)
-        return frame
+        return frame, math.fsum(part.F for part in parts)
 
     def _attempt(self, soc: SOC | PaperSOC | None, newton: Newton) -> None:
         """Start, SOC, Newton and bound."""

@@ -74,19 +74,21 @@ def own_weighting(graph: PoseGraph) -> Weighting:
     can be negative, because matrices are indefinite (`indefinite_edges`), it is F as well, and what
     `pgo solve` prints says so.
     """
-    if graph.information is None or _is_isotropic(graph.information, graph.d):
-        return Weighting.ISOTROPIC
-    if indefinite_edges(graph).any():
+    if is_isotropic(graph) or indefinite_edges(graph).any():
         return Weighting.ISOTROPIC
     return Weighting.INFORMATION
 
 
-def _is_isotropic(information: Array, d: int) -> bool:
-    """Whether chi2 is F: in space, with blocks that are multiples of the identity.
+def is_isotropic(graph: PoseGraph) -> bool:
+    """Whether chi2 is F, or the graph has no information matrices.
 
-    In the plane F counts the rotation term of chi2 twice, as SE-Sync does.
+    It is F in space, with blocks that are multiples of the identity. In the plane F counts the
+    rotation term of chi2 twice, as SE-Sync does.
     """
-    if d == 2:
+    information = graph.information
+    if information is None:
+        return True
+    if graph.d == 2:
         return False
     scales = np.repeat(information[:, [0, 3], [0, 3]], 3, axis=1)
     return bool((information == scales[:, :, None] * np.eye(6)).all())

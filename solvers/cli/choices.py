@@ -32,6 +32,8 @@ FOR_OWN_FILES = {
     "engine",
     "address",
     "driver_memory",
+    "cost",
+    "information",
     "gap",
     "max_iterations",
     "tolerance",

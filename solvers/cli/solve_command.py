@@ -20,6 +20,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.style import is_picture
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.cli import choices
 from solvers.cli.explanations import (
     edge_fit_of_solution,
@@ -226,7 +227,7 @@ def solve_command(
     outputs = Outputs(out or [], report, covariances, proof, resume)
     if network.reads_own_files(graph):
         _refuse_what_needs_the_graph(given, outputs)
-        raise typer.Exit(_solve_own_files(graph, stages, network, display, outputs))
+        raise typer.Exit(_solve_own_files(source, stages, network, display, outputs))
     outputs.check_pages()
     with JobBar(1, None, f"reading {graph}"):
         loaded = with_times(source.loaded(), times)
@@ -462,7 +463,7 @@ def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs) -> None:
 
 
 def _solve_own_files(
-    graph: str,
+    source: GraphOptions,
     stages: StageOptions,
     network: RobotOptions,
     display: Display,
@@ -471,11 +472,21 @@ def _solve_own_files(
     """Solve a folder whose files the robots read themselves; the exit code."""
     from solvers.folder_solve import solve_folder
 
+    weightings = {
+        None: Weighting.OWN,
+        Cost.CHI2: Weighting.INFORMATION,
+        Cost.ISOTROPIC: Weighting.ISOTROPIC,
+    }
+    if source.chosen_cost not in weightings:
+        raise SettingError(
+            "--cost unit takes the whole graph in one process; to have it read: --split given"
+        )
     method = choices.chosen_method(stages.method, None, True)
     pipeline = stages.pipeline(method, None, network.driver_memory)
     solution = solve_folder(
-        graph,
+        source.graph,
         pipeline,
+        weighting=weightings[source.chosen_cost],
         engine=choices.chosen_engine(method, network.engine, network.address, False),
         out=outputs.out[0] if outputs.out else None,
         time_limit=stages.time_limit,

@@ -203,7 +203,7 @@ class Driver:
         with_edges = [robot for robot in summaries if robot.touched is not None]
         self.robots_with_edges = np.array([robot.robot for robot in with_edges])
         self._parts = [robot.part for robot in with_edges]
-        self._has_two_costs = any(robot.has_two_costs for robot in summaries)
+        self.has_two_costs = any(robot.has_two_costs for robot in summaries)
         self.has_translations = all(robot.has_translations for robot in summaries)
         # Whether the process of the driver has the graph, too.
         self.has_whole = all(robot.part is not None for robot in summaries)
@@ -250,7 +250,7 @@ class Driver:
 
         Where there is one cost nothing happens.
         """
-        if self._has_two_costs and final != self.is_final:
+        if self.has_two_costs and final != self.is_final:
             self.is_final = final
             answers = self.ask(Interior.choose_cost, final, Count.PIGGYBACKED)
             self.current = self.with_cost(self.current, answers)

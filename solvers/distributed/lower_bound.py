@@ -127,10 +127,12 @@ def _bound_with_terms(driver: Driver, less_terms: Array) -> LowerBound | None:
     return replace(proven, terms=_collect_terms(driver))
 
 
-def _collect_terms(driver: Driver) -> HandednessTerms:
-    """All robots' handedness terms, for the result; off the ledger."""
+def _collect_terms(driver: Driver) -> HandednessTerms | None:
+    """All robots' handedness terms, for the result, or None without any; off the ledger."""
     reported = driver.ask(report_terms, None, Count.OFF)
     terms = [of_robot for of_robot in reported if of_robot is not None]
+    if not terms:
+        return None
     return HandednessTerms(
         np.concatenate([of_robot.i for of_robot in terms]),
         np.concatenate([of_robot.j for of_robot in terms]),

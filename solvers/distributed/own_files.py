@@ -7,7 +7,7 @@ of it, or else to the first file that names it. An edge that stands in several f
 in `read_g2o`.
 
 The orders to a robot stand below in the sequence in which they are given: `read_file`,
-`number_poses`, `join_neighbours`, `place_cover`; then, after the solve, `keep_answer`,
+`number_poses`, `join_neighbours`, `take_cost`, `place_cover`; then, after the solve, `keep_answer`,
 `return_to_answer`, `move_answer` and `write_answer`.
 """
 
@@ -34,14 +34,21 @@ from pgo_models.graphs.pose_graph import (
     edge_counts,
     middle_pose,
 )
-from pgo_models.graphs.precisions import edge_precisions
+from pgo_models.graphs.precisions import edge_precisions, indefinite_edges, proper_information
+from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.matrices import isotropic_weights
+from pgo_models.problem.weighting import (
+    Weighting,
+    convex_cost,
+    information_cost,
+    is_isotropic,
+)
 from solvers.distributed.driver import Driver
 from solvers.distributed.robots.agent import Agent, held_poses, order_interior
 from solvers.distributed.robots.interior import Interior, interior_of
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
-from solvers.soc.subgraph import Placement, RobotSummary, Subgraph, place_poses
+from solvers.soc.subgraph import PartProblem, Placement, RobotSummary, Subgraph, place_poses
 
 READ_HERE = (
     "have the graph read in one process: --split given, or solve(read_g2o(folder), robots=..)"
@@ -100,6 +107,8 @@ class Border:
     labels: IntArray
     alone: IntArray  # (3,): number of components without any of these poses
     middle: int  # its middle pose if it has no edge to another robot, else -1
+    is_isotropic: bool  # whether chi2 of its edges is F
+    has_indefinite: bool  # whether the share of an edge in chi2 can be negative
 
 
 NO_ROUNDING = ObjectiveRounding(0.0, 0.0, True)  # of no edges
@@ -107,7 +116,7 @@ NO_ROUNDING = ObjectiveRounding(0.0, 0.0, True)  # of no edges
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Rounding of a robot's part of F, and a pose that can hold the frame.
+    """Rounding of a robot's part of the cost, and a pose that can hold the frame.
 
     That pose is its first one with a FIX line, or else its first one.
     """
@@ -118,6 +127,15 @@ class Answer:
     given: Array  # (d + 1, d): the same in the file, nan if it is not there
 
 
+@dataclass(frozen=True, eq=False)
+class MovedAnswer:
+    """A robot's part of the cost where its answer was moved to, and of F there."""
+
+    cost: float
+    rounding: ObjectiveRounding
+    F: float
+
+
 class FileAgent(Agent):
     """A robot that loads its own file; its attributes are set by the orders below."""
 
@@ -126,6 +144,7 @@ class FileAgent(Agent):
     graph: PoseGraph  # of its own poses, and those at the far end of its edges
     numbers: IntArray  # (n_a,): numbers of these poses in the whole graph, ascending
     owners: IntArray  # (n_a,)
+    cost: EdgeCost  # of its edges, in the cost that is solved
     given: Array  # as in `Answer`
     answer: Poses
 
@@ -247,18 +266,44 @@ def _border(agent: FileAgent) -> Border:
         labels=np.stack(labels)[:, poses],
         alone=np.array([len(np.setdiff1d(label, label[poses])) for label in labels]),
         middle=-1 if len(poses) else int(agent.numbers[middle_pose(graph)]),
+        is_isotropic=is_isotropic(graph),
+        has_indefinite=bool(indefinite_edges(graph).any()),
     )
 
 
-def place_cover(agent: FileAgent, placement: Placement) -> RobotSummary:
+def take_cost(agent: FileAgent, weighting: Weighting) -> bool:
+    """Learn which cost is solved: F or chi2. Return whether SOC can run on the robot's part of it.
+
+    A GraphError for a matrix that chi2 cannot have, and where chi2 is one of rotations alone.
+    """
+    graph = agent.graph
+    if weighting is Weighting.ISOTROPIC:
+        agent.cost = isotropic_weights(graph)
+        return True
+    try:
+        agent.cost = information_cost(graph, proper_information(graph))
+    except GraphError as error:
+        raise GraphError(f"{agent.path}: {error}") from error
+    if not agent.cost.has_translations:
+        raise GraphError(f"{agent.path}: no edge measures a translation; {READ_HERE}")
+    return agent.cost.is_quadratic and agent.cost.is_convex
+
+
+def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary:
     """Learn which poses the driver solves for, and which robots hold which of them.
 
-    From now on the robot is an agent like any other.
+    `place` also says whether SOC runs on another cost than the one that is solved. From now on the
+    robot is an agent like any other.
     """
+    placement, has_two_costs = place
     graph = agent.graph
     known = agent.robot, graph, agent.numbers, agent.owners
     edges = np.arange(graph.num_edges)
-    agent.subgraph = Subgraph(*known, *placement.of(*known), edges, isotropic_weights(graph))
+    weights = agent.cost
+    if has_two_costs:
+        weights = convex_cost(proper_information(graph), graph.d)
+    final = agent.cost if has_two_costs else None
+    agent.subgraph = Subgraph(*known, *placement.of(*known), edges, weights, final)
     agent.interior = interior_of(agent.subgraph, agent.backend)
     return replace(agent.subgraph.summary, part=None)
 
@@ -284,14 +329,16 @@ def return_to_answer(agent: FileAgent, _: None) -> None:
         order_interior(Interior.set_poses, agent, _interior_answer(agent, agent.interior))
 
 
-def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> tuple[float, ObjectiveRounding]:
-    """Move the poses that were kept by (R, t); return the part of F there, and its rounding."""
+def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> MovedAnswer:
+    """Move the poses that were kept by (R, t); return the part of the cost there."""
     agent.answer = agent.answer.moved(*motion)
     if agent.interior is None:
-        return 0.0, NO_ROUNDING
+        return MovedAnswer(0.0, NO_ROUNDING, 0.0)
     problem = agent.interior.problem
     poses = _interior_answer(agent, agent.interior)
-    return problem.objective(poses), objective_rounding(problem, poses)
+    graph = problem.graph
+    F = PartProblem(graph, problem.backend, isotropic_weights(graph)).objective(poses)
+    return MovedAnswer(problem.objective(poses), objective_rounding(problem, poses), F)
 
 
 def _interior_answer(agent: FileAgent, interior: Interior) -> Poses:
@@ -305,13 +352,36 @@ def write_answer(folder: Path, agent: FileAgent, _: None) -> None:
     write_g2o(agent.graph, folder / f"{agent.robot}.g2o", agent.answer, agent.subgraph.is_own)
 
 
+@dataclass(frozen=True, eq=False)
+class OpenedFiles:
+    """Robots that have read their files, and what their driver knows of the graph.
+
+    Parameters
+    ----------
+    driver : Driver
+        The driver of the robots.
+    sizes : (2, num_robots) array
+        How many poses, and edges, every robot has.
+    weighting : Weighting
+        The cost that is solved: ISOTROPIC or INFORMATION.
+    has_indefinite : bool
+        Whether the share of any edge in chi2 can be negative.
+    """
+
+    driver: Driver
+    sizes: IntArray
+    weighting: Weighting
+    has_indefinite: bool
+
+
 def open_files(
-    files: Sequence[RobotFile], engine: Engine, memory: float
-) -> tuple[Driver, IntArray]:
-    """Driver of robots with these files, and how many poses and edges each has, (2, num_robots).
+    files: Sequence[RobotFile], engine: Engine, memory: float, weighting: Weighting
+) -> OpenedFiles:
+    """Have robots read these files, and agree on the cost that `weighting` stands for.
 
     Raises a FileFormatError for a file that cannot be read or has no pose of its own, and a
-    GraphError if the graph is not connected. All messages but the start of the robots are counted.
+    GraphError if the graph is not connected, or has a matrix that chi2 cannot have. All messages
+    but the start of the robots are counted.
     """
     network = CountedPool(engine.open(FileAgent, files), len(files))
     try:
@@ -325,13 +395,28 @@ def open_files(
         pairs = np.concatenate([border.pairs for border in borders])
         owners = np.concatenate([border.owners for border in borders])
         placements = place_poses(pairs, owners, len(files), borders[0].middle)
-        summaries = network.ask(place_cover, placements, Count.ROUND)
+        has_indefinite = any(border.has_indefinite for border in borders)
+        if weighting is Weighting.OWN:
+            weighting = _own_weighting(borders)
+        can_run_soc = network.ask(take_cost, [weighting] * len(files), Count.ROUND)
+        has_two_costs = not all(can_run_soc)
+        places = [(placement, has_two_costs) for placement in placements]
+        summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
         last = max(int(summary.in_cover.max(initial=0)) for summary in summaries)
         grounded = (last + 1) // 2  # a pose in the middle of the cover
-        return Driver(summaries, num_poses, lambda: network, memory, grounded), sizes
+        driver = Driver(summaries, num_poses, lambda: network, memory, grounded)
+        return OpenedFiles(driver, sizes, weighting, has_indefinite)
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()
         raise
+
+
+def _own_weighting(borders: Sequence[Border]) -> Weighting:
+    """The cost that is the own one of all robots' files together, as `weighting.own_weighting`."""
+    is_F = all(border.is_isotropic for border in borders)
+    if is_F or any(border.has_indefinite for border in borders):
+        return Weighting.ISOTROPIC
+    return Weighting.INFORMATION
 
 
 def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[list[OwnedRuns], int]:

@@ -131,7 +131,7 @@ class _Budget:
 
         Robots and their driver run them, or one process if SOC has no robots.
         """
-        pipeline = Pipeline(soc=soc, newton=newton, second_try=False, staircase=None)
+        pipeline = replace(Pipeline().with_newton_alone(newton), soc=soc)
         robots = self.robots if soc is None else soc.robots
         solution = solve_whole(problem, pipeline, start, robots=robots, time_limit=self._time_limit)
         return solution, _records_of(solution)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graphs import DIMENSIONS, SEEDS, varied_graph
+from graphs import DIMENSIONS, SEEDS, informed, varied_graph
 from hypothesis import given, settings, strategies as st
 from processes import LimitedProcesses, under_limit
 from robots import PARTITIONERS, Partitioner, Recording, arrays_in
@@ -21,7 +21,7 @@ from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingErro
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, project_to_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers import folder_solve
 from solvers.distributed import staircase, substructured
@@ -57,7 +57,8 @@ def tower(num_robots: int, poses_each: int) -> PoseGraph:
 
 def check_same(solution: FolderSolution, graph: PoseGraph, out: Path) -> None:
     """Objective and bound of the central solve, and files with poses that have this objective."""
-    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
+    weighting = solution.certificate.weighting
+    problem = pgo.PGOProblem(graph, weighting=weighting)
     central = solvers.solve(problem, robots=pgo.partition(graph, graph.num_robots))
     certificate = solution.certificate
     assert solution.status.is_success
@@ -70,9 +71,11 @@ def check_same(solution: FolderSolution, graph: PoseGraph, out: Path) -> None:
     assert (written.num_poses, written.num_edges) == (graph.num_poses, graph.num_edges)
     np.testing.assert_array_equal(written.robots, graph.robots)
     assert written.initial is not None
-    assert pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(
-        written.initial
-    ) == pytest.approx(certificate.objective, rel=1e-9, abs=level)
+    assert pgo.PGOProblem(written, weighting=weighting).objective(written.initial) == pytest.approx(
+        certificate.objective, rel=1e-9, abs=level
+    )
+    F = pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(written.initial)
+    assert pytest.approx(F, rel=1e-9, abs=level) == solution.F
 
 
 @settings(max_examples=12, deadline=None)
@@ -102,6 +105,53 @@ def test_folders_are_solved_as_the_whole_graph(
     check_same(solve_folder(folder, out=folder / "out"), graph, folder / "out")
 
 
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("one_without", [False, True])
+def test_chi2_of_the_files_is_solved_as_that_of_the_whole_graph(
+    tmp_path: Path, d: int, coupled: bool, one_without: bool
+) -> None:
+    """Also where the matrices of one robot, and all of its edges to others, are F's."""
+    graph = informed(3, 24, d, coupled, spread=0.5)
+    robots = pgo.partition(graph, 3).robot
+    assert graph.information is not None
+    if one_without:
+        information = graph.information.copy()
+        of_first = (robots[graph.i] == 0) | (robots[graph.j] == 0)
+        plain = isotropic_information(graph.kappa, graph.tau, d)
+        information[of_first] = plain[of_first]
+        graph = replace(graph, information=information)
+    write_g2o_folder(graph.with_robots(robots), tmp_path / "in")
+    written = read_g2o(tmp_path / "in")
+    solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    assert solution.certificate.weighting is pgo.Weighting.INFORMATION
+    assert solution.certificate.is_certified
+    assert "chi2 " in str(solution)
+    assert "the bound is on chi2 alone" in str(solution)
+    check_same(solution, written, tmp_path / "out")
+    isotropic = solve_folder(
+        tmp_path / "in", weighting=pgo.Weighting.ISOTROPIC, out=tmp_path / "out"
+    )
+    check_same(isotropic, written, tmp_path / "out")
+    assert isotropic.F < solution.F
+
+
+def test_an_indefinite_matrix_in_one_file_makes_the_cost_f(tmp_path: Path) -> None:
+    graph = informed(3, 12, 3, coupled=True, spread=0.5)
+    assert graph.information is not None
+    information = graph.information.copy()
+    information[4, 0, 3] = information[4, 3, 0] = 1e9
+    graph = replace(graph, information=information).with_robots(np.arange(12) // 6)
+    write_g2o_folder(graph, tmp_path)
+    solution = solve_folder(tmp_path)
+    assert solution.certificate.weighting is pgo.Weighting.ISOTROPIC
+    assert "some information matrices are indefinite" in solution.note
+    with pytest.raises(GraphError, match=r"[01]\.g2o: information matrices of 1 of .* indefinite"):
+        solve_folder(tmp_path, weighting=pgo.Weighting.INFORMATION)
+    with pytest.raises(SettingError, match="solve for poses"):
+        solve_folder(tmp_path, weighting=pgo.Weighting.ROTATIONS)
+
+
 @pytest.mark.parametrize("away", [1e6, 1e12, 9e14])
 def test_what_is_certified_is_what_is_written_however_far_its_frame(
     away: float, tmp_path: Path
@@ -112,10 +162,11 @@ def test_what_is_certified_is_what_is_written_however_far_its_frame(
     certificate = solve_folder(tmp_path / "in", out=tmp_path / "out").certificate
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    F = pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(written.initial)
+    cost = pgo.PGOProblem(written, weighting=certificate.weighting).objective(written.initial)
     level = certificate.rounding_level
-    assert certificate.objective == pytest.approx(F, rel=1e-9, abs=level)
-    assert certificate.gap == pytest.approx((F - certificate.lower_bound) / F, rel=1e-6, abs=1e-9)
+    assert certificate.objective == pytest.approx(cost, rel=1e-9, abs=level)
+    gap = (cost - certificate.lower_bound) / cost
+    assert certificate.gap == pytest.approx(gap, rel=1e-6, abs=1e-9)
     assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
 
 
@@ -273,18 +324,20 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
     graph = varied_graph(1, 30, d, NoiseModel(translation_std=1.0, rotation_std=1.5))
     graph = graph.with_robots(pgo.partition(graph, 4).robot)
     write_g2o_folder(graph, tmp_path / "in")
-    solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
-    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
-    central = solvers.solve(problem, robots=pgo.partition(graph, 4))
+    isotropic = pgo.Weighting.ISOTROPIC
+    solution = solve_folder(tmp_path / "in", weighting=isotropic, out=tmp_path / "out")
+    problem = pgo.PGOProblem(graph, weighting=isotropic)
+    pipeline = solvers.Pipeline(handedness=None)
+    central = solvers.solve(problem, pipeline, robots=pgo.partition(graph, 4))
     assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
     assert "Staircase" in [stage.name for stage in solution.stages]
     assert solution.certificate.source is central.certificate.source is BoundSource.RELAXATION
     assert solution.certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6)
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    assert pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(
-        written.initial
-    ) == pytest.approx(solution.certificate.objective, rel=1e-9)
+    assert pgo.PGOProblem(written, weighting=isotropic).objective(written.initial) == pytest.approx(
+        solution.certificate.objective, rel=1e-9
+    )
     unfinished = solvers.Pipeline(
         soc=None, newton=solvers.Newton(max_iterations=0), second_try=False, staircase=None
     )
@@ -364,9 +417,10 @@ def test_ctrl_c_between_the_loops_keeps_what_was_found(
     assert solution.status is Status.INTERRUPTED
     written = read_g2o(tmp_path / "out")
     assert written.initial is not None
-    assert pgo.PGOProblem(written, weighting=pgo.Weighting.ISOTROPIC).objective(
-        written.initial
-    ) == pytest.approx(solution.certificate.objective, rel=1e-9)
+    cost = pgo.PGOProblem(written, weighting=solution.certificate.weighting)
+    assert cost.objective(written.initial) == pytest.approx(
+        solution.certificate.objective, rel=1e-9
+    )
 
 
 def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:

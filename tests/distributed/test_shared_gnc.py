@@ -159,9 +159,7 @@ def num_rejected(solution: solvers.Solution) -> list[int]:
 
 def test_the_plain_solve_before_the_attempts_is_on_the_ledger(wrong) -> None:
     graph = wrong[0]
-    few = solvers.Pipeline(
-        soc=None, newton=solvers.Newton(max_iterations=10), second_try=False, staircase=None
-    )
+    few = solvers.Pipeline().with_newton_alone(solvers.Newton(max_iterations=10))
     plain = solvers.solve(graph, few, robots=2)
     start = first_poses(graph, subgraph_known(pgo.PGOProblem(graph)))
     whole = solvers.solve(graph, robust=GNC(), robots=2)

@@ -56,7 +56,7 @@ SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 # in one place, too, where the default goes to Newton at once
 BY_SOC = replace(WARM_START, max_iterations=99)
-SHORT = Pipeline(soc=BY_SOC, second_try=False, staircase=None)
+SHORT = replace(Pipeline().with_newton_alone(Newton()), soc=BY_SOC)
 
 
 def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> None:
@@ -234,8 +234,9 @@ def test_a_second_try_and_the_staircase_follow_where_the_gap_stays_wide(d: int) 
     # relaxation is loose.
     problem = PGOProblem(varied_graph(11, 14, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
     solution = solve(problem, robots=3)
-    central = solve(problem, Pipeline(soc=BY_SOC, handedness=None))  # which robots do not seek
-    assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
+    central = solve(problem, Pipeline(soc=BY_SOC, growing=None))
+    names = [stage.name.removesuffix(", in one place") for stage in solution.stages]
+    assert names == [stage.name for stage in central.stages]
     assert solution.lower_bound <= min(solution.objective, central.objective)
     assert solution.gap == pytest.approx(central.gap, abs=1e-4)
 
@@ -298,7 +299,7 @@ def test_ctrl_c_while_robots_go_to_a_trial_leaves_none_behind(
     problem = varied_problem(6, 25, 3, LOUD_NOISE)
     parts = metis(problem.graph, 4)
     monkeypatch.setattr(Interior, "accept", interrupted)
-    solution = solve(problem, Pipeline(soc=None, staircase=None, second_try=False), robots=parts)
+    solution = solve(problem, replace(SHORT, soc=None), robots=parts)
     newton = solution.stages[-1]
     assert newton.status is Status.INTERRUPTED
     assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
@@ -373,7 +374,7 @@ def test_every_stage_reports_f_of_its_poses(stage: str, d: int, threads: int) ->
             Pipeline(soc=None, newton=stay),
             *(Pipeline(soc=soc, newton=newton, faults=faults) for newton in (stay, Newton())),
         ):
-            short = replace(pipeline, second_try=False, staircase=None)
+            short = replace(pipeline, second_try=False, staircase=None, handedness=None)
             solution = solve(problem, short, start, robots=parts, engine=InProcess(threads))
             rounding = 1e-12 * solution.objective
             assert solution.objective == pytest.approx(
