@@ -9,7 +9,8 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -37,9 +38,11 @@ def main() -> None:
         print(text_of_version())
         return
     gc.disable()  # until a command runs: importing makes many objects and no garbage
-    run = _imported()
     try:
-        run()
+        with _memory_for_imports():
+            from solvers.cli.app import main as run
+
+            run()  # which imports its command
     finally:
         # All is written: nothing is left to break off.
         for number in _SIGNALS:
@@ -60,17 +63,17 @@ def _check_not_hidden(package: str, file: str) -> None:
     )
 
 
-def _imported() -> Callable[[], None]:
-    """The command line, imported; where there is no memory for that, leave with one line."""
+@contextmanager
+def _memory_for_imports() -> Iterator[None]:
+    """Leave with one line where an import finds no memory."""
     try:
-        from solvers.cli.app import main as run
+        yield
     except (ImportError, MemoryError) as error:
         # Loaders say in these words that memory ran out.
         is_out_of_memory = re.search("map segment|memory", str(error))
         if isinstance(error, ImportError) and not is_out_of_memory:
             raise
         sys.exit("pgo: there is not enough memory to start; raise the limit")
-    return run
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
