@@ -16,7 +16,9 @@ import solvers
 from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import NoiseModel
-from solvers.cli.options import BackEndName, FirstStage, chosen_partition, chosen_pipeline
+from solvers.cli.choices import chosen_pipeline
+from solvers.cli.inputs import chosen_partition
+from solvers.cli.options import BackEndName, FirstStage
 from solvers.distributed import checkpoint
 from solvers.distributed.checkpoint import Checkpoint, Journal
 from solvers.network.engine import InProcess
