@@ -47,6 +47,8 @@ SECOND_TRY_TOLERANCE = 1e-6
 HULL_PASSES = 3
 CLOSER = 0.1  # factor on the tolerance of the next pass
 GROWING_START = "growing start"
+# Poses from which Newton gets the memory of SOC's factor: a fifth of the most that a solve takes.
+MANY_POSES = 20_000
 BROKEN_OFF = (*OUT_OF_TIME, Status.STOPPED)
 AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
 
@@ -241,6 +243,8 @@ class RunNewton:
         job = self.job
         if job.is_out_of_time:
             return replace(answer, decrement=math.inf)
+        if job.problem.num_poses > MANY_POSES:
+            job.problem.analysis.release_memory()  # that of SOC: Newton's factor is far larger
         finished = job.monitor.run(self.newton, job.problem, answer.current_poses)
         job.stages.append(Stage.of(finished))
         decrement = finished.state.polish.decrement

@@ -132,6 +132,13 @@ class SymbolicCholesky(ABC):
         has nan or inf.
         """
 
+    @abstractmethod
+    def release_memory(self) -> None:
+        """Let go of the memory of factors that are out of use, which the next one would take over.
+
+        The next one costs another symbolic analysis.
+        """
+
     def expected_error(self, beside: int = 0) -> Array | None:
         """What `CholeskyFactor.backward_error` will be about; None before a factor was counted."""
         return None
@@ -339,6 +346,9 @@ class _SuperLU(SymbolicCholesky):
         laplacian.setdiag((1.0 + 1e-6) * np.diff(self._indptr))
         L = self._lu(laplacian).L
         return csc_array((np.full(L.nnz, 1e-300), L.indices, L.indptr), shape=L.shape)
+
+    def release_memory(self) -> None:
+        """Do nothing: every factor has memory of its own."""
 
     def factorize(
         self, matrix: csc_array, overwrite: CholeskyFactor | None = None
@@ -560,8 +570,16 @@ class _Cholmod(SymbolicCholesky):
             raise
         return capsule
 
+    def release_memory(self) -> None:
+        self._idle()
+
     def _spare(self) -> _Capsule:
         """Take out a symbolic part that no factor uses, and let go of others like it."""
+        idle = self._idle()
+        return idle[-1] if idle else self._analyze()
+
+    def _idle(self) -> list[_Capsule]:
+        """Take out all symbolic parts that no factor uses."""
         used = []
         idle = []
         for user, numeric in self._taken:
@@ -571,7 +589,7 @@ class _Cholmod(SymbolicCholesky):
             else:
                 used.append((user, numeric))
         self._taken = used
-        return idle[-1] if idle else self._analyze()
+        return idle
 
     def _fill(self, lower: Array, capsule: _Capsule) -> Array:
         """Fill the capsule with the factor of these values of the lower triangle.

@@ -15,6 +15,7 @@ from graphs import (
     varied_problem,
 )
 from hypothesis import given, strategies as st
+from scipy.sparse import csc_array
 
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
@@ -226,12 +227,14 @@ def test_poses_must_fit_the_graph(poses: Poses) -> None:
             function(poses)
 
 
-@pytest.mark.parametrize("seed", range(25, 35))
-def test_refinement_ends_where_chi2_comes_out_below_zero(seed: int) -> None:
-    """With an indefinite W chi2 of poses that fit is rounding of either sign.
+def test_refinement_ends_where_chi2_comes_out_below_zero() -> None:
+    """With an indefinite W chi2 of poses that fit is rounding of either sign."""
+    costs = [refined_cost_of_exact_poses(seed) for seed in range(40)]
+    assert min(costs) < 0.0 < max(costs)
 
-    Seed 31 is below zero.
-    """
+
+def refined_cost_of_exact_poses(seed: int) -> float:
+    """chi2 of exact poses with an indefinite W, which refined translations do not raise."""
     n = 4
     rng = np.random.default_rng(seed)
     truth = Poses(random_rotations(n, 3, rng), rng.standard_normal((n, 3)))
@@ -244,24 +247,33 @@ def test_refinement_ends_where_chi2_comes_out_below_zero(seed: int) -> None:
     graph = PoseGraph(n, i, j, back @ truth.R[j], t_ij, ones, ones, information=information)
     problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
     assert not problem.weights.is_convex
-    assert seed != 31 or problem.objective(truth) < 0.0
     refined = problem.with_refined_translations(truth)
     assert problem.objective(refined) <= problem.objective(truth)
+    return problem.objective(truth)
 
 
-@pytest.mark.parametrize(("d", "seed"), [(2, 5), (2, 16), (3, 4), (3, 8)])
-def test_starts_and_translations_are_there_whatever_the_weights(d: int, seed: int) -> None:
-    """Two Laplacians have no factor in doubles.
+@pytest.mark.parametrize("d", [2, 3])
+def test_starts_and_translations_are_there_whatever_the_weights(d: int) -> None:
+    """Also where the Laplacian of the translations, or of the rotations, has no factor."""
+    num_without = np.zeros(2, dtype=int)
+    for seed in range(60):
+        problem = PGOProblem(spread_graph(seed, 9, d))
+        laplacians = (problem.M[1:9, 1:9].tocsc(), relaxed_rotations(problem, 0)[0])
+        without = np.array([not has_factor(laplacian) for laplacian in laplacians])
+        if not without.any():
+            continue
+        num_without += without
+        poses = chordal_start(problem)
+        assert np.isfinite(poses.t).all()
+        again = problem.with_best_translations(poses.R)
+        np.testing.assert_array_equal(again.t, poses.t)
+    assert (num_without > 0).all()
 
-    They are that of the translations (5, 4), and that of the rotations (16, 8).
-    """
-    graph = spread_graph(seed, 9, d)
-    problem = PGOProblem(graph)
-    is_of_translations = seed in (4, 5)
-    matrix = problem.M[1:9, 1:9].tocsc() if is_of_translations else relaxed_rotations(problem, 0)[0]
-    with pytest.raises(NotPositiveDefiniteError):
+
+def has_factor(matrix: csc_array) -> bool:
+    """Whether a matrix has a Cholesky factor in doubles."""
+    try:
         factorize(matrix)
-    poses = chordal_start(problem)
-    assert np.isfinite(poses.t).all()
-    again = problem.with_best_translations(poses.R)
-    np.testing.assert_array_equal(again.t, poses.t)
+    except NotPositiveDefiniteError:
+        return False
+    return True
