@@ -269,12 +269,15 @@ class RunMonitor:
         return max(self.time_limit - (time.perf_counter() - self.began), 1e-9)
 
     @contextmanager
-    def showing(self, name: str, problem: PGOProblem) -> Iterator[None]:
-        """Show what is done in a stage without iterations, where it takes long."""
+    def showing(self, name: str, side: int = 0) -> Iterator[None]:
+        """Show what is done in a stage without iterations, where it takes long.
+
+        The `side` is that of a matrix which it factors.
+        """
         if self.verbose or not is_shown(self.progress):
             yield
             return
-        with self._line(name, None, problem.side):
+        with self._line(name, None, side):
             yield
 
     def _line(self, name: str, max_iterations: int | None, side: int = 0) -> StageLine:

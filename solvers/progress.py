@@ -91,9 +91,10 @@ class StageLine:
         self._draw(expected)
 
     def end(self, activity: Activity) -> None:
-        """Remember how long an activity took."""
+        """Remember how long an activity took, and show it no longer."""
         _, began = self._activities.pop()
         self._seconds_taken[activity] = time.perf_counter() - began
+        self._draw(0.0)
 
     def _draw(self, expected: float) -> None:
         """Draw the line, if it is time for it or what follows may take so many seconds."""
