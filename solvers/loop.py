@@ -8,18 +8,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
+from pgo_models.activity import Activity
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem, as_problem
-from solvers.progress import Table
+from solvers.progress import StageLine, Table, is_shown
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
-
-# Poses from which a factorisation takes seconds, so that a bar is shown.
-_TAKES_SECONDS = 20_000
 
 P = TypeVar("P", contravariant=True)
 X = TypeVar("X", contravariant=True)
@@ -246,7 +243,8 @@ class RunMonitor:
     """For how long several runs may go on together, and what is shown of them; see `run`.
 
     The seconds count from `began`. `poses_found` are those that the runs have ended at. `plan` has
-    the names of all stages in order, so that bars show which are still to come.
+    the names of all stages in order, so that bars show which are still to come. `seconds_taken` are
+    those of activities, from which bars estimate how long equal ones will take.
     """
 
     time_limit: float = math.inf
@@ -256,6 +254,7 @@ class RunMonitor:
     began: float = field(default_factory=lambda: time.perf_counter())
     poses_found: list[Poses] = field(default_factory=list)
     plan: list[str] = field(default_factory=list)
+    seconds_taken: dict[Activity, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.time_limit > 0:
@@ -270,19 +269,24 @@ class RunMonitor:
         return max(self.time_limit - (time.perf_counter() - self.began), 1e-9)
 
     @contextmanager
-    def showing(self, name: str, problem: PGOProblem) -> Iterator[None]:
-        """Show a bar for a stage without iterations, on graphs where it takes seconds."""
-        is_long = problem.num_poses >= _TAKES_SECONDS
-        if not self.progress or self.verbose or not is_long:
+    def showing(self, name: str, side: int = 0) -> Iterator[None]:
+        """Show what is done in a stage without iterations, where it takes long.
+
+        The `side` is that of a matrix which it factors.
+        """
+        if self.verbose or not is_shown(self.progress):
             yield
             return
-        bars = import_module("solvers.progress_bars")  # rich is slow to import
-        with bars.JobBar(None, True, self._titled(name)):
+        with self._line(name, None, side):
             yield
 
+    def _line(self, name: str, max_iterations: int | None, side: int = 0) -> StageLine:
+        """A line on a stage, for which it may still be too early."""
+        return StageLine(self._titled(name), max_iterations, self.began, self.seconds_taken, side)
+
     def _titled(self, name: str) -> str:
-        """Name of a stage and, unless a table is printed, of those that follow it."""
-        if self.verbose or name not in self.plan:
+        """Name of a stage, and of those that follow it."""
+        if name not in self.plan:
             return name
         following = self.plan[self.plan.index(name) + 1 :]
         return f"{name}, then {', '.join(following)}" if following else name
@@ -304,10 +308,11 @@ class RunMonitor:
             problem = as_problem(problem)
         name = type(method).__name__
         tolerance = getattr(method, "tolerance", 0.0)
-        course = _Course[S](lambda: method.init(problem, start), earlier)
-        with Table(
-            self._titled(name), method.max_iterations, self.verbose, self.progress, tolerance
-        ) as table:
+        line = None
+        if not self.verbose and is_shown(self.progress):
+            line = self._line(name, method.max_iterations)
+        with Table(name, self.verbose, line, tolerance) as table:
+            course = _Course[S](lambda: method.init(problem, start), earlier)
             try:
                 status = self._iterate(method, problem, course, table)
             except KeyboardInterrupt:

@@ -9,17 +9,21 @@ from pgo_models.errors import printable
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+_BAR_WIDTH = 8  # so that a line has room for figures in 80 columns
+
 
 class JobBar:
     """Bar over the parts of a job or the iterations of a run.
 
     `parts` None is a job without parts that are counted. The bar is shown if stderr is a terminal,
-    or as `progress` says.
+    or as `progress` says. `elapsed` are the seconds for which the job has run.
     """
 
-    def __init__(self, parts: int | None, progress: bool | None, name: str = "") -> None:
+    def __init__(
+        self, parts: int | None, progress: bool | None, name: str = "", elapsed: float = 0.0
+    ) -> None:
         is_shown = sys.stderr.isatty() if progress is None else progress
-        self._bar = _bar_of_rich(parts, name) if is_shown else None
+        self._bar = _bar_of_rich(parts, name, elapsed) if is_shown else None
 
     def __enter__(self) -> Self:
         if self._bar is not None:
@@ -39,10 +43,15 @@ class JobBar:
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], description=printable(text))
 
-    def show(self, num_done: int, text: str) -> None:
-        """Show how many parts are done, and figures of them."""
+    def show(self, num_done: int, text: str, at_once: bool = False) -> None:
+        """Show how many parts are done, and figures of them.
+
+        The line is drawn ten times a second; `at_once` draws it now, before work in a library that
+        lets no other thread run.
+        """
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=num_done, figures=text)
+            task = self._bar.task_ids[0]
+            self._bar.update(task, completed=num_done, figures=text, refresh=at_once)
 
     def end_part(self) -> None:
         """Count the part as done."""
@@ -55,8 +64,8 @@ class JobBar:
             self._bar.stop()
 
 
-def _bar_of_rich(parts: int | None, name: str) -> "Progress":
-    """A bar with one task."""
+def _bar_of_rich(parts: int | None, name: str, elapsed: float) -> "Progress":
+    """A bar with one task, which began so many seconds ago; no bar where no parts are counted."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -66,15 +75,16 @@ def _bar_of_rich(parts: int | None, name: str) -> "Progress":
         TextColumn,
         TimeElapsedColumn,
     )
+    from rich.table import Column
 
-    columns: list[ProgressColumn] = [
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-    ]
+    columns: list[ProgressColumn] = [TextColumn("{task.description}", markup=False)]
     if parts is not None:
-        columns.append(MofNCompleteColumn())
-    columns.append(TextColumn("{task.fields[figures]}"))
+        columns += [BarColumn(_BAR_WIDTH), MofNCompleteColumn()]
+    # The figures have the columns that are left, and are cut where these are few.
+    rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
+    columns.append(TextColumn("{task.fields[figures]}", markup=False, table_column=rest))
     columns.append(TimeElapsedColumn())
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    bar = Progress(*columns, console=Console(stderr=True), transient=True, expand=True)
     bar.add_task(printable(name), total=parts, figures="")
+    bar.tasks[0].start_time = bar.get_time() - elapsed
     return bar

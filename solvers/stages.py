@@ -186,7 +186,7 @@ class FindStart:
     def run(self, answer: Answer) -> Answer:
         """Return the poses of the start."""
         job = self.job
-        with job.monitor.showing(self.name, job.problem):
+        with job.monitor.showing(self.name, job.problem.side):
             poses = self.find()
         seconds = time.perf_counter() - self.began
         objective = job.problem.objective(poses)
@@ -266,7 +266,7 @@ class FindCertificate:
         """Return the answer with its certificate."""
         job = self.job
         poses = answer.current_poses
-        with job.monitor.showing(self.name, job.problem):
+        with job.monitor.showing(self.name, job.problem.side):
             certificate = certify_at(job.problem, poses, job.gap, answer.decrement)
         return replace(answer, certificate=certificate)
 

@@ -16,6 +16,7 @@ ORDER = {
     "pgo_models": (
         "lazy_names",
         "errors",
+        "activity",
         "figures",
         "verification",
         "memory",

@@ -1,4 +1,7 @@
 import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
 from types import ModuleType, TracebackType
 
 import numpy as np
@@ -7,18 +10,27 @@ from rich.progress import Progress
 
 import solvers
 import solvers.progress as table_module
+from pgo_models.activity import Activity, doing
 from pgo_models.graphs import scenes
-from solvers import loop
-from solvers.progress import Table
+from solvers.progress import StageLine, Table, is_shown
 from solvers.result import Measurement, Record, Status
+from solvers.riemannian.newton import Newton
 
 RECORDS = [
     Record(k, 0.25 * k, Measurement(100.0 / (k + 1), 10.0**-k, 2 * 10.0**-k)) for k in range(3)
 ]
 
 
+def line_of(name: str, elapsed: float = 0.0, most: int | None = 100) -> StageLine:
+    """Line on the only stage of a solve, which began so many seconds ago."""
+    line = StageLine(name, most, time.perf_counter() - elapsed, {})
+    line._began -= elapsed
+    return line
+
+
 def shown(verbose: bool, progress: bool | None, elapsed: float = 0.0) -> None:
-    with Table("SOC", 100, verbose=verbose, progress=progress) as table:
+    line = line_of("SOC", elapsed) if is_shown(progress) and not verbose else None
+    with Table("SOC", verbose, line) as table:
         for record in RECORDS:
             table.row(record, elapsed)
         table.end(Status.CONVERGED, 2)
@@ -51,7 +63,7 @@ def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[s
     measured = Measurement(
         1.2345678905e-05, 1e-100, 1e-100, rounds=123456, all_reduces=1234567, num_bytes=999_999_000
     )
-    with Table("SOC", 100, verbose=True, progress=False) as table:
+    with Table("SOC", verbose=True) as table:
         for k in (0, 99_999):
             table.row(Record(k, 9999.999, measured), 0.0)
     lines = capsys.readouterr().out.splitlines()[1:]
@@ -71,7 +83,7 @@ def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[s
 
 
 def test_a_run_that_goes_on_has_a_head_too(capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC", 100, verbose=True, progress=False) as table:
+    with Table("SOC", verbose=True) as table:
         table.row(Record(7, 0.0, Measurement(1.0, 1e-3, 1e-3)), 0.0)
         table.row(Record(8, 0.0, Measurement(1.0, 1e-4, 1e-4)), 0.0)
     name, head, *rows = capsys.readouterr().out.splitlines()
@@ -79,7 +91,7 @@ def test_a_run_that_goes_on_has_a_head_too(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC", 100, verbose=True, progress=False) as table:
+    with Table("SOC", verbose=True) as table:
         table.row(Record(0, 0.0, Measurement(1.0, float("inf"), float("inf"))), 0.0)
         table.row(Record(1, 0.0, Measurement(float("nan"), float("nan"), float("nan"))), 0.0)
     rows = capsys.readouterr().out.splitlines()[2:]
@@ -88,7 +100,7 @@ def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixtur
 
 
 def test_names_with_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC[bold]", 100, verbose=True, progress=False) as table:
+    with Table("SOC[bold]", verbose=True) as table:
         table.row(RECORDS[0], 0.0)
     assert capsys.readouterr().out.splitlines()[0] == "SOC[bold]"
 
@@ -111,7 +123,7 @@ def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(
     tolerance, left, monkeypatch
 ) -> None:
     notebook = Notebook(monkeypatch)
-    with Table("SOC", 100, verbose=False, progress=True, tolerance=tolerance) as table:
+    with Table("SOC", False, line_of("SOC", 10.0), tolerance) as table:
         table.row(RECORDS[0], 0.5)
         table.row(RECORDS[1], 10.0)  # one decade of two in ten seconds
     assert ("about 10 s left" in notebook.outputs[0][-2]) == left
@@ -119,7 +131,7 @@ def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(
 
 @pytest.mark.parametrize("status", Status)
 def test_lines_are_not_wrapped(status: Status, capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC", 100, verbose=True, progress=False) as table:
+    with Table("SOC", verbose=True) as table:
         table.end(status, 123_456)
     assert (
         capsys.readouterr().out.splitlines()[-1]
@@ -132,10 +144,14 @@ def test_a_short_run_shows_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
-def test_the_table_takes_the_place_of_the_bar(capsys: pytest.CaptureFixture[str]) -> None:
-    shown(verbose=True, progress=True, elapsed=10.0)
+def test_the_table_takes_the_place_of_the_bar(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = scenes.grid(np.random.default_rng(0))
+    monkeypatch.setattr(table_module, "_LARGE_SIDE", 1)
+    solvers.run(Newton(), graph, verbose=True, progress=True)
     out, err = capsys.readouterr()
-    assert len(out.splitlines()) == 6
+    assert out.startswith("Newton\n")
     assert err == ""
 
 
@@ -211,7 +227,7 @@ def test_the_bar_is_stopped_whatever_happens(
     monkeypatch.setattr(Progress, "stop", stop)
 
     def interrupted() -> None:
-        with Table("SOC", 100, verbose=False, progress=True) as table:
+        with Table("SOC", False, line_of("SOC", 10.0)) as table:
             table.row(RECORDS[1], 10.0)
             assert not stopped
             if error is not None:
@@ -226,7 +242,7 @@ def test_the_bar_is_stopped_whatever_happens(
 
 
 def test_it_swallows_no_exception() -> None:
-    table = Table("SOC", 100, verbose=False, progress=False)
+    table = Table("SOC", verbose=False)
     nothing: tuple[type[BaseException] | None, BaseException | None, TracebackType | None] = (
         None,
         None,
@@ -245,8 +261,98 @@ def test_stages_without_iterations_are_shown_on_large_graphs_with_what_is_still_
     graph = scenes.grid(np.random.default_rng(0))
     solvers.solve(graph, progress=True)
     assert "chordal start" not in capsys.readouterr().err
-    monkeypatch.setattr(loop, "_TAKES_SECONDS", 1)
+    monkeypatch.setattr(table_module, "_LARGE_SIDE", 1)
     solvers.solve(graph, progress=True)
     err = capsys.readouterr().err
-    assert "chordal start, then Newton, certificate" in err
-    assert "certificate " in err.split("chordal start, then Newton, certificate")[-1]
+    start, _, others = err.partition("Newton, then certificate")
+    assert "chordal start, then Newton, certificate" in start
+    assert "analysis" in start
+    newton, _, certificate = others.rpartition("Newton, then certificate")
+    assert "factorisation" in newton
+    assert "certificate  " in certificate
+
+
+class Clock:
+    """Stands for `time.perf_counter`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        monkeypatch.setattr(table_module.time, "perf_counter", lambda: self.now)
+
+
+HESSIAN = Activity("factorisation", 6 * 1000, 36 * 5000)
+OF_M = Activity("factorisation", 4 * 1000, 16 * 5000)
+OTHER_GRAPH = Activity("factorisation", 6 * 1000, 36 * 15000)
+
+
+@pytest.mark.parametrize(
+    ("activity", "text"),
+    [
+        (OF_M, "factorisation 2 (about 8 s)"),  # as measured
+        (HESSIAN, "factorisation 2 (about 27 s)"),  # 1.5^3 times that
+        (OTHER_GRAPH, "factorisation 2"),  # nothing is known of it
+        (replace(HESSIAN, name="analysis"), "analysis"),
+    ],
+)
+def test_the_seconds_of_a_factorisation_are_estimated_from_what_is_measured(
+    activity, text, monkeypatch
+) -> None:
+    notebook = Notebook(monkeypatch)
+    clock = Clock(monkeypatch)
+    with StageLine("certificate", None, 0.0, {}):
+        with doing(OF_M):
+            clock.now += 8.0
+        with doing(activity):
+            pass
+    assert f"certificate {text} 8 s" in notebook.outputs[0]
+
+
+def test_activities_within_others_are_shown_together_and_none_after_an_error(monkeypatch) -> None:
+    notebook = Notebook(monkeypatch)
+    clock = Clock(monkeypatch)
+    clock.now = 5.0
+    with StageLine("certificate", None, 0.0, {}) as line:
+        with suppress(ValueError), doing(Activity("shift 1 of at most 9")), doing(OF_M):
+            raise ValueError
+        line.show(0, "F 1")
+    first, second, _, _, last, removed = notebook.outputs[0][-6:]
+    assert "shift 1 of at most 9 0 s" in first
+    assert "shift 1 of at most 9, factorisation 0 s" in second
+    assert "certificate F 1 0 s" in last
+    assert removed == ""
+
+
+@pytest.mark.parametrize(
+    ("of_solve", "of_stage", "is_shown"),
+    [(0.9, 0.5, False), (1.1, 0.05, False), (1.1, 0.15, True), (5.0, 0.15, True)],
+)
+def test_a_line_waits_for_a_second_of_the_solve_and_a_moment_of_the_stage(
+    of_solve, of_stage, is_shown, monkeypatch
+) -> None:
+    notebook = Notebook(monkeypatch)
+    clock = Clock(monkeypatch)
+    monkeypatch.setattr(table_module, "_SECONDS_BETWEEN_UPDATES", 0.1)
+    clock.now = of_solve - of_stage
+    with StageLine("SOC", 100, 0.0, {}) as line:
+        line.show(0, "F 1")
+        assert notebook.outputs == []
+        clock.now += of_stage
+        line.show(1, "F 0.5")
+    assert bool(notebook.outputs) == is_shown
+
+
+def test_a_large_matrix_is_shown_before_a_second_has_passed(monkeypatch) -> None:
+    notebook = Notebook(monkeypatch)
+    with line_of("SOC", 0.0), doing(OF_M):
+        assert notebook.outputs == []
+    with line_of("SOC", 0.0), doing(replace(OF_M, side=table_module._LARGE_SIDE)):
+        assert "factorisation" in notebook.outputs[0][-1]
+
+
+def test_nobody_is_told_of_activities_after_a_line() -> None:
+    taken: dict[Activity, float] = {}
+    with StageLine("SOC", 100, time.perf_counter(), taken):
+        pass
+    with doing(OF_M):
+        pass
+    assert taken == {}

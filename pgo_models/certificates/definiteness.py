@@ -9,6 +9,7 @@ error) diag is positive definite (Rump 2006, *Verification of positive definiten
 Chaykin & Keil 2007, VSDP). The word shift is for eta, which is added to the rows of rotations.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import LinearOperator, cg
 
+from pgo_models.activity import Activity, doing
 from pgo_models.certificates.dual_variables import certificate_matrix
 from pgo_models.certificates.rounding_errors import matrix_errors
 from pgo_models.errors import NotPositiveDefiniteError
@@ -297,11 +299,16 @@ def smallest_eta(
     that nothing but zero is tried. `too_small` is an eta below the first for which there is known
     to be none.
     """
+    most = ETA_BISECTIONS + 1
+    if 0.0 < eta < below < math.inf:
+        most += math.floor(math.log(below / eta, ETA_GROWTH))
+    shifts = (Activity(f"shift {k} of at most {most}") for k in itertools.count(1))
     proof = None
     while proof is None:
         if not eta < below:
             return None
-        proof = attempt(eta)
+        with doing(next(shifts)):
+            proof = attempt(eta)
         if proof is None:
             if not eta > 0.0:
                 return None
@@ -311,7 +318,8 @@ def smallest_eta(
         if too_small is None:
             break
         middle = math.sqrt(too_small * eta)
-        better = attempt(middle)
+        with doing(next(shifts)):
+            better = attempt(middle)
         if better is None:
             too_small = middle
         else:

@@ -12,12 +12,14 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
+from pgo_models.activity import Activity, doing
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
@@ -119,6 +121,7 @@ class SymbolicCholesky(ABC):
         self._indptr = pattern.indptr
         self._indices = pattern.indices
         self._shape = pattern.shape
+        self._factorisation = Activity("factorisation", pattern.shape[0], pattern.nnz)
 
     @abstractmethod
     def factorize(
@@ -370,9 +373,9 @@ class _SuperLU(SymbolicCholesky):
 
     def _lu(self, matrix: csc_array) -> SuperLU:
         permuted = matrix[self.order][:, self.order].tocsc()
-        return splu(
-            permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        options = {"SymmetricMode": True}
+        with doing(self._factorisation):
+            return splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
 
 
 class _CholmodFactor(CholeskyFactor):
@@ -522,7 +525,8 @@ class _Cholmod(SymbolicCholesky):
         return cholmod.getfactor(capsule).CCS, np.array(order).ravel().astype(np.int64)
 
     def _analyze(self) -> _Capsule:
-        with supernodal() as cholmod:
+        analysis = replace(self._factorisation, name="analysis")
+        with supernodal() as cholmod, doing(analysis):
             if self._order is None:
                 return cholmod.symbolic(self._matrix)
             cvxopt, _ = import_cvxopt()
@@ -598,7 +602,7 @@ class _Cholmod(SymbolicCholesky):
         """
         cvxopt, cholmod = import_cvxopt()
         self._matrix.V = cvxopt.matrix(lower)
-        with supernodal():
+        with supernodal(), doing(self._factorisation):
             cholmod.numeric(self._matrix, capsule)
         # A ValueError here would mean L D L^T, which indefinite matrices have, too.
         return np.array(cholmod.diag(capsule)).ravel()

@@ -38,7 +38,6 @@ FOR_OWN_FILES = {
     "max_iterations",
     "tolerance",
     "time_limit",
-    "threads",
     "verbose",
     "quiet",
 }

@@ -48,9 +48,6 @@ _LONGEST_LINE = 2000
 QuietOption = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print errors and warnings alone.")
 ]
-ThreadsOption = Annotated[
-    int | None, typer.Option(min=1, help="Threads of linear algebra; one a core unless given.")
-]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print JSON, and nothing else on standard output.")
 ]

@@ -64,7 +64,6 @@ from solvers.cli.shell import (
     NOT_CONVERGED,
     JsonOption,
     QuietOption,
-    ThreadsOption,
     save_then_show,
     wrapped,
 )
@@ -202,7 +201,6 @@ def solve_command(
         ),
     ] = None,
     drop_edge: DropEdgeOption = None,
-    threads: ThreadsOption = None,  # `solvers.command` reads it, before BLAS is imported
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")
     ] = False,

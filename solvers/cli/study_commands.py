@@ -23,6 +23,16 @@ from solvers.studies.paper_tables_text import tables_as_text
 
 Choice = TypeVar("Choice", bound=enum.Enum)
 KEPT_FILE = Path("pgo-tables.json")
+JobsOption = Annotated[
+    int,
+    typer.Option(
+        "--jobs",
+        "-j",
+        min=1,
+        help="Runs side by side, each in a process of its own; they take wall time from each "
+        "other if there are fewer cores.",
+    ),
+]
 DownloadOption = Annotated[
     bool,
     typer.Option(
@@ -63,6 +73,7 @@ def tables_command(
         bool, typer.Option("--fresh", help="Ignore the kept figures, and run everything again.")
     ] = False,
     download: DownloadOption = False,
+    jobs: JobsOption = ReproductionSettings.num_jobs,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -70,7 +81,7 @@ def tables_command(
     check_outputs_differ({"--out": out, "--keep": keep})
     _check(out, check_table_format)
     check_writable(keep)
-    settings = ReproductionSettings(_split(only), seeds, robots, download)
+    settings = ReproductionSettings(_split(only), seeds, robots, download, jobs)
     tables = reproduce_tables(settings, keep, is_fresh=fresh, progress=False if quiet else None)
     table = tables_as_text(tables)
     save_then_show(
@@ -111,6 +122,7 @@ def compare_command(
     time_limit: Annotated[float, typer.Option(help="Seconds for every method.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
     drop_edge: DropEdgeOption = None,
+    jobs: JobsOption = ComparisonSettings.num_jobs,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -121,6 +133,7 @@ def compare_command(
     settings = ComparisonSettings(
         _chosen(BenchmarkMethod, methods, "method"),
         BenchmarkSettings(robots, time_limit=time_limit),
+        jobs,
     )
     loaded = load_graph(graph, unit_weights, dropped=drop_edge)
     comparison = compare_methods(loaded, settings, progress=False if quiet else None)

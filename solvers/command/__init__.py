@@ -21,13 +21,16 @@ _SIGNALS = [signal.SIGINT, signal.SIGTERM]
 if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
     _SIGNALS.append(signal.SIGHUP)
 # BLAS reads these once, when it is imported.
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_NUMBERS_OF_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def main() -> None:
-    """Run `solvers.cli.app.main`, with as many threads of BLAS as an option --threads says."""
-    if threads := re.search(r"--threads[= ]([1-9]\d*)", " ".join(sys.argv[1:])):
-        os.environ.update(dict.fromkeys(_THREADS, threads[1]))
+    """Run `solvers.cli.app.main`, with one thread of BLAS unless the environment has a number.
+
+    The dense blocks of a pose graph are small: more threads take more CPU time and save none.
+    """
+    for name in _NUMBERS_OF_THREADS:
+        os.environ.setdefault(name, "1")
     for number in _SIGNALS:
         signal.signal(number, _leave)
     for package, file in (("pgo_models", "errors.py"), ("solvers", "cli/app.py")):

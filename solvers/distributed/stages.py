@@ -123,12 +123,13 @@ class StartByRobots:
         driver.choose_cost(final=False)
         poses = self.find() if self.find is not None else None
         began = time.perf_counter()
-        if poses is None:
-            driver.go_to_chordal_start()
-        else:
-            driver.set_poses(poses)
-        objective = _final_objective(driver)
-        driver.choose_cost(final=False)
+        with self.job.monitor.showing(self.name):
+            if poses is None:
+                driver.go_to_chordal_start()
+            else:
+                driver.set_poses(poses)
+            objective = _final_objective(driver)
+            driver.choose_cost(final=False)
         seconds = time.perf_counter() - began
         self.job.stages.append(Stage(self.name, Status.CONVERGED, 0, objective, seconds, History()))
         return Answer()
@@ -254,11 +255,12 @@ class CertifyByRobots:
         Of the whole problem nothing is used but F of these poses.
         """
         driver = self.job.driver
-        bound = best_bound_distributed(driver, self.gap)
-        poses, Lambda = collect(driver)
-        certificate = certify_with(
-            self.problem, poses, Lambda, self.gap, answer.decrement, BoundSource.GIVEN, bound
-        )
+        with self.job.monitor.showing(self.name):
+            bound = best_bound_distributed(driver, self.gap)
+            poses, Lambda = collect(driver)
+            certificate = certify_with(
+                self.problem, poses, Lambda, self.gap, answer.decrement, BoundSource.GIVEN, bound
+            )
         self.job.journal.end_attempt((poses, certificate))
         return replace(answer, poses=poses, certificate=certificate)
 

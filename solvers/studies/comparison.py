@@ -2,15 +2,17 @@
 
 import importlib.util
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.certificates.rounding_errors import fits_to_rounding, objective_rounding
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -24,6 +26,7 @@ from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
+from solvers.studies.side_by_side import Trial, run_trials
 
 # Columns of figures: head, name in the record, and the function that formats a value.
 _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
@@ -48,10 +51,21 @@ class ComparisonSettings:
         Methods; all that can be run here unless given. GTSAM has to be installed.
     trial : BenchmarkSettings
         Common settings.
+    num_jobs : int
+        Number of methods that are run side by side, each in a process of its own if it is above 1.
+
+    Raises
+    ------
+    SettingError
+        If the number of jobs is not positive.
     """
 
     contenders: tuple[BenchmarkMethod, ...] = ()
     trial: BenchmarkSettings = field(default_factory=BenchmarkSettings)
+    num_jobs: int = 1
+
+    def __post_init__(self) -> None:
+        check_settings(self, at_least_one=["num_jobs"])
 
     @property
     def chosen(self) -> tuple[BenchmarkMethod, ...]:
@@ -82,6 +96,8 @@ class Comparison:
         Methods without figures, and why.
     is_complete : bool
         Whether all methods were run; after Ctrl-C they were not.
+    num_jobs : int
+        Number of methods that were run side by side.
     """
 
     problem: PGOProblem
@@ -90,6 +106,7 @@ class Comparison:
     trials: tuple[BenchmarkRun, ...]
     reasons: tuple[tuple[BenchmarkMethod, str], ...]
     is_complete: bool = True
+    num_jobs: int = 1
 
     @property
     def curves(self) -> list[Curve]:
@@ -130,6 +147,10 @@ class Comparison:
             "gaps are to the bound, over F",
             "rounds, all-reduces and MB: where they are counted; seconds a robot: side by side",
         ]
+        if self.num_jobs > 1:
+            notes.append(
+                f"seconds: of wall time, {self.num_jobs} methods having been run side by side"
+            )
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
         return tuple(notes)
@@ -163,7 +184,7 @@ def compare_methods(
     *,
     progress: bool | None = None,
 ) -> Comparison:
-    """Run methods on a graph, one after the other, and compare them with a proven lower bound.
+    """Run methods on a graph, and compare them with a proven lower bound.
 
     For a method that fails the result has the reason. After Ctrl-C the result has the methods that
     have ended; before the bound is known, Ctrl-C raises a KeyboardInterrupt.
@@ -200,24 +221,35 @@ def compare_methods(
     if isinstance(problem, PoseGraph):
         problem = PGOProblem(problem, weighting=Weighting.ISOTROPIC)
     solution = solve_whole(problem)
-    trials: list[BenchmarkRun] = []
-    reasons: list[tuple[BenchmarkMethod, str]] = []
+    outcomes: dict[BenchmarkMethod, BenchmarkRun | str] = {}
     is_complete = False
     with JobBar(len(settings.chosen), progress) as bar, suppress(KeyboardInterrupt):
-        for contender in settings.chosen:
-            bar.name_part(contender.label)
-            try:
-                trials.append(run_benchmark(contender, problem, settings.trial))
-            except FAILURES as error:
-                reasons.append((contender, reason_of(error)))
-            bar.end_part()
+        compared = deque(
+            _trial(contender, problem, settings.trial, outcomes, bar)
+            for contender in settings.chosen
+        )
+        run_trials(compared, settings.num_jobs)
         is_complete = True
+    trials: list[BenchmarkRun] = []
+    reasons: list[tuple[BenchmarkMethod, str]] = []
+    for contender in settings.chosen:
+        outcome = outcomes.get(contender)
+        if isinstance(outcome, BenchmarkRun):
+            trials.append(outcome)
+        elif outcome is not None:
+            reasons.append((contender, outcome))
     certificate = solution.certificate
     costs = [certificate.objective_at_most]
     costs.append(_cost_at_most(problem, certificate.poses, certificate.poses_objective))
     costs += [_cost_at_most(problem, trial.poses, trial.objective) for trial in trials]
     return Comparison(
-        problem, min(costs), solution.lower_bound, tuple(trials), tuple(reasons), is_complete
+        problem,
+        min(costs),
+        solution.lower_bound,
+        tuple(trials),
+        tuple(reasons),
+        is_complete,
+        settings.num_jobs,
     )
 
 
@@ -230,6 +262,29 @@ def check_plot_format(path: Path) -> None:
         problem = f"cannot write {path}: no plot has suffix {path.suffix!r}"
         raise SettingError(f"{problem}; use .html, .png, .svg or .pdf")
     check_installed(path)
+
+
+def _trial(
+    contender: BenchmarkMethod,
+    problem: PGOProblem,
+    settings: BenchmarkSettings,
+    outcomes: dict[BenchmarkMethod, BenchmarkRun | str],
+    bar: JobBar,
+) -> Trial:
+    """Trial of `run_trials`: run a method, and note its run or the reason why there is none."""
+    bar.name_part(contender.label)
+    outcomes[contender] = yield partial(_run_or_reason, contender, problem, settings)
+    bar.end_part()
+
+
+def _run_or_reason(
+    contender: BenchmarkMethod, problem: PGOProblem, settings: BenchmarkSettings
+) -> BenchmarkRun | str:
+    """Run of a method, or the reason for which it failed."""
+    try:
+        return run_benchmark(contender, problem, settings)
+    except FAILURES as error:
+        return reason_of(error)
 
 
 def _cost_at_most(problem: PGOProblem, poses: Poses, objective: float) -> float:

@@ -1,11 +1,13 @@
 """The paper's tables 1 to 4, row by row: its figures beside ours, with proven lower bounds."""
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,12 +23,14 @@ from solvers.progress_bars import JobBar
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
 from solvers.studies.results_cache import Entry, KeptResults, graph_fingerprint
+from solvers.studies.side_by_side import Call, Trial, run_trials
 
 SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {
     "circle": circle,
     "grid": grid,
     "sphere": sphere,
 }
+Value = TypeVar("Value")
 TABLE_CONTENDERS = (
     BenchmarkMethod.STAIRCASE,
     BenchmarkMethod.GAUSS_SEIDEL,
@@ -49,6 +53,8 @@ class ReproductionSettings:
         Number of robots, as in `BenchmarkSettings`.
     download : bool
         Whether to download graphs that are not here. Otherwise their row says how to get them.
+    num_jobs : int
+        Number of runs that are done side by side, each in a process of its own if it is above 1.
 
     Raises
     ------
@@ -60,9 +66,10 @@ class ReproductionSettings:
     num_seeds: int = 20
     num_robots: int = BenchmarkSettings.num_robots
     download: bool = False
+    num_jobs: int = 1
 
     def __post_init__(self) -> None:
-        check_settings(self, at_least_one=["num_seeds", "num_robots"])
+        check_settings(self, at_least_one=["num_seeds", "num_robots", "num_jobs"])
         known = [row.name for row in published_rows()]
         for name in self.only:
             if name not in known:
@@ -106,7 +113,10 @@ class Optimum:
 
 @dataclass(frozen=True)
 class TableEntry:
-    """Figures of a method on one draw, see `BenchmarkRun`; `first_gap` is the gap after SOC."""
+    """Figures of a method on one draw, see `BenchmarkRun`; `first_gap` is the gap after SOC.
+
+    Its seconds were measured while `num_jobs` runs were done side by side.
+    """
 
     objective: float
     gap: float
@@ -117,6 +127,7 @@ class TableEntry:
     seconds: float
     seconds_per_robot: float
     remark: str
+    num_jobs: int = 1
 
 
 @dataclass(frozen=True)
@@ -224,10 +235,11 @@ def reproduce_tables(
     results = [_RowResults(row, settings) for row in settings.rows]
     is_complete = False
     num_parts = sum(len(row.seeds) for row in results) * len(TABLE_CONTENDERS)
+    trials: deque[Trial] = deque()
     with JobBar(num_parts, progress) as bar, suppress(KeyboardInterrupt):
         for row in results:
-            for seed in row.seeds:
-                row.draw(seed, kept, bar)
+            trials += [row.draw(seed, kept, bar, trials) for seed in row.seeds]
+        run_trials(trials, settings.num_jobs)
         is_complete = True
     rows = chain.from_iterable(row.rows() for row in results)
     return Reproduction(settings, tuple(rows), is_complete)
@@ -258,12 +270,13 @@ class _RowResults:
         self.row = row
         self.settings = settings
         self.seeds = settings.seeds(row.name)
-        self.optima: list[Optimum] = []
-        self.cells: dict[BenchmarkMethod, list[TableEntry]] = {}
-        self.reasons: dict[BenchmarkMethod, list[str]] = {}
+        # By seed, since draws that are run side by side end in any order.
+        self.optima: dict[int, Optimum] = {}
+        self.cells: dict[BenchmarkMethod, dict[int, TableEntry]] = {}
+        self.reasons: dict[BenchmarkMethod, dict[int, str]] = {}
         for contender in TABLE_CONTENDERS:
-            self.cells[contender] = []
-            self.reasons[contender] = []
+            self.cells[contender] = {}
+            self.reasons[contender] = {}
 
     def rows(self) -> Iterator[ReproducedRow]:
         """Row of every contender."""
@@ -272,90 +285,124 @@ class _RowResults:
                 self.row,
                 contender,
                 num_draws=len(self.seeds),
-                optima=tuple(self.optima),
-                cells=tuple(self.cells[contender]),
-                reasons=tuple(self.reasons[contender]),
+                optima=_in_order(self.optima),
+                cells=_in_order(self.cells[contender]),
+                reasons=_in_order(self.reasons[contender]),
             )
 
-    def draw(self, seed: int, kept: KeptResults, bar: JobBar) -> None:
-        """Compute the optimum and all cells of one draw, unless they are kept.
+    def draw(self, seed: int, kept: KeptResults, bar: JobBar, trials: deque[Trial]) -> Trial:
+        """Compute the optimum of one draw, unless it is kept, and queue the trials of its cells.
 
-        For a method that fails the reason is noted.
+        If it cannot be computed the reason is noted.
         """
         bar.name_part(f"{self.row.name}: certified optimum")
         try:
             graph = graph_of_row(self.row, seed, self.settings.download)
         except FAILURES as error:
-            self._fail(reason_of(error), bar)
+            self._fail(seed, reason_of(error), bar)
             return
         problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
         name = f"{self.row.name} {seed} {graph_fingerprint(graph)}"
-        entry = _kept_or_computed(kept, f"{name} optimum", partial(_optimum, problem))
+        entry = yield from _kept_or_computed(kept, f"{name} optimum", partial(_optimum, problem))
         if isinstance(entry, str):
-            self._fail(entry, bar)
+            self._fail(seed, entry, bar)
             return
         optimum = Optimum(**entry)
-        self.optima.append(optimum)
+        self.optima[seed] = optimum
         robots = BenchmarkSettings(self.settings.num_robots).robots(graph)
-        for contender in TABLE_CONTENDERS:
-            bar.name_part(f"{self.row.name}: {contender.label}")
+        for contender in reversed(TABLE_CONTENDERS):  # the first one comes to the front
             key = f"{name} {contender.value}, {robots.num_robots} robots {robots.method.name}"
-            compute = partial(self._compute_cell, contender, problem, optimum.lower_bound)
-            entry = _kept_or_computed(kept, key, compute)
-            if isinstance(entry, str):
-                self.reasons[contender].append(entry)
-            else:
-                entry = {**entry, "iterations": tuple(entry["iterations"])}
-                self.cells[contender].append(TableEntry(**entry))
-            bar.end_part()
+            compute = partial(
+                _compute_cell, contender, problem, self.row, self.settings, optimum.lower_bound
+            )
+            trials.appendleft(
+                self._cell(contender, seed, _kept_or_computed(kept, key, compute), bar)
+            )
 
-    def _fail(self, reason: str, bar: JobBar) -> None:
+    def _cell(
+        self,
+        contender: BenchmarkMethod,
+        seed: int,
+        computation: Generator[Call, Any, Entry | str],
+        bar: JobBar,
+    ) -> Trial:
+        """Note the figures of a method on one draw, or the reason for which it fails."""
+        bar.name_part(f"{self.row.name}: {contender.label}")
+        entry = yield from computation
+        if isinstance(entry, str):
+            self.reasons[contender][seed] = entry
+        else:
+            entry = {**entry, "iterations": tuple(entry["iterations"])}
+            self.cells[contender][seed] = TableEntry(**entry)
+        bar.end_part()
+
+    def _fail(self, seed: int, reason: str, bar: JobBar) -> None:
         """Note why a draw has no figures at all."""
         for contender in TABLE_CONTENDERS:
-            self.reasons[contender].append(reason)
+            self.reasons[contender][seed] = reason
             bar.end_part()
 
-    def _compute_cell(
-        self, contender: BenchmarkMethod, problem: PGOProblem, lower_bound: float
-    ) -> Entry:
-        """Figures of a contender, as a record for the file; a PGOError if it has no result."""
-        start = None
-        if contender is BenchmarkMethod.PAPER and self.row.name in SCENES:
-            start = problem.graph.initial
-        settings = BenchmarkSettings(self.settings.num_robots, self.row.soc.iterations)
-        trial = run_benchmark(contender, problem, settings, start)
-        if not trial.is_answer or not np.isfinite(trial.objective):
-            raise PGOError(trial.remark)
-        first_gap = None
-        if trial.first_objective is not None:
-            first_gap = float(relative_gap(trial.first_objective, lower_bound))
-        entry = TableEntry(
-            objective=float(trial.objective),
-            gap=float(relative_gap(trial.objective, lower_bound)),
-            first_gap=first_gap,
-            iterations=trial.iterations,
-            rounds=trial.rounds,
-            num_bytes=trial.num_bytes,
-            seconds=trial.seconds,
-            seconds_per_robot=trial.seconds_per_robot,
-            remark=trial.remark,
-        )
-        return asdict(entry)
+
+def _in_order(by_seed: dict[int, Value]) -> tuple[Value, ...]:
+    """Values in order of their seeds."""
+    return tuple(by_seed[seed] for seed in sorted(by_seed))
 
 
-def _kept_or_computed(kept: KeptResults, key: str, compute: Callable[[], Entry]) -> Entry | str:
-    """Result that is kept under a key, or else is computed and then kept.
+def _kept_or_computed(
+    kept: KeptResults, key: str, compute: Callable[[], Entry]
+) -> Generator[Call, Any, Entry | str]:
+    """Result that is kept under a key, or else is computed, by a call of a trial, and then kept.
 
     If it cannot be computed the answer is the reason, which is not kept.
     """
     entry = kept.get(key)
-    if entry is None:
-        try:
-            entry = compute()
-        except FAILURES as error:
-            return reason_of(error)
-        kept.add(key, entry)
-    return entry
+    if entry is not None:
+        return entry
+    entry_or_reason: Entry | str = yield partial(_entry_or_reason, compute)
+    if not isinstance(entry_or_reason, str):
+        kept.add(key, entry_or_reason)
+    return entry_or_reason
+
+
+def _entry_or_reason(compute: Callable[[], Entry]) -> Entry | str:
+    """Result, or the reason for which it cannot be computed."""
+    try:
+        return compute()
+    except FAILURES as error:
+        return reason_of(error)
+
+
+def _compute_cell(
+    contender: BenchmarkMethod,
+    problem: PGOProblem,
+    row: PublishedRow,
+    settings: ReproductionSettings,
+    lower_bound: float,
+) -> Entry:
+    """Figures of a contender, as a record for the file; a PGOError if it has no result."""
+    start = None
+    if contender is BenchmarkMethod.PAPER and row.name in SCENES:
+        start = problem.graph.initial
+    common = BenchmarkSettings(settings.num_robots, row.soc.iterations)
+    trial = run_benchmark(contender, problem, common, start)
+    if not trial.is_answer or not np.isfinite(trial.objective):
+        raise PGOError(trial.remark)
+    first_gap = None
+    if trial.first_objective is not None:
+        first_gap = float(relative_gap(trial.first_objective, lower_bound))
+    entry = TableEntry(
+        objective=float(trial.objective),
+        gap=float(relative_gap(trial.objective, lower_bound)),
+        first_gap=first_gap,
+        iterations=trial.iterations,
+        rounds=trial.rounds,
+        num_bytes=trial.num_bytes,
+        seconds=trial.seconds,
+        seconds_per_robot=trial.seconds_per_robot,
+        remark=trial.remark,
+        num_jobs=settings.num_jobs,
+    )
+    return asdict(entry)
 
 
 def _optimum(problem: PGOProblem) -> Entry:

@@ -15,6 +15,8 @@ from graphs import (
 )
 from hypothesis import assume, given, settings, strategies as st
 
+from pgo_models.activity import Activity, watched_by
+from pgo_models.certificates.definiteness import smallest_eta
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.errors import SettingError
@@ -207,3 +209,25 @@ def test_multipliers_of_any_size_prove_nothing_above_zero(
         Lambda[pose, a, b] = Lambda[pose, b, a] = size if rng.random() < 0.5 else -size
     for at in (None, poses, Poses(poses.R, poses.t + spread * rng.standard_normal((n, d)))):
         assert prove_bound(problem, Lambda, eta, at) in (None, 0.0)
+
+
+@pytest.mark.parametrize("needed", [0.0, 1e-9, 3e-5, 1e-3, 0.2, 5.0, 1e9])
+@pytest.mark.parametrize("below", [1e-3, 1.0, 7.3])
+def test_a_search_for_eta_says_how_many_shifts_it_tries_at_most(needed: float, below: float):
+    class Listener:
+        def __init__(self) -> None:
+            self.names: list[str] = []
+
+        def begin(self, activity: Activity) -> None:
+            self.names.append(activity.name)
+
+        def end(self, activity: Activity) -> None:
+            pass
+
+    listener = Listener()
+    with watched_by(listener):
+        smallest_eta(lambda eta: True if eta >= needed else None, 1e-8, below)
+    numbers = [int(name.split()[1]) for name in listener.names]
+    (most,) = {int(name.split()[-1]) for name in listener.names}
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert len(numbers) <= most <= 12

@@ -307,18 +307,21 @@ def test_the_shell_completes_commands_and_options():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
-def test_the_linear_algebra_has_the_threads_that_are_asked_for():
-    def threads(number: int) -> int:
-        program = "import os, sys, pgo_command\ntry:\n    pgo_command.main()\nexcept SystemExit:\n"
-        program += "    print(len(os.listdir('/proc/self/task')), file=sys.stderr)"
-        run = [sys.executable, "-c", program, "solve", "grid", "--quiet", "--threads", str(number)]
-        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+def test_blas_has_one_thread_unless_the_environment_has_a_number():
+    def num_threads(**numbers: str) -> int:
+        program = (
+            "import os, sys\nfrom solvers.command import main\ntry:\n    main()\n"
+            "except SystemExit:\n    print(len(os.listdir('/proc/self/task')), file=sys.stderr)"
+        )
+        run = [sys.executable, "-c", program, "solve", "grid", "--quiet"]
+        env = {name: value for name, value in os.environ.items() if "_NUM_THREADS" not in name}
+        env |= {"PYTHONPATH": str(ROOT), **numbers}
         return int(subprocess.run(run, env=env, capture_output=True, text=True, check=True).stderr)
 
     # OpenBLAS starts no more threads than there are cores.
     cores = len(os.sched_getaffinity(0))
-    assert threads(1) >= 1
-    assert (threads(2) > threads(1)) == (cores > 1)
+    assert num_threads() == num_threads(OPENBLAS_NUM_THREADS="1")
+    assert (num_threads(OPENBLAS_NUM_THREADS="2") > num_threads()) == (cores > 1)
 
 
 def test_a_name_that_the_terminal_has_no_letters_for_is_shown_all_the_same(tmp_path, monkeypatch):

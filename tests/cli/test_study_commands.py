@@ -49,25 +49,31 @@ def test_a_missing_graph_is_a_row_and_no_failure(pgo_command, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX has them")
-def test_ctrl_c_prints_what_is_done_and_the_same_command_goes_on(tmp_path):
-    command = [*PGO, "tables", "--only", "grid", "--seeds", "400"]
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_ctrl_c_prints_what_is_done_and_the_same_command_goes_on(jobs, tmp_path):
+    command = [*PGO, "tables", "--only", "grid", "--seeds", "400", "--jobs", jobs]
     process = subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     kept = tmp_path / study_commands.KEPT_FILE
     end = time.monotonic() + 60
-    while not (kept.exists() and len(json.loads(kept.read_text())["results"]) >= 6):
+    while not (kept.exists() and len(json.loads(kept.read_text())["results"]) >= 11):
         assert time.monotonic() < end
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes of the command
     out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (130, "pgo: interrupted before it was done\n")
     assert "the same command goes on where it was" in out
     assert "of 400 not run yet" in out
     done = json.loads(kept.read_text())["results"]
     finished = subprocess.run(
-        [*PGO, "tables", "--only", "grid", "--seeds", "1"],
+        [*PGO, "tables", "--only", "grid", "--seeds", "1", "--jobs", jobs],
         cwd=tmp_path,
         capture_output=True,
         text=True,
