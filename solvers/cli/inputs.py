@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, SettingError
+from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate, places_of_edges
@@ -29,6 +29,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.cli.options import Cost, Split
 
+LARGE_FILE = 5_000_000  # bytes, which take about half a second to read
 Dropped = list[str] | None  # edges to leave out, by LINE or FILE:LINE
 
 
@@ -119,6 +120,15 @@ class GraphOptions:
         if cost in (Cost.ISOTROPIC, Cost.UNIT):
             options[f"--cost {cost.value}"] = True
         return graph_in_commands(self.graph, options, self.drop_edge)
+
+
+def takes_long_to_read(graph: str) -> bool:
+    """Whether it may take long to read a graph: a large file, a folder, or one to download."""
+    try:
+        path = locate(graph, download=False)
+    except PGOError:
+        return True  # whoever reads it finds out why
+    return path.is_dir() or path.stat().st_size >= LARGE_FILE
 
 
 def graph_in_commands(graph: str, options: Mapping[str, bool], dropped: Dropped) -> str:

@@ -36,6 +36,7 @@ from solvers.cli.inputs import (
     check_outputs_differ,
     chosen_partition,
     pose_named,
+    takes_long_to_read,
     with_times,
 )
 from solvers.cli.options import (
@@ -227,7 +228,7 @@ def solve_command(
         _refuse_what_needs_the_graph(given, outputs)
         raise typer.Exit(_solve_own_files(source, stages, network, display, outputs))
     outputs.check_pages()
-    with JobBar(1, None, f"reading {graph}"):
+    with JobBar(1, None if takes_long_to_read(graph) else False, f"reading {graph}"):
         loaded = with_times(source.loaded(), times)
     if network.has_no_driver and source.chosen_cost is None:
         source = replace(source, cost=Cost.ISOTROPIC)
