@@ -63,7 +63,6 @@ from pgo_models.relaxations.low_rank import poses_from, tangent_widths
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import order_interior
-from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import (
     CostParts,
@@ -72,6 +71,8 @@ from solvers.distributed.robots.records import (
     RightHandSide,
 )
 from solvers.distributed.robots.reweighting import reweigh
+from solvers.distributed.robots.subdomain_blocks import Widths
+from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import DEFAULT_MEMORY, WorkerPool
 from solvers.network.ledger import Ledger
@@ -178,8 +179,13 @@ class Driver:
         # and empty where none of its edges has an end in the cover.
         touched = tuple(robot.touched for robot in summaries if robot.touched is not None)
         has_interface = memory != 0
-        fronts = FrontOwners(touched if has_interface else (), g)
+        coupled = [robot.coupled for robot in summaries if robot.coupled is not None]
+        is_sparse = has_interface and len(coupled) > 0
+        fronts = FrontOwners(touched if has_interface and not is_sparse else (), g)
         self._any_widths = Interface(g, (), touched, fronts)  # `interface` sets the widths
+        if is_sparse:
+            pattern = CoverPattern.of(touched, coupled, g)
+            self._any_widths = SparseInterface(g, (), touched, fronts, pattern=pattern)
         self._interfaces: dict[Widths, Interface] = {}
         if has_interface:
             self.interface(*self.tangent).check_memory(memory)
