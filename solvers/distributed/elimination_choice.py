@@ -82,11 +82,17 @@ def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
     system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
     if not may_leave_poses(system):
         return tuple(subgraphs)
-    left = [subgraph.poses_left(MOST_COUPLED) for subgraph in subgraphs]
-    cover = np.union1d(system.cover, np.concatenate(left))
-    larger = [
+    larger = leave_poses(subgraphs, MOST_COUPLED)
+    sparse = CoverSystem.of([subgraph.summary for subgraph in larger])
+    return larger if sparse.flops < system.flops else tuple(subgraphs)
+
+
+def leave_poses(subgraphs: Sequence[Subgraph], most_coupled: int) -> tuple[Subgraph, ...]:
+    """Return the subgraphs of robots that leave poses to the driver (`Subgraph.poses_left`)."""
+    left = [subgraph.poses_left(most_coupled) for subgraph in subgraphs]
+    in_cover = [subgraph.poses[subgraph.in_cover >= 0] for subgraph in subgraphs]
+    cover = np.unique(np.concatenate([*left, *in_cover]))
+    return tuple(
         subgraph.with_larger_cover(cover, of_robot)
         for subgraph, of_robot in zip(subgraphs, left, strict=True)
-    ]
-    sparse = CoverSystem.of([subgraph.summary for subgraph in larger])
-    return tuple(larger if sparse.flops < system.flops else subgraphs)
+    )

@@ -34,7 +34,7 @@ from pgo_models.problem.ordering import (
     row_order,
 )
 from solvers.distributed.interface import Interface, Solved
-from solvers.distributed.robots.subdomain_blocks import coupled_unknowns, entry_keys
+from solvers.distributed.robots.subdomain_blocks import coupled_unknowns, entry_keys, positions_of
 
 # Bytes of a stored entry of the sum: its value, twice, its key, its row, and CVXOPT's copy.
 _BYTES_OF_ENTRY = 44
@@ -118,7 +118,7 @@ class SparseInterface(Interface):
         for columns, coupled in zip(self.columns, self.pattern.robots, strict=True):
             entries = coupled_unknowns(coupled, self.widths).tocoo()
             of_robot = entry_keys(columns[entries.col], columns[entries.row], side)
-            positions.append(np.searchsorted(keys, of_robot))
+            positions.append(positions_of(of_robot, keys))
         order = row_order(self.pattern.order, *self.widths)
         most = partial(most_counts_of_pattern, self.pattern.lower, self.pattern.order, *self.widths)
         analysis = analyze(lower, CholeskyBackend.CHOLMOD, order, most)
@@ -141,7 +141,7 @@ class SparseInterface(Interface):
             column = np.broadcast_to(columns[:, None, :], blocks.shape)
             is_lower = row >= column
             keys = entry_keys(column[is_lower], row[is_lower], self.side)
-            np.add.at(values, np.searchsorted(held.keys, keys), blocks[is_lower])
+            np.add.at(values, positions_of(keys, held.keys), blocks[is_lower])
         matrix = held.lower.copy()
         matrix.data = values
         held.factor = held.analysis.factorize(matrix)

@@ -103,9 +103,9 @@ class SubdomainBlocks:
         entries = K_IG.tocoo()
         subdomain = self.label[entries.row]
         of_columns = np.repeat(np.arange(len(self.pointers) - 1), np.diff(self.pointers))
-        places = np.searchsorted(
-            entry_keys(of_columns, self.columns, self.side),
+        places = positions_of(
             entry_keys(subdomain, entries.col, self.side),
+            entry_keys(of_columns, self.columns, self.side),
         )
         front = np.zeros((K_IG.shape[0], widest))
         front[entries.row, places - self.pointers[subdomain]] = entries.data
@@ -142,7 +142,7 @@ class SubdomainBlocks:
 
     def _positions(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Positions of entries of the pattern."""
-        return np.searchsorted(self._keys, entry_keys(rows, columns, self.side))
+        return positions_of(entry_keys(rows, columns, self.side), self._keys)
 
     @cached_property
     def _keys(self) -> IntArray:
@@ -154,3 +154,16 @@ class SubdomainBlocks:
 def entry_keys(rows: IntArray, columns: IntArray, side: int) -> IntArray:
     """One number for every entry of a matrix with so many columns, ascending row by row."""
     return rows.astype(np.int64) * side + columns
+
+
+def positions_of(keys: IntArray, stored: IntArray) -> IntArray:
+    """Positions of keys among those of the entries that are stored, ascending.
+
+    A ValueError for an entry that is not stored: it must not be added to another one.
+    """
+    positions = np.searchsorted(stored, keys)
+    is_stored = positions < len(stored)
+    is_stored[is_stored] = stored[positions[is_stored]] == keys[is_stored]
+    if not is_stored.all():
+        raise ValueError("the matrix has an entry that its pattern does not have")
+    return positions
