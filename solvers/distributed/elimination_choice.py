@@ -90,9 +90,18 @@ def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
 def leave_poses(subgraphs: Sequence[Subgraph], most_coupled: int) -> tuple[Subgraph, ...]:
     """Return the subgraphs of robots that leave poses to the driver (`Subgraph.poses_left`)."""
     left = [subgraph.poses_left(most_coupled) for subgraph in subgraphs]
-    in_cover = [subgraph.poses[subgraph.in_cover >= 0] for subgraph in subgraphs]
-    cover = np.unique(np.concatenate([*left, *in_cover]))
+    held = [
+        subgraph.held_cover(of_robot) for subgraph, of_robot in zip(subgraphs, left, strict=True)
+    ]
     return tuple(
-        subgraph.with_larger_cover(cover, of_robot)
-        for subgraph, of_robot in zip(subgraphs, left, strict=True)
+        subgraph.with_larger_cover(of_robot, positions)
+        for subgraph, of_robot, positions in zip(
+            subgraphs, left, positions_in_cover(held), strict=True
+        )
     )
+
+
+def positions_in_cover(held: Sequence[IntArray]) -> list[IntArray]:
+    """Positions, in the cover of all robots, of the poses of it that every robot holds."""
+    cover = np.unique(np.concatenate(held))
+    return [np.searchsorted(cover, poses) for poses in held]

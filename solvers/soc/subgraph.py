@@ -131,14 +131,18 @@ class Subgraph:
         is_boundary = part.in_cover >= 0
         return part.poses[poses_to_leave(part.problem.graph, is_boundary, most_coupled)]
 
-    def with_larger_cover(self, cover: IntArray, left: IntArray) -> Subgraph:
+    def held_cover(self, left: IntArray) -> IntArray:
+        """Numbers of its poses in the cover, ascending, with those that it leaves to the driver."""
+        return np.union1d(self.poses[self.in_cover >= 0], left)
+
+    def with_larger_cover(self, left: IntArray, positions: IntArray) -> Subgraph:
         """The subgraph when the driver solves for the poses that robots leave to it, too.
 
-        `cover`, ascending, has the poses of the cover before and those that all robots leave,
-        `left` those of this robot. Every edge is counted by the robot that counted it before.
+        `left` are those of this robot, `positions` where `held_cover(left)` are in the new cover.
+        Every edge is counted by the robot that counted it before.
         """
-        is_in_cover = (self.in_cover >= 0) | np.isin(self.poses, left)
-        in_cover = np.where(is_in_cover, np.searchsorted(cover, self.poses), -1)
+        in_cover = np.full(len(self.poses), -1)
+        in_cover[np.searchsorted(self.poses, self.held_cover(left))] = positions
         return replace(self, in_cover=in_cover, is_sparse=True)
 
     @cached_property
