@@ -60,6 +60,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.matrices import columns_of
 from pgo_models.relaxations.low_rank import poses_from, tangent_widths
+from solvers.distributed.elimination_choice import CoverSystem
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import order_interior
@@ -72,7 +73,6 @@ from solvers.distributed.robots.records import (
 )
 from solvers.distributed.robots.reweighting import reweigh
 from solvers.distributed.robots.subdomain_blocks import Widths
-from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import DEFAULT_MEMORY, WorkerPool
 from solvers.network.ledger import Ledger
@@ -175,24 +175,20 @@ class Driver:
         # Factor of the matrix of the translations on the cover, once it is needed.
         self._laplacian: Interface | None = None
 
-        # Boundaries of the robots with edges: `touched` is None where no edge belongs to a robot,
-        # and empty where none of its edges has an end in the cover.
-        touched = tuple(robot.touched for robot in summaries if robot.touched is not None)
         has_interface = memory != 0
-        coupled = [robot.coupled for robot in summaries if robot.coupled is not None]
-        is_sparse = has_interface and len(coupled) > 0
-        fronts = FrontOwners(touched if has_interface and not is_sparse else (), g)
-        self._any_widths = Interface(g, (), touched, fronts)  # `interface` sets the widths
-        if is_sparse:
-            pattern = CoverPattern.of(touched, coupled, g)
-            self._any_widths = SparseInterface(g, (), touched, fronts, pattern=pattern)
+        system = CoverSystem.of(summaries)
+        if has_interface:
+            self._any_widths = system.interface(())  # `interface` sets the widths
+        else:
+            no_fronts = FrontOwners((), len(self.cover))
+            self._any_widths = Interface(len(self.cover), (), system.touched, no_fronts)
         self._interfaces: dict[Widths, Interface] = {}
         if has_interface:
             self.interface(*self.tangent).check_memory(memory)
         pool = open_pool()
         self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(summaries))
         try:
-            fronts.hand_out(self.network, self.robots_with_edges)
+            self._any_widths.fronts.hand_out(self.network, self.robots_with_edges)
             self.describe(Count.OFF)
         except BaseException:  # also Ctrl-C: no robot stays behind
             self.network.workers.close()

@@ -13,11 +13,14 @@ import numpy as np
 
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
+from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners, flops_of_fronts
-from solvers.distributed.sparse_interface import CoverPattern
+from solvers.distributed.robots.subdomain_blocks import Widths
+from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
 from solvers.soc.subgraph import RobotSummary, Subgraph
 
-# Operations of a factorisation by fronts, about half a second, from which another way is tried.
+# Operations of a factorisation by fronts from which another way is tried; LAPACK takes about 0.15
+# CPU seconds for so many on one thread of a processor of 2023.
 ENOUGH_FLOPS = 5e9
 # Poses that a robot couples at most by eliminating one where it leaves poses to the driver. With 32
 # to 128 the driver of 16 robots in the plane, 20,000 poses that interleave, takes 0.74e9 to 1.26e9
@@ -27,7 +30,10 @@ MOST_COUPLED = 64
 
 @dataclass(frozen=True, eq=False)
 class CoverSystem:
-    """What the robots' summaries say of the driver's system."""
+    """What the robots' summaries say of the driver's system.
+
+    A robot without edges touches nothing; one whose edges have no end in the cover touches no pose.
+    """
 
     cover: IntArray  # (g,): numbers of its poses, ascending
     touched: tuple[IntArray, ...]  # as `Interface.touched`
@@ -66,6 +72,14 @@ class CoverSystem:
         """Pattern of a sparse system."""
         assert self.coupled is not None
         return CoverPattern.of(self.touched, self.coupled, len(self.cover))
+
+    def interface(self, widths: Widths) -> Interface:
+        """The system for unknowns with these numbers per pose; all fronts are with the driver."""
+        g = len(self.cover)
+        if self.coupled is None:
+            return Interface(g, widths, self.touched, FrontOwners(self.touched, g))
+        no_fronts = FrontOwners((), g)
+        return SparseInterface(g, widths, self.touched, no_fronts, pattern=self.pattern)
 
 
 def may_leave_poses(system: CoverSystem) -> bool:

@@ -59,10 +59,14 @@ class Interface:
             added = sum(0.5 * len(tree[child].boundary) ** 2 for child in front.children)
             waiting += 0.5 * b**2 - added
             kept += e * (e + b)
-        sides = [width * len(poses) for poses in self.touched]
-        contributions = sum(side * (side + 1) // 2 for side in sides)
         own = self.side * (width + 4)  # blocks of the driver, and orders of the unknowns
-        return int(8 * (width**2 * most + contributions + own))
+        return int(8 * (width**2 * most + sum(self.num_entries) + own))
+
+    @property
+    def num_entries(self) -> list[int]:
+        """Numbers that every robot sends of its Schur complement."""
+        sides = [sum(self.widths) * len(poses) for poses in self.touched]
+        return [side * (side + 1) // 2 for side in sides]
 
     def check_memory(self, limit: float) -> None:
         """Refuse before the memory is spent: a SettingError when `num_bytes` is above `limit`."""

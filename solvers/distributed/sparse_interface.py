@@ -101,10 +101,20 @@ class SparseInterface(Interface):
     def num_bytes(self) -> int:
         """Memory for contributions, their sum and the factor, known before it is spent."""
         width = sum(self.widths)
-        contributions = sum(robot.nnz for robot in self.pattern.robots)
-        entries = contributions + _BYTES_OF_ENTRY // 8 * self.pattern.lower.nnz
-        factor = int(self.pattern.counts.sum())
-        return 8 * width**2 * (entries + factor)
+        summed = _BYTES_OF_ENTRY * width**2 * self.pattern.lower.nnz
+        factor = 8 * width**2 * int(self.pattern.counts.sum())
+        # What robots send, and where it is added.
+        return summed + factor + 16 * sum(self.num_entries)
+
+    @property
+    def num_entries(self) -> list[int]:
+        """Numbers that every robot sends of its Schur complement."""
+        width = sum(self.widths)
+        lower = width * (width + 1) // 2
+        return [
+            width**2 * (robot.nnz - robot.shape[0]) + lower * robot.shape[0]
+            for robot in self.pattern.robots
+        ]
 
     @cached_property
     def held(self) -> CoverFactor:
