@@ -22,10 +22,10 @@ from solvers.soc.subgraph import RobotSummary, Subgraph
 # Operations of a factorisation by fronts from which another way is tried; LAPACK takes about 0.15
 # CPU seconds for so many on one thread of a processor of 2023.
 ENOUGH_FLOPS = 5e9
-# Poses that a robot couples at most by eliminating one where it leaves poses to the driver. With 32
-# to 128 the driver of 16 robots in the plane, 20,000 poses that interleave, takes 0.74e9 to 1.26e9
-# operations, and the robots send 4.9 to 11 MB.
-MOST_COUPLED = 64
+# Poses that a robot couples at most by eliminating one where it leaves poses to the driver. Between
+# 8 and 32 the driver of 16 robots in the plane, 20,000 poses that interleave, takes 0.80e9 to
+# 0.96e9 operations, and the robots send 3.8 to 7.8 MB.
+MOST_COUPLED = 16
 
 
 @dataclass(frozen=True, eq=False)

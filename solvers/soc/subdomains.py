@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import minimum_degree
-from pgo_models.problem.ordering import factor_pattern, pattern_of_edges
+from pgo_models.problem.ordering import pattern_of_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,25 +76,39 @@ def lower_triangle(pattern: csr_array) -> csr_array:
 def poses_to_leave(graph: PoseGraph, is_boundary: BoolArray, most_coupled: int) -> BoolArray:
     """Choose the interior poses that a robot leaves to the driver, (p,).
 
-    In an order of minimum degree with the boundary last, a pose is left if eliminating it would
-    couple more than `most_coupled` others, or if a pose that it couples next was left before it.
+    The interior is eliminated pose by pose, in an order of minimum degree of the robot's graph. A
+    pose is left, as if it were one of the boundary, where eliminating it would couple more than
+    `most_coupled` others.
     """
-    pattern = pattern_of_edges(graph.num_poses, graph.i, graph.j)
-    order = minimum_degree(pattern)
-    order = np.concatenate([order[~is_boundary[order]], order[is_boundary[order]]])
-    L, order = factor_pattern(pattern, order)
-    num_coupled = np.diff(L.indptr) - 1
-    is_inside = ~is_boundary[order]
-    is_left = is_inside & (num_coupled > most_coupled)
-    # The parent of a pose in the elimination tree is the first one that it couples.
-    parent = np.zeros(len(order), dtype=np.int64)
-    has_parent = num_coupled > 0
-    parent[has_parent] = L.indices[L.indptr[:-1][has_parent] + 1]
-    for pose in np.flatnonzero(is_inside & has_parent).tolist():
-        if is_left[pose]:
-            is_left[parent[pose]] = True
-    left = np.zeros(len(order), dtype=bool)
-    left[order] = is_left & is_inside
+    order = minimum_degree(pattern_of_edges(graph.num_poses, graph.i, graph.j))
+    order = order[~is_boundary[order]]
+    # When a pose is eliminated, or -1 for a pose that never is.
+    turn = np.full(graph.num_poses, -1)
+    turn[order] = np.arange(len(order))
+    turns = turn.tolist()
+    pointers = graph.adjacency.indptr.tolist()
+    neighbours = graph.adjacency.indices.tolist()
+    # Cliques that eliminated poses have left, with the pose of each that is eliminated next.
+    cliques: dict[int, list[set[int]]] = {}
+    left = np.zeros(graph.num_poses, dtype=bool)
+    for now, pose in enumerate(order.tolist()):
+        joined = cliques.pop(pose, [])
+        coupled = {
+            other
+            for other in neighbours[pointers[pose] : pointers[pose + 1]]
+            if turns[other] < 0 or turns[other] > now
+        }
+        coupled.update(*joined)
+        coupled.discard(pose)
+        passed_on = [coupled]
+        if len(coupled) > most_coupled:
+            left[pose] = True
+            turns[pose] = -1
+            passed_on = joined
+        for clique in passed_on:
+            following = [turns[other] for other in clique if turns[other] > now]
+            if following:
+                cliques.setdefault(int(order[min(following)]), []).append(clique)
     return left
 
 
