@@ -3,14 +3,17 @@
 Terms:
 
 - cover: a set of poses with an end of every edge between two robots (a vertex cover), or a single
-  pose where there is no such edge. Its g poses are the separators, which the driver holds.
+  pose where there is no such edge; where areas of robots interleave, also poses that robots leave
+  to the driver (`solvers.distributed.elimination_choice`). Its g poses are the separators, which
+  the driver holds.
 - boundary of a robot: the poses of the cover that its edges join; its other poses are its interior.
   Every edge belongs to one robot.
 - interface: the linear system on the cover, the sum of what all robots leave of their systems when
   they eliminate their interiors (Schur complements and reduced right-hand sides).
 - fronts: the dense matrices in which the interface is factored, along a tree of groups of robots
   (the separator tree, `solvers.distributed.multifrontal`). The driver holds the front of all robots
-  and, unless there are many large ones, the others, too.
+  and, unless there are many large ones, the others, too. Where robots leave poses, the driver
+  factors one sparse matrix instead (`solvers.distributed.sparse_interface`).
 
 The robots eliminate their interiors, the driver sums, solves on the cover, and sends every robot
 the solution on its boundary. No message of an iteration contains an interior pose, or a measurement
