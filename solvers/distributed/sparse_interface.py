@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
 from pgo_models.geometry.rotations import Array
@@ -36,6 +37,7 @@ from pgo_models.problem.ordering import (
 from solvers.distributed.interface import Interface, Solved
 from solvers.distributed.robots.subdomain_blocks import coupled_unknowns, entry_keys, positions_of
 
+Int32Array = NDArray[np.int32]
 # Bytes of a stored entry of the sum: its value, twice, its key, its row, and CVXOPT's copy.
 _BYTES_OF_ENTRY = 44
 
@@ -85,10 +87,16 @@ class CoverFactor:
     """The pattern of the unknowns, and the last factor; a driver has one for these widths."""
 
     lower: csc_array
-    keys: IntArray  # (k,): `entry_keys` of the entries, ascending
-    robots: tuple[IntArray, ...]  # positions of every robot's entries among them
+    robots: tuple[Int32Array, ...]  # positions of every robot's entries among those of `lower`
     analysis: SymbolicCholesky
     factor: CholeskyFactor | None = None
+
+    @property
+    def keys(self) -> IntArray:
+        """`entry_keys` of the entries, column by column, ascending."""
+        side = self.lower.shape[1]
+        columns = np.repeat(np.arange(side), np.diff(self.lower.indptr))
+        return entry_keys(columns, self.lower.indices, side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +112,7 @@ class SparseInterface(Interface):
         summed = _BYTES_OF_ENTRY * width**2 * self.pattern.lower.nnz
         factor = 8 * width**2 * int(self.pattern.counts.sum())
         # What robots send, and where it is added.
-        return summed + factor + 16 * sum(self.num_entries)
+        return summed + factor + 12 * sum(self.num_entries)
 
     @property
     def num_entries(self) -> list[int]:
@@ -121,18 +129,18 @@ class SparseInterface(Interface):
         """The pattern of the unknowns, analysed when it is first needed."""
         side = self.side
         lower = csc_array(coupled_unknowns(csr_array(self.pattern.lower), self.widths))
-        lower.data = np.zeros(lower.nnz)
-        column = np.repeat(np.arange(side), np.diff(lower.indptr))
-        keys = entry_keys(column, lower.indices, side)
+        order = row_order(self.pattern.order, *self.widths)
+        most = partial(most_counts_of_pattern, self.pattern.lower, self.pattern.order, *self.widths)
+        analysis = analyze(lower, CholeskyBackend.CHOLMOD, order, most)
+        held = CoverFactor(lower, (), analysis)
+        keys = held.keys
         positions = []
         for columns, coupled in zip(self.columns, self.pattern.robots, strict=True):
             entries = coupled_unknowns(coupled, self.widths).tocoo()
             of_robot = entry_keys(columns[entries.col], columns[entries.row], side)
-            positions.append(positions_of(of_robot, keys))
-        order = row_order(self.pattern.order, *self.widths)
-        most = partial(most_counts_of_pattern, self.pattern.lower, self.pattern.order, *self.widths)
-        analysis = analyze(lower, CholeskyBackend.CHOLMOD, order, most)
-        return CoverFactor(lower, keys, tuple(positions), analysis)
+            positions.append(positions_of(of_robot, keys).astype(np.int32))
+        held.robots = tuple(positions)
+        return held
 
     def factorize(
         self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()
@@ -143,17 +151,18 @@ class SparseInterface(Interface):
         """
         held = self.held
         held.factor = None  # its memory may be needed
-        values = np.zeros(len(held.keys))
+        values = np.zeros(held.lower.nnz)
+        keys = held.keys
         for positions, part in zip(held.robots, contributions, strict=True):
             values[positions] += part
         for columns, blocks in own:
             row = np.broadcast_to(columns[:, :, None], blocks.shape)
             column = np.broadcast_to(columns[:, None, :], blocks.shape)
             is_lower = row >= column
-            keys = entry_keys(column[is_lower], row[is_lower], self.side)
-            np.add.at(values, positions_of(keys, held.keys), blocks[is_lower])
-        matrix = held.lower.copy()
-        matrix.data = values
+            of_blocks = entry_keys(column[is_lower], row[is_lower], self.side)
+            np.add.at(values, positions_of(of_blocks, keys), blocks[is_lower])
+        del keys
+        matrix = csc_array((values, held.lower.indices, held.lower.indptr), held.lower.shape)
         held.factor = held.analysis.factorize(matrix)
         return self
 

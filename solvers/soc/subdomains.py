@@ -67,10 +67,11 @@ def find_subdomains(graph: PoseGraph, interior: IntArray, boundary: IntArray) ->
 
 
 def lower_triangle(pattern: csr_array) -> csr_array:
-    """Return a pattern's lower triangle with ones as its entries, sorted row by row."""
+    """Return a pattern's lower triangle, true at its entries, sorted row by row."""
     entries = pattern.tocoo()
     is_lower = entries.row >= entries.col
-    return _entries(entries.row[is_lower], entries.col[is_lower], pattern.shape)
+    lower = _entries(entries.row[is_lower], entries.col[is_lower], pattern.shape)
+    return lower.astype(bool)
 
 
 def poses_to_leave(graph: PoseGraph, is_boundary: BoolArray, most_coupled: int) -> BoolArray:

@@ -118,4 +118,4 @@ def test_memory_is_known_before_it_is_spent() -> None:
     width = 3
     factor = width**2 * int(interface.pattern.counts.sum())
     sent = sum(len(positions) for positions in held.robots)
-    assert interface.num_bytes >= 8 * (factor + len(held.keys) + sent)
+    assert interface.num_bytes >= 8 * (factor + held.lower.nnz) + 12 * sent

@@ -24,7 +24,7 @@ def coupled_unknowns(coupled: csr_array, widths: Widths) -> csr_array:
     if not coupled.shape[0]:
         return csr_array((0, 0))
     both = csr_array(coupled + coupled.T)
-    rows = [[kron(both, np.ones((w, v))) for v in widths] for w in widths]
+    rows = [[kron(both, np.ones((w, v), dtype=bool)) for v in widths] for w in widths]
     return lower_triangle(csr_array(block_array(rows)))
 
 
