@@ -3,12 +3,14 @@ share.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from functools import partial
 from typing import Any
 
 import numpy as np
+import pytest
 from graphs import MILD_NOISE
 from hypothesis import strategies as st
 
@@ -19,10 +21,14 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import PGOProblem
+from solvers.distributed import stages
 from solvers.distributed.driver import Driver
+from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import Agent
+from solvers.distributed.robots.elimination import Elimination, unpacked
+from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
 from solvers.distributed.stages import open_driver
 from solvers.network.engine import Engine, InProcess, WorkerPool
 from solvers.network.messages import Idle
@@ -124,6 +130,38 @@ def interface_of(
     """Interface of robots that touch these separators, all fronts with the driver."""
     fronts = FrontOwners(touched, num_separators)
     return Interface(num_separators, widths, touched, fronts)
+
+
+def sparse_interface_of(
+    touched: tuple[IntArray, ...],
+    coupled: Sequence[IntArray],
+    num_separators: int,
+    widths: tuple[int, ...],
+) -> SparseInterface:
+    """Sparse interface of robots that touch these separators and couple some pairs of them."""
+    pattern = CoverPattern.of(touched, coupled, num_separators)
+    fronts = FrontOwners((), num_separators)
+    return SparseInterface(num_separators, widths, touched, fronts, pattern=pattern)
+
+
+@contextmanager
+def sparse_elimination(most_coupled: int) -> Iterator[None]:
+    """Robots leave poses to the driver, whether that is cheaper or not."""
+
+    def left(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
+        return leave_poses(subgraphs, most_coupled)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stages, "choose_elimination", left)
+        yield
+
+
+def matrix_of_schur(found: Elimination) -> Array:
+    """Schur complement that a robot sends, in full."""
+    blocks = found.cut.blocks
+    if blocks is None:
+        return unpacked(found.schur, len(found.cut.boundary))
+    return blocks.symmetric(found.schur).toarray()
 
 
 def name_of(order: object) -> str:

@@ -75,6 +75,10 @@ class CholeskyFactor(ABC):
         """
 
     @abstractmethod
+    def row_order(self) -> IntArray:
+        """P of `half_solve`: rows of A in the order of elimination, (N,)."""
+
+    @abstractmethod
     def backward_error(self, beside: Array | int = 0) -> Array:
         """Shares epsilon, (N,), of the diagonal that bound the rounding of the factorisation.
 
@@ -266,6 +270,9 @@ class _SuperLUFactor(CholeskyFactor):
         root_pivots = np.sqrt(self._lu.U.diagonal())
         return np.asarray(half / root_pivots[:, None])
 
+    def row_order(self) -> IntArray:
+        return self._rows
+
     def most_in_row(self, beside: Array | int = 0) -> float:
         in_row = np.diff(self._lu.L.tocsc().indptr) + beside
         return float(in_row.max(initial=0))
@@ -430,6 +437,10 @@ class _CholmodFactor(CholeskyFactor):
     def half_solve(self, right_hand_side: Array) -> Array:
         return self._solved(right_hand_side, _PERMUTE, _FORWARD)
 
+    def row_order(self) -> IntArray:
+        rows = np.arange(self._analysis.side, dtype=float)
+        return self._solved(rows, _PERMUTE).astype(np.int64)
+
     def _solved(self, right_hand_side: Array, *systems: int) -> Array:
         cvxopt, cholmod = import_cvxopt()
         numeric = self._current()
@@ -477,6 +488,11 @@ class _Cholmod(SymbolicCholesky):
             (None, self._analyze())
         ]
         self._counts: FactorCounts | None = None
+
+    @property
+    def side(self) -> int:
+        """Number of rows."""
+        return int(self._shape[0])
 
     def expected_error(self, beside: int = 0) -> Array | None:
         return self._counts.error(beside) if self._counts is not None else None

@@ -24,7 +24,7 @@ DISSECTED_FROM = {2: 75_000, 3: 10_000}
 def pose_order(graph: PoseGraph) -> IntArray:
     """Order of elimination of the poses of a graph, (n,); METIS comes with the extra `fast`."""
     if graph.num_poses < DISSECTED_FROM[graph.d] or importlib.util.find_spec("pymetis") is None:
-        return minimum_degree(_pattern(graph))
+        return minimum_degree(pattern_of_edges(graph.num_poses, graph.i, graph.j))
     import pymetis
 
     neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr, graph.adjacency.indices)
@@ -45,14 +45,21 @@ def row_order(poses: IntArray, *widths: int) -> IntArray:
 def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts:
     """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
 
-    All entries of every block that fills in are counted. CHOLMOD stores further zeros to have wider
-    supernodes; they are exact and add no rounding.
+    As `most_counts_of_pattern`, of the matrices that couple two poses where an edge does.
     """
-    pattern = _pattern(graph)
+    pattern = pattern_of_edges(graph.num_poses, graph.i, graph.j)
+    return most_counts_of_pattern(pattern, poses, *widths)
+
+
+def most_counts_of_pattern(pattern: csc_array, poses: IntArray, *widths: int) -> FactorCounts:
+    """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
+
+    The pattern is the lower triangle of the poses that are coupled. All entries of every block that
+    fills in are counted. CHOLMOD stores further zeros to have wider supernodes; they are exact and
+    add no rounding.
+    """
     width = sum(widths)
-    pattern.data[:] = 0.0
-    pattern.setdiag(1.0)
-    L, order = factorize(pattern, CholeskyBackend.CHOLMOD, poses).take_apart()
+    L, order = factor_pattern(pattern, poses, CholeskyBackend.CHOLMOD)
     of_poses = FactorCounts.of(L.indptr, L.indices, order)
     # A block that fills in has `width` rows and columns, all of which count as non-zeros.
     return FactorCounts(
@@ -63,13 +70,24 @@ def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts
     )
 
 
-def _pattern(graph: PoseGraph) -> csc_array:
-    """Lower triangle, positive where two poses share an edge, and on the diagonal."""
-    n = graph.num_poses
-    diagonal = np.arange(n)
-    larger = np.maximum(graph.i, graph.j)
-    smaller = np.minimum(graph.i, graph.j)
-    rows = np.append(larger, diagonal)
-    columns = np.append(smaller, diagonal)
+def factor_pattern(
+    pattern: csc_array, order: IntArray, backend: CholeskyBackend | None = None
+) -> tuple[csc_array, IntArray]:
+    """L of a matrix with this lower triangle, of which the pattern counts, and its final order.
+
+    The matrix is the identity, with zeros stored in the rest of the pattern. A backend may put
+    poses that are independent in another order.
+    """
+    identity = pattern.copy()
+    identity.data = np.zeros(len(identity.data))
+    identity.setdiag(1.0)
+    return factorize(identity, backend, order).take_apart()
+
+
+def pattern_of_edges(num_poses: int, i: IntArray, j: IntArray) -> csc_array:
+    """Lower triangle, positive where two poses i and j share an edge, and on the diagonal."""
+    diagonal = np.arange(num_poses)
+    rows = np.append(np.maximum(i, j), diagonal)
+    columns = np.append(np.minimum(i, j), diagonal)
     ones = np.ones(len(rows))
-    return csc_array((ones, (rows, columns)), shape=(n, n))
+    return csc_array((ones, (rows, columns)), shape=(num_poses, num_poses))

@@ -3,14 +3,17 @@
 Terms:
 
 - cover: a set of poses with an end of every edge between two robots (a vertex cover), or a single
-  pose where there is no such edge. Its g poses are the separators, which the driver holds.
+  pose where there is no such edge; where areas of robots interleave, also poses that robots leave
+  to the driver (`solvers.distributed.elimination_choice`). Its g poses are the separators, which
+  the driver holds.
 - boundary of a robot: the poses of the cover that its edges join; its other poses are its interior.
   Every edge belongs to one robot.
 - interface: the linear system on the cover, the sum of what all robots leave of their systems when
   they eliminate their interiors (Schur complements and reduced right-hand sides).
 - fronts: the dense matrices in which the interface is factored, along a tree of groups of robots
   (the separator tree, `solvers.distributed.multifrontal`). The driver holds the front of all robots
-  and, unless there are many large ones, the others, too.
+  and, unless there are many large ones, the others, too. Where robots leave poses, the driver
+  factors one sparse matrix instead (`solvers.distributed.sparse_interface`).
 
 The robots eliminate their interiors, the driver sums, solves on the cover, and sends every robot
 the solution on its boundary. No message of an iteration contains an interior pose, or a measurement
@@ -60,10 +63,10 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.matrices import columns_of
 from pgo_models.relaxations.low_rank import poses_from, tangent_widths
+from solvers.distributed.elimination_choice import CoverSystem
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import order_interior
-from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import (
     CostParts,
@@ -72,6 +75,7 @@ from solvers.distributed.robots.records import (
     RightHandSide,
 )
 from solvers.distributed.robots.reweighting import reweigh
+from solvers.distributed.robots.subdomain_blocks import Widths
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import DEFAULT_MEMORY, WorkerPool
 from solvers.network.ledger import Ledger
@@ -174,19 +178,20 @@ class Driver:
         # Factor of the matrix of the translations on the cover, once it is needed.
         self._laplacian: Interface | None = None
 
-        # Boundaries of the robots with edges: `touched` is None where no edge belongs to a robot,
-        # and empty where none of its edges has an end in the cover.
-        touched = tuple(robot.touched for robot in summaries if robot.touched is not None)
         has_interface = memory != 0
-        fronts = FrontOwners(touched if has_interface else (), g)
-        self._any_widths = Interface(g, (), touched, fronts)  # `interface` sets the widths
+        system = CoverSystem.of(summaries)
+        if has_interface:
+            self._any_widths = system.interface(())  # `interface` sets the widths
+        else:
+            no_fronts = FrontOwners((), len(self.cover))
+            self._any_widths = Interface(len(self.cover), (), system.touched, no_fronts)
         self._interfaces: dict[Widths, Interface] = {}
         if has_interface:
             self.interface(*self.tangent).check_memory(memory)
         pool = open_pool()
         self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(summaries))
         try:
-            fronts.hand_out(self.network, self.robots_with_edges)
+            self._any_widths.fronts.hand_out(self.network, self.robots_with_edges)
             self.describe(Count.OFF)
         except BaseException:  # also Ctrl-C: no robot stays behind
             self.network.workers.close()

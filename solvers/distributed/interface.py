@@ -15,7 +15,8 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, column_error, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.multifrontal import FrontOwners, levels
-from solvers.distributed.robots.elimination import FrontParts, HeldFront, Widths
+from solvers.distributed.robots.elimination import FrontParts, HeldFront
+from solvers.distributed.robots.subdomain_blocks import Widths
 
 # memory of a front at work, in fronts: itself, and copies of what is added to it or split off
 _AT_WORK = 4.25
@@ -58,10 +59,14 @@ class Interface:
             added = sum(0.5 * len(tree[child].boundary) ** 2 for child in front.children)
             waiting += 0.5 * b**2 - added
             kept += e * (e + b)
-        sides = [width * len(poses) for poses in self.touched]
-        contributions = sum(side * (side + 1) // 2 for side in sides)
         own = self.side * (width + 4)  # blocks of the driver, and orders of the unknowns
-        return int(8 * (width**2 * most + contributions + own))
+        return int(8 * (width**2 * most + sum(self.num_entries) + own))
+
+    @property
+    def num_entries(self) -> list[int]:
+        """Numbers that every robot sends of its Schur complement."""
+        sides = [sum(self.widths) * len(poses) for poses in self.touched]
+        return [side * (side + 1) // 2 for side in sides]
 
     def check_memory(self, limit: float) -> None:
         """Refuse before the memory is spent: a SettingError when `num_bytes` is above `limit`."""
@@ -195,15 +200,22 @@ class Interface:
             most_in_row = max(most_in_row, every * len(front.separators))
         terms = np.concatenate([np.repeat(terms_of_separator, width) for width in self.widths])
         terms += len(sizes)
+        sums = self._row_sums(sizes, own, diagonal)
+        of_sums = gamma(float(terms.max(initial=0)) + 8.0)
+        of_factor = column_error(terms.astype(float), float(most_in_row))
+        error: Array = of_sums * sums + of_factor / (1.0 - of_sums) * diagonal
+        return OUTWARD * error
+
+    def _row_sums(
+        self, sizes: Sequence[Array], own: Sequence[tuple[IntArray, Array]], diagonal: Array
+    ) -> Array:
+        """Sum the `row_sums` of all parts of the sum, (side,)."""
         sums = self.gather([size[:, None] for size in sizes])[:, 0]
         for columns, values in own:  # as `row_sums`, block by block
             root = np.sqrt(diagonal[columns])
             weighted = np.abs(values) @ (1.0 / root)[:, :, None]
             np.add.at(sums, columns, root * weighted[:, :, 0])
-        of_sums = gamma(float(terms.max(initial=0)) + 8.0)
-        of_factor = column_error(terms.astype(float), float(most_in_row))
-        error: Array = of_sums * sums + of_factor / (1.0 - of_sums) * diagonal
-        return OUTWARD * error
+        return sums
 
     def gather(self, parts: Sequence[Array]) -> Array:
         """Sum the robots' vectors on their boundaries, (side, k)."""

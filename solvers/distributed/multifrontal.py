@@ -164,13 +164,29 @@ def levels(tree: Sequence[Front]) -> list[list[int]]:
     return [list(numbers) for _, numbers in by_level]
 
 
+def flops_of_fronts(fronts: FrontOwners, width: int) -> float:
+    """Operations of a factorisation with so many unknowns per pose.
+
+    Where robots hold the fronts, those of one level are eliminated at the same time, and the
+    largest of them counts.
+    """
+    flops = []
+    for front in fronts.tree:
+        e = float(width * len(front.eliminated))
+        b = float(width * len(front.boundary))
+        flops.append(e**3 / 3.0 + e**2 * b + e * b**2)
+    if not fronts.is_shared:
+        return sum(flops)
+    return sum(max(flops[number] for number in level) for level in levels(fronts.tree))
+
+
 class FrontOwners:
     """The tree of fronts, and who holds which; the driver holds all, until they are handed out."""
 
     def __init__(self, touched: Sequence[IntArray], num_separators: int) -> None:
         tree = separator_tree(touched, num_separators, LEAST_SEPARATORS)
-        self._is_shared = len(tree) >= LEAST_FRONTS
-        if not self._is_shared:
+        self.is_shared = len(tree) >= LEAST_FRONTS
+        if not self.is_shared:
             tree = separator_tree(touched, num_separators)
         self.tree = tree
         self.owner = [DRIVER] * len(tree)
@@ -182,7 +198,7 @@ class FrontOwners:
 
         `robots` are the numbers in the network of those who touch separators.
         """
-        if not self._is_shared:
+        if not self.is_shared:
             return
         self._network = network
         self._robots = robots.tolist()
@@ -211,7 +227,7 @@ class FrontOwners:
                 to_all[robot] = requests[number]
             of_all = self._network.workers.ask(partial(order_front, order), to_all)
             answers.update({number: of_all[robot] for robot, number in number_of.items()})
-        if self._is_shared:
+        if self.is_shared:
             self._count(requests, answers)
         return answers
 

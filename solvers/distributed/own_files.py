@@ -7,7 +7,8 @@ of it, or else to the first file that names it. An edge that stands in several f
 in `read_g2o`.
 
 The orders to a robot stand below in the sequence in which they are given: `read_file`,
-`number_poses`, `join_neighbours`, `take_cost`, `place_cover`; then, after the solve, `keep_answer`,
+`number_poses`, `join_neighbours`, `take_cost`, `place_cover`; where areas of robots interleave
+`propose_poses`, `place_larger_cover` and `take_larger_cover`; then, after the solve, `keep_answer`,
 `return_to_answer`, `move_answer` and `write_answer`.
 """
 
@@ -44,6 +45,12 @@ from pgo_models.problem.weighting import (
     is_isotropic,
 )
 from solvers.distributed.driver import Driver
+from solvers.distributed.elimination_choice import (
+    MOST_COUPLED,
+    CoverSystem,
+    may_leave_poses,
+    positions_in_cover,
+)
 from solvers.distributed.robots.agent import Agent, held_poses, order_interior
 from solvers.distributed.robots.interior import Interior, interior_of
 from solvers.network.counted_pool import Count, CountedPool
@@ -145,6 +152,8 @@ class FileAgent(Agent):
     numbers: IntArray  # (n_a,): numbers of these poses in the whole graph, ascending
     owners: IntArray  # (n_a,)
     cost: EdgeCost  # of its edges, in the cost that is solved
+    left: IntArray  # numbers of the poses that it proposes to leave to the driver
+    larger: Subgraph  # its subgraph if it does
     given: Array  # as in `Answer`
     answer: Poses
 
@@ -308,6 +317,24 @@ def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary
     return replace(agent.subgraph.summary, part=None)
 
 
+def propose_poses(agent: FileAgent, most_coupled: int) -> IntArray:
+    """Propose poses to leave to the driver; return those of the cover, with them, that it holds."""
+    agent.left = agent.subgraph.poses_left(most_coupled)
+    return agent.subgraph.held_cover(agent.left)
+
+
+def place_larger_cover(agent: FileAgent, positions: IntArray) -> RobotSummary:
+    """Learn where these poses would be in the cover."""
+    agent.larger = agent.subgraph.with_larger_cover(agent.left, positions)
+    return replace(agent.larger.summary, part=None)
+
+
+def take_larger_cover(agent: FileAgent, _: None) -> None:
+    """Leave the poses to the driver."""
+    agent.subgraph = agent.larger
+    agent.interior = interior_of(agent.subgraph, agent.backend)
+
+
 def keep_answer(agent: FileAgent, cover: Poses) -> Answer:
     """Keep the current poses for the answer; the driver sends those of the cover."""
     agent.answer = held_poses(agent, cover)
@@ -402,6 +429,8 @@ def open_files(
         has_two_costs = not all(can_run_soc)
         places = [(placement, has_two_costs) for placement in placements]
         summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
+        if memory != 0:
+            summaries = _chosen_elimination(network, summaries)
         last = max(int(summary.in_cover.max(initial=0)) for summary in summaries)
         grounded = (last + 1) // 2  # a pose in the middle of the cover
         driver = Driver(summaries, num_poses, lambda: network, memory, grounded)
@@ -409,6 +438,19 @@ def open_files(
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()
         raise
+
+
+def _chosen_elimination(network: CountedPool, summaries: list[RobotSummary]) -> list[RobotSummary]:
+    """Have robots leave poses to the driver where that is cheaper, as `choose_elimination`."""
+    system = CoverSystem.of(summaries)
+    if not may_leave_poses(system):
+        return summaries
+    held = network.ask(propose_poses, [MOST_COUPLED] * len(summaries), Count.ROUND)
+    larger = network.ask(place_larger_cover, positions_in_cover(held), Count.ROUND)
+    if CoverSystem.of(larger).flops >= system.flops:
+        return summaries
+    network.ask(take_larger_cover, [None] * len(summaries), Count.PIGGYBACKED)
+    return larger
 
 
 def _own_weighting(borders: Sequence[Border]) -> Weighting:

@@ -22,6 +22,7 @@ from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver, collect
+from solvers.distributed.elimination_choice import choose_elimination
 from solvers.distributed.handedness import (
     RobotsPoint,
     begin_without_terms,
@@ -63,6 +64,8 @@ def open_driver(
     A robust solve gives the `thresholds`, (m,), of its edges.
     """
     subgraphs = split_graph(problem, robots, thresholds)
+    if memory != 0:
+        subgraphs = choose_elimination(subgraphs)
     grounded = middle_separator(problem.graph, subgraphs)
     summaries = [subgraph.summary for subgraph in subgraphs]
     start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)

@@ -15,6 +15,7 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses
 from pgo_models.graphs.separators import cover_of_edges
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.problem import PGOProblem, as_problem
+from solvers.soc.subdomains import Subdomains, find_subdomains, poses_to_leave
 
 
 class PartProblem(PGOProblem):
@@ -59,6 +60,9 @@ class Subgraph:
         (`PGOProblem.convex_part`).
     thresholds : (m_a,) array or None
         What its edges may cost in a robust solve, inf for known inliers.
+    is_sparse : bool
+        Whether the robot sends its Schur complement subdomain by subdomain
+        (`solvers.soc.subdomains`), or as one dense matrix.
     """
 
     robot: int
@@ -73,6 +77,7 @@ class Subgraph:
     weights: EdgeCost
     final: EdgeCost | None = None
     thresholds: Array | None = None
+    is_sparse: bool = False
 
     @cached_property
     def is_own(self) -> BoolArray:
@@ -115,7 +120,30 @@ class Subgraph:
             final=final,
             edges=self.edges[kept],
             thresholds=None if self.thresholds is None else self.thresholds[kept],
+            is_sparse=self.is_sparse,
         )
+
+    def poses_left(self, most_coupled: int) -> IntArray:
+        """Numbers of its interior poses that it leaves to the driver (`poses_to_leave`)."""
+        part = self.part
+        if part is None:
+            return np.zeros(0, dtype=np.int64)
+        is_boundary = part.in_cover >= 0
+        return part.poses[poses_to_leave(part.problem.graph, is_boundary, most_coupled)]
+
+    def held_cover(self, left: IntArray) -> IntArray:
+        """Numbers of its poses in the cover, ascending, with those that it leaves to the driver."""
+        return np.union1d(self.poses[self.in_cover >= 0], left)
+
+    def with_larger_cover(self, left: IntArray, positions: IntArray) -> Subgraph:
+        """The subgraph when the driver solves for the poses that robots leave to it, too.
+
+        `left` are those of this robot, `positions` where `held_cover(left)` are in the new cover.
+        Every edge is counted by the robot that counted it before.
+        """
+        in_cover = np.full(len(self.poses), -1)
+        in_cover[np.searchsorted(self.poses, self.held_cover(left))] = positions
+        return replace(self, in_cover=in_cover, is_sparse=True)
 
     @cached_property
     def summary(self) -> RobotSummary:
@@ -133,7 +161,15 @@ class Subgraph:
             has_two_costs=self.final is not None,
             has_translations=self.weights.has_translations,
             part=self.poses[poses_of_part],
+            coupled=self._coupled,
         )
+
+    @property
+    def _coupled(self) -> IntArray | None:
+        """Pairs of touched poses that the Schur complement couples, (k, 2), if it is sparse."""
+        if self.part is None or not self.is_sparse:
+            return None
+        return np.stack(self.part.subdomains.coupled.nonzero(), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +195,9 @@ class RobotSummary:
         Whether translations are among the unknowns (`PGOProblem.has_translations`).
     part : (p,) array or None
         Numbers of all poses that these edges join; None where only the robot may know them.
+    coupled : (k, 2) array or None
+        Pairs of positions in `touched`, the larger first, of poses that are coupled in the Schur
+        complement of the robot; None where it is dense.
     """
 
     robot: int
@@ -169,6 +208,7 @@ class RobotSummary:
     has_two_costs: bool
     has_translations: bool
     part: IntArray | None
+    coupled: IntArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,6 +255,8 @@ class Part:
         Numbers of its edges in the whole graph.
     thresholds : (k,) array or None
         What its edges may cost in a robust solve.
+    is_sparse : bool
+        Whether its Schur complement is sent subdomain by subdomain.
     """
 
     problem: PartProblem
@@ -223,6 +265,7 @@ class Part:
     final: PartProblem | None = None
     edges: IntArray | None = None
     thresholds: Array | None = None
+    is_sparse: bool = False
 
     def weighted(self, weights: Array) -> Part:
         """The part with the costs of its edges times weights, (k,)."""
@@ -249,6 +292,11 @@ class Part:
         """Poses of the part that the driver solves for, in the driver's order."""
         in_cover = np.flatnonzero(self.in_cover >= 0)
         return in_cover[np.argsort(self.in_cover[in_cover])]
+
+    @cached_property
+    def subdomains(self) -> Subdomains:
+        """The connected pieces of its interior."""
+        return find_subdomains(self.problem.graph, self.interior, self.boundary)
 
 
 def _scaled(problem: PartProblem, weights: Array) -> PartProblem:

@@ -2,10 +2,10 @@
 world of 100 robots.
 
     PGO_DATA=folder python tests/benchmarks/robots.py
-    [substructured|consensus|held|seconds|faults|driver|world|ray ..]
+    [substructured|consensus|held|seconds|faults|driver|world|ray|interleaved ..]
 
 Every line runs in a process of its own, one thread, robots in this process; those of `ray` in
-actors on two CPUs, too.
+actors on two CPUs, too, and those of `interleaved` in a process each.
 """
 
 import json
@@ -195,6 +195,52 @@ def world_job() -> dict[str, object]:
         "seconds": seconds,
         "memory": memory(),
     }
+
+
+def interleaved_job(poses: str) -> dict[str, object]:
+    """Sixteen robots in the plane, whose areas interleave, with their own files, in Ray actors."""
+    with tempfile.TemporaryDirectory() as folder:
+        world = Path(folder) / "world"
+        shape = ["--robots", "16", "--poses", poses, "-d", "2"]
+        run_cli(["generate", "grid-world", *shape, "--out", str(world)])
+        began = time.perf_counter()
+        with RayEngine(num_cpus=16, actors=16).kept() as engine:
+            solution = solvers.solve_folder(world, engine=engine)
+            actors = processes_of("ray::")
+        seconds = time.perf_counter() - began
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return {
+        "poses": int(solution.sizes[0].sum()),
+        "edges": int(solution.sizes[1].sum()),
+        "rounds": solution.ledger.rounds,
+        "megabytes": solution.ledger.num_bytes / 1e6,
+        "driver": usage.ru_utime + usage.ru_stime,
+        "busiest": max(cpu for cpu, _ in actors),
+        "robots": sum(cpu for cpu, _ in actors),
+        "driver_memory": memory(),
+        "robot_memory": max(megabytes for _, megabytes in actors),
+        "gap": solution.certificate.proven_gap,
+        "verdict": solution.certificate.verdict.name,
+        "seconds": seconds,
+    }
+
+
+def processes_of(name: str) -> list[tuple[float, float]]:
+    """CPU seconds and largest memory, MB, of all processes whose command begins so (Linux)."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (folder / "cmdline").read_text()
+            status = (folder / "status").read_text()
+            numbers = (folder / "stat").read_text().rsplit(")", 1)[1].split()
+        except OSError:  # it has ended
+            continue
+        # Idle workers that Ray has started in advance hold no robot.
+        if command.startswith(name) and "IDLE" not in command:
+            ticks = int(numbers[11]) + int(numbers[12])
+            (peak,) = (line.split()[1] for line in status.splitlines() if "VmHWM" in line)
+            found.append((ticks / os.sysconf("SC_CLK_TCK"), int(peak) / 1024))
+    return found
 
 
 class TimedRobots:
@@ -417,6 +463,35 @@ def driver_table() -> Table:
     return table
 
 
+def interleaved_table() -> Table:
+    """Sixteen robots on Ray, whose areas interleave: CPU seconds and memory of every process."""
+    heads = (
+        "poses",
+        "edges",
+        "rounds",
+        "MB sent",
+        "driver, CPU s",
+        "busiest robot",
+        "all robots",
+        "driver, MB",
+        "largest robot",
+        "gap",
+        "s",
+    )
+    table = Table(*heads, box=MARKDOWN)
+    for poses in ("1250", "18750"):
+        row = child("interleaved", poses)
+        table.add_row(
+            *(str(row[key]) for key in ("poses", "edges", "rounds")),
+            f"{row['megabytes']:.0f}",
+            *(f"{row[key]:.1f}" for key in ("driver", "busiest", "robots")),
+            *(f"{row[key]:.0f}" for key in ("driver_memory", "robot_memory")),
+            f"{rounded_up(row['gap'], 2)} {row['verdict']}",
+            f"{row['seconds']:.0f}",
+        )
+    return table
+
+
 def world_table() -> Table:
     """100 robots, 50,000 poses: read, solved and certified in this process."""
     row = child("world")
@@ -496,6 +571,7 @@ JOBS: dict[str, Callable[..., dict[str, object]]] = {
     "driver": driver_job,
     "world": world_job,
     "ray": ray_job,
+    "interleaved": interleaved_job,
 }
 TABLES = {
     "substructured": substructured_table,
@@ -506,6 +582,7 @@ TABLES = {
     "driver": driver_table,
     "world": world_table,
     "ray": ray_table,
+    "interleaved": interleaved_table,
 }
 
 if __name__ == "__main__":

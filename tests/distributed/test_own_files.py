@@ -24,7 +24,7 @@ from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers import folder_solve
-from solvers.distributed import staircase, substructured
+from solvers.distributed import elimination_choice, own_files, staircase, substructured
 from solvers.distributed.robots import climbing
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.stages import ClimbByRobots, NewtonByRobots, SOCByRobots
@@ -215,6 +215,27 @@ def test_the_frame_is_that_of_a_fixed_pose(tmp_path: Path) -> None:
 
 
 # What crosses.
+
+
+@pytest.mark.parametrize("is_interleaved", [False, True])
+def test_robots_leave_poses_where_their_areas_interleave(
+    is_interleaved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cvxopt")
+    monkeypatch.setattr(elimination_choice, "ENOUGH_FLOPS", 0.0)
+    graph = pgo.grid_world(4, 300, np.random.default_rng(0), d=2)
+    robots = pgo.partition(graph, 4, pgo.PartitionMethod.METIS).robot.copy()
+    if is_interleaved:
+        swapped = np.random.default_rng(1).random(graph.num_poses) < 0.5
+        robots[swapped] = np.random.default_rng(2).permutation(robots[swapped])
+    graph = graph.with_robots(robots)
+    write_g2o_folder(graph, tmp_path / "in")
+    engine = Recording()
+    solution = solve_folder(tmp_path / "in", engine=engine, out=tmp_path / "out")
+    check_same(solution, graph, tmp_path / "out")
+    assert engine.times(own_files.propose_poses) == 1
+    assert engine.times(own_files.take_larger_cover) == int(is_interleaved)
+    assert all(agent.subgraph.is_sparse == is_interleaved for agent in engine.agents)
 
 
 @pytest.mark.parametrize("climbs", [False, True])

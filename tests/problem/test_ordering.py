@@ -41,7 +41,9 @@ def test_a_dissected_world_in_space_fills_less() -> None:
     pytest.importorskip("pymetis")
     world = pgo.grid_world(100, 100, np.random.default_rng(0), d=3)
     assert world.num_poses == ordering.DISSECTED_FROM[3]
-    by_degree = ordering.minimum_degree(ordering._pattern(world))
+    by_degree = ordering.minimum_degree(
+        ordering.pattern_of_edges(world.num_poses, world.i, world.j)
+    )
     filled = [
         most_counts(world, order, 1).in_column.sum() for order in (pose_order(world), by_degree)
     ]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
@@ -25,8 +26,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, check_pivots, column_error
 from pgo_models.problem.matrices import inner
-
-Widths = tuple[int, ...]  # numbers a separator in every field
+from solvers.distributed.robots.subdomain_blocks import SubdomainBlocks, Widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,7 @@ class Cut:
     interior: IntArray
     boundary: IntArray
     analysis: SymbolicCholesky | None  # of the interior's matrix, once there has been one
+    blocks: SubdomainBlocks | None = None  # where the Schur complement is sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,9 @@ class Elimination:
     cut: Cut
     K_IG: csr_array  # sparse (i, g)
     factor: CholeskyFactor | None  # of K_II; None when there is no interior
-    schur: Array  # (g (g + 1) / 2,): lower triangle of K_GG - K_GI K_II^-1 K_IG, `packed`
+    # lower triangle of K_GG - K_GI K_II^-1 K_IG: `packed`, (g (g + 1) / 2,), or the entries that
+    # the blocks of the cut store
+    schur: Array
     diagonal: Array  # (g,): of K_GG
     # (i,): share of the diagonal of K_II that rounding can take, where it was asked for
     interior_error: Array
@@ -68,6 +71,12 @@ class Elimination:
             x[self.cut.interior] = self.factor.solve(b_I - self.K_IG @ x_G)
         return x
 
+    def schur_row_sums(self, scale: Array) -> Array:
+        """`row_sums` of the Schur complement."""
+        if self.cut.blocks is not None:
+            return row_sums(self.cut.blocks.symmetric(self.schur), scale)
+        return row_sums(unpacked(self.schur, len(self.cut.boundary)), scale)
+
 
 def eliminate(
     K: csc_array, cut: Cut, backend: CholeskyBackend | None, is_verified: bool = False
@@ -84,6 +93,8 @@ def eliminate(
 
     A NotPositiveDefiniteError when K_II is not positive definite.
     """
+    if cut.blocks is not None:
+        return _eliminate_subdomains(K, cut, cut.blocks, backend, is_verified)
     interior = cut.interior
     boundary = cut.boundary
     K_G = K[:, boundary].tocsc()
@@ -99,36 +110,87 @@ def eliminate(
     Z = factor.half_solve(K_IG.toarray())
     schur -= Z.T @ Z
     if is_verified:
-        schur[np.diag_indices(len(schur))] -= OUTWARD * _schur_error(Z, factor, schur, diagonal)
         nonzeros_in_row = np.count_nonzero(Z, axis=1)
+        nonzeros_in_column = np.count_nonzero(Z, axis=0)
+        squares = np.einsum("ig,ig->g", Z, Z)
+        most_in_row = factor.most_in_row(nonzeros_in_row)
+        error = _schur_error(nonzeros_in_column, squares, most_in_row, schur, diagonal)
+        schur[np.diag_indices(len(schur))] -= OUTWARD * error
         interior_error = factor.backward_error(nonzeros_in_row)
-    cut = Cut(interior, boundary, analysis)
+    cut = replace(cut, analysis=analysis)
     schur = 0.5 * (schur + schur.T)
     return Elimination(cut, K_IG, factor, packed(schur), diagonal, interior_error)
 
 
-def _schur_error(Z: Array, factor: CholeskyFactor, schur: Array, diagonal: Array) -> Array:
+def _eliminate_subdomains(
+    K: csc_array,
+    cut: Cut,
+    blocks: SubdomainBlocks,
+    backend: CholeskyBackend | None,
+    is_verified: bool,
+) -> Elimination:
+    """Eliminate as `eliminate`, to the entries that the blocks store.
+
+    A row of Z has entries for the boundary of its subdomain alone. `half_solve` computes them in as
+    many columns as the widest of these boundaries has. The products of all subdomains are summed up
+    before they are subtracted: they are one inner product of columns of Z, in some order.
+    """
+    K_G = K[:, cut.boundary].tocsc()
+    K_GG = K_G[cut.boundary].tocsr()
+    K_IG = K_G[cut.interior].tocsr()
+    diagonal = K_GG.diagonal()
+    schur = blocks.lower_entries(K_GG)
+    interior_error = np.zeros(0)
+    if not len(cut.interior):
+        return Elimination(cut, K_IG, None, schur, diagonal, interior_error)
+    K_II = K[cut.interior][:, cut.interior].tocsc()
+    analysis = cut.analysis if cut.analysis is not None else analyze(K_II, backend)
+    factor = analysis.factorize(K_II)
+    Z = factor.half_solve(blocks.compressed(K_IG))
+    products = blocks.products(Z, factor.row_order())
+    schur -= products.lower
+    if is_verified:
+        nonzeros_in_row = np.count_nonzero(Z, axis=1)
+        most_in_row = factor.most_in_row(nonzeros_in_row)
+        error = _schur_error(
+            products.nonzeros_in_column,
+            products.squares,
+            most_in_row,
+            blocks.symmetric(schur),
+            diagonal,
+        )
+        schur[blocks.diagonal] -= OUTWARD * error
+        interior_error = factor.backward_error(nonzeros_in_row)
+    return Elimination(
+        replace(cut, analysis=analysis), K_IG, factor, schur, diagonal, interior_error
+    )
+
+
+def _schur_error(
+    nonzeros_in_column: Array,
+    squares: Array,
+    most_in_row: float,
+    schur: Array | csr_array,
+    diagonal: Array,
+) -> Array:
     """Bound what rounding can take of the Schur complement, as a diagonal, (g,).
 
-    The columns of Z are those of a Cholesky factor (`column_error`); the last term is the rounding
-    of the difference itself.
+    The columns of Z are those of a Cholesky factor (`column_error`), with these numbers of
+    non-zeros and sums of squares; the last term is the rounding of the difference itself.
     """
-    nonzeros_in_row = np.count_nonzero(Z, axis=1)
-    nonzeros_in_column = np.count_nonzero(Z, axis=0)
-    squares = np.einsum("ig,ig->g", Z, Z)
-    most_in_row = factor.most_in_row(nonzeros_in_row)
     error = column_error(nonzeros_in_column, most_in_row) * squares
     error += 2.0 * UNIT_ROUNDOFF * row_sums(schur, np.maximum(diagonal, squares))
     return np.asarray(error)
 
 
-def row_sums(matrix: Array, scale: Array) -> Array:
+def row_sums(matrix: Array | csr_array, scale: Array) -> Array:
     """Compute a diagonal D with v^T |matrix| v <= v^T D v for every v.
 
     D_g = sum_h |matrix_gh| sqrt(scale_g / scale_h).
     """
     root = np.sqrt(np.where(scale > 0, scale, 1.0))
-    return np.asarray(root * (np.abs(matrix) @ (1.0 / root)))
+    sizes = cast(Array, abs(matrix))  # numpy's abs() of a sparse matrix has no type
+    return np.asarray(root * (sizes @ (1.0 / root)))
 
 
 def packed(matrix: Array) -> Array:

@@ -11,7 +11,8 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
-from solvers.distributed.robots.elimination import Cut, Elimination, Widths, eliminate
+from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
+from solvers.distributed.robots.subdomain_blocks import SubdomainBlocks, Widths
 from solvers.soc.subgraph import Part
 
 
@@ -58,7 +59,10 @@ class Factors:
             p = part.problem.num_poses
             interior = columns_of(part.interior, p, widths)
             boundary = columns_of(part.boundary, p, widths)
-            self._cuts[widths] = Cut(interior, boundary, None)
+            blocks = None
+            if part.is_sparse:
+                blocks = SubdomainBlocks.of(part.subdomains, widths)
+            self._cuts[widths] = Cut(interior, boundary, None, blocks)
         return self._cuts[widths]
 
     def eliminate(self, K: csc_array, widths: Widths) -> tuple[Eliminated, Elimination]:

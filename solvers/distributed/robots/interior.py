@@ -30,7 +30,6 @@ from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.initialization import relaxed_rotations
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.low_rank import gradient_at, hessian_at, tangent_widths
-from solvers.distributed.robots.elimination import Widths
 from solvers.distributed.robots.factors import Eliminated, Factors
 from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import (
@@ -46,6 +45,7 @@ from solvers.distributed.robots.records import (
     RobotAscent,
     TrialEvaluation,
 )
+from solvers.distributed.robots.subdomain_blocks import Widths
 from solvers.riemannian.newton_step import ModelOrder
 from solvers.soc.copies import Norms, subsampled
 from solvers.soc.penalty import PenaltyOrder

@@ -8,7 +8,6 @@ import numpy as np
 from pgo_models.certificates.rounding_errors import fits_to_rounding
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.robots.elimination import row_sums, unpacked
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof import begin_proof, verify_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
@@ -39,8 +38,7 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     matrix, elimination, slack = verified
     eliminated = factors.keep(matrix, widths, elimination)
     following = robot.with_changes(proof=None, eliminated=eliminated)
-    schur = unpacked(elimination.schur, len(cut.boundary))
-    sizes = row_sums(schur, order.diagonal)
+    sizes = elimination.schur_row_sums(order.diagonal)
     if order.point is None:
         return following, ProofAnswer(elimination.schur, sizes, trace, None)
     proof = begin_proof(

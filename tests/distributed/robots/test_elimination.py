@@ -6,7 +6,14 @@ import pytest
 from budget import examples
 from graphs import DIMENSIONS, EPS, LOUD_NOISE, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings, strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, interface_of
+from robots import (
+    BACKENDS,
+    PARTITIONERS,
+    Partitioner,
+    interface_of,
+    matrix_of_schur,
+    sparse_interface_of,
+)
 from scipy.sparse import csc_array, diags_array
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
@@ -18,6 +25,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import riemannian_hessian
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.elimination import (
@@ -29,9 +37,11 @@ from solvers.distributed.robots.elimination import (
     packed,
     unpacked,
 )
+from solvers.distributed.robots.factors import Factors
 from solvers.soc.subgraph import Part, split_graph
 
 SIZES = st.integers(2, 30)
+LIMITS = st.sampled_from([None, 0, 3, 1000])  # poses that a robot couples at most
 KINDS = st.sampled_from(["translations", "poses", "tangent"])
 
 
@@ -74,23 +84,33 @@ class Split:
         return True
 
 
-def split(problem: PGOProblem, parts: Partition, kind: str, seed: int, diagonal: Array) -> Split:
+def split(
+    problem: PGOProblem,
+    parts: Partition,
+    kind: str,
+    seed: int,
+    diagonal: Array,
+    most_coupled: int | None = None,
+) -> Split:
     """Matrix of a kind plus a diagonal, (side,).
 
-    Each robot adds it in its interior, the driver on the cover.
+    Each robot adds it in its interior, the driver on the cover. With `most_coupled` the robots
+    leave poses to the driver, and the interface is sparse.
     """
     n = problem.num_poses
     widths = widths_of(kind, problem.d)
     poses = random_poses(problem.num_poses, problem.d, seed)
-    working = [share.part for share in split_graph(problem.graph, parts) if share.part is not None]
+    shares = split_graph(problem.graph, parts)
+    if most_coupled is not None:
+        shares = leave_poses(shares, most_coupled)
+    working = [share.part for share in shares if share.part is not None]
     cover = np.unique(np.concatenate([part.poses[part.boundary] for part in working]))
     pieces = []
     cuts = []
     columns = []
     for part in working:
-        p = part.problem.num_poses
         local = Poses(poses.R[part.poses], poses.t[part.poses])
-        cut = Cut(columns_of(part.interior, p, widths), columns_of(part.boundary, p, widths), None)
+        cut = Factors(part, None).cut(*widths)
         mine = columns_of(part.poses, n, widths)
         added = np.zeros(len(mine))
         added[cut.interior] = diagonal[mine[cut.interior]]
@@ -98,6 +118,10 @@ def split(problem: PGOProblem, parts: Partition, kind: str, seed: int, diagonal:
         cuts.append(cut)
         columns.append(mine)
     touched = tuple(part.in_cover[part.boundary] for part in working)
+    interface = interface_of(touched, len(cover), widths)
+    if most_coupled is not None:
+        coupled = [share.summary.coupled for share in shares if share.summary.coupled is not None]
+        interface = sparse_interface_of(touched, coupled, len(cover), widths)
     at = columns_of(cover, n, widths)
     return Split(
         whole=matrix_of(problem, poses, kind).toarray() + np.diag(diagonal),
@@ -106,7 +130,7 @@ def split(problem: PGOProblem, parts: Partition, kind: str, seed: int, diagonal:
         cuts=cuts,
         columns=columns,
         own=[(np.arange(len(at))[:, None], diagonal[at][:, None, None])],
-        interface=interface_of(touched, len(cover), widths),
+        interface=interface,
         cover_columns=at,
     )
 
@@ -116,9 +140,23 @@ def side_of(problem: PGOProblem, kind: str) -> int:
 
 
 @settings(max_examples=examples(50))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    partitioner=PARTITIONERS,
+    kind=KINDS,
+    backend=BACKENDS,
+    most=LIMITS,
+)
 def test_elimination_and_back_substitution_solve_the_whole_system(
-    seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
+    seed: int,
+    n: int,
+    d: int,
+    partitioner: Partitioner,
+    kind: str,
+    backend: CholeskyBackend,
+    most: int | None,
 ) -> None:
     problem = varied_problem(seed, n, d)
     rng = np.random.default_rng(seed)
@@ -129,6 +167,7 @@ def test_elimination_and_back_substitution_solve_the_whole_system(
         kind,
         seed,
         scale * rng.uniform(1e-3, 1.0, side_of(problem, kind)),
+        most,
     )
     robots, driver = system.eliminate(backend)
     b = rng.standard_normal((len(system.whole), 3))
@@ -153,13 +192,27 @@ def test_elimination_and_back_substitution_solve_the_whole_system(
 
 
 @settings(max_examples=examples(50))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    partitioner=PARTITIONERS,
+    kind=KINDS,
+    backend=BACKENDS,
+    most=LIMITS,
+)
 def test_robots_hold_the_matrix_between_them(
-    seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
+    seed: int,
+    n: int,
+    d: int,
+    partitioner: Partitioner,
+    kind: str,
+    backend: CholeskyBackend,
+    most: int | None,
 ) -> None:
     problem = varied_problem(seed, n, d)
     system = split(
-        problem, partitioner(problem.graph, seed), kind, seed, np.ones(side_of(problem, kind))
+        problem, partitioner(problem.graph, seed), kind, seed, np.ones(side_of(problem, kind)), most
     )
     total = np.zeros_like(system.whole)
     for mine, piece in zip(system.columns, system.pieces, strict=True):
@@ -178,16 +231,28 @@ def test_robots_hold_the_matrix_between_them(
             expected = expected - K[np.ix_(g, inside)] @ np.linalg.solve(
                 K[np.ix_(inside, inside)], K[np.ix_(inside, g)]
             )
-        np.testing.assert_allclose(
-            unpacked(robot.schur, len(g)), expected, rtol=0, atol=1e-9 * scale
-        )
+        np.testing.assert_allclose(matrix_of_schur(robot), expected, rtol=0, atol=1e-9 * scale)
         np.testing.assert_array_equal(robot.diagonal, K.diagonal()[g])
 
 
 @settings(max_examples=examples(50))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, kind=KINDS, backend=BACKENDS)
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    partitioner=PARTITIONERS,
+    kind=KINDS,
+    backend=BACKENDS,
+    most=LIMITS,
+)
 def test_the_whole_is_positive_definite_where_all_parts_of_it_are(
-    seed: int, n: int, d: int, partitioner: Partitioner, kind: str, backend: CholeskyBackend
+    seed: int,
+    n: int,
+    d: int,
+    partitioner: Partitioner,
+    kind: str,
+    backend: CholeskyBackend,
+    most: int | None,
 ) -> None:
     # Inertia is additive: just above and just below its smallest eigenvalue the verdict is that of
     # the whole.
@@ -196,11 +261,11 @@ def test_the_whole_is_positive_definite_where_all_parts_of_it_are(
     side = side_of(problem, kind)
     rng = np.random.default_rng(seed)
     rough = float(problem.M.diagonal().max()) * rng.standard_normal(side)
-    whole = split(problem, parts, kind, seed, rough).whole
+    whole = split(problem, parts, kind, seed, rough, most).whole
     values = np.linalg.eigvalsh(whole)
     near = 1e-9 * np.abs(values).max()
     for sign, expected in ((1.0, True), (-1.0, False)):
-        shifted = split(problem, parts, kind, seed, rough - values[0] + sign * near)
+        shifted = split(problem, parts, kind, seed, rough - values[0] + sign * near, most)
         assert shifted.is_positive_definite(backend) is expected
 
 

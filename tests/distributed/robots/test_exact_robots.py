@@ -1,6 +1,6 @@
 """Bounds by a driver and robots, as they were proved, held against F in exact arithmetic."""
 
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,15 @@ from exact_arithmetic import ExactGraph, exact, is_positive_definite, less_diago
 from graphs import DIMENSIONS, SEEDS, random_poses, turned_away, varied_graph, wound_ring
 from hypothesis import given, settings, strategies as st
 from roads import Shape, road
-from robots import BACKENDS, PARTITIONERS, Partitioner, contiguous, driver_at, metis
+from robots import (
+    BACKENDS,
+    PARTITIONERS,
+    Partitioner,
+    contiguous,
+    driver_at,
+    metis,
+    sparse_elimination,
+)
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import pose_rows, prove_bound
@@ -111,14 +119,24 @@ def test_what_eta_adds_is_taken_off_by_robots(d: int) -> None:
 
 
 @settings(max_examples=examples(10))
-@given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS, cut=PARTITIONERS, backend=BACKENDS)
+@given(
+    seed=SEEDS,
+    n=st.integers(4, 10),
+    d=DIMENSIONS,
+    cut=PARTITIONERS,
+    backend=BACKENDS,
+    most=st.sampled_from([None, 2]),
+)
 def test_what_a_driver_says_to_be_definite_is(
-    seed: int, n: int, d: int, cut: Partitioner, backend: CholeskyBackend
+    seed: int, n: int, d: int, cut: Partitioner, backend: CholeskyBackend, most: int | None
 ) -> None:
     """S_r, less what the driver has left over on the separators, is positive definite."""
     problem = PGOProblem(varied_graph(seed, n, d), backend)
     poses = polish(problem, chordal_start(problem))
-    with closing(driver_at(problem, cut(problem.graph, seed), poses)) as driver:
+    with ExitStack() as stack:
+        if most is not None:
+            stack.enter_context(sparse_elimination(most))
+        driver = stack.enter_context(closing(driver_at(problem, cut(problem.graph, seed), poses)))
         r = driver.grounded_position
         X = Poses(driver.current.R, driver.current.t).stacked()
         proof = distributed_bound.eliminate_S(driver, r, 0.0, 1e-9, X)

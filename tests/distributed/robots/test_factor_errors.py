@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cvxopt
 import numpy as np
@@ -21,8 +22,8 @@ from exact_arithmetic import (
 from graphs import DIMENSIONS, SEEDS, still_ring, varied_graph
 from hypothesis import given, settings, strategies as st
 from roads import road
-from robots import interface_of
-from scipy.sparse import csc_array
+from robots import interface_of, matrix_of_schur, sparse_interface_of
+from scipy.sparse import csc_array, csr_array
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import partition
@@ -38,9 +39,13 @@ from pgo_models.problem.cholesky import (
 from pgo_models.problem.floating_point import gamma
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums, unpacked
+from solvers.distributed.robots.factors import Factors
 from solvers.distributed.robots.proof import verify_interior
+from solvers.distributed.robots.subdomain_blocks import SubdomainBlocks
+from solvers.soc.subdomains import Subdomains
 from solvers.soc.subgraph import Part, split_graph
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
@@ -156,6 +161,56 @@ def test_an_elimination_is_below_its_matrix(backend: CholeskyBackend, coupling: 
     assert any(needed)
 
 
+def subdivided(seed: int) -> tuple[Array, Cut]:
+    """A matrix whose interior falls into pieces that reach some of the boundary, and the cut."""
+    rng = np.random.default_rng(seed)
+    num_pieces = int(rng.integers(1, 5))
+    label = np.sort(rng.integers(0, num_pieces, 12))
+    _, label = np.unique(label, return_inverse=True)
+    g = int(rng.integers(2, 8))
+    reached = rng.random((label.max() + 1, g)) < 0.5
+    i = len(label)
+    K = well_conditioned(seed, i + g - 1, 1)
+    K[:i, :i][label[:, None] != label] = 0.0
+    K[:i, i:][~reached[label]] = 0.0
+    K[i:, :i] = K[:i, i:].T
+    K += 2.0 * np.diag(np.abs(K).sum(axis=1))
+    everything = csr_array(np.tri(g))
+    blocks = SubdomainBlocks.of(Subdomains(label, csr_array(1 * reached), everything), (1,))
+    return K, Cut(np.arange(i), np.arange(i, i + g), None, blocks)
+
+
+@BACKENDS
+def test_an_elimination_of_subdomains_is_below_its_matrix(backend: CholeskyBackend) -> None:
+    needed = []
+    for seed in range(24):
+        K, cut = subdivided(seed)
+        i = len(cut.interior)
+        dense = eliminate(csc_array(K), replace(cut, blocks=None), backend, is_verified=True)
+        for is_verified in (True, False):
+            found = eliminate(csc_array(K), cut, backend, is_verified)
+            schur = matrix_of_schur(found)
+            left = exact(K)
+            left[i:, i:] -= exact(schur)
+            if is_verified:
+                np.testing.assert_allclose(schur, matrix_of_schur(dense), rtol=1e-13, atol=1e-13)
+                np.testing.assert_array_equal(found.interior_error, dense.interior_error)
+                left[:i, :i] += np.diag(exact(found.interior_error) * exact(K.diagonal()[:i]))
+            is_below = is_positive_definite([dict(enumerate(row)) for row in left])
+            if is_verified:
+                assert is_below
+            else:
+                needed.append(not is_below)
+    assert any(needed)
+
+
+def test_an_entry_outside_of_its_subdomain_is_refused() -> None:
+    K, cut = subdivided(3)
+    assert (K == 0.0).any()
+    with pytest.raises(ValueError, match="its pattern"):
+        eliminate(stored_matrix(K + 1e-3), cut, CholeskyBackend.SUPERLU)
+
+
 def is_true_of_robot(
     problem: PGOProblem,
     part: Part,
@@ -170,7 +225,7 @@ def is_true_of_robot(
     """
     p = problem.num_poses
     d = problem.d
-    cut = Cut(columns_of(part.interior, p, (1, d)), columns_of(part.boundary, p, (1, d)), None)
+    cut = Factors(part, backend).cut(1, d)
     proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), share, backend)
     if proved is None:
         return None
@@ -181,7 +236,7 @@ def is_true_of_robot(
     )
     inside = cut.interior
     S[inside, inside] += np.where(inside >= p, exact(eta), MP.mpf(0)) - exact(slack)
-    S[np.ix_(cut.boundary, cut.boundary)] -= exact(unpacked(found.schur, len(cut.boundary)))
+    S[np.ix_(cut.boundary, cut.boundary)] -= exact(matrix_of_schur(found))
     return is_positive_definite([dict(enumerate(row)) for row in S])
 
 
@@ -207,13 +262,20 @@ def test_no_rounding_is_lost_between_multipliers_and_eta_by_a_robot(
 
 @BACKENDS
 @settings(max_examples=examples(10))
-@given(seed=SEEDS, n=st.integers(4, 9), d=DIMENSIONS, eta=st.sampled_from([0.0, 1e-3, 1e9]))
+@given(
+    seed=SEEDS,
+    n=st.integers(4, 9),
+    d=DIMENSIONS,
+    eta=st.sampled_from([0.0, 1e-3, 1e9]),
+    most=st.sampled_from([None, 2]),
+)
 def test_what_a_robot_hands_on_is_below_its_part_of_S(
-    backend: CholeskyBackend, seed: int, n: int, d: int, eta: float
+    backend: CholeskyBackend, seed: int, n: int, d: int, eta: float, most: int | None
 ) -> None:
     graph = varied_graph(seed, n, d)
     rng = np.random.default_rng(seed)
-    for share in split_graph(graph, partition(graph, 2)):
+    shares = split_graph(graph, partition(graph, 2))
+    for share in shares if most is None else leave_poses(shares, most):
         if share.part is None:
             continue
         problem = share.part.problem
@@ -255,6 +317,45 @@ def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
         lost = space.rounding([row_sums(*side) for side in sides], [(columns, values)], diagonal)
         factor = space.factorize(contributions, [(columns, values)])
         difference = square_of_tree(factor) - K
+        assert max(largest_share(sign * difference, diagonal) for sign in (1, -1)) > 0.0
+        assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
+
+
+@pytest.mark.parametrize("cancelling", [0.0, 1e6])
+def test_the_drivers_sparse_factor_is_within_its_rounding(cancelling: float) -> None:
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        g = int(rng.integers(4, 9))
+        d = int(rng.integers(2, 4))
+        touched = tuple(np.sort(rng.permutation(g)[: int(rng.integers(2, 5))]) for _ in range(4))
+        coupled = [np.stack(np.tril_indices(len(poses)), axis=1) for poses in touched]
+        space = sparse_interface_of(touched, coupled, g, (1, d))
+        contributions = []
+        parts = []
+        K = np.full((space.side, space.side), MP.mpf(0), dtype=object)
+        for a, columns in enumerate(space.columns):
+            W = rng.standard_normal((len(columns), len(columns)))
+            added = (cancelling if a == 0 else -cancelling if a == 1 else 0.0) * (a < 2)
+            C = W @ W.T + added * np.eye(len(columns))
+            parts.append(unpacked(packed(C), len(columns)))
+            contributions.append(packed(C))  # the pattern is full
+            K[np.ix_(columns, columns)] += exact(parts[-1])
+        # more than what is subtracted where only one of the first two robots is
+        values = np.broadcast_to(np.eye(d + 1), (g, d + 1, d + 1)) * (1.0 + 2.0 * cancelling)
+        columns = np.stack([columns_of(np.array([pose]), g, (1, d)) for pose in range(g)])
+        for block in zip(columns, values, strict=True):
+            K[np.ix_(block[0], block[0])] += exact(block[1])
+        diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
+        sizes = [row_sums(C, diagonal[at]) for C, at in zip(parts, space.columns, strict=True)]
+        lost = space.rounding(sizes, [(columns, values)], diagonal)
+        space.factorize(contributions, [(columns, values)])
+        factor = space.held.factor
+        assert factor is not None
+        L, order = factor.take_apart()
+        product = np.full((space.side, space.side), MP.mpf(0), dtype=object)
+        exact_L = exact(L.toarray())
+        product[np.ix_(order, order)] = exact_L @ exact_L.T
+        difference = product - K
         assert max(largest_share(sign * difference, diagonal) for sign in (1, -1)) > 0.0
         assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
 

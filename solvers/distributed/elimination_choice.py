@@ -1,0 +1,121 @@
+"""How far robots eliminate: all of their interiors, or less where their areas interleave.
+
+Where the fronts of groups of robots would take the driver long, robots leave it the poses that
+would couple many others (`solvers.soc.subdomains`), if its sparse system is then cheaper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.cholesky import CholeskyBackend, default_backend
+from solvers.distributed.interface import Interface
+from solvers.distributed.multifrontal import FrontOwners, flops_of_fronts
+from solvers.distributed.robots.subdomain_blocks import Widths
+from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
+from solvers.soc.subgraph import RobotSummary, Subgraph
+
+# Operations of a factorisation by fronts from which another way is tried; LAPACK takes about 0.15
+# CPU seconds for so many on one thread of a processor of 2023.
+ENOUGH_FLOPS = 5e9
+# Poses that a robot couples at most by eliminating one where it leaves poses to the driver. Between
+# 8 and 32 the driver of 16 robots in the plane, 20,000 poses that interleave, takes 0.80e9 to
+# 0.96e9 operations, and the robots send 3.8 to 7.8 MB.
+MOST_COUPLED = 16
+
+
+@dataclass(frozen=True, eq=False)
+class CoverSystem:
+    """What the robots' summaries say of the driver's system.
+
+    A robot without edges touches nothing; one whose edges have no end in the cover touches no pose.
+    """
+
+    cover: IntArray  # (g,): numbers of its poses, ascending
+    touched: tuple[IntArray, ...]  # as `Interface.touched`
+    coupled: tuple[IntArray, ...] | None  # as `RobotSummary.coupled`; None where it has fronts
+    width: int  # numbers per pose
+
+    @classmethod
+    def of(cls, summaries: Sequence[RobotSummary]) -> CoverSystem:
+        """System of the robots with edges."""
+        touched = []
+        coupled = []
+        for robot in summaries:
+            if robot.touched is not None:
+                touched.append(robot.touched)
+            if robot.coupled is not None:
+                coupled.append(robot.coupled)
+        return cls(
+            cover=np.unique(np.concatenate([robot.cover for robot in summaries])),
+            touched=tuple(touched),
+            coupled=tuple(coupled) if coupled else None,
+            width=summaries[0].d + 1,
+        )
+
+    @property
+    def flops(self) -> float:
+        """Operations of a factorisation, one after the other: what robots do at a time counts once.
+
+        Where the system is sparse the driver does them all.
+        """
+        if self.coupled is None:
+            return flops_of_fronts(FrontOwners(self.touched, len(self.cover)), self.width)
+        return self.pattern.flops(self.width)
+
+    @property
+    def pattern(self) -> CoverPattern:
+        """Pattern of a sparse system."""
+        assert self.coupled is not None
+        return CoverPattern.of(self.touched, self.coupled, len(self.cover))
+
+    def interface(self, widths: Widths) -> Interface:
+        """The system for unknowns with these numbers per pose; all fronts are with the driver."""
+        g = len(self.cover)
+        if self.coupled is None:
+            return Interface(g, widths, self.touched, FrontOwners(self.touched, g))
+        no_fronts = FrontOwners((), g)
+        return SparseInterface(g, widths, self.touched, no_fronts, pattern=self.pattern)
+
+
+def may_leave_poses(system: CoverSystem) -> bool:
+    """Whether fronts take so long that robots should try to leave poses to the driver.
+
+    Only CHOLMOD (extra `fast`) factors what they leave fast enough.
+    """
+    has_cholmod = default_backend() is CholeskyBackend.CHOLMOD
+    return has_cholmod and system.flops >= ENOUGH_FLOPS
+
+
+def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
+    """Return the subgraphs with the cover for which the driver takes fewer operations."""
+    system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
+    if not may_leave_poses(system):
+        return tuple(subgraphs)
+    larger = leave_poses(subgraphs, MOST_COUPLED)
+    sparse = CoverSystem.of([subgraph.summary for subgraph in larger])
+    return larger if sparse.flops < system.flops else tuple(subgraphs)
+
+
+def leave_poses(subgraphs: Sequence[Subgraph], most_coupled: int) -> tuple[Subgraph, ...]:
+    """Return the subgraphs of robots that leave poses to the driver (`Subgraph.poses_left`)."""
+    left = [subgraph.poses_left(most_coupled) for subgraph in subgraphs]
+    held = [
+        subgraph.held_cover(of_robot) for subgraph, of_robot in zip(subgraphs, left, strict=True)
+    ]
+    return tuple(
+        subgraph.with_larger_cover(of_robot, positions)
+        for subgraph, of_robot, positions in zip(
+            subgraphs, left, positions_in_cover(held), strict=True
+        )
+    )
+
+
+def positions_in_cover(held: Sequence[IntArray]) -> list[IntArray]:
+    """Positions, in the cover of all robots, of the poses of it that every robot holds."""
+    cover = np.unique(np.concatenate(held))
+    return [np.searchsorted(cover, poses) for poses in held]

@@ -1,0 +1,121 @@
+"""Robots that leave poses to a driver with one sparse matrix: the answers of robots that do not."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from graphs import varied_graph
+from robots import Recording, arrays_in, scattered, sparse_elimination
+
+from pgo_models.graphs.grid_worlds import grid_world
+from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed import elimination_choice
+from solvers.distributed.elimination_choice import CoverSystem, choose_elimination
+from solvers.distributed.sparse_interface import SparseInterface
+from solvers.distributed.stages import open_driver
+from solvers.network.engine import InProcess
+from solvers.pipeline import solve
+from solvers.request import Pipeline
+from solvers.soc.subgraph import split_graph
+
+pytest.importorskip("cvxopt")
+
+
+@pytest.mark.parametrize(("seed", "d"), [(0, 2), (1, 3), (2, 2), (7, 3)])
+@pytest.mark.parametrize("most_coupled", [0, 3, 100])
+def test_the_numbers_are_those_of_fronts(seed: int, d: int, most_coupled: int) -> None:
+    graph = varied_graph(seed, 30, d)
+    robots = scattered(graph, seed + 4)
+    pipeline = Pipeline(staircase=None)
+    expected = solve(graph, pipeline, robots=robots)
+    with sparse_elimination(most_coupled):
+        found = solve(graph, pipeline, robots=robots)
+    assert found.objective == pytest.approx(expected.objective, rel=1e-9)
+    assert found.lower_bound == pytest.approx(expected.lower_bound, rel=1e-6, abs=1e-9)
+    assert found.certificate.verdict is expected.certificate.verdict
+    assert [stage.name for stage in found.stages] == [stage.name for stage in expected.stages]
+    start, other_start = (solution.stages[0].objective for solution in (found, expected))
+    assert start == pytest.approx(other_start, rel=1e-7)
+    assert found.ledger is not None
+    assert expected.ledger is not None
+    assert found.ledger.rounds == expected.ledger.rounds
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_the_staircase_climbs_with_a_sparse_interface(seed: int) -> None:
+    graph = varied_graph(seed, 24, 2)
+    robots = scattered(graph, 5)
+    with sparse_elimination(2):
+        driver = open_driver(PGOProblem(graph), robots, InProcess())
+        assert isinstance(driver.interface(3, 3), SparseInterface)
+        assert driver.fits(3)
+        found = solve(graph, Pipeline(), robots=robots)
+    assert found.is_certified == solve(graph, Pipeline(), robots=robots).is_certified
+
+
+def test_the_ledger_counts_the_entries_that_are_sent() -> None:
+    graph = grid_world(4, 60, np.random.default_rng(0), d=2)
+    engine = Recording()
+    with sparse_elimination(8):
+        ledger = solve(graph, Pipeline(staircase=None), robots=4, engine=engine).ledger
+    assert ledger is not None
+    off = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")
+    counted = [said for said in engine.log if said[0] not in off]
+    for robot, agent in enumerate(engine.agents):
+        answers = [answers[robot] for _, _, answers in counted]
+        sent = sum(value.size for name, value in numbers_in(answers) if name != "measured")
+        assert ledger.bytes_sent[robot] == 8 * sent
+        schur = [value.size for name, value in numbers_in(answers) if name == "schur"]
+        assert agent.interior is not None
+        pairs = agent.interior.part.subdomains.coupled
+        separators = pairs.shape[0]
+        assert pairs.nnz < separators * (separators + 1) // 2
+        off_diagonal = pairs.nnz - separators
+        for width in (1, 2, 3):  # translations, rotations at the start, poses
+            assert width**2 * off_diagonal + width * (width + 1) // 2 * separators in schur
+
+
+def numbers_in(answers: list[Any]) -> list[tuple[str, Any]]:
+    return [found for answer in answers for found in arrays_in(answer)]
+
+
+def test_robots_leave_poses_where_their_areas_interleave(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(elimination_choice, "ENOUGH_FLOPS", 0.0)
+    graph = grid_world(4, 400, np.random.default_rng(0), d=2)
+    rng = np.random.default_rng(1)
+    interleaved = partition(graph, 4).robot.copy()
+    swapped = rng.random(graph.num_poses) < 0.5
+    interleaved[swapped] = rng.permutation(interleaved[swapped])
+    for robots, is_sparse in (
+        (partition(graph, 4, PartitionMethod.METIS), False),
+        (Partition(interleaved, PartitionMethod.GIVEN), True),
+    ):
+        shares = split_graph(PGOProblem(graph), robots)
+        chosen = choose_elimination(shares)
+        assert all(share.is_sparse is is_sparse for share in chosen)
+        flops = [CoverSystem.of([s.summary for s in some]).flops for some in (shares, chosen)]
+        assert (flops[1] < flops[0]) is is_sparse
+        driver = open_driver(PGOProblem(graph), robots, InProcess())
+        assert isinstance(driver.interface(1), SparseInterface) is is_sparse
+
+
+def test_without_many_operations_nothing_is_left() -> None:
+    graph = grid_world(4, 60, np.random.default_rng(0), d=2)
+    shares = split_graph(PGOProblem(graph), partition(graph, 4))
+    assert choose_elimination(shares) == tuple(shares)
+    driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess(), memory=0)
+    assert not isinstance(driver.interface(1), SparseInterface)
+
+
+def test_memory_is_known_before_it_is_spent() -> None:
+    graph = grid_world(4, 200, np.random.default_rng(0), d=2)
+    with sparse_elimination(8):
+        driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
+    interface = driver.interface(1, 2)
+    assert isinstance(interface, SparseInterface)
+    held = interface.held
+    width = 3
+    factor = width**2 * int(interface.pattern.counts.sum())
+    sent = sum(len(positions) for positions in held.robots)
+    assert interface.num_bytes >= 8 * (factor + held.lower.nnz) + 12 * sent
