@@ -30,6 +30,7 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.edge_problem import EdgeProblem
 from pgo_models.problem.floating_point import OUTWARD, gamma
 from pgo_models.problem.incidence import blocks_of_rows, rows_of_blocks
@@ -174,6 +175,10 @@ class EdgeCost:
         # numpy sums in pairs: the result is off by a few dozen roundings, not by one an edge.
         return float(np.sum(weighted_squares))
 
+    def value_at(self, problem: EdgeProblem, poses: Poses) -> float:
+        """Sum of the costs at poses."""
+        return self.value(problem, *problem.evaluated(poses))
+
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """Cost of every edge, (m,)."""
         m = problem.graph.num_edges
@@ -192,12 +197,24 @@ class EdgeCost:
     def edge_products(self, graph: PoseGraph, X: Array, residuals: Array) -> Array:
         """Z = rho R_i, (m, d + 1, d): the residuals of every edge in the frame of pose i."""
         rho = self.residual_blocks(residuals)
-        R = unstack_transposes(X[graph.num_poses :])
+        R = np.ascontiguousarray(unstack_transposes(X[graph.num_poses :]))
         R_i = R[graph.i]
         return np.asarray(rho @ R_i)
 
-    def best_translations(self, problem: EdgeProblem, poses: Poses) -> Poses:
-        """Poses with the translations of least cost for their rotations."""
+    def translation_factor(self, problem: EdgeProblem, poses: Poses) -> CholeskyFactor | None:
+        """Factor of the matrix of the translations, where that depends on the rotations.
+
+        Of a quadratic cost it does not, and the problem has the factor.
+        """
+        return None
+
+    def best_translations(
+        self, problem: EdgeProblem, poses: Poses, factor: CholeskyFactor | None = None
+    ) -> Poses:
+        """Poses with the translations of least cost for their rotations.
+
+        The factor is `translation_factor`, of these poses unless given.
+        """
         t = problem.recover_translations(poses.R)
         return poses.with_translations(t)
 

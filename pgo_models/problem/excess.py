@@ -83,28 +83,18 @@ class Excess:
         """u, (m, q), which is linear in Z, (m, d + 1, d)."""
         return Z[:, 0]
 
-    def gradient_in_u(self, Z: Array) -> Array:
-        """J u, (m, q): half the gradient of u^T J u."""
+    def evaluate(self, Z: Array) -> tuple[Array, Array]:
+        """The excess of every edge, (m,), and C, (m, d + 1, d): half its gradient in Z."""
         u = self.argument(Z)
-        return np.asarray(np.einsum("mab,mb->ma", self.J, u))
-
-    def values(self, Z: Array) -> Array:
-        """The excess of every edge, (m,)."""
-        u = self.argument(Z)
-        J_u = self.gradient_in_u(Z)
-        return np.asarray(np.einsum("ma,ma->m", u, J_u))
-
-    def half_gradient(self, Z: Array) -> Array:
-        """C, (m, d + 1, d): half the gradient of the excess in Z."""
-        d = Z.shape[2]
+        J_u = _times_vectors(self.J, u)
         C = np.zeros_like(Z)
-        C[:, 0] = self.gradient_in_u(Z)[:, :d]
-        return C
+        C[:, 0] = J_u
+        return np.asarray(np.einsum("ma,ma->m", u, J_u)), C
 
     def tangent(self, Z: Array) -> "Tangent":
         """Tangent at Z, (m, d + 1, d)."""
-        C = self.half_gradient(Z)
-        return Tangent(C, Z, self)
+        value, C = self.evaluate(Z)
+        return Tangent(C, Z, value, self)
 
     def derivative_of_argument(self, relative_R: Array, relative_t: Array) -> Array:
         """Derivative of u in (R_i^T v_i, R_i^T v_j, w_i), (m, d, 2 d + p).
@@ -161,27 +151,28 @@ class CoupledExcess(Excess):
 
     def argument(self, Z: Array) -> Array:
         """The vectors (r, s), (m, d + p)."""
-        s = vee(self._rotation_defect(Z))
-        return np.concatenate([Z[:, 0], s], axis=1)
+        return _argument(Z, self._rotation_defect(Z))
 
-    def values(self, Z: Array) -> Array:
-        """The excess of every edge, (m,)."""
-        H = _defect_to_H(self._rotation_defect(Z))
-        K_H = self.K @ H
-        return np.asarray(super().values(Z) + np.einsum("mab,mab->m", H, K_H))
+    def evaluate(self, Z: Array) -> tuple[Array, Array]:
+        """The excess, (m,), and C, (m, d + 1, d).
 
-    def half_gradient(self, Z: Array) -> Array:
-        """C, (m, d + 1, d): the adjoints of Z -> u and Z -> H, applied to J u and K H."""
+        C is the sum of the adjoints of Z -> u and Z -> H, applied to J u and K H.
+        """
         d = Z.shape[2]
-        C = super().half_gradient(Z)
+        D = self._rotation_defect(Z)
+        u = _argument(Z, D)
+        J_u = _times_vectors(self.J, u)
+        H = _defect_to_H(D)
+        K_H = self.K @ H
+        value = np.einsum("ma,ma->m", u, J_u) + np.einsum("mab,mab->m", H, K_H)
         # The gradient in D = (R_ij Z_R)^T.
-        K_H = self.K @ _defect_to_H(self._rotation_defect(Z))
-        J_u_s = self.gradient_in_u(Z)[:, d:]
-        from_s = hat(J_u_s)
+        from_s = hat(J_u[:, d:])
         from_H = _adjoint_of_defect_to_H(K_H + np.swapaxes(K_H, 1, 2), d)
         in_D = from_s + from_H
+        C = np.empty_like(Z)
+        C[:, 0] = J_u[:, :d]
         C[:, 1:] = 0.5 * np.swapaxes(in_D @ self.R_ij, 1, 2)
-        return C
+        return np.asarray(value), C
 
     def _derivative_of_defect(self, relative_R: Array) -> Array:
         """Derivatives of D in (w_i, w_j), (m, 2 p, d, d)."""
@@ -235,12 +226,13 @@ class Tangent:
 
     C: Array  # (m, d + 1, d)
     Z: Array  # Z*, (m, d + 1, d)
+    value: Array  # the excess at Z*, (m,)
     excess: Excess
 
     def of_edges(self, chosen: IntArray | BoolArray) -> "Tangent":
         """The tangent of the chosen edges."""
         excess = self.excess.of_edges(chosen)
-        return Tangent(self.C[chosen], self.Z[chosen], excess)
+        return Tangent(self.C[chosen], self.Z[chosen], self.value[chosen], excess)
 
     def with_silent_edges(self, R_ij: Array) -> "Tangent":
         """The tangent with further edges, which have no excess; R_ij, (k, d, d), is theirs."""
@@ -248,18 +240,15 @@ class Tangent:
         return Tangent(
             np.concatenate([self.C, silent]),
             np.concatenate([self.Z, silent]),
+            np.concatenate([self.value, np.zeros(len(R_ij))]),
             self.excess.with_silent_edges(R_ij),
         )
 
     def scaled(self, share: Array) -> "Tangent":
         """The tangent times shares, (m,)."""
-        C = share[:, None, None] * self.C
-        return Tangent(C, self.Z, self.excess.scaled(share))
-
-    @cached_property
-    def value(self) -> Array:
-        """The excess at Z*, (m,)."""
-        return self.excess.values(self.Z)
+        excess = self.excess.scaled(share)
+        value, _ = excess.evaluate(self.Z)  # not a rounded product with the share
+        return Tangent(share[:, None, None] * self.C, self.Z, value, excess)
 
     @cached_property
     def value_error(self) -> Array:
@@ -313,6 +302,16 @@ class Tangent:
         num_products = products[0].size
         errors = self.value_error + gamma(num_products + 8.0) * sizes
         return total, OUTWARD * float(np.sum(errors))
+
+
+def _times_vectors(matrices: Array, vectors: Array) -> Array:
+    """Products, (m, a), of matrices (m, a, b) with vectors (m, b)."""
+    return np.asarray(np.einsum("mab,mb->ma", matrices, vectors))
+
+
+def _argument(Z: Array, D: Array) -> Array:
+    """(r, s), (m, d + p), of Z and D = E - I."""
+    return np.concatenate([Z[:, 0], vee(D)], axis=1)
 
 
 def _generators(m: int, d: int) -> Array:

@@ -25,7 +25,9 @@ from pgo_models.problem.cholesky import (
     factorize_damped,
 )
 from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.excess import Tangent
 from pgo_models.problem.incidence import Incidence
+from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.problem.weighting import (
@@ -229,6 +231,23 @@ class PGOProblem(ReadOnly):
             self._tangents[poses] = tangent
         return tangent
 
+    def tangent_of_excess(self, poses: Poses) -> Tangent:
+        """Return the tangent of the excess of chi2 that `tangent_at` has.
+
+        Parameters
+        ----------
+        poses : Poses
+            Where they touch.
+
+        Returns
+        -------
+        Tangent
+            With the value and the gradient of the excess at the poses.
+        """
+        cost = self.tangent_at(poses).weights
+        assert isinstance(cost, TangentCost)
+        return cost.tangent
+
     def with_rotation_terms(self, i: IntArray, j: IntArray, R_ij: Array, W: Array) -> "PGOProblem":
         """Return the problem with terms tr(W rho_R rho_R^T), rho_R = R_j^T - R_ij^T R_i^T.
 
@@ -431,7 +450,7 @@ class PGOProblem(ReadOnly):
         >>> bool(np.isclose(problem.objective(graph.truth), problem.edge_costs(graph.truth).sum()))
         True
         """
-        return self.objective_stacked(*self.evaluated(poses))
+        return self.weights.value_at(self, poses)
 
     def edge_costs(self, poses: Poses) -> Array:
         """Return the share of every edge in the cost.
@@ -586,20 +605,38 @@ class PGOProblem(ReadOnly):
         """
         return Poses(R, self.recover_translations(R))
 
-    def at_best_translations(self, poses: Poses) -> Poses:
+    def translation_factor(self, poses: Poses) -> CholeskyFactor | None:
+        """Factor the matrix of the translations where it depends on the rotations.
+
+        Parameters
+        ----------
+        poses : Poses
+            Their rotations count.
+
+        Returns
+        -------
+        CholeskyFactor or None
+            For `at_best_translations`; None of a quadratic cost, whose factor is kept.
+        """
+        return self.weights.translation_factor(self, poses)
+
+    def at_best_translations(self, poses: Poses, factor: CholeskyFactor | None = None) -> Poses:
         """Return the poses with the translations of least cost for their rotations.
 
         Parameters
         ----------
         poses : Poses
             Their translations count only where chi2 is not quadratic: t_0 stays where it is.
+        factor : CholeskyFactor, optional
+            The `translation_factor` of these poses. That of poses with nearly the same rotations
+            gives nearly the best translations.
 
         Returns
         -------
         Poses
             With the same rotations.
         """
-        return self.weights.best_translations(self, poses)
+        return self.weights.best_translations(self, poses, factor)
 
     def with_refined_translations(self, poses: Poses) -> Poses:
         """Return the poses after steps of iterative refinement of the translations.
@@ -738,14 +775,30 @@ class PGOProblem(ReadOnly):
         return factorize_damped(analyze(M_tt, self.backend, order), M_tt)
 
     @cached_property
+    def _translation_laplacian(self) -> matrices.BlockLaplacian:
+        return matrices.BlockLaplacian.of(self.incidence, self.d)
+
+    def translation_matrix(self, of_edges: Array) -> csc_array:
+        """Return the matrix of the translations where chi2 is not quadratic.
+
+        Parameters
+        ----------
+        of_edges : (m, d, d) array
+            Information matrices of the edges, in world axes.
+
+        Returns
+        -------
+        (d n, d n) csc_array
+            Their Laplacian, with the diagonal block of pose 0 doubled, which makes it definite.
+        """
+        return self._translation_laplacian.matrix(of_edges)
+
+    @cached_property
     def translation_information_analysis(self) -> SymbolicCholesky:
-        """Of the matrix of `at_best_translations`, whose pattern the graph alone gives."""
+        """Symbolic factorisation of `translation_matrix`, whose pattern the graph alone gives."""
         ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
-        return analyze(
-            matrices.block_laplacian(self.incidence, ones),
-            self.backend,
-            row_order(self.pose_order, self.d),
-        )
+        order = row_order(self.pose_order, self.d)
+        return analyze(self.translation_matrix(ones), self.backend, order)
 
     @cached_property
     def _M_tR(self) -> csr_array:
