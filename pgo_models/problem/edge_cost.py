@@ -290,9 +290,9 @@ class EdgeCost:
     def added_curvatures(self, graph: PoseGraph, poses: Poses) -> Sequence[Array]:
         """Second derivatives of the parts of the cost that are not quadratic in X, (m, k, k) each.
 
-        Edge (i, j) has the unknowns (R_i^T v_i, R_i^T v_j, w_i, w_j) of the moves t <- t + v and R
-        <- R exp([w]_x) of its two poses. The matrices are in the first k of these numbers. The
-        sequence is empty for a quadratic cost.
+        Edge (i, j) has the unknowns (v_i, v_j, w_i, w_j) of the moves t <- t + v and R <- R
+        exp([w]_x) of its two poses. The matrices are in the first k of these numbers. The sequence
+        is empty for a quadratic cost.
         """
         return ()
 

@@ -96,22 +96,12 @@ class Excess:
         value, C = self.evaluate(Z)
         return Tangent(C, Z, value, self)
 
-    def derivative_of_argument(self, relative_R: Array, relative_t: Array) -> Array:
-        """Derivative of u in (R_i^T v_i, R_i^T v_j, w_i), (m, d, 2 d + p).
+    def curvature(self, R_i: Array, R_j: Array, difference: Array) -> Array:
+        """The Gauss-Newton matrix of the excess, 2 (du)^T J (du), in (v_i, v_j, w_i).
 
-        The relative pose of an edge is R_i^T R_j, (m, d, d), and R_i^T (t_j - t_i), (m, d).
+        The rotations of the ends of an edge have shape (m, d, d), t_j - t_i has shape (m, d).
         """
-        m, d = relative_t.shape
-        in_v_j = np.broadcast_to(np.eye(d), (m, d, d))
-        in_w_i = -np.einsum("mkab,mb->mak", _generators(m, d), relative_t)
-        return np.concatenate([-in_v_j, in_v_j, in_w_i], axis=2)
-
-    def curvature(self, relative_R: Array, relative_t: Array) -> Array:
-        """The Gauss-Newton matrix of the excess, 2 (du)^T J (du).
-
-        Its unknowns are those of the derivative of u.
-        """
-        du = self.derivative_of_argument(relative_R, relative_t)
+        du = _derivative_of_r(R_i, difference)
         return np.asarray(2.0 * np.swapaxes(du, 1, 2) @ self.J @ du)
 
     def relative_rounding(self, d: int) -> float:
@@ -174,41 +164,30 @@ class CoupledExcess(Excess):
         C[:, 1:] = 0.5 * np.swapaxes(in_D @ self.R_ij, 1, 2)
         return np.asarray(value), C
 
-    def _derivative_of_defect(self, relative_R: Array) -> Array:
+    def _derivative_of_defect(self, R_i: Array, R_j: Array) -> Array:
         """Derivatives of D in (w_i, w_j), (m, 2 p, d, d)."""
-        m, d, _ = relative_R.shape
-        generators = _generators(m, d)
+        generators = hat(np.eye(tangent_dimension(R_i.shape[1])))
+        relative_R = np.swapaxes(R_i, 1, 2) @ R_j
         R_ij_transposed = np.swapaxes(self.R_ij, 1, 2)
         E = relative_R @ R_ij_transposed
-        in_w_i = -generators @ E[:, None]
-        in_w_j = relative_R[:, None] @ generators @ R_ij_transposed[:, None]
-        return np.concatenate([in_w_i, in_w_j], axis=1)
+        in_w_i = [-generator @ E for generator in generators]
+        in_w_j = [relative_R @ generator @ R_ij_transposed for generator in generators]
+        return np.stack([*in_w_i, *in_w_j], axis=1)
 
-    def derivative_of_argument(self, relative_R: Array, relative_t: Array) -> Array:
-        """Derivative of u in (R_i^T v_i, R_i^T v_j, w_i, w_j), (m, d + p, 2 d + 2 p)."""
-        m, d = relative_t.shape
+    def curvature(self, R_i: Array, R_j: Array, difference: Array) -> Array:
+        """The Gauss-Newton matrix in (v_i, v_j, w_i, w_j), with that of tr(H K H)."""
+        m, d = difference.shape
         p = tangent_dimension(d)
-        dr = super().derivative_of_argument(relative_R, relative_t)
-        dr_in_w_j = np.zeros((m, d, p))
-        dr = np.concatenate([dr, dr_in_w_j], axis=2)
-        dD = self._derivative_of_defect(relative_R).reshape(-1, d, d)
-        ds_in_w = vee(dD).reshape(m, 2 * p, p)
-        ds_in_v = np.zeros((m, p, 2 * d))
-        ds = np.concatenate([ds_in_v, np.swapaxes(ds_in_w, 1, 2)], axis=2)
-        return np.concatenate([dr, ds], axis=1)
-
-    def curvature(self, relative_R: Array, relative_t: Array) -> Array:
-        """The Gauss-Newton matrix, with that of tr(H K H) in (w_i, w_j)."""
-        m, d = relative_t.shape
-        p = tangent_dimension(d)
-        dD = self._derivative_of_defect(relative_R).reshape(-1, d, d)
-        dH = _defect_to_H(dD).reshape(m, 2 * p, p, p)
-        dH = np.moveaxis(dH, 1, 3)
-        K_dH = np.einsum("mab,mbck->mack", self.K, dH)
-        curvature = super().curvature(relative_R, relative_t)
-        of_w = curvature[:, 2 * d :, 2 * d :]
-        of_w += 2.0 * np.einsum("mabk,mabl->mkl", dH, K_dH)
-        return curvature
+        dD = self._derivative_of_defect(R_i, R_j).reshape(-1, d, d)
+        of_w = slice(2 * d, 2 * d + 2 * p)
+        du = np.zeros((m, d + p, 2 * d + 2 * p))
+        du[:, :d, : 2 * d + p] = _derivative_of_r(R_i, difference)
+        du[:, d:, of_w] = np.swapaxes(vee(dD).reshape(m, 2 * p, p), 1, 2)
+        curvature = 2.0 * np.swapaxes(du, 1, 2) @ self.J @ du
+        dH = _defect_to_H(dD).reshape(m, 2 * p, p * p)
+        K_dH = self.K[:, None] @ dH.reshape(m, 2 * p, p, p)
+        curvature[:, of_w, of_w] += 2.0 * dH @ np.swapaxes(K_dH.reshape(m, 2 * p, -1), 1, 2)
+        return np.asarray(curvature)
 
     def relative_rounding(self, d: int) -> float:
         """8 d times that of r alone, as every entry of s and H is a sum of entries of R_ij Z_R."""
@@ -314,11 +293,17 @@ def _argument(Z: Array, D: Array) -> Array:
     return np.concatenate([Z[:, 0], vee(D)], axis=1)
 
 
-def _generators(m: int, d: int) -> Array:
-    """Skew matrices hat(e_k) of the unit vectors, (m, p, d, d), repeated for every edge."""
-    p = tangent_dimension(d)
-    generators = hat(np.eye(p))
-    return np.broadcast_to(generators, (m, p, d, d))
+def _derivative_of_r(R_i: Array, difference: Array) -> Array:
+    """Derivative of r = R_i^T (t_j - t_i) - t_ij in (v_i, v_j, w_i), (m, d, 2 d + p)."""
+    m, d = difference.shape
+    generators = hat(np.eye(tangent_dimension(d)))
+    R_i_transposed = np.swapaxes(R_i, 1, 2)
+    relative_t = np.einsum("mba,mb->ma", R_i, difference)
+    derivative = np.empty((m, d, 2 * d + len(generators)))
+    derivative[:, :, :d] = -R_i_transposed
+    derivative[:, :, d : 2 * d] = R_i_transposed
+    derivative[:, :, 2 * d :] = -np.einsum("kab,mb->mak", generators, relative_t)
+    return derivative
 
 
 def _defect_to_H(D: Array) -> Array:

@@ -133,11 +133,8 @@ class ExcessCost(EdgeCost):
 
         The rest of the Hessian of the excess is that of its tangent, which is quadratic in X.
         """
-        R_i = poses.R[graph.i]
-        relative_R = np.swapaxes(R_i, 1, 2) @ poses.R[graph.j]
         difference = poses.t[graph.j] - poses.t[graph.i]
-        relative_t = np.einsum("mba,mb->ma", R_i, difference)
-        return (self.excess.curvature(relative_R, relative_t),)
+        return (self.excess.curvature(poses.R[graph.i], poses.R[graph.j], difference),)
 
     def value_errors(
         self, problem: EdgeProblem, poses: Poses, e_t: Array, e_R: float

@@ -173,15 +173,9 @@ class BlockLaplacian:
     def of(cls, incidence: Incidence, d: int) -> BlockLaplacian:
         """The Laplacians of a graph."""
         n = incidence.begins.shape[0]
-        columns = rotation_columns(short(np.arange(n)), 0, d)
-        columns_i = rotation_columns(short(incidence.i), 0, d)
-        columns_j = rotation_columns(short(incidence.j), 0, d)
-        blocks = [
-            block_entries(columns, columns),
-            block_entries(columns_i, columns_j),
-            block_entries(columns_j, columns_i),
-        ]
-        return cls(incidence, SummedPattern.of(blocks, d * n))
+        every_pose = np.arange(n)
+        pairs = [(every_pose, every_pose), (incidence.i, incidence.j), (incidence.j, incidence.i)]
+        return cls(incidence, SummedPattern.of(pairs, n).of_blocks(d))
 
     def matrix(self, of_edges: Array) -> csc_array:
         """Laplacian with symmetric weights, (m, d, d), the diagonal block of pose 0 doubled.
@@ -263,6 +257,23 @@ class SummedPattern:
         indptr = np.concatenate([[0], np.cumsum(column_lengths)])
         return cls(rows[is_new], short(indptr), positions)
 
+    def of_blocks(self, d: int) -> SummedPattern:
+        """The pattern with a block of d x d entries in place of each."""
+        side = len(self.indptr) - 1
+        lengths = np.diff(self.indptr)
+        columns = np.repeat(np.arange(side), lengths)
+        # Column c becomes d columns, each with d entries in place of one.
+        rank = np.arange(len(self.indices)) - self.indptr[columns]
+        first = d * d * self.indptr[columns] + d * rank
+        within = np.arange(d)
+        to_next_column = d * lengths[columns]
+        positions = first[:, None, None] + within[:, None] + to_next_column[:, None, None] * within
+        indices = np.empty(positions.size, dtype=self.indices.dtype)
+        indices[positions] = (d * self.indices[:, None] + within)[:, :, None]
+        indptr = np.concatenate([[0], np.cumsum(np.repeat(d * lengths, d))])
+        of_triplets: IntArray = positions[self.positions]
+        return SummedPattern(indices, short(indptr), of_triplets.ravel())
+
     def matrix(self, values: list[Array]) -> csc_array:
         """The matrix with these values of the triplets, in the order of the blocks."""
         all_values = np.concatenate([np.ravel(of_block) for of_block in values])
@@ -298,6 +309,12 @@ def entry_positions(matrix: csc_array, rows: IntArray, columns: IntArray) -> Int
     stored = np.repeat(all_columns, column_lengths) * side + matrix.indices
     wanted = columns.astype(np.int64) * side + rows
     return np.searchsorted(stored, wanted)
+
+
+def diagonal_positions(matrix: csc_array) -> IntArray:
+    """Positions in `matrix.data` of the diagonal, (N,), of which every entry is stored."""
+    columns = np.repeat(short(np.arange(matrix.shape[1])), np.diff(matrix.indptr))
+    return np.flatnonzero(matrix.indices == columns)
 
 
 def meets(matrix: csc_array, rows: IntArray) -> BoolArray:

@@ -163,7 +163,8 @@ class PGOProblem(ReadOnly):
         """
         if self.is_quadratic and self.weights.is_convex:
             return self
-        return replace(self, weighting=convex_cost(self._information, self.d))
+        cost = convex_cost(self._information, self.d)
+        return _SharingProblem(self.graph, self.backend, cost, original=self)
 
     def check_quadratic(self, method: str, convex: bool = False) -> None:
         """Raise an error where a method needs a cost that is quadratic, or convex, and it is not.
@@ -346,16 +347,16 @@ class PGOProblem(ReadOnly):
     @cached_property
     def diagonal_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal of M, (N,)."""
-        all_rows = np.arange(self.side)
-        return read_only(matrices.entry_positions(self.M, all_rows, all_rows))
+        return read_only(matrices.diagonal_positions(self.M))
 
     @cached_property
     def block_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal d x d rotation blocks of M, (n, d, d)."""
-        n = self.num_poses
         d = self.d
-        block = matrices.rotation_columns(np.arange(n), n, d)
-        return read_only(matrices.entry_positions(self.M, *matrices.block_entries(block, block)))
+        # The rows of a block follow each other in each of its columns.
+        from_diagonal = np.arange(d)[:, None] - np.arange(d)
+        diagonal = self.diagonal_positions[self.num_poses :].reshape(-1, 1, d)
+        return read_only(diagonal + from_diagonal)
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
         """Return the matrix that has the pattern of M and given values.
@@ -810,13 +811,28 @@ class PGOProblem(ReadOnly):
 
 
 @dataclass(frozen=True, eq=False)
-class _TangentProblem(PGOProblem):
-    """A tangent of chi2, which has the graph of the `original` and what follows from that alone."""
+class _SharingProblem(PGOProblem):
+    """Another cost of the graph of an `original`, which has what follows from the graph alone."""
 
     original: PGOProblem = field(kw_only=True)
 
     def __post_init__(self) -> None:
         """Accept what the original was accepted with."""
+
+    @cached_property
+    def incidence(self) -> Incidence:
+        """Which edges begin and end at a pose."""
+        return self.original.incidence
+
+    @cached_property
+    def pose_order(self) -> IntArray:
+        """Order of elimination of the poses."""
+        return self.original.pose_order
+
+
+@dataclass(frozen=True, eq=False)
+class _TangentProblem(_SharingProblem):
+    """A tangent of chi2."""
 
     @cached_property
     def residual_matrix(self) -> tuple[csr_array, Array]:
@@ -837,16 +853,6 @@ class _TangentProblem(PGOProblem):
     def residual_adjoint(self) -> csc_array:
         """A^T."""
         return self.original.residual_adjoint
-
-    @cached_property
-    def incidence(self) -> Incidence:
-        """Which edges begin and end at a pose."""
-        return self.original.incidence
-
-    @cached_property
-    def pose_order(self) -> IntArray:
-        """Order of elimination of the poses."""
-        return self.original.pose_order
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:
