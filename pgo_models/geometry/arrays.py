@@ -120,3 +120,17 @@ def _numbers(values: object, name: str, wanted: str, error: type[PGOError]) -> N
 def _needs_copy(array: NDArray[Any], dtype: type[np.generic]) -> bool:
     """Whether an array has another type, or others may write to it."""
     return array.dtype != dtype or array.flags.writeable or not array.flags.owndata
+
+
+def inner_products(A: Array, B: Array) -> Array:
+    """Inner products <A_e, B_e>, (m,), of arrays (m, ..) of one shape.
+
+    For many small blocks this takes a fraction of the time of a product and a sum over axes.
+    """
+    m = len(A)
+    return np.asarray(np.einsum("mk,mk->m", A.reshape(m, -1), B.reshape(m, -1)))
+
+
+def block_norms(A: Array) -> Array:
+    """Frobenius norms ||A_e||, (m,), of blocks (m, ..)."""
+    return np.asarray(np.sqrt(inner_products(A, A)))

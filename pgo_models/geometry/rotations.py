@@ -163,7 +163,7 @@ def _determinants(X: Array) -> Array:
 
 def _columns(rows: Array) -> Array:
     """Views of the columns of rows (.., k), k of them."""
-    return np.moveaxis(rows, -1, 0)
+    return rows.transpose(-1, *range(rows.ndim - 1))
 
 
 def _cofactors(X: Array) -> tuple[Array, Array]:

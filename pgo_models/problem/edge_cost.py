@@ -27,6 +27,7 @@ from typing import Self
 
 import numpy as np
 
+from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -183,7 +184,7 @@ class EdgeCost:
         """Cost of every edge, (m,)."""
         m = problem.graph.num_edges
         _, w = problem.residual_matrix
-        row_costs = w * np.sum(residuals**2, axis=1)
+        row_costs = w * inner_products(residuals, residuals)
         translation_costs = row_costs[:m]
         rotation_costs = row_costs[m:].reshape(m, problem.d).sum(axis=1)
         return np.asarray(translation_costs + rotation_costs)
@@ -359,7 +360,7 @@ class EdgeCost:
         G = self.apply_weights(rho)
         G_size = self.apply_absolute_weights(rho_size)
         G_error = self.apply_absolute_weights(errors)
-        value = np.sum(G * rho, axis=(1, 2))
+        value = inner_products(G, rho)
         # Errors of rho.
         value_error = float(np.sum((2.0 * G_size + G_error) * errors))
         # Rounding of <G, rho>.

@@ -29,6 +29,7 @@ from typing import Self
 
 import numpy as np
 
+from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, gamma
@@ -248,7 +249,7 @@ class Tangent:
         """
         share, length = self._rounding
         ratios = self.excess.size**2 / self.excess.least
-        sizes = np.sum(ratios, axis=1)
+        sizes = ratios[:, 0] + ratios[:, 1]
         return np.asarray(OUTWARD * 32.0 * (share * length) ** 2 * sizes)
 
     @cached_property
@@ -259,26 +260,27 @@ class Tangent:
         """
         d = self.Z.shape[2]
         size = self.excess.size
-        norm_t = np.linalg.norm(self.Z[:, 0], axis=1)
-        norm_R = np.linalg.norm(self.Z[:, 1:], axis=(1, 2))
+        norm_t = block_norms(self.Z[:, 0])
+        norm_R = block_norms(self.Z[:, 1:])
         length = size[:, 0] * norm_t
         length += size[:, 1] * norm_R
         return self.excess.relative_rounding(d), length
 
     def values(self, Z: Array) -> Array:
         """The minorant of every edge, (m,)."""
-        slopes = np.sum(self.C * (Z - self.Z), axis=(1, 2))
+        slopes = inner_products(self.C, Z - self.Z)
         return np.asarray(self.value - self.loss + 2.0 * slopes)
 
     @property
     def constant(self) -> tuple[float, float]:
         """The sum of value - loss - 2 <C, Z*>, and a bound on its rounding error."""
-        products = 2.0 * self.C * self.Z
-        of_edges = self.value - self.loss - np.sum(products, axis=(1, 2))
+        of_edges = self.value - self.loss - 2.0 * inner_products(self.C, self.Z)
         total = math.fsum(of_edges)
         # Rounding: of the sum over the entries of an edge, and of a few operations beside it.
-        sizes = np.abs(self.value) + self.loss + np.sum(np.abs(products), axis=(1, 2))
-        num_products = products[0].size
+        sizes = (
+            np.abs(self.value) + self.loss + 2.0 * inner_products(np.abs(self.C), np.abs(self.Z))
+        )
+        num_products = self.C[0].size
         errors = self.value_error + gamma(num_products + 8.0) * sizes
         return total, OUTWARD * float(np.sum(errors))
 

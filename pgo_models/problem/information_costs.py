@@ -12,6 +12,7 @@ from typing import Self
 
 import numpy as np
 
+from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -151,12 +152,12 @@ class ExcessCost(EdgeCost):
         d = problem.d
         tangent = problem.tangent_of_excess(poses)
         C = tangent.C
-        C_norm_t = np.linalg.norm(C[:, 0], axis=1)
-        C_norm_R = np.linalg.norm(C[:, 1:], axis=(1, 2))
-        row_norms = np.linalg.norm(tangent.Z, axis=2)
+        C_norm_t = block_norms(C[:, 0])
+        C_norm_R = block_norms(C[:, 1:])
+        row_norms = np.sqrt(np.einsum("mab,mab->ma", tangent.Z, tangent.Z))
         omega = poses.orthogonality_error + d * gamma(d + 2)
         error_t = e_t + omega * row_norms[:, 0]
-        error_R = e_R + omega * row_norms[:, 1:].sum(axis=1)
+        error_R = e_R + omega * np.einsum("ma->m", row_norms[:, 1:])
         summation_error = PAIRWISE_SUM * UNIT_ROUNDOFF * np.abs(tangent.value)
         rounding = tangent.value_error + summation_error
         return [
@@ -335,7 +336,7 @@ class TangentCost(EdgeCost):
         P_size = np.abs(P_transposed)
         # The value, and its error.
         difference = rho @ P_transposed - tangent.Z
-        linear_part = 2.0 * np.sum(C * difference, axis=(1, 2))
+        linear_part = 2.0 * inner_products(C, difference)
         constant = tangent.value - tangent.loss
         product_errors = errors + gamma(d + 1) * rho_size
         difference_error = product_errors @ P_size

@@ -267,12 +267,12 @@ class SummedPattern:
         first = d * d * self.indptr[columns] + d * rank
         within = np.arange(d)
         to_next_column = d * lengths[columns]
-        positions = first[:, None, None] + within[:, None] + to_next_column[:, None, None] * within
+        in_column = first[:, None, None] + within[:, None]
+        positions = cast("IntArray", in_column + to_next_column[:, None, None] * within)
         indices = np.empty(positions.size, dtype=self.indices.dtype)
         indices[positions] = (d * self.indices[:, None] + within)[:, :, None]
         indptr = np.concatenate([[0], np.cumsum(np.repeat(d * lengths, d))])
-        of_triplets: IntArray = positions[self.positions]
-        return SummedPattern(indices, short(indptr), of_triplets.ravel())
+        return SummedPattern(indices, short(indptr), positions[self.positions].ravel())
 
     def matrix(self, values: list[Array]) -> csc_array:
         """The matrix with these values of the triplets, in the order of the blocks."""
