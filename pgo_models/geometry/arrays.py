@@ -1,5 +1,6 @@
 """Numbers as frozen objects hold them: checked, never cast silently, in read-only arrays."""
 
+import math
 import operator
 from contextlib import suppress
 from functools import cached_property
@@ -127,8 +128,8 @@ def inner_products(A: Array, B: Array) -> Array:
 
     For many small blocks this takes a fraction of the time of a product and a sum over axes.
     """
-    m = len(A)
-    return np.asarray(np.einsum("mk,mk->m", A.reshape(m, -1), B.reshape(m, -1)))
+    shape = (len(A), math.prod(A.shape[1:]))  # there may be no block
+    return np.asarray(np.einsum("mk,mk->m", A.reshape(shape), B.reshape(shape)))
 
 
 def block_norms(A: Array) -> Array:

@@ -189,23 +189,44 @@ def are_definite(blocks: Array, least: float) -> BoolArray:
 
     They are scaled first, to ones where the diagonal is positive.
     """
-    scaled, _ = scaled_blocks(blocks)
-    shifted = scaled - least * np.eye(blocks.shape[1])
-    try:
-        np.linalg.cholesky(shifted)
-    except np.linalg.LinAlgError:  # some are not; eigenvalues say which
-        smallest = np.linalg.eigvalsh(shifted)[:, 0]
-        return np.asarray(smallest > 0.0)
-    return np.ones(len(blocks), dtype=bool)
+    # The blocks come last, (k, k, m): then every operation runs through contiguous memory.
+    shifted = np.ascontiguousarray(np.moveaxis(blocks, 0, -1))
+    diagonal = np.einsum("kkm->km", shifted)  # a view
+    scale = _scale_to_ones(diagonal)
+    shifted *= scale[:, None]
+    shifted *= scale
+    diagonal -= least
+    if _have_positive_pivots(shifted.copy()):
+        return np.ones(len(blocks), dtype=bool)
+    smallest = np.linalg.eigvalsh(np.moveaxis(shifted, -1, 0))[:, 0]
+    return np.asarray(smallest > 0.0)
+
+
+def _have_positive_pivots(U: Array) -> bool:
+    """Whether all blocks, (k, k, m), have a factor L D L^T with D > 0, as definite ones have.
+
+    All are eliminated at once, in a fraction of the time of their Cholesky factors. The array is
+    overwritten.
+    """
+    for k in range(len(U)):
+        pivot = U[k, k].copy()
+        if not (pivot > 0.0).all():
+            return False
+        U[k + 1 :] -= U[k + 1 :, k, None] / pivot * U[k]
+    return True
+
+
+def _scale_to_ones(diagonal: Array) -> Array:
+    """What scales rows and columns so that a positive diagonal becomes one."""
+    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)))
 
 
 def scaled_blocks(blocks: Array) -> tuple[Array, Array]:
     """Blocks D A D, (m, k, k), with ones on the diagonal where that is positive, and D, (m, k)."""
-    diagonal = np.einsum("mkk->mk", blocks)
-    positive = np.where(diagonal > 0.0, diagonal, 1.0)
-    scale = 1.0 / np.sqrt(positive)
-    scaled_rows = blocks * scale[:, :, None]
-    return scaled_rows * scale[:, None, :], scale
+    scale = _scale_to_ones(np.einsum("mkk->mk", blocks))
+    scaled = blocks * scale[:, :, None]
+    scaled *= scale[:, None, :]
+    return scaled, scale
 
 
 def uncoupled_share(information: Array, d: int) -> Array:

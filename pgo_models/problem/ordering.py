@@ -12,7 +12,12 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.cholesky import CholeskyBackend, factorize, minimum_degree
+from pgo_models.problem.cholesky import (
+    CholeskyBackend,
+    SymbolicCholesky,
+    analyze,
+    minimum_degree,
+)
 from pgo_models.problem.floating_point import FactorCounts
 
 # Number of poses, by the dimension of space, from which METIS saves time. It takes six to ten times
@@ -32,6 +37,11 @@ def pose_order(graph: PoseGraph) -> IntArray:
     return np.array(order, dtype=np.int64)  # a copy: CVXOPT takes no C long long
 
 
+def analyze_poses(graph: PoseGraph, poses: IntArray) -> SymbolicCholesky:
+    """Symbolic factorisation, by CHOLMOD, of a matrix with one entry for two poses on an edge."""
+    return analyze(_pattern(graph), CholeskyBackend.CHOLMOD, poses)
+
+
 def row_order(poses: IntArray, *widths: int) -> IntArray:
     """Order of the rows that belongs to an order of the poses.
 
@@ -42,17 +52,15 @@ def row_order(poses: IntArray, *widths: int) -> IntArray:
     return np.argsort(row_ranks, kind="stable")
 
 
-def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts:
+def most_counts(poses: SymbolicCholesky, *widths: int) -> FactorCounts:
     """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
 
-    All entries of every block that fills in are counted. CHOLMOD stores further zeros to have wider
-    supernodes; they are exact and add no rounding.
+    The analysis is that of a matrix with one entry for each of the blocks, in that order of the
+    poses. All entries of every block that fills in are counted. CHOLMOD stores further zeros to
+    have wider supernodes; they are exact and add no rounding.
     """
-    pattern = _pattern(graph)
     width = sum(widths)
-    pattern.data[:] = 0.0
-    pattern.setdiag(1.0)
-    L, order = factorize(pattern, CholeskyBackend.CHOLMOD, poses).take_apart()
+    L, order = poses.factorize(poses.identity()).take_apart()
     of_poses = FactorCounts.of(L.indptr, L.indices, order)
     # A block that fills in has `width` rows and columns, all of which count as non-zeros.
     return FactorCounts(

@@ -336,7 +336,7 @@ class PGOProblem(ReadOnly):
         if self.convex_part is not self:
             return self.convex_part.analysis
         order = row_order(self.pose_order, 1, self.d)
-        counts = partial(most_counts, self.graph, self.pose_order, 1, self.d)
+        counts = partial(most_counts, self._pose_analysis, 1, self.d)
         return analyze(self.M, self.backend, order, counts)
 
     @cached_property
@@ -587,9 +587,9 @@ class PGOProblem(ReadOnly):
         (n, k) array
             Solutions.
         """
-        t = np.zeros(b.shape)
-        t[1:] = self._translation_factor.solve(b[1:])
-        return t
+        without_pose_0 = b.copy()
+        without_pose_0[0] = 0.0
+        return self._translation_factor.solve(without_pose_0)
 
     def with_best_translations(self, R: Array) -> Poses:
         """Return poses with given rotations and the translations of `recover_translations`.
@@ -769,11 +769,22 @@ class PGOProblem(ReadOnly):
         return self.weights.edge_products(self.graph, X, residuals)
 
     @cached_property
+    def _M_tt(self) -> csc_array:
+        return self.M[: self.num_poses, : self.num_poses].tocsc()
+
+    @cached_property
+    def _pose_analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of the pattern of M_tt, with one entry for a block of poses."""
+        return analyze(self._M_tt, self.backend, self.pose_order)
+
+    @cached_property
     def _translation_factor(self) -> CholeskyFactor:
-        n = self.num_poses
-        order = self.pose_order[self.pose_order > 0] - 1
-        M_tt = self.M[1:n, 1:n].tocsc()
-        return factorize_damped(analyze(M_tt, self.backend, order), M_tt)
+        """Factor of M_tt, in which pose 0 has its diagonal entry alone."""
+        grounded = self._M_tt.copy()
+        of_pose_0 = matrices.meets(grounded, np.zeros(1, dtype=np.int64))
+        of_pose_0[matrices.diagonal_positions(grounded)] = False
+        grounded.data[of_pose_0] = 0.0
+        return factorize_damped(self._pose_analysis, grounded)
 
     @cached_property
     def _translation_laplacian(self) -> matrices.BlockLaplacian:

@@ -258,7 +258,8 @@ class _Rounded(RotationWeights):
         U^T rho_R has the norm of rho_R.
         """
         m = len(self.kappa)
-        blocks = rows.reshape(m, -1)
+        d = rows.shape[1]
+        blocks = rows.reshape(m, d, d)
         squares = inner_products(blocks, blocks)
         error = self.error + self._error_of_axes(rows.shape[1])
         return float(np.sum(error * squares))
