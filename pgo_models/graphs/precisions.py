@@ -238,12 +238,43 @@ def uncoupled_share(information: Array, d: int) -> Array:
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
-    I_rt = np.swapaxes(I_tr, 1, 2)
-    left = np.linalg.solve(filled(I_rr), I_rt)
-    right = np.linalg.solve(filled(I_tt), I_tr)
-    eigenvalues = np.linalg.eigvals(left @ right)
-    squared_norm = np.abs(eigenvalues).max(axis=1)
+    product = eliminated_products(filled(I_tt), I_tr)
+    if product.shape[1] == 1:
+        squared_norm = np.abs(product / filled(I_rr))[:, 0, 0]
+    else:
+        eigenvalues = np.linalg.eigvals(np.linalg.solve(filled(I_rr), product))
+        squared_norm = np.abs(eigenvalues).max(axis=1)
     return np.asarray(1.0 - np.sqrt(squared_norm))
+
+
+def eliminated_products(A: Array, B: Array) -> Array:
+    """B^T A^-1 B, (m, p, p), of definite blocks A, (m, k, k), and B, (m, k, p).
+
+    All blocks are eliminated at once, A = L D L^T: it is the product of D^-1/2 L^-1 B with itself.
+    """
+    # The blocks come last, as in `are_definite`.
+    U = np.moveaxis(A, 0, -1).copy()
+    V = np.moveaxis(B, 0, -1).copy()
+    products = np.zeros((B.shape[2], B.shape[2], len(B)))
+    for k in range(len(U)):
+        pivot = U[k, k].copy()
+        products += V[k, :, None] * V[k] / pivot
+        multiplier = U[k + 1 :, k, None] / pivot
+        U[k + 1 :] -= multiplier * U[k]
+        V[k + 1 :] -= multiplier * V[k]
+    return np.moveaxis(products, -1, 0)
+
+
+def smallest_eigenvalues(blocks: Array) -> Array:
+    """Smallest eigenvalue, (m,), of symmetric blocks (m, k, k)."""
+    size = blocks.shape[1]
+    if size == 1:
+        return np.asarray(blocks[:, 0, 0])
+    if size > 2:
+        return np.asarray(np.linalg.eigvalsh(blocks)[:, 0])
+    mean = 0.5 * (blocks[:, 0, 0] + blocks[:, 1, 1])
+    half_difference = 0.5 * (blocks[:, 0, 0] - blocks[:, 1, 1])
+    return np.asarray(mean - np.hypot(half_difference, blocks[:, 1, 0]))
 
 
 def condition(blocks: Array) -> Array:

@@ -293,6 +293,11 @@ class PGOProblem(ReadOnly):
         """`evaluated` of the poses that are still in use: it goes when they do."""
         return WeakKeyDictionary()
 
+    @cached_property
+    def _half_gradients(self) -> "WeakKeyDictionary[Poses, Array]":
+        """`apply_M_at` of the poses that are still in use: it goes when they do."""
+        return WeakKeyDictionary()
+
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
 
     @cached_property
@@ -479,9 +484,13 @@ class PGOProblem(ReadOnly):
         Returns
         -------
         (N, d) array
-            In the rows of X.
+            In the rows of X, read-only: it is computed once for these poses.
         """
-        return self.tangent_at(poses).apply_M(*self.evaluated(poses))
+        half_gradient = self._half_gradients.get(poses)
+        if half_gradient is None:
+            half_gradient = self.tangent_at(poses).apply_M(*self.evaluated(poses))
+            self._half_gradients[poses] = read_only(half_gradient)
+        return half_gradient
 
     def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
         """Return M X = A^T (w A X) by way of the residuals.
