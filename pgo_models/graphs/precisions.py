@@ -190,7 +190,7 @@ def are_definite(blocks: Array, least: float) -> BoolArray:
     They are scaled first, to ones where the diagonal is positive.
     """
     # The blocks come last, (k, k, m): then every operation runs through contiguous memory.
-    shifted = np.ascontiguousarray(np.moveaxis(blocks, 0, -1))
+    shifted = np.moveaxis(blocks, 0, -1).copy()
     diagonal = np.einsum("kkm->km", shifted)  # a view
     scale = _scale_to_ones(diagonal)
     shifted *= scale[:, None]

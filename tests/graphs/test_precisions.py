@@ -112,7 +112,9 @@ def test_small_blocks_are_eliminated_like_single_matrices(k: int) -> None:
     np.testing.assert_allclose(smallest_eigenvalues(A), smallest, rtol=1e-12, atol=1e-13)
     products = [b.T @ np.linalg.solve(a, b) for a, b in zip(A, B, strict=True)]
     np.testing.assert_allclose(eliminated_products(A, B), products, rtol=1e-11, atol=1e-12)
+    as_given = A.copy()
     assert are_definite(A, 0.0).all()
+    np.testing.assert_array_equal(A, as_given)
     indefinite = A.copy()
     indefinite[7] -= 2.0 * smallest[7] * np.eye(k)
     assert np.flatnonzero(~are_definite(indefinite, 0.0)).tolist() == [7]
