@@ -18,7 +18,7 @@ from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 
 # Decrement of a stationary point of chi2. What is left weighs more in its bound than in that of F,
 # because the tangent is softer than chi2 itself.
-STATIONARY_FOR_TANGENTS = 1e-15
+STATIONARY_FOR_TANGENTS = 1e-16
 SMALL_DECREMENT = 1e-9  # decrement that a Newton step squares
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
 SUFFICIENT = 1e-4  # Armijo's constant
