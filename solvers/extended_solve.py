@@ -61,7 +61,7 @@ def solve_extended(
             f"{' and '.join(asked)} go with priors alone, and there are {left_out[0]}; "
             "leave that out"
         )
-    with_known_priors = replace(problem, graph=graph)
+    with_known_priors = PGOProblem(graph, problem.backend, problem.weighting)
     known_start = None if start is None else graph.completed(start)
     solution = solve_once(with_known_priors, start=known_start, time_limit=monitor.left)
     if not left_out:

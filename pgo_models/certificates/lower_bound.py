@@ -75,6 +75,7 @@ from pgo_models.certificates.dual_variables import check_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
 from pgo_models.errors import SettingError
+from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.graphs.pose_graph import IntArray, middle_pose
@@ -325,7 +326,7 @@ def squared_distances(moved: Array, rotations: Array) -> float:
     d = rotations.shape[1]
     blocks = rotations.reshape(-1, d, d)
     moves = (moved - rotations).reshape(-1, d * d)
-    away = np.linalg.norm(moves, axis=1)
+    away = block_norms(moves)
     apart = math.sqrt(8.0) + orthogonality_error(blocks) + away
     return OUTWARD * float(np.sum(apart**2))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -40,7 +41,7 @@ def has_safe_scale(problem: PGOProblem) -> bool:
     does no harm.
     """
     offsets = problem.weights.seen_offsets(problem.graph.t_ij)
-    squared_lengths = np.sum(offsets**2, axis=1)
+    squared_lengths = inner_products(offsets, offsets)
     longest = np.maximum(1.0, squared_lengths)
     sizes = problem.weights.weight_sizes(longest)
     smallest = sizes[sizes > 0.0].min(initial=np.inf)
@@ -122,12 +123,10 @@ def evaluate_multipliers(Lambda: Array, P: Array) -> Evaluation:
     # Errors of the defect: a product of sums of d, and one subtraction.
     product_size = P_size @ np.abs(transposed)
     defect_error = gamma(d) * product_size + UNIT_ROUNDOFF * np.abs(defect)
-    terms = Lambda * defect
-    term_sums = terms.reshape(-1, d * d).sum(axis=1)
-    value = exact_sum(term_sums)
+    value = exact_sum(inner_products(Lambda, defect))
     # They enter with the weights |Lambda|; the products and the sum of d^2 of them round, too.
     of_defects = float(np.sum(Lambda_size * defect_error))
-    size_of_terms = float(np.sum(np.abs(terms)))
+    size_of_terms = float(np.sum(Lambda_size * np.abs(defect)))
     value_error = of_defects + gamma(d * d + 3) * size_of_terms
     product = -(Lambda @ P)
     product_error = OUTWARD * gamma(d) * (Lambda_size @ P_size)
@@ -247,21 +246,21 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     d = problem.d
     m = problem.graph.num_edges
     offsets = poses.t[graph.j] - poses.t[graph.i]
-    distances = np.linalg.norm(offsets, axis=1)
+    distances = block_norms(offsets)
     e_t, e_R = _residual_errors(problem, poses, distances)
     _, residuals = problem.evaluated(poses)
     _, w = problem.residual_matrix
     # sum ||D r|| e, the terms that are linear in the errors. Along the axes of W, which turn no
     # norm, kappa weighs row by row.
-    squared_rows = np.sum((w[:, None] * residuals) ** 2, axis=1)
+    weighted = w[:, None] * residuals
+    squared_rows = inner_products(weighted, weighted)
     norms_t = np.sqrt(squared_rows[:m])
-    norms_R = np.sqrt(squared_rows[m:].reshape(m, d).sum(axis=1))
+    norms_R = np.sqrt(np.einsum("mk->m", squared_rows[m:].reshape(m, d)))
     cross = float(np.sum(norms_t * e_t))
     cross += e_R * float(np.sum(norms_R))
     # The terms that are quadratic in the errors, and the rounding of the sum F.
     quadratic = problem.weights.bound_of_norms(e_t, e_R)
-    squares = np.sum(residuals**2, axis=1)
-    F = float(np.sum(np.abs(w) * squares))
+    F = float(np.sum(np.abs(w) * inner_products(residuals, residuals)))
     error = quadratic + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * F
     for of_cost in problem.weights.value_errors(problem, poses, e_t, e_R):
         error += of_cost
@@ -330,8 +329,8 @@ def _is_exact(problem: PGOProblem, poses: Poses, level: float) -> bool:
     turned_offsets = (R_i @ offsets[:, :, None])[:, :, 0]
     residuals_t = t[graph.j] - t[graph.i] - turned_offsets
     residuals_R = R[graph.j] - R_i @ graph.R_ij
-    r_t = np.linalg.norm(residuals_t, axis=1)
-    r_R = np.linalg.norm(residuals_R, axis=(1, 2))
+    r_t = block_norms(residuals_t)
+    r_R = block_norms(residuals_R)
     is_seen_t, is_seen_R = problem.weights.is_seen()
     e_t, e_R = _last_bits(problem, poses)
     share = _SHARE_OF_ONE * math.sqrt(graph.num_edges)
@@ -345,7 +344,7 @@ def _is_exact(problem: PGOProblem, poses: Poses, level: float) -> bool:
 def _last_bits(problem: PGOProblem, poses: Poses) -> tuple[Array, float]:
     """Errors e_t, (m,), and e_R of residuals, with the last bits of the farthest coordinates."""
     from_first = poses.t - poses.t[:1]
-    extent = 2.0 * np.linalg.norm(from_first, axis=1).max()
+    extent = 2.0 * block_norms(from_first).max()
     distances = np.full(problem.graph.num_edges, extent)
     return _residual_errors(problem, poses, distances)
 
@@ -356,7 +355,7 @@ def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tupl
     share = (2 * d + 3) * UNIT_ROUNDOFF
     omega = poses.orthogonality_error + d * gamma(d + 2)
     offsets = problem.weights.seen_offsets(problem.graph.t_ij)
-    length = np.linalg.norm(offsets, axis=1)
+    length = block_norms(offsets)
     e_t = share * (distance + length) + omega * length
     e_R = 2.0 * math.sqrt(d) * share + 2.0 * omega
     return e_t, e_R

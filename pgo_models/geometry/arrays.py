@@ -1,5 +1,6 @@
 """Numbers as frozen objects hold them: checked, never cast silently, in read-only arrays."""
 
+import math
 import operator
 from contextlib import suppress
 from functools import cached_property
@@ -120,3 +121,17 @@ def _numbers(values: object, name: str, wanted: str, error: type[PGOError]) -> N
 def _needs_copy(array: NDArray[Any], dtype: type[np.generic]) -> bool:
     """Whether an array has another type, or others may write to it."""
     return array.dtype != dtype or array.flags.writeable or not array.flags.owndata
+
+
+def inner_products(A: Array, B: Array) -> Array:
+    """Inner products <A_e, B_e>, (m,), of arrays (m, ..) of one shape.
+
+    For many small blocks this takes a fraction of the time of a product and a sum over axes.
+    """
+    shape = (len(A), math.prod(A.shape[1:]))  # there may be no block
+    return np.asarray(np.einsum("mk,mk->m", A.reshape(shape), B.reshape(shape)))
+
+
+def block_norms(A: Array) -> Array:
+    """Frobenius norms ||A_e||, (m,), of blocks (m, ..)."""
+    return np.asarray(np.sqrt(inner_products(A, A)))

@@ -124,9 +124,12 @@ def _project_2d(A: Array) -> Array:
 
 def _from_cosine_sine(cosine: Array, sine: Array) -> Array:
     """Matrices [c, -s; s, c], (.., 2, 2), of cosines and sines, (..)."""
-    first_row = np.stack([cosine, -sine], -1)
-    second_row = np.stack([sine, cosine], -1)
-    return np.stack([first_row, second_row], -2)
+    matrices = np.empty((*cosine.shape, 2, 2))
+    matrices[..., 0, 0] = cosine
+    matrices[..., 0, 1] = -sine
+    matrices[..., 1, 0] = sine
+    matrices[..., 1, 1] = cosine
+    return matrices
 
 
 def _polar(X: Array, cofactors: Array, determinant: Array) -> tuple[Array, BoolArray]:
@@ -163,7 +166,7 @@ def _determinants(X: Array) -> Array:
 
 def _columns(rows: Array) -> Array:
     """Views of the columns of rows (.., k), k of them."""
-    return np.moveaxis(rows, -1, 0)
+    return rows.transpose(-1, *range(rows.ndim - 1))
 
 
 def _cofactors(X: Array) -> tuple[Array, Array]:

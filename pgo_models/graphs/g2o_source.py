@@ -182,7 +182,9 @@ class Source:
         ids_field = ("ids", "i8", (kind.num_ids + kind.num_offsets,))
         numbers_field = ("numbers", "f8", (num_own,))
         row_type = np.dtype([("tag", f"S{len(written_tag) + 1}"), ids_field, numbers_field])
-        own_ends = [line.removesuffix(shared_end) for line in lines]
+        own_ends = lines
+        if shared_end:
+            own_ends = [line.removesuffix(shared_end) for line in lines]
         shared = np.zeros((1, 0))
         try:
             # NumPy warns of an id like 1.0, which is none.

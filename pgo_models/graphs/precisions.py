@@ -189,23 +189,44 @@ def are_definite(blocks: Array, least: float) -> BoolArray:
 
     They are scaled first, to ones where the diagonal is positive.
     """
-    scaled, _ = scaled_blocks(blocks)
-    shifted = scaled - least * np.eye(blocks.shape[1])
-    try:
-        np.linalg.cholesky(shifted)
-    except np.linalg.LinAlgError:  # some are not; eigenvalues say which
-        smallest = np.linalg.eigvalsh(shifted)[:, 0]
-        return np.asarray(smallest > 0.0)
-    return np.ones(len(blocks), dtype=bool)
+    # The blocks come last, (k, k, m): then every operation runs through contiguous memory.
+    shifted = np.moveaxis(blocks, 0, -1).copy()
+    diagonal = np.einsum("kkm->km", shifted)  # a view
+    scale = _scale_to_ones(diagonal)
+    shifted *= scale[:, None]
+    shifted *= scale
+    diagonal -= least
+    if _have_positive_pivots(shifted.copy()):
+        return np.ones(len(blocks), dtype=bool)
+    smallest = np.linalg.eigvalsh(np.moveaxis(shifted, -1, 0))[:, 0]
+    return np.asarray(smallest > 0.0)
+
+
+def _have_positive_pivots(U: Array) -> bool:
+    """Whether all blocks, (k, k, m), have a factor L D L^T with D > 0, as definite ones have.
+
+    All are eliminated at once, in a fraction of the time of their Cholesky factors. The array is
+    overwritten.
+    """
+    for k in range(len(U)):
+        pivot = U[k, k].copy()
+        if not (pivot > 0.0).all():
+            return False
+        U[k + 1 :] -= U[k + 1 :, k, None] / pivot * U[k]
+    return True
+
+
+def _scale_to_ones(diagonal: Array) -> Array:
+    """What scales rows and columns so that a positive diagonal becomes one."""
+    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)))
 
 
 def scaled_blocks(blocks: Array) -> tuple[Array, Array]:
     """Blocks D A D, (m, k, k), with ones on the diagonal where that is positive, and D, (m, k)."""
-    diagonal = np.einsum("mkk->mk", blocks)
-    positive = np.where(diagonal > 0.0, diagonal, 1.0)
-    scale = 1.0 / np.sqrt(positive)
-    scaled_rows = blocks * scale[:, :, None]
-    return scaled_rows * scale[:, None, :], scale
+    scale = _scale_to_ones(np.einsum("mkk->mk", blocks))
+    scaled = blocks * scale[:, :, None]
+    scaled *= scale[:, None, :]
+    return scaled, scale
 
 
 def uncoupled_share(information: Array, d: int) -> Array:
@@ -217,12 +238,43 @@ def uncoupled_share(information: Array, d: int) -> Array:
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
-    I_rt = np.swapaxes(I_tr, 1, 2)
-    left = np.linalg.solve(filled(I_rr), I_rt)
-    right = np.linalg.solve(filled(I_tt), I_tr)
-    eigenvalues = np.linalg.eigvals(left @ right)
-    squared_norm = np.abs(eigenvalues).max(axis=1)
+    product = eliminated_products(filled(I_tt), I_tr)
+    if product.shape[1] == 1:
+        squared_norm = np.abs(product / filled(I_rr))[:, 0, 0]
+    else:
+        eigenvalues = np.linalg.eigvals(np.linalg.solve(filled(I_rr), product))
+        squared_norm = np.abs(eigenvalues).max(axis=1)
     return np.asarray(1.0 - np.sqrt(squared_norm))
+
+
+def eliminated_products(A: Array, B: Array) -> Array:
+    """B^T A^-1 B, (m, p, p), of definite blocks A, (m, k, k), and B, (m, k, p).
+
+    All blocks are eliminated at once, A = L D L^T: it is the product of D^-1/2 L^-1 B with itself.
+    """
+    # The blocks come last, as in `are_definite`.
+    U = np.moveaxis(A, 0, -1).copy()
+    V = np.moveaxis(B, 0, -1).copy()
+    products = np.zeros((B.shape[2], B.shape[2], len(B)))
+    for k in range(len(U)):
+        pivot = U[k, k].copy()
+        products += V[k, :, None] * V[k] / pivot
+        multiplier = U[k + 1 :, k, None] / pivot
+        U[k + 1 :] -= multiplier * U[k]
+        V[k + 1 :] -= multiplier * V[k]
+    return np.moveaxis(products, -1, 0)
+
+
+def smallest_eigenvalues(blocks: Array) -> Array:
+    """Smallest eigenvalue, (m,), of symmetric blocks (m, k, k)."""
+    size = blocks.shape[1]
+    if size == 1:
+        return np.asarray(blocks[:, 0, 0])
+    if size > 2:
+        return np.asarray(np.linalg.eigvalsh(blocks)[:, 0])
+    mean = 0.5 * (blocks[:, 0, 0] + blocks[:, 1, 1])
+    half_difference = 0.5 * (blocks[:, 0, 0] - blocks[:, 1, 1])
+    return np.asarray(mean - np.hypot(half_difference, blocks[:, 1, 0]))
 
 
 def condition(blocks: Array) -> Array:

@@ -179,6 +179,13 @@ class SymbolicCholesky(ABC):
                 "the matrix has nan or inf; check the weights and measurements"
             )
 
+    def identity(self) -> csc_array:
+        """Identity matrix, stored with the pattern."""
+        pattern = self._pattern()
+        columns = np.repeat(np.arange(self._shape[1]), np.diff(self._indptr))
+        pattern.data[self._indices == columns] = 1.0
+        return pattern
+
     def _pattern(self) -> csc_array:
         """Matrix of zeros, all stored, from which a copy of the analysis is made."""
         return csc_array(

@@ -27,9 +27,11 @@ from typing import Self
 
 import numpy as np
 
+from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.edge_problem import EdgeProblem
 from pgo_models.problem.floating_point import OUTWARD, gamma
 from pgo_models.problem.incidence import blocks_of_rows, rows_of_blocks
@@ -174,11 +176,15 @@ class EdgeCost:
         # numpy sums in pairs: the result is off by a few dozen roundings, not by one an edge.
         return float(np.sum(weighted_squares))
 
+    def value_at(self, problem: EdgeProblem, poses: Poses) -> float:
+        """Sum of the costs at poses."""
+        return self.value(problem, *problem.evaluated(poses))
+
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """Cost of every edge, (m,)."""
         m = problem.graph.num_edges
         _, w = problem.residual_matrix
-        row_costs = w * np.sum(residuals**2, axis=1)
+        row_costs = w * inner_products(residuals, residuals)
         translation_costs = row_costs[:m]
         rotation_costs = row_costs[m:].reshape(m, problem.d).sum(axis=1)
         return np.asarray(translation_costs + rotation_costs)
@@ -192,12 +198,24 @@ class EdgeCost:
     def edge_products(self, graph: PoseGraph, X: Array, residuals: Array) -> Array:
         """Z = rho R_i, (m, d + 1, d): the residuals of every edge in the frame of pose i."""
         rho = self.residual_blocks(residuals)
-        R = unstack_transposes(X[graph.num_poses :])
+        R = np.ascontiguousarray(unstack_transposes(X[graph.num_poses :]))
         R_i = R[graph.i]
         return np.asarray(rho @ R_i)
 
-    def best_translations(self, problem: EdgeProblem, poses: Poses) -> Poses:
-        """Poses with the translations of least cost for their rotations."""
+    def translation_factor(self, problem: EdgeProblem, poses: Poses) -> CholeskyFactor | None:
+        """Factor of the matrix of the translations, where that depends on the rotations.
+
+        Of a quadratic cost it does not, and the problem has the factor.
+        """
+        return None
+
+    def best_translations(
+        self, problem: EdgeProblem, poses: Poses, factor: CholeskyFactor | None = None
+    ) -> Poses:
+        """Poses with the translations of least cost for their rotations.
+
+        The factor is `translation_factor`, of these poses unless given.
+        """
         t = problem.recover_translations(poses.R)
         return poses.with_translations(t)
 
@@ -273,9 +291,9 @@ class EdgeCost:
     def added_curvatures(self, graph: PoseGraph, poses: Poses) -> Sequence[Array]:
         """Second derivatives of the parts of the cost that are not quadratic in X, (m, k, k) each.
 
-        Edge (i, j) has the unknowns (R_i^T v_i, R_i^T v_j, w_i, w_j) of the moves t <- t + v and R
-        <- R exp([w]_x) of its two poses. The matrices are in the first k of these numbers. The
-        sequence is empty for a quadratic cost.
+        Edge (i, j) has the unknowns (v_i, v_j, w_i, w_j) of the moves t <- t + v and R <- R
+        exp([w]_x) of its two poses. The matrices are in the first k of these numbers. The sequence
+        is empty for a quadratic cost.
         """
         return ()
 
@@ -342,7 +360,7 @@ class EdgeCost:
         G = self.apply_weights(rho)
         G_size = self.apply_absolute_weights(rho_size)
         G_error = self.apply_absolute_weights(errors)
-        value = np.sum(G * rho, axis=(1, 2))
+        value = inner_products(G, rho)
         # Errors of rho.
         value_error = float(np.sum((2.0 * G_size + G_error) * errors))
         # Rounding of <G, rho>.

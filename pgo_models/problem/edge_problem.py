@@ -8,6 +8,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.cholesky import SymbolicCholesky
+from pgo_models.problem.excess import Tangent
 from pgo_models.problem.incidence import Incidence
 
 
@@ -44,10 +45,16 @@ class EdgeProblem(Protocol):
 
     @property
     def translation_information_analysis(self) -> SymbolicCholesky:
-        """Symbolic factorisation of a Laplacian of d x d blocks."""
+        """Symbolic factorisation of `translation_matrix`."""
+
+    def translation_matrix(self, of_edges: Array) -> csc_array:
+        """Laplacian of d x d blocks, of which every edge has one, (m, d, d)."""
 
     def evaluated(self, poses: Poses) -> tuple[Array, Array]:
         """X, (N, d), of poses and its residuals A X, ((d+1) m, d)."""
+
+    def tangent_of_excess(self, poses: Poses) -> Tangent:
+        """Tangent of the excess of chi2 at poses."""
 
     def recover_translations(self, R: Array) -> Array:
         """The translations of least quadratic part for given rotations, (n, d)."""

@@ -29,6 +29,7 @@ from typing import Self
 
 import numpy as np
 
+from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, gamma
@@ -83,45 +84,25 @@ class Excess:
         """u, (m, q), which is linear in Z, (m, d + 1, d)."""
         return Z[:, 0]
 
-    def gradient_in_u(self, Z: Array) -> Array:
-        """J u, (m, q): half the gradient of u^T J u."""
+    def evaluate(self, Z: Array) -> tuple[Array, Array]:
+        """The excess of every edge, (m,), and C, (m, d + 1, d): half its gradient in Z."""
         u = self.argument(Z)
-        return np.asarray(np.einsum("mab,mb->ma", self.J, u))
-
-    def values(self, Z: Array) -> Array:
-        """The excess of every edge, (m,)."""
-        u = self.argument(Z)
-        J_u = self.gradient_in_u(Z)
-        return np.asarray(np.einsum("ma,ma->m", u, J_u))
-
-    def half_gradient(self, Z: Array) -> Array:
-        """C, (m, d + 1, d): half the gradient of the excess in Z."""
-        d = Z.shape[2]
+        J_u = _times_vectors(self.J, u)
         C = np.zeros_like(Z)
-        C[:, 0] = self.gradient_in_u(Z)[:, :d]
-        return C
+        C[:, 0] = J_u
+        return np.asarray(np.einsum("ma,ma->m", u, J_u)), C
 
     def tangent(self, Z: Array) -> "Tangent":
         """Tangent at Z, (m, d + 1, d)."""
-        C = self.half_gradient(Z)
-        return Tangent(C, Z, self)
+        value, C = self.evaluate(Z)
+        return Tangent(C, Z, value, self)
 
-    def derivative_of_argument(self, relative_R: Array, relative_t: Array) -> Array:
-        """Derivative of u in (R_i^T v_i, R_i^T v_j, w_i), (m, d, 2 d + p).
+    def curvature(self, R_i: Array, R_j: Array, difference: Array) -> Array:
+        """The Gauss-Newton matrix of the excess, 2 (du)^T J (du), in (v_i, v_j, w_i).
 
-        The relative pose of an edge is R_i^T R_j, (m, d, d), and R_i^T (t_j - t_i), (m, d).
+        The rotations of the ends of an edge have shape (m, d, d), t_j - t_i has shape (m, d).
         """
-        m, d = relative_t.shape
-        in_v_j = np.broadcast_to(np.eye(d), (m, d, d))
-        in_w_i = -np.einsum("mkab,mb->mak", _generators(m, d), relative_t)
-        return np.concatenate([-in_v_j, in_v_j, in_w_i], axis=2)
-
-    def curvature(self, relative_R: Array, relative_t: Array) -> Array:
-        """The Gauss-Newton matrix of the excess, 2 (du)^T J (du).
-
-        Its unknowns are those of the derivative of u.
-        """
-        du = self.derivative_of_argument(relative_R, relative_t)
+        du = _derivative_of_r(R_i, difference)
         return np.asarray(2.0 * np.swapaxes(du, 1, 2) @ self.J @ du)
 
     def relative_rounding(self, d: int) -> float:
@@ -161,63 +142,53 @@ class CoupledExcess(Excess):
 
     def argument(self, Z: Array) -> Array:
         """The vectors (r, s), (m, d + p)."""
-        s = vee(self._rotation_defect(Z))
-        return np.concatenate([Z[:, 0], s], axis=1)
+        return _argument(Z, self._rotation_defect(Z))
 
-    def values(self, Z: Array) -> Array:
-        """The excess of every edge, (m,)."""
-        H = _defect_to_H(self._rotation_defect(Z))
-        K_H = self.K @ H
-        return np.asarray(super().values(Z) + np.einsum("mab,mab->m", H, K_H))
+    def evaluate(self, Z: Array) -> tuple[Array, Array]:
+        """The excess, (m,), and C, (m, d + 1, d).
 
-    def half_gradient(self, Z: Array) -> Array:
-        """C, (m, d + 1, d): the adjoints of Z -> u and Z -> H, applied to J u and K H."""
+        C is the sum of the adjoints of Z -> u and Z -> H, applied to J u and K H.
+        """
         d = Z.shape[2]
-        C = super().half_gradient(Z)
+        D = self._rotation_defect(Z)
+        u = _argument(Z, D)
+        J_u = _times_vectors(self.J, u)
+        H = _defect_to_H(D)
+        K_H = self.K @ H
+        value = np.einsum("ma,ma->m", u, J_u) + np.einsum("mab,mab->m", H, K_H)
         # The gradient in D = (R_ij Z_R)^T.
-        K_H = self.K @ _defect_to_H(self._rotation_defect(Z))
-        J_u_s = self.gradient_in_u(Z)[:, d:]
-        from_s = hat(J_u_s)
+        from_s = hat(J_u[:, d:])
         from_H = _adjoint_of_defect_to_H(K_H + np.swapaxes(K_H, 1, 2), d)
         in_D = from_s + from_H
+        C = np.empty_like(Z)
+        C[:, 0] = J_u[:, :d]
         C[:, 1:] = 0.5 * np.swapaxes(in_D @ self.R_ij, 1, 2)
-        return C
+        return np.asarray(value), C
 
-    def _derivative_of_defect(self, relative_R: Array) -> Array:
+    def _derivative_of_defect(self, R_i: Array, R_j: Array) -> Array:
         """Derivatives of D in (w_i, w_j), (m, 2 p, d, d)."""
-        m, d, _ = relative_R.shape
-        generators = _generators(m, d)
+        generators = hat(np.eye(tangent_dimension(R_i.shape[1])))
+        relative_R = np.swapaxes(R_i, 1, 2) @ R_j
         R_ij_transposed = np.swapaxes(self.R_ij, 1, 2)
         E = relative_R @ R_ij_transposed
-        in_w_i = -generators @ E[:, None]
-        in_w_j = relative_R[:, None] @ generators @ R_ij_transposed[:, None]
-        return np.concatenate([in_w_i, in_w_j], axis=1)
+        in_w_i = [-generator @ E for generator in generators]
+        in_w_j = [relative_R @ generator @ R_ij_transposed for generator in generators]
+        return np.stack([*in_w_i, *in_w_j], axis=1)
 
-    def derivative_of_argument(self, relative_R: Array, relative_t: Array) -> Array:
-        """Derivative of u in (R_i^T v_i, R_i^T v_j, w_i, w_j), (m, d + p, 2 d + 2 p)."""
-        m, d = relative_t.shape
+    def curvature(self, R_i: Array, R_j: Array, difference: Array) -> Array:
+        """The Gauss-Newton matrix in (v_i, v_j, w_i, w_j), with that of tr(H K H)."""
+        m, d = difference.shape
         p = tangent_dimension(d)
-        dr = super().derivative_of_argument(relative_R, relative_t)
-        dr_in_w_j = np.zeros((m, d, p))
-        dr = np.concatenate([dr, dr_in_w_j], axis=2)
-        dD = self._derivative_of_defect(relative_R).reshape(-1, d, d)
-        ds_in_w = vee(dD).reshape(m, 2 * p, p)
-        ds_in_v = np.zeros((m, p, 2 * d))
-        ds = np.concatenate([ds_in_v, np.swapaxes(ds_in_w, 1, 2)], axis=2)
-        return np.concatenate([dr, ds], axis=1)
-
-    def curvature(self, relative_R: Array, relative_t: Array) -> Array:
-        """The Gauss-Newton matrix, with that of tr(H K H) in (w_i, w_j)."""
-        m, d = relative_t.shape
-        p = tangent_dimension(d)
-        dD = self._derivative_of_defect(relative_R).reshape(-1, d, d)
-        dH = _defect_to_H(dD).reshape(m, 2 * p, p, p)
-        dH = np.moveaxis(dH, 1, 3)
-        K_dH = np.einsum("mab,mbck->mack", self.K, dH)
-        curvature = super().curvature(relative_R, relative_t)
-        of_w = curvature[:, 2 * d :, 2 * d :]
-        of_w += 2.0 * np.einsum("mabk,mabl->mkl", dH, K_dH)
-        return curvature
+        dD = self._derivative_of_defect(R_i, R_j).reshape(-1, d, d)
+        of_w = slice(2 * d, 2 * d + 2 * p)
+        du = np.zeros((m, d + p, 2 * d + 2 * p))
+        du[:, :d, : 2 * d + p] = _derivative_of_r(R_i, difference)
+        du[:, d:, of_w] = np.swapaxes(vee(dD).reshape(m, 2 * p, p), 1, 2)
+        curvature = 2.0 * np.swapaxes(du, 1, 2) @ self.J @ du
+        dH = _defect_to_H(dD).reshape(m, 2 * p, p * p)
+        K_dH = self.K[:, None] @ dH.reshape(m, 2 * p, p, p)
+        curvature[:, of_w, of_w] += 2.0 * dH @ np.swapaxes(K_dH.reshape(m, 2 * p, -1), 1, 2)
+        return np.asarray(curvature)
 
     def relative_rounding(self, d: int) -> float:
         """8 d times that of r alone, as every entry of s and H is a sum of entries of R_ij Z_R."""
@@ -235,12 +206,13 @@ class Tangent:
 
     C: Array  # (m, d + 1, d)
     Z: Array  # Z*, (m, d + 1, d)
+    value: Array  # the excess at Z*, (m,)
     excess: Excess
 
     def of_edges(self, chosen: IntArray | BoolArray) -> "Tangent":
         """The tangent of the chosen edges."""
         excess = self.excess.of_edges(chosen)
-        return Tangent(self.C[chosen], self.Z[chosen], excess)
+        return Tangent(self.C[chosen], self.Z[chosen], self.value[chosen], excess)
 
     def with_silent_edges(self, R_ij: Array) -> "Tangent":
         """The tangent with further edges, which have no excess; R_ij, (k, d, d), is theirs."""
@@ -248,18 +220,15 @@ class Tangent:
         return Tangent(
             np.concatenate([self.C, silent]),
             np.concatenate([self.Z, silent]),
+            np.concatenate([self.value, np.zeros(len(R_ij))]),
             self.excess.with_silent_edges(R_ij),
         )
 
     def scaled(self, share: Array) -> "Tangent":
         """The tangent times shares, (m,)."""
-        C = share[:, None, None] * self.C
-        return Tangent(C, self.Z, self.excess.scaled(share))
-
-    @cached_property
-    def value(self) -> Array:
-        """The excess at Z*, (m,)."""
-        return self.excess.values(self.Z)
+        excess = self.excess.scaled(share)
+        value, _ = excess.evaluate(self.Z)  # not a rounded product with the share
+        return Tangent(share[:, None, None] * self.C, self.Z, value, excess)
 
     @cached_property
     def value_error(self) -> Array:
@@ -280,7 +249,7 @@ class Tangent:
         """
         share, length = self._rounding
         ratios = self.excess.size**2 / self.excess.least
-        sizes = np.sum(ratios, axis=1)
+        sizes = ratios[:, 0] + ratios[:, 1]
         return np.asarray(OUTWARD * 32.0 * (share * length) ** 2 * sizes)
 
     @cached_property
@@ -291,35 +260,52 @@ class Tangent:
         """
         d = self.Z.shape[2]
         size = self.excess.size
-        norm_t = np.linalg.norm(self.Z[:, 0], axis=1)
-        norm_R = np.linalg.norm(self.Z[:, 1:], axis=(1, 2))
+        norm_t = block_norms(self.Z[:, 0])
+        norm_R = block_norms(self.Z[:, 1:])
         length = size[:, 0] * norm_t
         length += size[:, 1] * norm_R
         return self.excess.relative_rounding(d), length
 
     def values(self, Z: Array) -> Array:
         """The minorant of every edge, (m,)."""
-        slopes = np.sum(self.C * (Z - self.Z), axis=(1, 2))
+        slopes = inner_products(self.C, Z - self.Z)
         return np.asarray(self.value - self.loss + 2.0 * slopes)
 
     @property
     def constant(self) -> tuple[float, float]:
         """The sum of value - loss - 2 <C, Z*>, and a bound on its rounding error."""
-        products = 2.0 * self.C * self.Z
-        of_edges = self.value - self.loss - np.sum(products, axis=(1, 2))
+        of_edges = self.value - self.loss - 2.0 * inner_products(self.C, self.Z)
         total = math.fsum(of_edges)
         # Rounding: of the sum over the entries of an edge, and of a few operations beside it.
-        sizes = np.abs(self.value) + self.loss + np.sum(np.abs(products), axis=(1, 2))
-        num_products = products[0].size
+        sizes = (
+            np.abs(self.value) + self.loss + 2.0 * inner_products(np.abs(self.C), np.abs(self.Z))
+        )
+        num_products = self.C[0].size
         errors = self.value_error + gamma(num_products + 8.0) * sizes
         return total, OUTWARD * float(np.sum(errors))
 
 
-def _generators(m: int, d: int) -> Array:
-    """Skew matrices hat(e_k) of the unit vectors, (m, p, d, d), repeated for every edge."""
-    p = tangent_dimension(d)
-    generators = hat(np.eye(p))
-    return np.broadcast_to(generators, (m, p, d, d))
+def _times_vectors(matrices: Array, vectors: Array) -> Array:
+    """Products, (m, a), of matrices (m, a, b) with vectors (m, b)."""
+    return np.asarray(np.einsum("mab,mb->ma", matrices, vectors))
+
+
+def _argument(Z: Array, D: Array) -> Array:
+    """(r, s), (m, d + p), of Z and D = E - I."""
+    return np.concatenate([Z[:, 0], vee(D)], axis=1)
+
+
+def _derivative_of_r(R_i: Array, difference: Array) -> Array:
+    """Derivative of r = R_i^T (t_j - t_i) - t_ij in (v_i, v_j, w_i), (m, d, 2 d + p)."""
+    m, d = difference.shape
+    generators = hat(np.eye(tangent_dimension(d)))
+    R_i_transposed = np.swapaxes(R_i, 1, 2)
+    relative_t = np.einsum("mba,mb->ma", R_i, difference)
+    derivative = np.empty((m, d, 2 * d + len(generators)))
+    derivative[:, :, :d] = -R_i_transposed
+    derivative[:, :, d : 2 * d] = R_i_transposed
+    derivative[:, :, 2 * d :] = -np.einsum("kab,mb->mak", generators, relative_t)
+    return derivative
 
 
 def _defect_to_H(D: Array) -> Array:

@@ -13,6 +13,7 @@ from scipy.sparse import csc_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.matrices import (
     assemble,
     block_entries,
@@ -141,10 +142,7 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
         (*block_entries(w, w), diagonal_ww),
     ]
     for curvature in problem.weights.added_curvatures(graph, poses):
-        num_unknowns = curvature.shape[1]
-        unknowns = np.concatenate([v_i, v_j, w_i, w_j], axis=1)
-        columns = unknowns[:, :num_unknowns]
-        blocks.append((*block_entries(columns, columns), _in_world_axes(curvature, R_i)))
+        blocks += _curvature_blocks(incidence, layout, curvature)
     return assemble(blocks, layout.side)
 
 
@@ -165,18 +163,33 @@ def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
         matrix.data[position] += abs(matrix.data[position])
 
 
-def _in_world_axes(curvature: Array, R_i: Array) -> Array:
-    """Matrix, (m, k, k), in (v_i, v_j, ..) from that in (R_i^T v_i, R_i^T v_j, ..)."""
-    d = R_i.shape[1]
-    R_i_transposed = np.swapaxes(R_i, 1, 2)
-    of_v_i = slice(0, d)
-    of_v_j = slice(d, 2 * d)
-    rotated = curvature.copy()
-    for block in (of_v_i, of_v_j):
-        rotated[:, block] = R_i @ rotated[:, block]
-    for block in (of_v_i, of_v_j):
-        rotated[:, :, block] = rotated[:, :, block] @ R_i_transposed
-    return rotated
+def _curvature_blocks(
+    incidence: Incidence, layout: TangentLayout, curvature: Array
+) -> list[tuple[IntArray, IntArray, Array]]:
+    """Entries of matrices of the edges, (m, k, k), in the first k of (v_i, v_j, w_i, w_j).
+
+    What the edges of a pose add to its own block is summed first.
+    """
+    d = layout.d
+    all_numbers = np.arange(curvature.shape[1])
+    is_of_j = (all_numbers // d == 1) | (all_numbers >= 2 * d + layout.turns)
+    at_i = np.flatnonzero(~is_of_j)
+    at_j = np.flatnonzero(is_of_j)
+    of_i = curvature.take(at_i, 1).take(at_i, 2)
+    of_j = np.zeros_like(of_i)
+    of_j[:, : len(at_j), : len(at_j)] = curvature.take(at_j, 1).take(at_j, 2)
+    between = curvature.take(at_i, 1).take(at_j, 2)
+    # The unknowns of a pose, (v, w), of which those at j may be v alone.
+    every_pose = short(np.arange(layout.num_poses))
+    unknowns = [layout.translations(every_pose), layout.rotations(every_pose)]
+    columns = np.concatenate(unknowns, axis=1)
+    columns_i = columns[incidence.i]
+    columns_j = columns[incidence.j][:, : len(at_j)]
+    return [
+        (*block_entries(columns, columns), incidence.at_both(of_i, of_j)),
+        (*block_entries(columns_i, columns_j), between),
+        (*block_entries(columns_j, columns_i), np.swapaxes(between, 1, 2)),
+    ]
 
 
 def double_cross(A: Array, B: Array) -> Array:

@@ -7,15 +7,16 @@ part to that of the quadratic part. The notation is that of `pgo_models.problem.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 
+from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem import matrices
-from pgo_models.problem.cholesky import factorize_damped
+from pgo_models.problem.cholesky import CholeskyFactor, factorize_damped
 from pgo_models.problem.edge_cost import EdgeCost, EdgeTerms
 from pgo_models.problem.edge_problem import EdgeProblem
 from pgo_models.problem.excess import Excess, Tangent
@@ -63,7 +64,7 @@ class ExcessCost(EdgeCost):
         """True: only chi2 has an excess."""
         return True
 
-    def minorant(self, problem: EdgeProblem, poses: Poses) -> EdgeCost:
+    def minorant(self, problem: EdgeProblem, poses: Poses) -> "TangentCost":
         """The cost with the excess replaced by its tangent at the poses."""
         X, residuals = problem.evaluated(poses)
         Z = self.edge_products(problem.graph, X, residuals)
@@ -74,43 +75,57 @@ class ExcessCost(EdgeCost):
         """chi2 at X."""
         Z = self.edge_products(problem.graph, X, residuals)
         quadratic_part = super().value(problem, X, residuals)
-        excess = float(np.sum(self.excess.values(Z)))
-        return quadratic_part + excess
+        excess, _ = self.excess.evaluate(Z)
+        return quadratic_part + float(np.sum(excess))
+
+    def value_at(self, problem: EdgeProblem, poses: Poses) -> float:
+        """chi2 at poses, whose excess the tangent there has."""
+        quadratic_part = super().value(problem, *problem.evaluated(poses))
+        return quadratic_part + float(np.sum(problem.tangent_of_excess(poses).value))
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """chi2 of every edge, (m,)."""
         Z = self.edge_products(problem.graph, X, residuals)
         quadratic_part = super().edge_values(problem, X, residuals)
-        return quadratic_part + self.excess.values(Z)
+        excess, _ = self.excess.evaluate(Z)
+        return quadratic_part + excess
 
-    def best_translations(self, problem: EdgeProblem, poses: Poses) -> Poses:
+    @cached_property
+    def _frame_information(self) -> Array:
+        """J_tt + tau I, (m, d, d): weights of the translations, in the frames of poses i."""
+        d = self.excess.R_ij.shape[1]
+        J_tt = self.excess.J[:, :d, :d]
+        return np.asarray(J_tt + self.tau[:, None, None] * np.eye(d))
+
+    def translation_factor(self, problem: EdgeProblem, poses: Poses) -> CholeskyFactor:
+        """Factor of the Laplacian with the matrices R_i (J_tt + tau I) R_i^T on its edges."""
+        R_i = poses.R[problem.graph.i]
+        edge_matrices = R_i @ self._frame_information @ np.swapaxes(R_i, 1, 2)
+        laplacian = problem.translation_matrix(edge_matrices)
+        return factorize_damped(problem.translation_information_analysis, laplacian)
+
+    def best_translations(
+        self, problem: EdgeProblem, poses: Poses, factor: CholeskyFactor | None = None
+    ) -> Poses:
         """Poses with the translations of least chi2 for their rotations; t_0 does not change.
 
-        For given rotations chi2 is a quadratic function of the translations. Its half Hessian is
-        the Laplacian with the matrices R_i (J_tt + tau I) R_i^T on its edges, and edge (i, j) adds
-        tau rho_t + R_i (J u)_t to the half gradient at t_j and subtracts it at t_i. One step of
-        Newton's method is exact.
+        For given rotations chi2 is a quadratic function of the translations, whose half Hessian is
+        that of `translation_factor`. Edge (i, j) adds tau rho_t + R_i (J u)_t to the half gradient
+        at t_j and subtracts it at t_i. One step of Newton's method is exact.
         """
         graph = problem.graph
         incidence = problem.incidence
         d = problem.d
         m = graph.num_edges
+        if factor is None:
+            factor = self.translation_factor(problem, poses)
         X, residuals = problem.evaluated(poses)
-        R_i = poses.R[graph.i]
-        # Half Hessian.
-        J_tt = self.excess.J[:, :d, :d]
-        in_frame_i = J_tt + self.tau[:, None, None] * np.eye(d)
-        edge_matrices = R_i @ in_frame_i @ np.swapaxes(R_i, 1, 2)
-        laplacian = matrices.block_laplacian(incidence, edge_matrices)
-        # Half gradient.
         Z = self.edge_products(graph, X, residuals)
         u = self.excess.argument(Z)
-        J_u_t = self.excess.J[:, :d] @ u[:, :, None]
-        of_excess = (R_i @ J_u_t)[:, :, 0]
+        J_u_t = np.einsum("mab,mb->ma", self.excess.J[:, :d], u)
+        of_excess = np.einsum("mab,mb->ma", poses.R[graph.i], J_u_t)
         of_edges = self.tau[:, None] * residuals[:m] + of_excess
         half_gradient = incidence.ends @ of_edges - incidence.begins @ of_edges
-        # Newton step.
-        factor = factorize_damped(problem.translation_information_analysis, laplacian)
         step = factor.solve(half_gradient.ravel()).reshape(-1, d)
         return poses.with_translations(poses.t - (step - step[0]))
 
@@ -119,11 +134,8 @@ class ExcessCost(EdgeCost):
 
         The rest of the Hessian of the excess is that of its tangent, which is quadratic in X.
         """
-        R_i = poses.R[graph.i]
-        relative_R = np.swapaxes(R_i, 1, 2) @ poses.R[graph.j]
         difference = poses.t[graph.j] - poses.t[graph.i]
-        relative_t = np.einsum("mba,mb->ma", R_i, difference)
-        return (self.excess.curvature(relative_R, relative_t),)
+        return (self.excess.curvature(poses.R[graph.i], poses.R[graph.j], difference),)
 
     def value_errors(
         self, problem: EdgeProblem, poses: Poses, e_t: Array, e_R: float
@@ -138,16 +150,14 @@ class ExcessCost(EdgeCost):
         rounding of the excess.
         """
         d = problem.d
-        X, residuals = problem.evaluated(poses)
-        Z = self.edge_products(problem.graph, X, residuals)
-        tangent = self.excess.tangent(Z)
+        tangent = problem.tangent_of_excess(poses)
         C = tangent.C
-        C_norm_t = np.linalg.norm(C[:, 0], axis=1)
-        C_norm_R = np.linalg.norm(C[:, 1:], axis=(1, 2))
-        row_norms = np.linalg.norm(tangent.Z, axis=2)
+        C_norm_t = block_norms(C[:, 0])
+        C_norm_R = block_norms(C[:, 1:])
+        row_norms = np.sqrt(np.einsum("mab,mab->ma", tangent.Z, tangent.Z))
         omega = poses.orthogonality_error + d * gamma(d + 2)
         error_t = e_t + omega * row_norms[:, 0]
-        error_R = e_R + omega * row_norms[:, 1:].sum(axis=1)
+        error_R = e_R + omega * np.einsum("ma->m", row_norms[:, 1:])
         summation_error = PAIRWISE_SUM * UNIT_ROUNDOFF * np.abs(tangent.value)
         rounding = tangent.value_error + summation_error
         return [
@@ -326,7 +336,7 @@ class TangentCost(EdgeCost):
         P_size = np.abs(P_transposed)
         # The value, and its error.
         difference = rho @ P_transposed - tangent.Z
-        linear_part = 2.0 * np.sum(C * difference, axis=(1, 2))
+        linear_part = 2.0 * inner_products(C, difference)
         constant = tangent.value - tangent.loss
         product_errors = errors + gamma(d + 1) * rho_size
         difference_error = product_errors @ P_size

@@ -1,7 +1,5 @@
 """Initial poses: from odometry, from a spanning tree, and from the chordal relaxation."""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.csgraph import breadth_first_order
@@ -190,7 +188,7 @@ def _start_with_loose_world(problem: PGOProblem, world: int, averaged: bool) -> 
     inner_poses = np.delete(np.arange(graph.num_poses), world)
     inner_weights = problem.weights.of_edges(~graph.is_prior)
     inner_graph = graph.subgraph(inner_poses)
-    inner_problem = replace(problem, graph=inner_graph, weighting=inner_weights)
+    inner_problem = PGOProblem(inner_graph, problem.backend, inner_weights)
     inner_start = chordal_start(inner_problem, averaged)
     R = np.insert(inner_start.R, world, np.eye(problem.d), axis=0)
     t = np.insert(inner_start.t, world, 0.0, axis=0)

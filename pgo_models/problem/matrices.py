@@ -6,8 +6,10 @@ Unknowns are stacked in X, (N, d) with N = (d+1) n: first the n rows t_i, then t
 R_i^T.
 """
 
+from __future__ import annotations
+
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -157,25 +159,32 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> Ar
     return np.asarray(M_RR - product)
 
 
-def block_laplacian(incidence: Incidence, of_edges: Array) -> csc_array:
-    """Laplacian with the weights `of_edges`, (m, d, d), with the diagonal block of pose 0 doubled.
+@dataclass(frozen=True, eq=False)
+class BlockLaplacian:
+    """Laplacians of a graph whose edges have weights of d x d numbers, with one pattern for all.
 
-    It is the matrix of translations whose edges have such information matrices. Doubling a block
-    makes it positive definite.
+    They are the matrices of translations whose edges have such information matrices.
     """
-    d = of_edges.shape[1]
-    diagonal = incidence.at_both(of_edges, of_edges)
-    diagonal[0] *= 2.0
-    n = len(diagonal)
-    columns = rotation_columns(np.arange(n), 0, d)
-    columns_i = rotation_columns(incidence.i, 0, d)
-    columns_j = rotation_columns(incidence.j, 0, d)
-    blocks = [
-        (*block_entries(columns, columns), diagonal),
-        (*block_entries(columns_i, columns_j), -of_edges),
-        (*block_entries(columns_j, columns_i), -of_edges),
-    ]
-    return assemble(blocks, d * n)
+
+    incidence: Incidence
+    pattern: SummedPattern
+
+    @classmethod
+    def of(cls, incidence: Incidence, d: int) -> BlockLaplacian:
+        """The Laplacians of a graph."""
+        n = incidence.begins.shape[0]
+        every_pose = np.arange(n)
+        pairs = [(every_pose, every_pose), (incidence.i, incidence.j), (incidence.j, incidence.i)]
+        return cls(incidence, SummedPattern.of(pairs, n).of_blocks(d))
+
+    def matrix(self, of_edges: Array) -> csc_array:
+        """Laplacian with symmetric weights, (m, d, d), the diagonal block of pose 0 doubled.
+
+        Doubling a block makes it positive definite.
+        """
+        diagonal = self.incidence.at_both(of_edges, of_edges)
+        diagonal[0] *= 2.0
+        return self.pattern.matrix([diagonal, -of_edges, -of_edges])
 
 
 def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:
@@ -222,6 +231,70 @@ def assemble(blocks: list[tuple[IntArray, IntArray, Array]], side: int) -> csc_a
     return csc_array((values, (rows, columns)), shape=(side, side))
 
 
+@dataclass(frozen=True, eq=False)
+class SummedPattern:
+    """Where the triplets of `assemble` go in the matrix, for matrices that have the same ones."""
+
+    indices: IntArray  # of the canonical CSC matrix
+    indptr: IntArray
+    positions: IntArray  # (k,): the entry of the matrix that a triplet is added to
+
+    @classmethod
+    def of(cls, blocks: list[tuple[IntArray, IntArray]], side: int) -> SummedPattern:
+        """Pattern of triplets with these rows and columns."""
+        rows = np.concatenate([short(np.ravel(block[0])) for block in blocks])
+        columns = np.concatenate([short(np.ravel(block[1])) for block in blocks])
+        # By column, and by row within a column: two stable sorts.
+        by_row = _stable_order(rows, side)
+        order = by_row[_stable_order(columns[by_row], side)]
+        rows = rows[order]
+        columns = columns[order]
+        is_new = np.ones(len(order), dtype=bool)
+        is_new[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1])
+        positions = np.empty(len(order), dtype=np.int64)
+        positions[order] = np.cumsum(is_new) - 1
+        column_lengths = np.bincount(columns[is_new], minlength=side)
+        indptr = np.concatenate([[0], np.cumsum(column_lengths)])
+        return cls(rows[is_new], short(indptr), positions)
+
+    def of_blocks(self, d: int) -> SummedPattern:
+        """The pattern with a block of d x d entries in place of each."""
+        side = len(self.indptr) - 1
+        lengths = np.diff(self.indptr)
+        columns = np.repeat(np.arange(side), lengths)
+        # Column c becomes d columns, each with d entries in place of one.
+        rank = np.arange(len(self.indices)) - self.indptr[columns]
+        first = d * d * self.indptr[columns] + d * rank
+        within = np.arange(d)
+        to_next_column = d * lengths[columns]
+        in_column = first[:, None, None] + within[:, None]
+        positions = cast("IntArray", in_column + to_next_column[:, None, None] * within)
+        indices = np.empty(positions.size, dtype=self.indices.dtype)
+        indices[positions] = (d * self.indices[:, None] + within)[:, :, None]
+        indptr = np.concatenate([[0], np.cumsum(np.repeat(d * lengths, d))])
+        return SummedPattern(indices, short(indptr), positions[self.positions].ravel())
+
+    def matrix(self, values: list[Array]) -> csc_array:
+        """The matrix with these values of the triplets, in the order of the blocks."""
+        all_values = np.concatenate([np.ravel(of_block) for of_block in values])
+        data = np.bincount(self.positions, all_values, minlength=len(self.indices))
+        side = len(self.indptr) - 1
+        matrix = csc_array((data, self.indices, self.indptr), shape=(side, side))
+        matrix.has_canonical_format = True
+        return matrix
+
+
+def _stable_order(keys: IntArray, num_keys: int) -> IntArray:
+    """Order that sorts keys, integers below `num_keys`, and keeps that of equal ones.
+
+    A conversion from rows to columns is such a sort, by counting.
+    """
+    num_rows = len(keys)
+    marks = np.ones(num_rows, dtype=np.int8)
+    row_starts = np.arange(num_rows + 1, dtype=np.int32)
+    return csr_array((marks, keys, row_starts), shape=(num_rows, num_keys)).tocsc().indices
+
+
 def short(indices: IntArray) -> IntArray:
     """The same numbers in 32 bits, as scipy has them in matrices, to save memory in `assemble`."""
     return cast("IntArray", indices.astype(np.int32, copy=False))
@@ -236,6 +309,12 @@ def entry_positions(matrix: csc_array, rows: IntArray, columns: IntArray) -> Int
     stored = np.repeat(all_columns, column_lengths) * side + matrix.indices
     wanted = columns.astype(np.int64) * side + rows
     return np.searchsorted(stored, wanted)
+
+
+def diagonal_positions(matrix: csc_array) -> IntArray:
+    """Positions in `matrix.data` of the diagonal, (N,), of which every entry is stored."""
+    columns = np.repeat(short(np.arange(matrix.shape[1])), np.diff(matrix.indptr))
+    return np.flatnonzero(matrix.indices == columns)
 
 
 def meets(matrix: csc_array, rows: IntArray) -> BoolArray:

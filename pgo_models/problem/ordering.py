@@ -12,7 +12,12 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.cholesky import CholeskyBackend, factorize, minimum_degree
+from pgo_models.problem.cholesky import (
+    CholeskyBackend,
+    SymbolicCholesky,
+    analyze,
+    minimum_degree,
+)
 from pgo_models.problem.floating_point import FactorCounts
 
 # Number of poses, by the dimension of space, from which METIS saves time. It takes six to ten times
@@ -32,6 +37,13 @@ def pose_order(graph: PoseGraph) -> IntArray:
     return np.array(order, dtype=np.int64)  # a copy: CVXOPT takes no C long long
 
 
+def analyze_poses(graph: PoseGraph, poses: IntArray) -> SymbolicCholesky:
+    """Symbolic factorisation, by CHOLMOD, of a matrix with one entry for two poses on an edge."""
+    return analyze(
+        pattern_of_edges(graph.num_poses, graph.i, graph.j), CholeskyBackend.CHOLMOD, poses
+    )
+
+
 def row_order(poses: IntArray, *widths: int) -> IntArray:
     """Order of the rows that belongs to an order of the poses.
 
@@ -42,24 +54,15 @@ def row_order(poses: IntArray, *widths: int) -> IntArray:
     return np.argsort(row_ranks, kind="stable")
 
 
-def most_counts(graph: PoseGraph, poses: IntArray, *widths: int) -> FactorCounts:
+def most_counts(poses: SymbolicCholesky, *widths: int) -> FactorCounts:
     """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
 
-    As `most_counts_of_pattern`, of the matrices that couple two poses where an edge does.
-    """
-    pattern = pattern_of_edges(graph.num_poses, graph.i, graph.j)
-    return most_counts_of_pattern(pattern, poses, *widths)
-
-
-def most_counts_of_pattern(pattern: csc_array, poses: IntArray, *widths: int) -> FactorCounts:
-    """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
-
-    The pattern is the lower triangle of the poses that are coupled. All entries of every block that
-    fills in are counted. CHOLMOD stores further zeros to have wider supernodes; they are exact and
-    add no rounding.
+    The analysis is that of a matrix with one entry for each of the blocks, in that order of the
+    poses. All entries of every block that fills in are counted. CHOLMOD stores further zeros to
+    have wider supernodes; they are exact and add no rounding.
     """
     width = sum(widths)
-    L, order = factor_pattern(pattern, poses, CholeskyBackend.CHOLMOD)
+    L, order = poses.factorize(poses.identity()).take_apart()
     of_poses = FactorCounts.of(L.indptr, L.indices, order)
     # A block that fills in has `width` rows and columns, all of which count as non-zeros.
     return FactorCounts(
@@ -68,20 +71,6 @@ def most_counts_of_pattern(pattern: csc_array, poses: IntArray, *widths: int) ->
         widest=np.repeat(width * of_poses.widest, width),
         order=row_order(order, *widths),
     )
-
-
-def factor_pattern(
-    pattern: csc_array, order: IntArray, backend: CholeskyBackend | None = None
-) -> tuple[csc_array, IntArray]:
-    """L of a matrix with this lower triangle, of which the pattern counts, and its final order.
-
-    The matrix is the identity, with zeros stored in the rest of the pattern. A backend may put
-    poses that are independent in another order.
-    """
-    identity = pattern.copy()
-    identity.data = np.zeros(len(identity.data))
-    identity.setdiag(1.0)
-    return factorize(identity, backend, order).take_apart()
 
 
 def pattern_of_edges(num_poses: int, i: IntArray, j: IntArray) -> csc_array:

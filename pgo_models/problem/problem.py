@@ -25,7 +25,9 @@ from pgo_models.problem.cholesky import (
     factorize_damped,
 )
 from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.excess import Tangent
 from pgo_models.problem.incidence import Incidence
+from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.problem.weighting import (
@@ -161,7 +163,8 @@ class PGOProblem(ReadOnly):
         """
         if self.is_quadratic and self.weights.is_convex:
             return self
-        return replace(self, weighting=convex_cost(self._information, self.d))
+        cost = convex_cost(self._information, self.d)
+        return _SharingProblem(self.graph, self.backend, cost, original=self)
 
     def check_quadratic(self, method: str, convex: bool = False) -> None:
         """Raise an error where a method needs a cost that is quadratic, or convex, and it is not.
@@ -229,6 +232,23 @@ class PGOProblem(ReadOnly):
             self._tangents[poses] = tangent
         return tangent
 
+    def tangent_of_excess(self, poses: Poses) -> Tangent:
+        """Return the tangent of the excess of chi2 that `tangent_at` has.
+
+        Parameters
+        ----------
+        poses : Poses
+            Where they touch.
+
+        Returns
+        -------
+        Tangent
+            With the value and the gradient of the excess at the poses.
+        """
+        cost = self.tangent_at(poses).weights
+        assert isinstance(cost, TangentCost)
+        return cost.tangent
+
     def with_rotation_terms(self, i: IntArray, j: IntArray, R_ij: Array, W: Array) -> "PGOProblem":
         """Return the problem with terms tr(W rho_R rho_R^T), rho_R = R_j^T - R_ij^T R_i^T.
 
@@ -271,6 +291,11 @@ class PGOProblem(ReadOnly):
     @cached_property
     def _evaluations(self) -> "WeakKeyDictionary[Poses, tuple[Array, Array]]":
         """`evaluated` of the poses that are still in use: it goes when they do."""
+        return WeakKeyDictionary()
+
+    @cached_property
+    def _half_gradients(self) -> "WeakKeyDictionary[Poses, Array]":
+        """`apply_M_at` of the poses that are still in use: it goes when they do."""
         return WeakKeyDictionary()
 
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
@@ -316,7 +341,7 @@ class PGOProblem(ReadOnly):
         if self.convex_part is not self:
             return self.convex_part.analysis
         order = row_order(self.pose_order, 1, self.d)
-        counts = partial(most_counts, self.graph, self.pose_order, 1, self.d)
+        counts = partial(most_counts, self._pose_analysis, 1, self.d)
         return analyze(self.M, self.backend, order, counts)
 
     @cached_property
@@ -327,16 +352,16 @@ class PGOProblem(ReadOnly):
     @cached_property
     def diagonal_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal of M, (N,)."""
-        all_rows = np.arange(self.side)
-        return read_only(matrices.entry_positions(self.M, all_rows, all_rows))
+        return read_only(matrices.diagonal_positions(self.M))
 
     @cached_property
     def block_positions(self) -> IntArray:
         """Positions in `M.data` of the diagonal d x d rotation blocks of M, (n, d, d)."""
-        n = self.num_poses
         d = self.d
-        block = matrices.rotation_columns(np.arange(n), n, d)
-        return read_only(matrices.entry_positions(self.M, *matrices.block_entries(block, block)))
+        # The rows of a block follow each other in each of its columns.
+        from_diagonal = np.arange(d)[:, None] - np.arange(d)
+        diagonal = self.diagonal_positions[self.num_poses :].reshape(-1, 1, d)
+        return read_only(diagonal + from_diagonal)
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
         """Return the matrix that has the pattern of M and given values.
@@ -431,7 +456,7 @@ class PGOProblem(ReadOnly):
         >>> bool(np.isclose(problem.objective(graph.truth), problem.edge_costs(graph.truth).sum()))
         True
         """
-        return self.objective_stacked(*self.evaluated(poses))
+        return self.weights.value_at(self, poses)
 
     def edge_costs(self, poses: Poses) -> Array:
         """Return the share of every edge in the cost.
@@ -459,9 +484,13 @@ class PGOProblem(ReadOnly):
         Returns
         -------
         (N, d) array
-            In the rows of X.
+            In the rows of X, read-only: it is computed once for these poses.
         """
-        return self.tangent_at(poses).apply_M(*self.evaluated(poses))
+        half_gradient = self._half_gradients.get(poses)
+        if half_gradient is None:
+            half_gradient = self.tangent_at(poses).apply_M(*self.evaluated(poses))
+            self._half_gradients[poses] = read_only(half_gradient)
+        return half_gradient
 
     def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
         """Return M X = A^T (w A X) by way of the residuals.
@@ -567,9 +596,9 @@ class PGOProblem(ReadOnly):
         (n, k) array
             Solutions.
         """
-        t = np.zeros(b.shape)
-        t[1:] = self._translation_factor.solve(b[1:])
-        return t
+        without_pose_0 = b.copy()
+        without_pose_0[0] = 0.0
+        return self._translation_factor.solve(without_pose_0)
 
     def with_best_translations(self, R: Array) -> Poses:
         """Return poses with given rotations and the translations of `recover_translations`.
@@ -586,20 +615,38 @@ class PGOProblem(ReadOnly):
         """
         return Poses(R, self.recover_translations(R))
 
-    def at_best_translations(self, poses: Poses) -> Poses:
+    def translation_factor(self, poses: Poses) -> CholeskyFactor | None:
+        """Factor the matrix of the translations where it depends on the rotations.
+
+        Parameters
+        ----------
+        poses : Poses
+            Their rotations count.
+
+        Returns
+        -------
+        CholeskyFactor or None
+            For `at_best_translations`; None of a quadratic cost, whose factor is kept.
+        """
+        return self.weights.translation_factor(self, poses)
+
+    def at_best_translations(self, poses: Poses, factor: CholeskyFactor | None = None) -> Poses:
         """Return the poses with the translations of least cost for their rotations.
 
         Parameters
         ----------
         poses : Poses
             Their translations count only where chi2 is not quadratic: t_0 stays where it is.
+        factor : CholeskyFactor, optional
+            The `translation_factor` of these poses. That of poses with nearly the same rotations
+            gives nearly the best translations.
 
         Returns
         -------
         Poses
             With the same rotations.
         """
-        return self.weights.best_translations(self, poses)
+        return self.weights.best_translations(self, poses, factor)
 
     def with_refined_translations(self, poses: Poses) -> Poses:
         """Return the poses after steps of iterative refinement of the translations.
@@ -731,21 +778,48 @@ class PGOProblem(ReadOnly):
         return self.weights.edge_products(self.graph, X, residuals)
 
     @cached_property
+    def _M_tt(self) -> csc_array:
+        return self.M[: self.num_poses, : self.num_poses].tocsc()
+
+    @cached_property
+    def _pose_analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of the pattern of M_tt, with one entry for a block of poses."""
+        return analyze(self._M_tt, self.backend, self.pose_order)
+
+    @cached_property
     def _translation_factor(self) -> CholeskyFactor:
-        n = self.num_poses
-        order = self.pose_order[self.pose_order > 0] - 1
-        M_tt = self.M[1:n, 1:n].tocsc()
-        return factorize_damped(analyze(M_tt, self.backend, order), M_tt)
+        """Factor of M_tt, in which pose 0 has its diagonal entry alone."""
+        grounded = self._M_tt.copy()
+        of_pose_0 = matrices.meets(grounded, np.zeros(1, dtype=np.int64))
+        of_pose_0[matrices.diagonal_positions(grounded)] = False
+        grounded.data[of_pose_0] = 0.0
+        return factorize_damped(self._pose_analysis, grounded)
+
+    @cached_property
+    def _translation_laplacian(self) -> matrices.BlockLaplacian:
+        return matrices.BlockLaplacian.of(self.incidence, self.d)
+
+    def translation_matrix(self, of_edges: Array) -> csc_array:
+        """Return the matrix of the translations where chi2 is not quadratic.
+
+        Parameters
+        ----------
+        of_edges : (m, d, d) array
+            Information matrices of the edges, in world axes.
+
+        Returns
+        -------
+        (d n, d n) csc_array
+            Their Laplacian, with the diagonal block of pose 0 doubled, which makes it definite.
+        """
+        return self._translation_laplacian.matrix(of_edges)
 
     @cached_property
     def translation_information_analysis(self) -> SymbolicCholesky:
-        """Of the matrix of `at_best_translations`, whose pattern the graph alone gives."""
+        """Symbolic factorisation of `translation_matrix`, whose pattern the graph alone gives."""
         ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
-        return analyze(
-            matrices.block_laplacian(self.incidence, ones),
-            self.backend,
-            row_order(self.pose_order, self.d),
-        )
+        order = row_order(self.pose_order, self.d)
+        return analyze(self.translation_matrix(ones), self.backend, order)
 
     @cached_property
     def _M_tR(self) -> csr_array:
@@ -757,13 +831,28 @@ class PGOProblem(ReadOnly):
 
 
 @dataclass(frozen=True, eq=False)
-class _TangentProblem(PGOProblem):
-    """A tangent of chi2, which has the graph of the `original` and what follows from that alone."""
+class _SharingProblem(PGOProblem):
+    """Another cost of the graph of an `original`, which has what follows from the graph alone."""
 
     original: PGOProblem = field(kw_only=True)
 
     def __post_init__(self) -> None:
         """Accept what the original was accepted with."""
+
+    @cached_property
+    def incidence(self) -> Incidence:
+        """Which edges begin and end at a pose."""
+        return self.original.incidence
+
+    @cached_property
+    def pose_order(self) -> IntArray:
+        """Order of elimination of the poses."""
+        return self.original.pose_order
+
+
+@dataclass(frozen=True, eq=False)
+class _TangentProblem(_SharingProblem):
+    """A tangent of chi2."""
 
     @cached_property
     def residual_matrix(self) -> tuple[csr_array, Array]:
@@ -784,16 +873,6 @@ class _TangentProblem(PGOProblem):
     def residual_adjoint(self) -> csc_array:
         """A^T."""
         return self.original.residual_adjoint
-
-    @cached_property
-    def incidence(self) -> Incidence:
-        """Which edges begin and end at a pose."""
-        return self.original.incidence
-
-    @cached_property
-    def pose_order(self) -> IntArray:
-        """Order of elimination of the poses."""
-        return self.original.pose_order
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:

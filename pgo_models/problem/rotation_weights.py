@@ -19,6 +19,7 @@ from typing import Self
 
 import numpy as np
 
+from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, gamma
@@ -246,7 +247,7 @@ class _Rounded(RotationWeights):
 
     def effect_of_error(self, sizes: Array, errors: Array) -> tuple[float, Array | float]:
         """Bounds sum_e e s^2 and e s for s = ||sizes + errors||_F, rounded up."""
-        length = np.linalg.norm(sizes + errors, axis=(1, 2))
+        length = block_norms(sizes + errors)
         of_value = float(np.sum(self.error * length**2))
         of_product = self.error * length
         return OUTWARD * of_value, OUTWARD * of_product[:, None, None]
@@ -257,8 +258,9 @@ class _Rounded(RotationWeights):
         U^T rho_R has the norm of rho_R.
         """
         m = len(self.kappa)
-        row_squares = np.sum(rows**2, axis=1)
-        squares = row_squares.reshape(m, -1).sum(axis=1)
+        d = rows.shape[1]
+        blocks = rows.reshape(m, d, d)
+        squares = inner_products(blocks, blocks)
         error = self.error + self._error_of_axes(rows.shape[1])
         return float(np.sum(error * squares))
 

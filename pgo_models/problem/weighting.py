@@ -25,7 +25,9 @@ from pgo_models.graphs.precisions import (
     LEAST_SCALED,
     are_definite,
     edge_precisions,
+    eliminated_products,
     indefinite_edges,
+    smallest_eigenvalues,
     uncoupled_share,
 )
 from pgo_models.problem.edge_cost import EdgeCost
@@ -118,15 +120,13 @@ class _Information:
         I_tt = information[:, :d, :d]
         I_tr = information[:, :d, d:]
         I_rr = information[:, d:, d:]
-        eigenvalues = np.linalg.eigvalsh(I_tt)
-        eigenvalues_R = np.linalg.eigvalsh(I_rr)
         return cls(
             I_tt,
             I_tr,
             I_rr,
-            smallest=np.asarray(eigenvalues[:, 0]),
+            smallest=smallest_eigenvalues(I_tt),
             trace=np.einsum("mkk->m", I_tt),
-            smallest_R=np.asarray(eigenvalues_R[:, 0]),
+            smallest_R=smallest_eigenvalues(I_rr),
             trace_R=np.einsum("mkk->m", I_rr),
         )
 
@@ -203,7 +203,7 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     margin_t = np.repeat(blocks.margin[:, None], d, axis=1)
     margin_R = _rotation_margin(blocks)
     # K is above the Schur complement I_tr^T J_tt^-1 I_tr, so that J is positive definite.
-    schur = np.swapaxes(blocks.I_tr, 1, 2) @ np.linalg.solve(J_tt, blocks.I_tr)
+    schur = eliminated_products(J_tt, blocks.I_tr)
     share = 0.5 + 4.0 * margin_t[:, 0] / blocks.smallest + _MARGIN
     K = share[:, None, None] * (schur + np.swapaxes(schur, 1, 2))
     K = K + 2.0 * margin_R[:, None, None] * np.eye(p)

@@ -28,12 +28,7 @@ from pgo_models.problem.cholesky import (
 )
 from pgo_models.problem.floating_point import OUTWARD, gamma
 from pgo_models.problem.matrices import inner
-from pgo_models.problem.ordering import (
-    factor_pattern,
-    most_counts_of_pattern,
-    pattern_of_edges,
-    row_order,
-)
+from pgo_models.problem.ordering import most_counts, pattern_of_edges, row_order
 from solvers.distributed.interface import Interface, Solved
 from solvers.distributed.robots.subdomain_blocks import coupled_unknowns, entry_keys, positions_of
 
@@ -72,9 +67,14 @@ class CoverPattern:
         return minimum_degree(self.lower)
 
     @cached_property
+    def analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of a matrix with one entry for two poses that are coupled."""
+        return analyze(self.lower, CholeskyBackend.CHOLMOD, self.order)
+
+    @cached_property
     def counts(self) -> IntArray:
         """Poses in every column of the factor, (g,)."""
-        L, _ = factor_pattern(self.lower, self.order, CholeskyBackend.CHOLMOD)
+        L, _ = self.analysis.factorize(self.analysis.identity()).take_apart()
         return np.diff(L.indptr).astype(np.int64)
 
     def flops(self, width: int) -> float:
@@ -130,7 +130,7 @@ class SparseInterface(Interface):
         side = self.side
         lower = csc_array(coupled_unknowns(csr_array(self.pattern.lower), self.widths))
         order = row_order(self.pattern.order, *self.widths)
-        most = partial(most_counts_of_pattern, self.pattern.lower, self.pattern.order, *self.widths)
+        most = partial(most_counts, self.pattern.analysis, *self.widths)
         analysis = analyze(lower, CholeskyBackend.CHOLMOD, order, most)
         held = CoverFactor(lower, (), analysis)
         keys = held.keys

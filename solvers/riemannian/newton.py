@@ -15,7 +15,7 @@ from solvers.riemannian.newton_step import NewtonFigures
 from solvers.riemannian.polish import (
     PolishState,
     polish_step,
-    start_polish,
+    start_run,
 )
 
 SMALL = 1000  # poses in space up to which Newton alone is faster
@@ -82,9 +82,9 @@ class Newton:
         return self.tolerance / STATIONARY_DECREMENT
 
     def init(self, problem: PGOProblem, start: Poses | None) -> NewtonState:
-        """State 0: `start`, or the chordal relaxation."""
+        """State 0: `start`, or the chordal relaxation; of chi2 with the best translations."""
         poses = start if start is not None else chordal_start(problem)
-        return NewtonState(0, start_polish(problem, poses, self.share))
+        return NewtonState(0, start_run(problem, poses, self.share))
 
     def step(self, problem: PGOProblem, state: NewtonState) -> NewtonState:
         """One factorisation and the moves it serves."""

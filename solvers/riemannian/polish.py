@@ -36,7 +36,7 @@ from solvers.riemannian.newton_step import (
     stationary_tolerance,
 )
 
-NEARLY_STRAIGHT = 1e-7  # decrement below which the path of the best translations of chi2 is a line
+SHORT_MOVE = 1e-4  # decrement up to which the moves that follow hardly turn a pose
 NEARLY_EXACT = 1e4  # times its rounding level: then F is what the solve for the translations leaves
 MOST_FITTING_STEPS = 3  # Newton steps at the rounding level of F
 
@@ -90,6 +90,7 @@ class CentralAlgebra:
         self.rounding_level = rounding_level(problem, state.poses)  # hardly moves with them
         self.has_secants = has_secants
         self._secants: list[tuple[Array, Array]] = []  # moves, and changes of g along them
+        self._short_move_factor: CholeskyFactor | None = None  # of translations
 
     def factorize(self, order: ModelOrder) -> CentralModel | None:
         """Return the model at the poses of the state."""
@@ -121,18 +122,31 @@ class CentralAlgebra:
 
         The translations that are best for the turned rotations lie on the curved path that a
         straight move of both leaves: on parking-garage this saves two thirds of the factorisations.
+        Where they are best at every point of a step, its secants are those of the cost as a
+        function of the rotations, and one factorisation serves all moves of most runs.
         """
         problem = self.problem
         w, v = self.layout.split(model.step)
-        poses = model.poses.moved_along(length * w, length * v)
-        if problem.is_quadratic or decrement_of(model) > NEARLY_STRAIGHT:
-            poses = problem.at_best_translations(poses)
+        moved = model.poses.moved_along(length * w, length * v)
+        poses = problem.at_best_translations(moved, self._factor_of_translations(model, moved))
         objective = problem.objective(poses)
         is_nearly_exact = objective <= NEARLY_EXACT * model.rounding_level
         if problem.is_quadratic and length == 1.0 and is_nearly_exact:
             poses = problem.with_refined_translations(poses)
             objective = problem.objective(poses)
         return PolishTrial(poses, objective)
+
+    def _factor_of_translations(self, model: CentralModel, moved: Poses) -> CholeskyFactor | None:
+        """Factor for the translations of moved poses, where chi2 needs one.
+
+        That of the first short move serves the others: rotations hardly change from then on.
+        """
+        if self._short_move_factor is not None:
+            return self._short_move_factor
+        factor = self.problem.translation_factor(moved)
+        if decrement_of(model) <= SHORT_MOVE:
+            self._short_move_factor = factor
+        return factor
 
     def model_at(self, model: CentralModel, trial: PolishTrial) -> CentralModel:
         """Return the model at the trial, its step by L-BFGS where the algebra learns from moves."""
@@ -179,18 +193,29 @@ def start_polish(problem: PGOProblem, poses: Poses, share: float = 1.0) -> Polis
     return PolishState(poses=poses, objective=problem.objective(poses), tolerance=tolerance)
 
 
+def start_run(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishState:
+    """Begin a run at poses, for chi2 with their best translations where these cost less.
+
+    The start of chi2 has the translations of another cost. With its own, the Hessian is the better
+    model from the first step on, and one factorisation is saved.
+    """
+    if not problem.is_quadratic:
+        settled = problem.at_best_translations(poses)
+        if problem.objective(settled) < problem.objective(poses):
+            poses = settled
+    return start_polish(problem, poses, share)
+
+
 def polish_step(
     problem: PGOProblem, state: PolishState, second_order: bool = True, secants: bool = True
 ) -> PolishState:
     """Take one `newton_step` in one place.
 
-    The first move of a run that minimises chi2 takes the Gauss-Newton matrix, which is the better
-    model far from the minimum. Where no damping makes the matrix definite, as with weights too far
-    apart for doubles, the poses stay as they are.
+    Where no damping makes the matrix definite, as with weights too far apart for doubles, the poses
+    stay as they are.
     """
-    is_far = state.analysis is None and not problem.is_quadratic
     algebra = CentralAlgebra(problem, state, secants)
-    rules = StepRules(state.tolerance, second_order and not is_far)
+    rules = StepRules(state.tolerance, second_order)
     try:
         result = newton_step(algebra, rules)
     except NotPositiveDefiniteError:
@@ -265,7 +290,7 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
     >>> bool(problem.objective(polish(problem, start)) < problem.objective(start))
     True
     """
-    state = start_polish(problem, poses)
+    state = start_run(problem, poses)
     for _ in range(max_steps):
         state = polish_step(problem, state)
         if state.is_stationary or not state.moved:

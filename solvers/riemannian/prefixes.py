@@ -318,7 +318,7 @@ def _prefix_problem(problem: PGOProblem, members: IntArray) -> PGOProblem:
     is_member = np.zeros(graph.num_poses, dtype=bool)
     is_member[members] = True
     weights = problem.weights.of_edges(is_member[graph.i] & is_member[graph.j])
-    return replace(problem, graph=graph.subgraph(members), weighting=weights)
+    return PGOProblem(graph.subgraph(members), problem.backend, weights)
 
 
 def _is_at_global_minimum(problem: PGOProblem, poses: Poses) -> bool:

@@ -110,7 +110,7 @@ class IRLS:
     def step(self, problem: PGOProblem, state: IRLSState) -> IRLSState:
         """Weights for the current residuals, and steps towards the minimum with them."""
         weights = np.sqrt(state.thresholds / np.maximum(state.costs, state.thresholds))
-        weighted = replace(problem, weighting=problem.weights.scaled(weights))
+        weighted = PGOProblem(problem.graph, problem.backend, problem.weights.scaled(weights))
         method = self.inner
         inner = method.init(weighted, state.poses)
         for _ in range(self.inner_steps):

@@ -13,7 +13,7 @@ for s, steps on clusters the s by which attempts are compared.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 
 import numpy as np
@@ -56,7 +56,7 @@ def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
             f"known inliers and the edges kept leave {graph.name} in {apart}; "
             "name more known inliers, or raise the quantile"
         )
-    return replace(problem, graph=graph.without_edges(~kept))
+    return PGOProblem(graph.without_edges(~kept), problem.backend, problem.weighting)
 
 
 def truncated_cost(problem: PGOProblem, known: BoolArray, thresholds: Array, poses: Poses) -> float:

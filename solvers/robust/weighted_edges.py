@@ -194,10 +194,10 @@ def weighted_problem(
     # rotation.
     has_own_weights = len(graph.landmarks) > 0 and isinstance(problem.weighting, Weighting)
     if has_own_weights:
-        unscaled = replace(problem, graph=graph).weights
+        unscaled = PGOProblem(graph, problem.backend, problem.weighting).weights
     else:
         unscaled = problem.weights.of_edges(kept)
-    return replace(problem, graph=graph, weighting=unscaled.scaled(weights[kept]))
+    return PGOProblem(graph, problem.backend, unscaled.scaled(weights[kept]))
 
 
 def first_poses(graph: PoseGraph, known: BoolArray) -> Poses:

@@ -17,7 +17,7 @@ from pgo_models.certificates.certificate import Certificate, certify_at
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
-from pgo_models.problem.ordering import most_counts, pose_order
+from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robust import SharedEstimate
 from solvers.loop import RunMonitor
@@ -86,8 +86,8 @@ class DoubtedProblem:
         problem = self.problem
         if (problem.backend or default_backend()) is not CholeskyBackend.CHOLMOD:
             return False
-        order = pose_order(problem.graph)
-        counts = most_counts(problem.graph, order, problem.d + 1)
+        graph = problem.graph
+        counts = most_counts(analyze_poses(graph, pose_order(graph)), problem.d + 1)
         return float(np.sum(counts.in_column**2)) <= _AFFORDABLE_OPERATIONS
 
     def with_edges(self, kept: BoolArray) -> PGOProblem:

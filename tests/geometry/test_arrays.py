@@ -16,7 +16,14 @@ from scipy.sparse import issparse
 from pgo_models.convex.bregman import BregmanPoint, BregmanProblem
 from pgo_models.convex.orthogonality import OrthogonalPoint
 from pgo_models.errors import GraphError, PGOError, SettingError
-from pgo_models.geometry.arrays import read_only, real_array, whole_array, whole_number
+from pgo_models.geometry.arrays import (
+    block_norms,
+    inner_products,
+    read_only,
+    real_array,
+    whole_array,
+    whole_number,
+)
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -235,3 +242,14 @@ def test_integers_of_any_kind_are_counts() -> None:
 def test_nothing_is_cast_silently(make: Callable[[], object], message: str) -> None:
     with pytest.raises(PGOError, match=message):
         make()
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (0, 2, 2), (5, 1), (5, 3), (5, 3, 2)])
+def test_inner_products_of_blocks(shape: tuple[int, ...]) -> None:
+    """There may be no blocks, as where a robot has no edge of its own."""
+    rng = np.random.default_rng(0)
+    A, B = rng.standard_normal((2, *shape))
+    expected = [float(np.vdot(a, b)) for a, b in zip(A, B, strict=True)]
+    np.testing.assert_allclose(inner_products(A, B), expected, rtol=1e-13, atol=1e-15)
+    norms = [float(np.linalg.norm(a)) for a in A]
+    np.testing.assert_allclose(block_norms(A), norms, rtol=1e-13, atol=0)

@@ -11,7 +11,9 @@ from pgo_models.geometry.rotations import stack_transposes
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem import matrices
+from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.matrices import (
+    BlockLaplacian,
     assemble,
     connection_laplacian,
     entry_positions,
@@ -20,6 +22,7 @@ from pgo_models.problem.matrices import (
     residual_matrix,
     rotation_columns,
 )
+from pgo_models.problem.problem import PGOProblem
 
 
 def rotation_cost(graph: PoseGraph, R: np.ndarray) -> float:
@@ -223,3 +226,41 @@ def test_assemble_sums_repeated_entries_and_keeps_zeros() -> None:
     assert isinstance(matrix, csc_array)
     np.testing.assert_array_equal(matrix.toarray(), [[3.0, 0.0], [0.0, 0.0]])
     assert matrix.nnz == 3
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_a_laplacian_of_blocks_is_assembled_in_its_pattern(seed: int, n: int, d: int) -> None:
+    """It is the sum over the edges of (e_j - e_i) (e_j - e_i)^T (x) W, with pose 0 held once more.
+
+    Parallel edges add up in one entry.
+    """
+    graph = varied_graph(seed, n, d)
+    i = np.append(graph.i, graph.i[:2])
+    j = np.append(graph.j, graph.j[:2])
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((len(i), d, d))
+    W = root @ np.swapaxes(root, 1, 2)
+    laplacian = BlockLaplacian.of(Incidence.of_pairs(n, i, j), d).matrix(W)
+    expected = np.zeros((d * n, d * n))
+    for a, b, weight in zip(i, j, W, strict=True):
+        ends = np.zeros((d, d * n))
+        ends[:, d * a : d * a + d] -= np.eye(d)
+        ends[:, d * b : d * b + d] += np.eye(d)
+        expected += ends.T @ weight @ ends
+    expected[:d, :d] *= 2.0
+    stored = csc_array(laplacian.tocoo())  # canonical, as sorted anew
+    np.testing.assert_array_equal(laplacian.indices, stored.indices)
+    np.testing.assert_array_equal(laplacian.indptr, stored.indptr)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(laplacian.toarray(), expected, rtol=0, atol=1e-13 * scale)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_positions_of_the_diagonal_and_its_blocks(seed: int, n: int, d: int) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d))
+    M = problem.M
+    dense = M.toarray()
+    np.testing.assert_array_equal(M.data[problem.diagonal_positions], np.diag(dense))
+    for pose, positions in enumerate(problem.block_positions):
+        rows = slice(n + d * pose, n + d * pose + d)
+        np.testing.assert_array_equal(M.data[positions], dense[rows, rows])

@@ -7,7 +7,7 @@ import pgo_models as pgo
 from pgo_models.problem import ordering
 from pgo_models.problem.cholesky import CholeskyBackend, analyze
 from pgo_models.problem.hessian import ground_pose, riemannian_hessian, tangent_order
-from pgo_models.problem.ordering import most_counts, pose_order, row_order
+from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order, row_order
 
 WORLD = pgo.grid_world(4, 40, np.random.default_rng(0), d=3)
 
@@ -45,7 +45,8 @@ def test_a_dissected_world_in_space_fills_less() -> None:
         ordering.pattern_of_edges(world.num_poses, world.i, world.j)
     )
     filled = [
-        most_counts(world, order, 1).in_column.sum() for order in (pose_order(world), by_degree)
+        most_counts(analyze_poses(world, order), 1).in_column.sum()
+        for order in (pose_order(world), by_degree)
     ]
     assert filled[0] < 0.8 * filled[1]
 
@@ -65,7 +66,7 @@ def test_no_factor_has_more_non_zeros_than_blocks_can_have(graph: pgo.PoseGraph)
     n = problem.num_poses
     d = problem.d
     M.setdiag(2.0 * M.diagonal())
-    most = most_counts(problem.graph, problem.pose_order, 1, d)
+    most = most_counts(analyze_poses(problem.graph, problem.pose_order), 1, d)
     factor = analyze(M, CholeskyBackend.CHOLMOD, row_order(problem.pose_order, 1, d)).factorize(M)
     L, order = factor.take_apart()
     L.eliminate_zeros()  # entries that CHOLMOD stores to have wider blocks are exact

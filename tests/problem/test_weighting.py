@@ -246,3 +246,26 @@ def test_the_least_eigenvalue_is_seen_in_every_unit() -> None:
     assert are_definite(blocks[[0, 2]], 0.0).tolist() == [True, False]
     assert are_definite(blocks[[0, 2]], -0.2649).tolist() == [True, False]
     assert are_definite(blocks[[0, 2]], -0.2650).all()
+
+
+@given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS, coupled=COUPLED)
+def test_a_factor_for_the_translations_serves_nearly_the_same_rotations(
+    seed: int, n: int, d: int, coupled: bool
+) -> None:
+    """It is exact for its own rotations, and off in proportion to a turn for others."""
+    problem = PGOProblem(informed(seed, n, d, coupled), weighting=Weighting.INFORMATION)
+    poses = random_poses(n, d, seed)
+    factor = problem.translation_factor(poses)
+    assert factor is not None
+    best = problem.at_best_translations(poses)
+    np.testing.assert_array_equal(problem.at_best_translations(poses, factor).t, best.t)
+    turned = moved(best, 1e-5, seed)
+    settled = problem.at_best_translations(turned)
+    nearly = problem.at_best_translations(turned, factor)
+    lost = np.linalg.norm(turned.t - settled.t)
+    assert 0.0 < np.linalg.norm(nearly.t - settled.t) <= 1e-2 * lost
+
+
+def test_the_factor_for_translations_of_f_is_the_problems_own() -> None:
+    problem = PGOProblem(varied_graph(0, 5, 3), weighting=Weighting.ISOTROPIC)
+    assert problem.translation_factor(random_poses(5, 3, 0)) is None

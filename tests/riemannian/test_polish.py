@@ -11,6 +11,7 @@ from graphs import (
     SEEDS,
     SIZES,
     exact_graph,
+    informed,
     optimum_tolerance,
     random_poses,
     varied_graph,
@@ -26,7 +27,9 @@ from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from pgo_models.problem.weighting import Weighting
 from solvers.loop import run
+from solvers.riemannian.newton import Newton
 from solvers.riemannian.polish import (
     _apply_inverse,
     polish,
@@ -252,3 +255,20 @@ def test_units_of_the_weights_do_not_matter(scale: float) -> None:
     assert relative_decrement(problem, poses) <= STATIONARY_DECREMENT
     least = scale * expected.objective(polish(expected, chordal_start(expected)))
     assert problem.objective(poses) == pytest.approx(least, rel=1e-12, abs=STATIONARY_DECREMENT)
+
+
+@given(seed=SEEDS, n=st.integers(3, 8), d=DIMENSIONS, coupled=st.booleans())
+def test_newton_on_chi2_begins_at_its_best_translations(
+    seed: int, n: int, d: int, coupled: bool
+) -> None:
+    """Of the given rotations; no run begins at a higher cost than it was given."""
+    problem = PGOProblem(informed(seed, n, d, coupled), weighting=Weighting.INFORMATION)
+    start = random_poses(n, d, seed)
+    first = Newton().init(problem, start).polish
+    np.testing.assert_array_equal(first.poses.R, start.R)
+    assert first.objective < problem.objective(start)
+    again = problem.at_best_translations(first.poses)
+    scale = np.abs(start.t - first.poses.t).max()
+    np.testing.assert_allclose(again.t, first.poses.t, rtol=0, atol=1e-6 * scale)
+    given_best = Newton().init(problem, first.poses).polish
+    assert given_best.objective <= first.objective
