@@ -390,7 +390,8 @@ def _solve_from(
     engine: Engine | None = None,
 ) -> Solution:
     """Solution by Newton alone or, where its certificate is too wide, by the whole pipeline."""
-    if pipeline.has_added_terms:  # Newton alone would leave them out
+    # Newton alone would leave added terms out, and needs a driver.
+    if pipeline.has_added_terms or not pipeline.has_driver:
         return solve(problem, pipeline, start, robots=robots, engine=engine)
     tolerance = max(pipeline.newton.tolerance, _SHARE * pipeline.gap)
     newton = replace(pipeline.newton, tolerance=tolerance)

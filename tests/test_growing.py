@@ -296,6 +296,26 @@ def test_robots_can_be_given_and_a_further_one_joins() -> None:
     assert grown.ledger.rounds > before.ledger.rounds
 
 
+def test_robots_without_a_driver_go_on_without_one() -> None:
+    graph = replace(grid(np.random.default_rng(0)), information=None)
+    owner = np.repeat([0, 1], [9, 18])
+    whole = Partition(owner, PartitionMethod.GIVEN)
+    parts = [Partition(owner[:18], PartitionMethod.GIVEN), whole]
+    pipelines = [
+        solvers.Pipeline(
+            soc=solvers.SOC(robots=robots, coupling=solvers.Coupling.CONSENSUS), driver_memory=0
+        )
+        for robots in parts
+    ]
+    before = solvers.solve(first_poses(graph, 18), pipelines[0], robots=parts[0])
+    grown = extend(before, graph, pipelines[1], robots=whole)
+    assert [stage.name for stage in grown.stages] == ["given start", "SOC"]
+    assert grown.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-3)
+    assert grown.ledger is not None
+    assert before.ledger is not None
+    assert grown.ledger.rounds > before.ledger.rounds
+
+
 def test_robots_go_on_with_a_certificate_alone() -> None:
     graph = grid(np.random.default_rng(0))
     before = solvers.solve(first_poses(graph, 18), robots=2)
