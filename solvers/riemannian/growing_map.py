@@ -91,8 +91,9 @@ class GrowingMap:
     def of(cls, cost: GrowingCost, R: Array, t: Array) -> GrowingMap:
         """Begin at poses with the cost of their edges; a NotPositiveDefiniteError as `updated`."""
         empty = EliminationTree.empty(cost.d * (cost.d + 1) // 2)
-        curvature = np.median(np.einsum("mkk->m", cost.W))
-        length = float(np.sqrt(curvature / np.median(cost.tau)))
+        trace = np.einsum("mkk->m", cost.W)
+        # Edges of a rotation or a position alone say nothing of it.
+        length = float(np.sqrt(np.median(trace[trace > 0.0]) / np.median(cost.tau[cost.tau > 0.0])))
         return cls(R, t, cost, empty, 0, R, t, length)._with_all_springs()
 
     @cached_property
