@@ -15,7 +15,7 @@ from solvers.convex.orthogonal import (
 )
 from solvers.distributed.checkpoint import Checkpoint as Checkpoint
 from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
-from solvers.growing import extend as extend
+from solvers.growing import GrowingSolution as GrowingSolution, extend as extend
 from solvers.handedness.ascent import HandednessAscent as HandednessAscent
 from solvers.handedness.hull_lagrangian import HullLagrangian as HullLagrangian
 from solvers.handedness.search import HandednessSearch as HandednessSearch
@@ -113,6 +113,7 @@ __all__ = [
 ]
 __all__ += [
     "FolderSolution",
+    "GrowingSolution",
     "Pipeline",
     "Solution",
     "certify",

@@ -1,55 +1,350 @@
-"""Graphs that grow: new poses start where their edges put them, and Newton goes on from there.
+"""Graphs that grow: new poses start where their edges put them, and the solution goes on.
 
-An update ends where the gap that is asked for is proven, not at rounding level. It mostly takes one
-factorisation and the certificate.
+With a certificate Newton comes next. An update ends where the gap that is asked for is proven, not
+at rounding level; it mostly takes one factorisation and the certificate. Without one an update
+changes what the new edges touch (`solvers.riemannian.growing_map`), and the certificate can be had
+at any later one.
 """
 
-from dataclasses import replace
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, overload
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.cholesky import factorize
-from pgo_models.problem.matrices import columns_of
+from pgo_models.graphs.precisions import proper_information
+from pgo_models.problem.cholesky import CholeskyBackend, factorize
+from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.growing_cost import GrowingCost
+from pgo_models.problem.matrices import columns_of, isotropic_weights
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from pgo_models.problem.weighting import Weighting, information_cost
+from solvers.loop import run
+from solvers.network.engine import Engine
+from solvers.network.ledger import Ledger
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import OUT_OF_TIME
+from solvers.riemannian.growing_map import GrowingMap
+from solvers.riemannian.newton import Newton
 from solvers.solution import Solution
 
 # Share of the gap by which Newton may leave F above its minimum: the bound can be ten times as far
 # below it.
 _SHARE = 0.01
+# Relative decrement of Newton where an update without a certificate did not converge by itself.
+_AFRESH = 1e-9
+# Arrays with a row for every edge, by which two graphs are compared and joined.
+_MEASURED = ("R_ij", "t_ij", "kappa", "tau", "information")
 
 
-def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = None) -> Solution:
-    """Solve a graph that has grown out of another one, from the solution of that.
+@dataclass(frozen=True, eq=False)
+class GrowingSolution:
+    """Poses near the optimum of a graph that grows, without a certificate.
 
-    Newton alone comes first. Where its certificate is wider than asked for, the whole pipeline
-    follows, and the stages of the solution are those of both.
+    `extend(.., certify=False)` returns one, and takes it again. `with_edges` adds new edges alone,
+    without a graph of all. The cost is F, or chi2 where it is quadratic.
 
     Parameters
     ----------
-    solution : Solution
+    graphs : tuple of PoseGraph
+        The first graph, and what it has grown by: each has its edges and the poses of these.
+    numbers : dict
+        Number of every pose by its id.
+    map : GrowingMap
+        Poses, cost and factor.
+    weighting : Weighting
+        Which cost it is.
+    backend : CholeskyBackend, optional
+        The sparse Cholesky of a certificate.
+
+    Examples
+    --------
+    A graph of 18 poses grows by one pose after the other:
+
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> growing = GrowingSolution.of(solve(graph.subgraph(np.arange(18))))
+    >>> for n in range(19, 28):
+    ...     growing = extend(growing, graph.subgraph(np.arange(n)), certify=False)
+    >>> growing
+    GrowingSolution('grid', poses=27, edges=108, F=97.01402)
+    >>> growing.certified().is_certified
+    True
+    """
+
+    graphs: tuple[PoseGraph, ...]
+    numbers: dict[int, int]
+    map: GrowingMap
+    weighting: Weighting
+    backend: CholeskyBackend | None = None
+
+    @classmethod
+    def of(cls, solution: Solution) -> GrowingSolution:
+        """Begin at a solution: one factorisation.
+
+        Parameters
+        ----------
+        solution : Solution
+            Of the graph before it grows.
+
+        Returns
+        -------
+        GrowingSolution
+            At the same poses.
+
+        Raises
+        ------
+        SettingError
+            When the cost is not quadratic, or the graph has landmarks or priors.
+        NotPositiveDefiniteError
+            When the weights are too far apart for doubles.
+        """
+        return cls._at(solution.problem, solution.poses)
+
+    @classmethod
+    def _at(cls, problem: PGOProblem, poses: Poses) -> GrowingSolution:
+        graph = problem.graph
+        weighting = problem.weighting
+        if weighting not in (Weighting.ISOTROPIC, Weighting.INFORMATION):
+            raise SettingError(f"certify=False is for F and chi2, not for {problem!r}")
+        assert isinstance(weighting, Weighting)
+        cost = GrowingCost.of(graph, _quadratic_cost(graph, weighting))
+        numbers = dict(zip(graph.pose_ids.tolist(), range(graph.num_poses), strict=True))
+        started = GrowingMap.of(cost, poses.R, poses.t)
+        return cls((graph,), numbers, started, weighting, problem.backend)
+
+    @property
+    def poses(self) -> Poses:
+        """All poses, in the frame of the first solution."""
+        return Poses(self.map.R, self.map.t)
+
+    @property
+    def objective(self) -> float:
+        """Cost of the poses, as computed: F, or chi2."""
+        return self.map.objective
+
+    @cached_property
+    def graph(self) -> PoseGraph:
+        """The whole graph: its poses and edges in the order in which they came.
+
+        Estimates, truth and time stamps are those of a whole graph alone, if one was given last.
+        """
+        first, *added = self.graphs
+        if not added:
+            return first
+        ids = np.array(list(self.numbers))
+        arrays: dict[str, Any] = {}
+        for name in _MEASURED:
+            rows = [getattr(graph, name) for graph in self.graphs]
+            arrays[name] = None if rows[0] is None else np.concatenate(rows)
+        ends_i = [self._numbers_of(graph)[graph.i] for graph in self.graphs]
+        ends_j = [self._numbers_of(graph)[graph.j] for graph in self.graphs]
+        i = np.concatenate(ends_i)
+        j = np.concatenate(ends_j)
+        return PoseGraph(len(ids), i, j, **arrays, ids=ids, fixed=first.fixed, name=first.name)
+
+    def with_edges(self, graph: PoseGraph) -> GrowingSolution:
+        """Return the solution after new edges.
+
+        Most updates take one or two products with an inverse that is factored anew only above the
+        poses of the new edges (Kaess et al. 2012). Where that does not converge, Newton solves
+        the whole graph.
+
+        Parameters
+        ----------
+        graph : PoseGraph
+            The new edges alone, with the poses that they join. Poses are recognised by their ids;
+            all others are new.
+
+        Returns
+        -------
+        GrowingSolution
+            At a minimum of the cost of all edges, near the poses before.
+
+        Raises
+        ------
+        GraphError
+            When a new pose is not joined with those before, or some edges have information
+            matrices and others have none.
+        SettingError
+            As for `of`.
+
+        References
+        ----------
+        M. Kaess, H. Johannsson, R. Roberts, V. Ila, J. Leonard and F. Dellaert, iSAM2: Incremental
+        smoothing and mapping using the Bayes tree, IJRR 2012.
+
+        Examples
+        --------
+        Two poses, and a third one that sees both:
+
+        >>> from pgo_models import PoseGraph, read_g2o
+        >>> step = np.array([[1.0, 0.0]])
+        >>> turn = np.eye(2)[None]
+        >>> one = np.ones(1)
+        >>> pair = PoseGraph(2, np.array([0]), np.array([1]), turn, step, one, one)
+        >>> growing = GrowingSolution.of(solve(pair))
+        >>> seen = np.array([[1.0, 0.1], [2.0, 0.2]])
+        >>> turns = np.array([np.eye(2), np.eye(2)])
+        >>> third = PoseGraph(
+        ...     3, np.array([1, 0]), np.array([2, 2]), turns, seen, np.ones(2), np.ones(2)
+        ... )
+        >>> growing.with_edges(third)
+        GrowingSolution('graph', poses=3, edges=3, F=0.003000674)
+        """
+        first = self.graphs[0]
+        if (graph.information is None) != (first.information is None):
+            raise GraphError(
+                f"of {first.name} and {graph.name} one has information matrices and one has none; "
+                "give them to both"
+            )
+        cost = GrowingCost.of(graph, _quadratic_cost(graph, self.weighting))
+        numbers = dict(self.numbers)
+        for name in graph.pose_ids.tolist():
+            numbers.setdefault(name, len(numbers))
+        pose = _numbers_of(graph, numbers)
+        grown = replace(
+            self,
+            graphs=(*self.graphs, graph),
+            numbers=numbers,
+            map=self.map.with_edges(graph, cost, pose),
+        )
+        return grown if grown.map.has_converged else grown._solved_afresh()
+
+    def certified(self, pipeline: Pipeline | None = None) -> Solution:
+        """Return the solution with a certificate, as `extend` does.
+
+        Parameters
+        ----------
+        pipeline : Pipeline, optional
+            Settings of the stages; `Pipeline()` unless given.
+
+        Returns
+        -------
+        Solution
+            Of the whole graph. The growing solution can be extended all the same.
+        """
+        pipeline = pipeline if pipeline is not None else Pipeline()
+        return _solve_from(self.problem, pipeline, self.poses)
+
+    def __repr__(self) -> str:
+        name = "F" if self.weighting is Weighting.ISOTROPIC else "chi2"
+        size = f"poses={len(self.numbers)}, edges={self.map.cost.num_edges}"
+        title = self.graphs[0].name
+        return f"GrowingSolution({title!r}, {size}, {name}={self.objective:.7g})"
+
+    @cached_property
+    def problem(self) -> PGOProblem:
+        """The problem of the whole graph."""
+        return PGOProblem(self.graph, self.backend, self.weighting)
+
+    def _numbers_of(self, graph: PoseGraph) -> IntArray:
+        return _numbers_of(graph, self.numbers)
+
+    def _solved_afresh(self) -> GrowingSolution:
+        """The solution by Newton on the whole graph, from the present poses."""
+        solved = run(Newton(tolerance=_AFRESH), self.problem, self.poses)
+        poses = solved.poses
+        return replace(self, map=GrowingMap.of(self.map.cost, poses.R, poses.t))
+
+    def _with_whole(self, graph: PoseGraph) -> GrowingSolution:
+        """Return the solution of a whole graph that has grown out of this one."""
+        edges = _new_edges(self.graph, graph)
+        if edges is None:
+            problem = PGOProblem(graph, self.backend, self.weighting)
+            start = extended_poses(problem, self.graph.pose_ids, self.poses)
+            return GrowingSolution._at(problem, start)._solved_afresh()
+        if not len(edges):
+            return self
+        poses = np.unique(np.concatenate([graph.i[edges], graph.j[edges]]))
+        added = PoseGraph(
+            len(poses),
+            np.searchsorted(poses, graph.i[edges]),
+            np.searchsorted(poses, graph.j[edges]),
+            **_rows(graph, edges),
+            ids=graph.pose_ids[poses],
+            name=graph.name,
+        )
+        return replace(self.with_edges(added), graphs=(graph,))
+
+
+@overload
+def extend(
+    solution: Solution | GrowingSolution,
+    graph: PoseGraph,
+    pipeline: Pipeline | None = None,
+    *,
+    certify: Literal[True] = True,
+    robots: Partition | None = None,
+    engine: Engine | None = None,
+) -> Solution: ...
+
+
+@overload
+def extend(
+    solution: Solution | GrowingSolution,
+    graph: PoseGraph,
+    pipeline: Pipeline | None = None,
+    *,
+    certify: Literal[False],
+    robots: Partition | None = None,
+    engine: Engine | None = None,
+) -> GrowingSolution: ...
+
+
+def extend(
+    solution: Solution | GrowingSolution,
+    graph: PoseGraph,
+    pipeline: Pipeline | None = None,
+    *,
+    certify: bool = True,
+    robots: Partition | None = None,
+    engine: Engine | None = None,
+) -> Solution | GrowingSolution:
+    """Solve a graph that has grown out of another one, from the solution of that.
+
+    With a certificate Newton alone comes first. Where its certificate is wider than asked for, the
+    whole pipeline follows, and the stages of the solution are those of both. A solution by robots
+    is extended by them.
+
+    Parameters
+    ----------
+    solution : Solution or GrowingSolution
         Of the graph before it has grown.
     graph : PoseGraph
         Poses of the solution, recognised by their ids, and new ones.
     pipeline : Pipeline, optional
         Settings of the stages; `Pipeline()` unless given.
+    certify : bool, optional
+        Whether the solution has a certificate. Without one, an update costs what the new edges
+        change, if the poses and edges of the solution come first in the graph, in their order; the
+        first update after a Solution factors the whole graph.
+    robots : Partition, optional
+        Robots that own the poses of the grown graph. Unless given, they are those of the solution,
+        and a new pose goes to the robot of the pose that its first edge joins it with.
+    engine : Engine, optional
+        Where the robots run; in this process unless given.
 
     Returns
     -------
-    Solution
-        Of the whole graph.
+    Solution or GrowingSolution
+        Of the whole graph. The ledger of a solve by robots goes on from that of the solution.
 
     Raises
     ------
     GraphError
         When the graph has no pose of the solution, or is not connected.
+    SettingError
+        When no certificate is asked for, and there are robots, landmarks or priors, or the cost is
+        not quadratic; when the robots are not those of the graph's poses.
 
     Examples
     --------
@@ -58,27 +353,70 @@ def extend(solution: Solution, graph: PoseGraph, pipeline: Pipeline | None = Non
     >>> solution = solve(graph.subgraph(np.arange(18)))
     >>> extend(solution, graph).is_certified
     True
+
+    Robots go on with what they own, and so does the account of what they send:
+
+    >>> shared = solve(graph.subgraph(np.arange(18)), robots=3)
+    >>> grown = extend(shared, graph)
+    >>> grown.robots.num_robots, grown.ledger.rounds > shared.ledger.rounds
+    (3, True)
     """
+    if robots is None and isinstance(solution, Solution) and solution.robots is not None:
+        robots = extended_partition(solution.robots, solution.problem.graph.pose_ids, graph)
+    if not certify:
+        if robots is not None:
+            raise SettingError(
+                "certify=False is for updates in one place; robots go on with a certificate"
+            )
+        if isinstance(solution, Solution):
+            solution = GrowingSolution.of(solution)
+        return solution._with_whole(graph)
     pipeline = pipeline if pipeline is not None else Pipeline()
     weighting = solution.problem.weighting
     if not isinstance(weighting, Weighting):
         weighting = Weighting.ISOTROPIC
     problem = PGOProblem(graph, solution.problem.backend, weighting)
     start = extended_poses(problem, solution.problem.graph.pose_ids, solution.poses)
-    if pipeline.has_added_terms:  # Newton alone would leave them out
-        return solve(problem, pipeline, start)
+    grown = _solve_from(problem, pipeline, start, robots, engine)
+    before = solution.ledger if isinstance(solution, Solution) else None
+    return replace(grown, ledger=_joined(before, grown.ledger))
+
+
+def _solve_from(
+    problem: PGOProblem,
+    pipeline: Pipeline,
+    start: Poses,
+    robots: Partition | None = None,
+    engine: Engine | None = None,
+) -> Solution:
+    """Solution by Newton alone or, where its certificate is too wide, by the whole pipeline."""
+    # Newton alone would leave added terms out, and needs a driver.
+    if pipeline.has_added_terms or not pipeline.has_driver:
+        return solve(problem, pipeline, start, robots=robots, engine=engine)
     tolerance = max(pipeline.newton.tolerance, _SHARE * pipeline.gap)
     newton = replace(pipeline.newton, tolerance=tolerance)
     # Terms are sought at the poses alone: the whole solve has the relaxation with hulls.
     search = pipeline.handedness
     terms = None if search is None else replace(search, hulls=None)
     newton_alone = replace(pipeline.with_newton_alone(newton), handedness=terms)
-    update = solve(problem, newton_alone, start)
+    update = solve(problem, newton_alone, start, robots=robots, engine=engine)
     if update.status in OUT_OF_TIME or not update.certificate.can_improve:
         return update
-    whole = solve(problem, pipeline, start)
-    stages = update.stages + whole.stages
-    return replace(whole, stages=stages, seconds=update.seconds + whole.seconds)
+    whole = solve(problem, pipeline, start, robots=robots, engine=engine)
+    return replace(
+        whole,
+        stages=update.stages + whole.stages,
+        seconds=update.seconds + whole.seconds,
+        ledger=_joined(update.ledger, whole.ledger),
+    )
+
+
+def _joined(before: Ledger | None, after: Ledger | None) -> Ledger | None:
+    """The account of both solves; of one of them where the other was in one place."""
+    if before is None or after is None:
+        return after if after is not None else before
+    num_robots = max(before.num_robots, after.num_robots)
+    return replace(before, num_robots=num_robots).joined(replace(after, num_robots=num_robots))
 
 
 def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
@@ -113,3 +451,85 @@ def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
         R[new] = project_to_rotations(unstack_transposes(X[n:])[new])
         t[new] = X[new]
     return problem.at_best_translations(Poses(R, t))
+
+
+def extended_partition(robots: Partition, ids: IntArray, graph: PoseGraph) -> Partition:
+    """Owners of the poses of a graph that has grown, from the `robots` of the poses with these ids.
+
+    A new pose goes to the robot of the pose that its first edge joins it with. A GraphError where
+    no edge joins some poses with known ones.
+    """
+    owner = np.full(graph.num_poses, -1)
+    _, known, place = np.intersect1d(graph.pose_ids, ids, return_indices=True)
+    owner[known] = robots.robot[place]
+    while (owner < 0).any():
+        is_open = (owner[graph.i] < 0) != (owner[graph.j] < 0)
+        if not is_open.any():
+            raise GraphError(
+                f"{graph.name} has poses that no edge joins with the {len(ids)} solved before; "
+                "solve it on its own"
+            )
+        i = graph.i[is_open]
+        j = graph.j[is_open]
+        new = np.where(owner[i] < 0, i, j)
+        known_ends = np.where(owner[i] < 0, j, i)
+        poses, first = np.unique(new, return_index=True)
+        owner[poses] = owner[known_ends[first]]
+    return Partition(owner, robots.method)
+
+
+def _quadratic_cost(graph: PoseGraph, weighting: Weighting) -> EdgeCost:
+    """F or chi2 of a graph; a SettingError for what updates without a certificate cannot take."""
+    if len(graph.landmarks) or graph.world is not None:
+        raise SettingError(
+            f"{graph.name} has landmarks or priors; extend it with a certificate, certify=True"
+        )
+    if weighting is Weighting.ISOTROPIC:
+        return isotropic_weights(graph)
+    cost = information_cost(graph, proper_information(graph))
+    if not (cost.is_quadratic and cost.is_convex and cost.has_translations):
+        raise SettingError(
+            f"chi2 of {graph.name} is not quadratic and convex; take F (Weighting.ISOTROPIC), "
+            "or extend it with a certificate, certify=True"
+        )
+    return cost
+
+
+def _numbers_of(graph: PoseGraph, numbers: dict[int, int]) -> IntArray:
+    """Numbers, (n,), of the poses of a graph by their ids."""
+    return np.array([numbers[name] for name in graph.pose_ids.tolist()])
+
+
+def _rows(graph: PoseGraph, edges: IntArray) -> dict[str, Any]:
+    """Measurements of some edges."""
+    rows = {}
+    for name in _MEASURED:
+        values = getattr(graph, name)
+        if values is not None:
+            rows[name] = values[edges]
+    return rows
+
+
+def _new_edges(before: PoseGraph, graph: PoseGraph) -> IntArray | None:
+    """Edges of a graph that the one before does not have.
+
+    None unless its poses come first in the graph, and its edges come in the same order.
+    """
+    n = before.num_poses
+    m = before.num_edges
+    if graph.num_poses < n or not np.array_equal(graph.pose_ids[:n], before.pose_ids):
+        return None
+    between_known = np.flatnonzero((graph.i < n) & (graph.j < n))
+    old = between_known[:m]
+    if len(old) < m:
+        return None
+    for name in ("i", "j", *_MEASURED):
+        own = getattr(before, name)
+        other = getattr(graph, name)
+        if (own is None) != (other is None):
+            return None
+        if own is not None and not np.array_equal(own, other[old]):
+            return None
+    is_new = np.ones(graph.num_edges, dtype=bool)
+    is_new[old] = False
+    return np.flatnonzero(is_new)

@@ -7,19 +7,21 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 import pytest
-from graphs import COSTS, informed
+from graphs import COSTS, exact_graph, informed
 
 import solvers
 from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.convex.graph_subproblem import ModelChange
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.grid_worlds import grid_world
+from pgo_models.graphs.partitioning import Partition, PartitionMethod
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, grid, random_geometric
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.growing import extend, extended_poses
+from solvers.growing import GrowingSolution, extend, extended_partition, extended_poses
 
 
 def first_poses(graph: PoseGraph, count: int) -> PoseGraph:
@@ -119,3 +121,203 @@ def test_terms_of_an_extended_model_stay() -> None:
     grown = extend(before, graph, pipeline)
     afresh = solvers.solve(graph, pipeline)
     assert grown.objective == pytest.approx(afresh.objective, rel=1e-6)
+
+
+def edges_of(graph: PoseGraph, pose: int) -> IntArray:
+    """Edges of a pose to earlier ones."""
+    return np.flatnonzero(np.maximum(graph.i, graph.j) == pose)
+
+
+def part_of(graph: PoseGraph, edges: IntArray) -> PoseGraph:
+    """Graph of some edges and their poses."""
+    poses = np.unique(np.concatenate([graph.i[edges], graph.j[edges]]))
+    is_left_out = np.ones(graph.num_edges, dtype=bool)
+    is_left_out[edges] = False
+    return replace(graph.without_edges(is_left_out).subgraph(poses), initial=None, truth=None)
+
+
+def world(d: int, seed: int) -> PoseGraph:
+    """One robot that walks on a lattice and closes loops."""
+    return grid_world(1, 80, np.random.default_rng(seed), d=d, loop_closure_probability=0.3)
+
+
+@pytest.mark.parametrize("as_wholes", [False, True])
+@pytest.mark.parametrize("d", [2, 3])
+def test_pose_by_pose_it_stays_at_the_optimum(d: int, as_wholes: bool) -> None:
+    graph = world(d, 0)
+    n = graph.num_poses
+    half = n // 2
+    growing = GrowingSolution.of(solvers.solve(first_poses(graph, half)))
+    for pose in range(half, n):
+        if as_wholes:
+            growing = extend(growing, first_poses(graph, pose + 1), certify=False)
+        else:
+            growing = growing.with_edges(part_of(graph, edges_of(graph, pose)))
+        if pose % 10 == 0 or pose == n - 1:
+            best = solvers.solve(first_poses(graph, pose + 1))
+            assert best.is_certified
+            assert growing.objective == pytest.approx(best.objective, rel=1e-6)
+            assert growing.objective >= best.lower_bound
+    assert growing.graph.num_edges == graph.num_edges
+    certified = growing.certified()
+    assert certified.is_certified
+    assert certified.problem.graph.num_poses == n
+    assert certified.objective == pytest.approx(best.objective, rel=1e-9)
+
+
+def test_a_state_is_left_alone_by_what_follows() -> None:
+    graph = world(2, 1)
+    n = graph.num_poses
+    before = GrowingSolution.of(solvers.solve(first_poses(graph, n - 8)))
+    poses = before.poses
+    left = before
+    right = before
+    for pose in range(n - 8, n):
+        left = left.with_edges(part_of(graph, edges_of(graph, pose)))
+    for pose in range(n - 8, n):
+        right = right.with_edges(part_of(graph, edges_of(graph, pose)))
+    np.testing.assert_array_equal(before.poses.t, poses.t)
+    assert before.graph.num_poses == n - 8
+    np.testing.assert_array_equal(left.poses.t, right.poses.t)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_exact_edges_cost_nothing(d: int) -> None:
+    graph = exact_graph(0, 20, d)
+    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 12)))
+    for pose in range(12, 20):
+        growing = growing.with_edges(part_of(graph, edges_of(graph, pose)))
+    assert growing.objective < 1e-20 * graph.tau.sum()
+    assert graph.truth is not None
+    aligned = growing.poses.aligned_to(graph.truth)
+    np.testing.assert_allclose(aligned.t, graph.truth.t, rtol=0, atol=1e-9)
+
+
+def test_a_closure_that_moves_half_of_the_map_is_solved_as_well() -> None:
+    """A long chain with a bend, which the closure takes away."""
+    n = 120
+    rng = np.random.default_rng(3)
+    turns = exp_map(rng.normal(0.03, 0.05, (n, 1)))
+    steps = np.tile([1.0, 0.0], (n, 1)) + rng.normal(0.0, 0.05, (n, 2))
+    i = np.arange(n)
+    kappa = np.full(n, 100.0)
+    tau = np.full(n, 400.0)
+    ring = PoseGraph(n, i, (i + 1) % n, turns, steps, kappa, tau)
+    open_ring = ring.without_edges(i == n - 1)
+    growing = extend(solvers.solve(open_ring), ring, certify=False)
+    best = solvers.solve(ring)
+    assert growing.objective == pytest.approx(best.objective, rel=1e-6)
+
+
+def test_edges_in_another_order_are_another_graph_and_solved_all_the_same() -> None:
+    graph = grid(np.random.default_rng(3))
+    before = solvers.solve(first_poses(graph, 20))
+    shuffled = graph.subgraph(np.arange(27))
+    order = np.random.default_rng(0).permutation(graph.num_edges)
+    rows = {
+        name: getattr(graph, name)[order] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
+    }
+    growing = extend(before, replace(shuffled, **rows), certify=False)
+    assert growing.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-6)
+    assert extend(growing, graph).is_certified
+    # nothing new
+    again = extend(growing, growing.graph, certify=False)
+    assert again.objective == growing.objective
+
+
+def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
+    graph = informed(4, 30, 3, coupled=True, noise=NoiseModel(0.002, 0.002))
+    chi2 = solvers.solve(PGOProblem(graph, weighting=Weighting.INFORMATION))
+    with pytest.raises(SettingError, match="not quadratic and convex"):
+        GrowingSolution.of(chi2)
+    scene = grid(np.random.default_rng(0))
+    seen = scene.with_landmark(np.array([0, 1, 2]), np.eye(3), tau=1.0)
+    with pytest.raises(SettingError, match="landmarks or priors"):
+        GrowingSolution.of(solvers.solve(seen))
+    rotations = solvers.solve(PGOProblem(scene, weighting=Weighting.ROTATIONS))
+    with pytest.raises(SettingError, match="for F and chi2"):
+        GrowingSolution.of(rotations)
+    growing = GrowingSolution.of(solvers.solve(first_poses(scene, 20)))
+    far = replace(first_poses(scene, 4), ids=np.arange(100, 104), truth=None)
+    with pytest.raises(GraphError, match="is not joined with the poses solved before"):
+        growing.with_edges(far)
+    with pytest.raises(GraphError, match="one has information matrices"):
+        growing.with_edges(part_of(graph, np.array([0])))
+
+
+# Robots
+
+
+def test_robots_and_their_account_go_on() -> None:
+    graph = grid(np.random.default_rng(0))
+    before = solvers.solve(first_poses(graph, 18), robots=3)
+    grown = extend(before, graph)
+    assert before.ledger is not None
+    assert before.robots is not None
+    assert grown.ledger is not None
+    assert grown.robots is not None
+    assert grown.is_certified
+    np.testing.assert_array_equal(grown.robots.robot[:18], before.robots.robot)
+    alone = solvers.solve(graph, robots=grown.robots)
+    assert grown.objective == pytest.approx(alone.objective, rel=DEFAULT_GAP)
+    assert grown.ledger.rounds > before.ledger.rounds
+    assert grown.ledger.num_bytes > before.ledger.num_bytes
+    assert (grown.ledger.bytes_sent >= before.ledger.bytes_sent).all()
+    # and once more, with the robots that it has now
+    assert extend(grown, graph).ledger.rounds > grown.ledger.rounds
+
+
+def test_a_new_pose_goes_to_the_robot_that_its_first_edge_joins_it_with() -> None:
+    e = np.eye(2)
+    i = np.array([0, 1, 2, 4, 0])
+    j = np.array([1, 2, 3, 3, 4])
+    chain = PoseGraph(
+        5, i, j, np.tile(e, (5, 1, 1)), np.ones((5, 2)), kappa=np.ones(5), tau=np.ones(5)
+    )
+    robots = Partition(np.array([0, 1, 1]), PartitionMethod.CONTIGUOUS)
+    grown = extended_partition(robots, np.arange(3), chain)
+    # Pose 3 is joined with pose 2; pose 4 with pose 0, and only then with pose 3.
+    assert grown.robot.tolist() == [0, 1, 1, 1, 0]
+    assert grown.method is PartitionMethod.CONTIGUOUS
+    with pytest.raises(GraphError, match="no edge joins"):
+        extended_partition(robots, np.arange(3), chain.without_edges(i > 1))
+
+
+def test_robots_can_be_given_and_a_further_one_joins() -> None:
+    graph = grid(np.random.default_rng(0))
+    before = solvers.solve(first_poses(graph, 18), robots=2)
+    chosen = Partition(np.repeat([0, 1, 2], 9), PartitionMethod.GIVEN)
+    grown = extend(before, graph, robots=chosen)
+    assert grown.robots is chosen
+    assert grown.is_certified
+    assert grown.ledger is not None
+    assert before.ledger is not None
+    assert grown.ledger.num_robots == 3
+    assert grown.ledger.rounds > before.ledger.rounds
+
+
+def test_robots_without_a_driver_go_on_without_one() -> None:
+    graph = replace(grid(np.random.default_rng(0)), information=None)
+    owner = np.repeat([0, 1], [9, 18])
+    whole = Partition(owner, PartitionMethod.GIVEN)
+    parts = [Partition(owner[:18], PartitionMethod.GIVEN), whole]
+    pipelines = [
+        solvers.Pipeline(
+            soc=solvers.SOC(robots=robots, coupling=solvers.Coupling.CONSENSUS), driver_memory=0
+        )
+        for robots in parts
+    ]
+    before = solvers.solve(first_poses(graph, 18), pipelines[0], robots=parts[0])
+    grown = extend(before, graph, pipelines[1], robots=whole)
+    assert [stage.name for stage in grown.stages] == ["given start", "SOC"]
+    assert grown.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-3)
+    assert grown.ledger is not None
+    assert before.ledger is not None
+    assert grown.ledger.rounds > before.ledger.rounds
+
+
+def test_robots_go_on_with_a_certificate_alone() -> None:
+    graph = grid(np.random.default_rng(0))
+    before = solvers.solve(first_poses(graph, 18), robots=2)
+    with pytest.raises(SettingError, match="in one place"):
+        extend(before, graph, certify=False)

@@ -30,6 +30,7 @@ def test_there_is_a_page_for_every_task():
         "own_cost",
         "certify",
         "outliers",
+        "growing",
         "robots",
         "change_the_model",
         "teach",

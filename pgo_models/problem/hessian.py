@@ -107,11 +107,11 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     # The same blocks in the unknowns v and w.
     tau = np.repeat(2.0 * weights.tau[:, None], d, axis=1)
     tau_sums = incidence.at_both(tau[:, None], tau[:, None])[:, 0]
-    coupling_vw = 2.0 * R_i @ _translation_generator(coupling_t)
+    coupling_vw = 2.0 * R_i @ translation_generator(coupling_t)
     coupling_vw_sums = incidence.at_beginning(coupling_vw).reshape(-1, *coupling_vw.shape[1:])
     relative_R = np.swapaxes(R_i, 1, 2) @ R_j
     coupling_ww = -2.0 * double_cross(relative_R, coupling_R)
-    diagonal_ww = _curvature_of_rotations(S_ii)
+    diagonal_ww = curvature_of_rotations(S_ii)
     # Rows and columns: of the poses, then of the two ends of every edge.
     layout = TangentLayout(problem.num_poses, d)
     every_pose = short(np.arange(problem.num_poses))
@@ -217,7 +217,7 @@ def double_cross(A: Array, B: Array) -> Array:
     return np.asarray(isotropic_part + np.swapaxes(transposed_part, 1, 2))
 
 
-def _curvature_of_rotations(S_ii: Array) -> Array:
+def curvature_of_rotations(S_ii: Array) -> Array:
     """2 (tr(S_ii) I - S_ii) in space, 2 tr(S_ii) in the plane.
 
     S_ii are the diagonal rotation blocks of S.
@@ -228,7 +228,7 @@ def _curvature_of_rotations(S_ii: Array) -> Array:
     return 2.0 * (trace * np.eye(3) - S_ii)
 
 
-def _translation_generator(c: Array) -> Array:
+def translation_generator(c: Array) -> Array:
     """T with hat(w) c = -T w for c, (m, d): hat(c) in space, -hat(1) c in the plane."""
     if c.shape[1] == 2:
         minus_rotated = np.stack([c[:, 1], -c[:, 0]], axis=1)

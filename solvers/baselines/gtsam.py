@@ -93,7 +93,7 @@ def run_gtsam(
         values = _own_start(gtsam, problem, graph) if start is None else _values(gtsam, start)
         optimizer = _optimizer(gtsam, settings, graph, values)
     seconds = time.perf_counter() - began
-    poses = _poses(gtsam, optimizer.values(), problem.d)
+    poses = poses_of_values(gtsam, optimizer.values(), problem.d)
     objective = problem.objective(poses)
     best = (objective, poses)
     records = [Record(0, seconds, Measurement(objective, 0.0, math.inf))]
@@ -110,7 +110,7 @@ def run_gtsam(
             status = Status.NOT_FINITE
             break
         change = abs(cost_before - cost) / max(cost_before, np.finfo(float).tiny)
-        poses = _poses(gtsam, optimizer.values(), problem.d)
+        poses = poses_of_values(gtsam, optimizer.values(), problem.d)
         objective = problem.objective(poses)
         records.append(Record(k, seconds, Measurement(objective, 0.0, change)))
         best = min(best, (objective, poses), key=lambda pair: pair[0])
@@ -145,7 +145,7 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
     full_noise = gtsam.noiseModel.Gaussian.Information
     factors = gtsam.NonlinearFactorGraph()
-    measured = _gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
+    measured = gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
     edges = zip(graph.i.tolist(), graph.j.tolist(), measured, information, strict=True)
     definite = are_definite(information, LEAST_SCALED).tolist()
     for (i, j, pose, weight), is_definite in zip(edges, definite, strict=True):
@@ -154,7 +154,7 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     pose_0 = Poses.identity(1, d) if start is None else start[:1]
     largest_information = np.einsum("mkk->mk", information).max(axis=0)
     noise = full_noise(np.diag(largest_information))
-    factors.add(prior(0, _gtsam_poses(gtsam, pose_0)[0], noise))
+    factors.add(prior(0, gtsam_poses(gtsam, pose_0)[0], noise))
     return factors
 
 
@@ -202,7 +202,8 @@ def _singular_named() -> Iterator[None]:
         raise NotPositiveDefiniteError(message) from error
 
 
-def _gtsam_poses(gtsam: ModuleType, poses: Poses) -> list[Any]:
+def gtsam_poses(gtsam: ModuleType, poses: Poses) -> list[Any]:
+    """Poses as GTSAM's Pose2 or Pose3."""
     if poses.d == 3:
         return [gtsam.Pose3(gtsam.Rot3(R), t) for R, t in zip(poses.R, poses.t, strict=True)]
     angles: Array = log_map(poses.R)[:, 0]
@@ -212,12 +213,12 @@ def _gtsam_poses(gtsam: ModuleType, poses: Poses) -> list[Any]:
 
 def _values(gtsam: ModuleType, poses: Poses) -> Any:  # noqa: ANN401
     values = gtsam.Values()
-    for key, pose in enumerate(_gtsam_poses(gtsam, poses)):
+    for key, pose in enumerate(gtsam_poses(gtsam, poses)):
         values.insert(key, pose)
     return values
 
 
-def _poses(gtsam: ModuleType, values: Any, d: int) -> Poses:  # noqa: ANN401
+def poses_of_values(gtsam: ModuleType, values: Any, d: int) -> Poses:  # noqa: ANN401
     """Poses of values with keys 0 .. n-1, cleaned of rounding."""
     if d == 3:
         rows = np.asarray(gtsam.utilities.extractPose3(values))

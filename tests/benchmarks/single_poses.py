@@ -1,0 +1,179 @@
+"""The last 200 poses of a graph, one by one: updates without a certificate, and iSAM2 of GTSAM.
+
+    python tests/benchmarks/single_poses.py [FILE ..]
+
+Both begin at a solve of the graph before these poses. CPU seconds of one thread an update, the two
+in turn: ours for `GrowingSolution.with_edges` and the poses; beside it `extend(.., certify=False)`
+with the whole graph, which compares its edges; iSAM2's (extra `peers`), with its default settings,
+for the start of the new pose, `update` and `calculateEstimate`. At every tenth update F of the
+poses is compared with that of a solve afresh: the largest relative difference, of ours and of
+iSAM2's, whose cost is F but for terms of fourth order. The cost is F: information matrices are left
+out. A closure is an edge of the new pose beside the one that places it; medians of the updates
+with one are in columns of their own.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import importlib
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+from pgo_models.figures import rounded_up
+from solvers.baselines.gtsam import factor_graph, gtsam_poses, poses_of_values
+
+NAMES = ("M3500", "sphere2500", "city10000", "intel", "manhattan", "parking-garage", "kitti_00")
+UPDATES = 200
+EVERY = 10
+HEADS = (
+    "graph",
+    "poses",
+    "updates with a closure",
+    "ours, ms: median",
+    "mean",
+    "longest",
+    "whole graphs: median",
+    "iSAM2, ms: median",
+    "mean",
+    "longest",
+    "ratio of medians",
+    "with a closure: ours",
+    "iSAM2",
+    "F above the optimum",
+    "iSAM2's",
+)
+
+
+class Isam:
+    """iSAM2 that is given the poses of a graph one by one."""
+
+    def __init__(self, graph: pgo.PoseGraph, start: pgo.Poses) -> None:
+        self.gtsam: Any = importlib.import_module("gtsam")
+        self.graph = graph
+        self.factors = factor_graph(pgo.PGOProblem(graph))
+        self.isam = self.gtsam.ISAM2(self.gtsam.ISAM2Params())
+        n = start.num_poses
+        batch = self.gtsam.NonlinearFactorGraph()
+        for e in np.flatnonzero(np.maximum(graph.i, graph.j) < n).tolist():
+            batch.add(self.factors.at(e))
+        batch.add(self.factors.at(graph.num_edges))  # the prior of pose 0
+        values = self.gtsam.Values()
+        for key, pose in enumerate(gtsam_poses(self.gtsam, start)):
+            values.insert(key, pose)
+        self.isam.update(batch, values)
+        self.estimate = self.isam.calculateEstimate()
+
+    def add(self, pose: int, edges: list[int]) -> float:
+        """Add a pose with its edges; CPU seconds."""
+        new = self.gtsam.NonlinearFactorGraph()
+        for e in edges:
+            new.add(self.factors.at(e))
+        first = edges[0]
+        other = int(min(self.graph.i[first], self.graph.j[first]))
+        measured = self.factors.at(first).measured()
+        if self.graph.i[first] == pose:
+            measured = measured.inverse()
+        estimate_of = self.isam.calculateEstimatePose2
+        if self.graph.d == 3:
+            estimate_of = self.isam.calculateEstimatePose3
+        began = time.process_time()
+        values = self.gtsam.Values()
+        values.insert(pose, estimate_of(other).compose(measured))
+        self.isam.update(new, values)
+        self.estimate = self.isam.calculateEstimate()
+        return time.process_time() - began
+
+    def poses(self) -> pgo.Poses:
+        """Estimate of all poses so far."""
+        return poses_of_values(self.gtsam, self.estimate, self.graph.d)
+
+
+def edges_of(graph: pgo.PoseGraph, pose: int) -> np.ndarray:
+    """Edges of a pose to earlier ones, the nearest pose first."""
+    edges = np.flatnonzero(np.maximum(graph.i, graph.j) == pose)
+    earlier = np.minimum(graph.i, graph.j)[edges]
+    return edges[np.argsort(-earlier, kind="stable")]
+
+
+def part_of(graph: pgo.PoseGraph, edges: np.ndarray) -> pgo.PoseGraph:
+    """Graph of some edges and their poses, with their numbers for ids."""
+    poses = np.unique(np.concatenate([graph.i[edges], graph.j[edges]]))
+    return pgo.PoseGraph(
+        len(poses),
+        np.searchsorted(poses, graph.i[edges]),
+        np.searchsorted(poses, graph.j[edges]),
+        graph.R_ij[edges],
+        graph.t_ij[edges],
+        graph.kappa[edges],
+        graph.tau[edges],
+        ids=poses,
+    )
+
+
+def row(graph: pgo.PoseGraph) -> list[str]:
+    """Figures of one graph, as they are printed."""
+    n = graph.num_poses
+    num_before = n - UPDATES
+    before = solvers.solve(graph.subgraph(np.arange(num_before)), progress=False)
+    growing = solvers.GrowingSolution.of(before)
+    by_wholes = growing
+    isam = Isam(graph, before.poses)
+    times = []
+    differences = []
+    is_closure = []
+    for pose in range(num_before, n):
+        edges = edges_of(graph, pose)
+        is_closure.append(len(edges) > 1)
+        part = part_of(graph, edges)
+        whole = graph.subgraph(np.arange(pose + 1))
+        began = time.process_time()
+        growing = growing.with_edges(part)
+        _ = growing.poses
+        seconds = time.process_time() - began
+        began = time.process_time()
+        by_wholes = solvers.extend(by_wholes, whole, certify=False)
+        _ = by_wholes.poses
+        of_wholes = time.process_time() - began
+        times.append((seconds, of_wholes, isam.add(pose, edges.tolist())))
+        if (pose - num_before) % EVERY == EVERY - 1:
+            best = solvers.solve(whole, progress=False)
+            problem = best.problem
+            costs = np.array(
+                [growing.objective, by_wholes.objective, problem.objective(isam.poses())]
+            )
+            differences.append(costs / best.objective - 1.0)
+    ours, wholes, theirs = 1e3 * np.array(times).T
+    worst = np.max(differences, axis=0)
+    figures = [
+        *(f"{f(ours):.2f}" for f in (np.median, np.mean, np.max)),
+        f"{np.median(wholes):.2f}",
+        *(f"{f(theirs):.2f}" for f in (np.median, np.mean, np.max)),
+        f"{np.median(ours) / np.median(theirs):.2f}",
+        *(f"{np.median(seconds[is_closure]):.2f}" for seconds in (ours, theirs)),
+        rounded_up(max(worst[0], worst[1], 0.0), 2),
+        rounded_up(max(worst[2], 0.0), 2),
+    ]
+    return [graph.name, str(n), str(sum(is_closure)), *figures]
+
+
+def main() -> None:
+    folder = Path(os.environ.get("PGO_DATA", "."))
+    print(f"| {' | '.join(HEADS)} |\n{'|---' * len(HEADS)}|")
+    for path in [Path(name) for name in sys.argv[1:]] or [folder / f"{name}.g2o" for name in NAMES]:
+        graph = replace(pgo.read_g2o(path), information=None)
+        print(f"| {' | '.join(row(graph))} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
