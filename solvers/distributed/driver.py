@@ -387,7 +387,9 @@ class Driver:
         gathers those of the translations and scatters the best ones.
         """
         answers = self.ask(Interior.chordal, None, Count.PIGGYBACKED)
-        factor = self.interface(self.d).factorize([answer.schur for answer in answers])
+        # Unknowns of these widths are solved for at the start alone: the factor is not kept.
+        interface = replace(self._any_widths, widths=(self.d,))
+        factor = interface.factorize([answer.schur for answer in answers])
         Y, parts, _ = factor.solve([answer.right.b for answer in answers])
         self.current = replace(self.current, R=project_to_rotations(unstack_transposes(Y)))
         self.set_translations(self.ask_each(Interior.project, parts, is_along=True))
