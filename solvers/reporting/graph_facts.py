@@ -73,15 +73,15 @@ def memory_of_a_solve(graph: PoseGraph) -> float:
     """Memory that a solve in one process takes, in bytes, beside the program and the graph.
 
     It is about 600 (n + m) bytes, and the Cholesky factor: 390 k log2 k bytes in the plane,
-    1250 k^(4/3) in space, as nested dissection fills lattices. Here k = min(n, 2 (m - n + 1)) is
-    the number of poses that are left after chains are eliminated. The estimate is right to 20 % on
-    grid worlds of 10,000 to a million poses in the plane, and to 50,000 in space; narrow graphs
-    take less.
+    850 k^(4/3) in space, as nested dissection fills lattices. Here k = min(n, 2 (m - n + 1)) is the
+    number of poses that are left after chains are eliminated. The estimate is right to 20 % on grid
+    worlds of 10,000 to a million poses in the plane, and to 30 % on those of 12,500 to 100,000 in
+    space. Narrow graphs take less, and lattices in space two to three times as much.
     """
     n = graph.num_poses
     m = graph.num_edges
     k = max(2, min(n, 2 * (m - n + 1)))
-    factor = 390.0 * k * np.log2(k) if graph.d == 2 else 1250.0 * k ** (4 / 3)
+    factor = 390.0 * k * np.log2(k) if graph.d == 2 else 850.0 * k ** (4 / 3)
     return float(600.0 * (n + m) + factor)
 
 
