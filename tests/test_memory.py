@@ -58,7 +58,7 @@ def test_a_solve_beyond_what_is_available_is_refused_but_not_one_by_robots(
     monkeypatch.setattr("pgo_models.memory.available_memory", lambda: 1e4)
     code, out, err = pgo_command("solve", "sphere")
     assert (code, out, one_line(err)) == (1, "", True)
-    assert "sphere: a solve takes about 0.587 MB of memory, and 0.01 MB is available" in err
+    assert "sphere: a solve takes about 0.513 MB of memory, and 0.01 MB is available" in err
     assert pgo_command("solve", "sphere", "--robots", "2", "-q") == (0, "", "")
 
 
