@@ -139,7 +139,7 @@ def sparse_interface_of(
     widths: tuple[int, ...],
 ) -> SparseInterface:
     """Sparse interface of robots that touch these separators and couple some pairs of them."""
-    pattern = CoverPattern.of(touched, coupled, num_separators)
+    pattern = CoverPattern.of(touched, coupled, num_separators, d=2)
     fronts = FrontOwners((), num_separators)
     return SparseInterface(num_separators, widths, touched, fronts, pattern=pattern)
 

@@ -9,7 +9,7 @@ large graphs nested dissection by METIS (Karypis & Kumar 1998), whose factors of
 import importlib.util
 
 import numpy as np
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array, tril
 
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import (
@@ -28,11 +28,32 @@ DISSECTED_FROM = {2: 75_000, 3: 10_000}
 
 def pose_order(graph: PoseGraph) -> IntArray:
     """Order of elimination of the poses of a graph, (n,); METIS comes with the extra `fast`."""
-    if graph.num_poses < DISSECTED_FROM[graph.d] or importlib.util.find_spec("pymetis") is None:
-        return minimum_degree(pattern_of_edges(graph.num_poses, graph.i, graph.j))
+    if _is_dissected(graph.num_poses, graph.d):
+        return _dissection(graph.adjacency)
+    return minimum_degree(pattern_of_edges(graph.num_poses, graph.i, graph.j))
+
+
+def order_of_pattern(lower: csc_array, d: int) -> IntArray:
+    """Order of elimination for the poses of a graph in d dimensions, coupled as this triangle says.
+
+    It is chosen as that of `pose_order`.
+    """
+    if not _is_dissected(lower.shape[0], d):
+        return minimum_degree(lower)
+    below = csr_array(tril(lower, -1))
+    return _dissection(csr_array(below + below.T))
+
+
+def _is_dissected(num_poses: int, d: int) -> bool:
+    """Whether METIS saves time, and is there."""
+    return num_poses >= DISSECTED_FROM[d] and importlib.util.find_spec("pymetis") is not None
+
+
+def _dissection(adjacency: csr_array) -> IntArray:
+    """Order of nested dissection of a graph with this adjacency matrix."""
     import pymetis
 
-    neighbours = pymetis.CSRAdjacency(graph.adjacency.indptr, graph.adjacency.indices)
+    neighbours = pymetis.CSRAdjacency(adjacency.indptr, adjacency.indices)
     order, _ = pymetis.nested_dissection(adjacency=neighbours)
     return np.array(order, dtype=np.int64)  # a copy: CVXOPT takes no C long long
 

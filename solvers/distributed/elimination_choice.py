@@ -71,7 +71,7 @@ class CoverSystem:
     def pattern(self) -> CoverPattern:
         """Pattern of a sparse system."""
         assert self.coupled is not None
-        return CoverPattern.of(self.touched, self.coupled, len(self.cover))
+        return CoverPattern.of(self.touched, self.coupled, len(self.cover), self.width - 1)
 
     def interface(self, widths: Widths) -> Interface:
         """The system for unknowns with these numbers per pose; all fronts are with the driver."""

@@ -24,11 +24,15 @@ from pgo_models.problem.cholesky import (
     CholeskyFactor,
     SymbolicCholesky,
     analyze,
-    minimum_degree,
 )
 from pgo_models.problem.floating_point import OUTWARD, gamma
 from pgo_models.problem.matrices import inner
-from pgo_models.problem.ordering import most_counts, pattern_of_edges, row_order
+from pgo_models.problem.ordering import (
+    most_counts,
+    order_of_pattern,
+    pattern_of_edges,
+    row_order,
+)
 from solvers.distributed.interface import Interface, Solved
 from solvers.distributed.robots.subdomain_blocks import coupled_unknowns, entry_keys, positions_of
 
@@ -43,10 +47,11 @@ class CoverPattern:
 
     robots: tuple[csr_array, ...]  # lower triangles of the poses that every robot touches
     lower: csc_array  # (g, g): of the cover
+    d: int
 
     @classmethod
     def of(
-        cls, touched: Sequence[IntArray], coupled: Sequence[IntArray], num_separators: int
+        cls, touched: Sequence[IntArray], coupled: Sequence[IntArray], num_separators: int, d: int
     ) -> CoverPattern:
         """Pattern of pairs (k, 2) of positions in the `touched` poses of every robot."""
         robots = []
@@ -59,12 +64,12 @@ class CoverPattern:
             rows.append(poses[larger])
             columns.append(poses[smaller])
         lower = pattern_of_edges(num_separators, np.concatenate(rows), np.concatenate(columns))
-        return cls(tuple(robots), lower)
+        return cls(tuple(robots), lower, d)
 
     @cached_property
     def order(self) -> IntArray:
         """Order of elimination of the poses, (g,)."""
-        return minimum_degree(self.lower)
+        return order_of_pattern(self.lower, self.d)
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:

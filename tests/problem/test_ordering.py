@@ -51,6 +51,18 @@ def test_a_dissected_world_in_space_fills_less() -> None:
     assert filled[0] < 0.8 * filled[1]
 
 
+@pytest.mark.parametrize("dissected", [False, True])
+def test_a_pattern_is_ordered_as_the_graph_that_has_it(
+    dissected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pymetis")
+    if dissected:
+        monkeypatch.setattr(ordering, "DISSECTED_FROM", {2: 2, 3: 2})
+    lower = ordering.pattern_of_edges(WORLD.num_poses, WORLD.i, WORLD.j)
+    order = ordering.order_of_pattern(lower, WORLD.d)
+    np.testing.assert_array_equal(order, pose_order(WORLD))
+
+
 SCENES = [pgo.load("circle"), pgo.load("grid"), pgo.load("sphere"), WORLD]
 
 
