@@ -80,7 +80,10 @@ def test_ctrl_c_prints_what_is_done_and_the_same_command_goes_on(jobs, tmp_path)
         check=True,
     )
     assert "not run yet" not in finished.stdout
-    assert json.loads(kept.read_text())["results"] == done
+    results = json.loads(kept.read_text())["results"]
+    assert {name: results[name] for name in done} == done
+    if jobs == "1":  # else the first draw may have been under way
+        assert results == done
 
 
 def test_compare_prints_a_table_and_draws(pgo_command, tmp_path):

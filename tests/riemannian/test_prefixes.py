@@ -243,7 +243,7 @@ def test_the_public_graph_of_victoria_park_is_certified(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [1, 4, 5])
 def test_soc_ends_where_its_residuals_stop_falling(seed: int) -> None:
     """Of these graphs the chordal start is far from the optimum."""
     rng = np.random.default_rng(seed)
