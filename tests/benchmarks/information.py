@@ -86,7 +86,8 @@ def theirs(path: Path, own_start: bool) -> tuple[float, float]:
 
 def chi2_of_theirs(path: Path) -> str:
     """The chi2, ours, of the poses that GTSAM finds from the file's estimate."""
-    problem = pgo.PGOProblem(pgo.read_g2o(path), weighting=pgo.Weighting.INFORMATION)
+    graph = pgo.without_indefinite_coupling(pgo.read_g2o(path))
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
     if problem.graph.initial is None:
         return "-"
     try:
