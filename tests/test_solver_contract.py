@@ -357,7 +357,7 @@ def fields_of_settings() -> list[Any]:
         kind for kind in kinds if dataclasses.is_dataclass(kind) and hasattr(kind, "__post_init__")
     ]
     every = [(kind, field) for kind in kinds for field in dataclasses.fields(kind)]
-    open_ones = ("r_step", "known", "idle", "soc", "changer", "only")
+    open_ones = ("r_step", "known", "idle", "soc", "changer", "only", "contenders")
     return [
         pytest.param(k, f.name, id=f"{k.__name__}-{f.name}")
         for k, f in every

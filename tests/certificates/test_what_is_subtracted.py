@@ -19,7 +19,7 @@ from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.errors import ProofError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, random_rotations
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
@@ -62,6 +62,9 @@ class FactorOfKnownError(CholeskyFactor):
 
     def half_solve(self, right_hand_side: Array) -> Array:
         return right_hand_side
+
+    def row_order(self) -> IntArray:
+        return np.arange(len(self.error))
 
     def backward_error(self, beside: Array | int = 0) -> Array:
         return self.error
