@@ -19,13 +19,12 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.cholesky import CholeskyBackend, factorize
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.growing_cost import GrowingCost
-from pgo_models.problem.matrices import columns_of, isotropic_weights
+from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting, information_cost
+from pgo_models.problem.weighting import Weighting
 from solvers.loop import run
 from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
@@ -34,6 +33,7 @@ from solvers.request import Pipeline
 from solvers.result import OUT_OF_TIME
 from solvers.riemannian.growing_map import GrowingMap
 from solvers.riemannian.newton import Newton
+from solvers.soc.subgraph import PartProblem
 from solvers.solution import Solution
 
 # Share of the gap by which Newton may leave F above its minimum: the bound can be ten times as far
@@ -264,15 +264,7 @@ class GrowingSolution:
             return GrowingSolution._at(problem, start)._solved_afresh()
         if not len(edges):
             return self
-        poses = np.unique(np.concatenate([graph.i[edges], graph.j[edges]]))
-        added = PoseGraph(
-            len(poses),
-            np.searchsorted(poses, graph.i[edges]),
-            np.searchsorted(poses, graph.j[edges]),
-            **_rows(graph, edges),
-            ids=graph.pose_ids[poses],
-            name=graph.name,
-        )
+        added = graph.edge_subgraph(edges)
         return replace(self.with_edges(added), graphs=(graph,))
 
 
@@ -484,9 +476,7 @@ def _quadratic_cost(graph: PoseGraph, weighting: Weighting) -> EdgeCost:
         raise SettingError(
             f"{graph.name} has landmarks or priors; extend it with a certificate, certify=True"
         )
-    if weighting is Weighting.ISOTROPIC:
-        return isotropic_weights(graph)
-    cost = information_cost(graph, proper_information(graph))
+    cost = PartProblem(graph, weighting=weighting).weights
     if not (cost.is_quadratic and cost.is_convex and cost.has_translations):
         raise SettingError(
             f"chi2 of {graph.name} is not quadratic and convex; take F (Weighting.ISOTROPIC), "
@@ -498,16 +488,6 @@ def _quadratic_cost(graph: PoseGraph, weighting: Weighting) -> EdgeCost:
 def _numbers_of(graph: PoseGraph, numbers: dict[int, int]) -> IntArray:
     """Numbers, (n,), of the poses of a graph by their ids."""
     return np.array([numbers[name] for name in graph.pose_ids.tolist()])
-
-
-def _rows(graph: PoseGraph, edges: IntArray) -> dict[str, Any]:
-    """Measurements of some edges."""
-    rows = {}
-    for name in _MEASURED:
-        values = getattr(graph, name)
-        if values is not None:
-            rows[name] = values[edges]
-    return rows
 
 
 def _new_edges(before: PoseGraph, graph: PoseGraph) -> IntArray | None:

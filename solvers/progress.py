@@ -36,9 +36,9 @@ class StageLine:
 
     It appears on stderr, or in the notebook, where the solve has taken `_LINE_AFTER_SECONDS` and
     the stage is no matter of a moment, or before work that may take seconds. It is removed at the
-    end of the stage. It is drawn when an
-    activity begins: the library that factors lets no other thread draw meanwhile. `seconds_taken`
-    are the seconds that activities of all stages took, from which those of the next are estimated.
+    end of the stage. It is drawn when an activity begins: the library that factors lets no other
+    thread draw meanwhile. `seconds_taken` are the seconds that activities of all stages took, from
+    which those of the next are estimated.
     `began` is the time at which the solve did, and `side` that of a matrix which the stage factors.
     """
 

@@ -47,7 +47,7 @@ SECOND_TRY_TOLERANCE = 1e-6
 HULL_PASSES = 3
 CLOSER = 0.1  # factor on the tolerance of the next pass
 GROWING_START = "growing start"
-# Poses from which Newton gets the memory of SOC's factor: a fifth of the most that a solve takes.
+# Poses from which SOC gives the memory of its factor up: a fifth of the most that a solve takes.
 MANY_POSES = 20_000
 BROKEN_OFF = (*OUT_OF_TIME, Status.STOPPED)
 AnySOC = TypeVar("AnySOC", bound=SOC | PaperSOC)
@@ -212,9 +212,17 @@ class RunSOC:
 
         This happens: on the data set CSAIL the chordal start costs less than every iterate of SOC.
         """
+        poses = self._best_poses(answer.current_poses)
+        problem = self.job.problem
+        if problem.num_poses > MANY_POSES:
+            # Newton's factor is far larger, and comes next.
+            problem.analysis.release_memory()
+        return Answer(poses)
+
+    def _best_poses(self, poses: Poses) -> Poses:
+        """Run SOC, which leaves its factor to nobody."""
         job = self.job
         convex_part = job.problem.convex_part
-        poses = answer.current_poses
         finished: Run[Any] = job.monitor.run(self.soc, convex_part, poses)
         if finished.objective <= convex_part.objective(poses):
             poses = finished.poses
@@ -223,7 +231,7 @@ class RunSOC:
             objective = job.problem.objective(poses)
             stage = replace(stage, name=f"{stage.name}, convex", objective=objective)
         job.stages.append(stage)
-        return Answer(poses)
+        return poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,8 +251,6 @@ class RunNewton:
         job = self.job
         if job.is_out_of_time:
             return replace(answer, decrement=math.inf)
-        if job.problem.num_poses > MANY_POSES:
-            job.problem.analysis.release_memory()  # that of SOC: Newton's factor is far larger
         finished = job.monitor.run(self.newton, job.problem, answer.current_poses)
         job.stages.append(Stage.of(finished))
         decrement = finished.state.polish.decrement

@@ -715,6 +715,32 @@ class PoseGraph(ReadOnly):
             landmarks=landmarks[landmarks >= 0],
         )
 
+    def edge_subgraph(self, edges: IntArray) -> PoseGraph:
+        """Return the graph of some edges, in the given order, and of the poses that they join.
+
+        Parameters
+        ----------
+        edges : IntArray, (k,)
+            Numbers of the edges.
+
+        Returns
+        -------
+        PoseGraph
+            Graph of these edges. The poses keep their ids, and are numbered anew in ascending
+            order. Estimates, truth, robots and times are left out.
+
+        Examples
+        --------
+        >>> from pgo_models.graphs.scenes import grid
+        >>> grid(np.random.default_rng(0)).edge_subgraph(np.array([5, 6])).num_edges
+        2
+        """
+        poses = np.unique(np.concatenate([self.i[edges], self.j[edges]]))
+        rows = self._edge_rows(edges)
+        rows["i"] = np.searchsorted(poses, rows["i"])
+        rows["j"] = np.searchsorted(poses, rows["j"])
+        return PoseGraph(len(poses), **rows, ids=self.pose_ids[poses], name=self.name)
+
     def unit_weights(self) -> PoseGraph:
         """Return the graph with kappa = tau = 1, as in the paper, but where they are zero.
 
@@ -969,8 +995,8 @@ class PoseGraph(ReadOnly):
             )
         return poses
 
-    def _edge_rows(self, edges: BoolArray) -> dict[str, Any]:
-        """Rows of the given edges, (m,), of every field that has a row for each edge."""
+    def _edge_rows(self, edges: BoolArray | IntArray) -> dict[str, Any]:
+        """Rows of the given edges of every field that has a row for each edge."""
         rows = {}
         for name in _EDGE_FIELDS:
             values = getattr(self, name)

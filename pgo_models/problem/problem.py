@@ -134,10 +134,11 @@ class PGOProblem(ReadOnly):
             return matrices.isotropic_weights(self.graph)
         if self.weighting is Weighting.ROTATIONS:
             return RotationAveraging.of(self.graph)
-        return information_cost(self.graph, self._information)
+        return information_cost(self.graph, self.information)
 
     @cached_property
-    def _information(self) -> Array:
+    def information(self) -> Array:
+        """Information matrices of chi2, (m, k, k)."""
         return proper_information(self.graph)
 
     @property
@@ -163,7 +164,7 @@ class PGOProblem(ReadOnly):
         """
         if self.is_quadratic and self.weights.is_convex:
             return self
-        cost = convex_cost(self._information, self.d)
+        cost = convex_cost(self.information, self.d)
         return _SharingProblem(self.graph, self.backend, cost, original=self)
 
     def check_quadratic(self, method: str, convex: bool = False) -> None:

@@ -225,7 +225,7 @@ def solve_command(
     display = Display(verbose, quiet, as_json)
     outputs = Outputs(out or [], report, covariances, proof, resume)
     if network.reads_own_files(graph):
-        _refuse_what_needs_the_graph(given, outputs)
+        _refuse_what_needs_the_graph(given, outputs, source.chosen_cost)
         raise typer.Exit(_solve_own_files(source, stages, network, display, outputs))
     outputs.check_pages()
     with JobBar(1, None if takes_long_to_read(graph) else False, f"reading {graph}"):
@@ -445,7 +445,7 @@ def _given_options(arguments: dict[str, object]) -> set[str]:
     return {name for name, value in arguments.items() if value is not None and value is not False}
 
 
-def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs) -> None:
+def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs, cost: Cost | None) -> None:
     """Raise a SettingError for an option that robots with own files cannot serve.
 
     Nobody has the whole graph then.
@@ -454,6 +454,8 @@ def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs) -> None:
     out = outputs.out
     if not others and (len(out) > 1 or (out and out[0].suffix)):
         others = ["out FILE"]
+    if not others and cost is Cost.UNIT:
+        others = ["cost unit"]
     if others:
         option = others[0].removeprefix("as_").replace("_", "-")
         raise SettingError(
@@ -476,10 +478,6 @@ def _solve_own_files(
         Cost.CHI2: Weighting.INFORMATION,
         Cost.ISOTROPIC: Weighting.ISOTROPIC,
     }
-    if source.chosen_cost not in weightings:
-        raise SettingError(
-            "--cost unit takes the whole graph in one process; to have it read: --split given"
-        )
     method = choices.chosen_method(stages.method, None, True)
     pipeline = stages.pipeline(method, None, network.driver_memory)
     solution = solve_folder(

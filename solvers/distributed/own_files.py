@@ -35,13 +35,10 @@ from pgo_models.graphs.pose_graph import (
     edge_counts,
     middle_pose,
 )
-from pgo_models.graphs.precisions import edge_precisions, indefinite_edges, proper_information
-from pgo_models.problem.edge_cost import EdgeCost
-from pgo_models.problem.matrices import isotropic_weights
+from pgo_models.graphs.precisions import edge_precisions, indefinite_edges
 from pgo_models.problem.weighting import (
     Weighting,
     convex_cost,
-    information_cost,
     is_isotropic,
 )
 from solvers.distributed.driver import Driver
@@ -151,7 +148,7 @@ class FileAgent(Agent):
     graph: PoseGraph  # of its own poses, and those at the far end of its edges
     numbers: IntArray  # (n_a,): numbers of these poses in the whole graph, ascending
     owners: IntArray  # (n_a,)
-    cost: EdgeCost  # of its edges, in the cost that is solved
+    problem: PartProblem  # the cost that is solved, of its edges
     left: IntArray  # numbers of the poses that it proposes to leave to the driver
     larger: Subgraph  # its subgraph if it does
     given: Array  # as in `Answer`
@@ -285,17 +282,14 @@ def take_cost(agent: FileAgent, weighting: Weighting) -> bool:
 
     A GraphError for a matrix that chi2 cannot have, and where chi2 is one of rotations alone.
     """
-    graph = agent.graph
-    if weighting is Weighting.ISOTROPIC:
-        agent.cost = isotropic_weights(graph)
-        return True
+    agent.problem = PartProblem(agent.graph, weighting=weighting)
     try:
-        agent.cost = information_cost(graph, proper_information(graph))
+        cost = agent.problem.weights
     except GraphError as error:
         raise GraphError(f"{agent.path}: {error}") from error
-    if not agent.cost.has_translations:
+    if not cost.has_translations:
         raise GraphError(f"{agent.path}: no edge measures a translation; {READ_HERE}")
-    return agent.cost.is_quadratic and agent.cost.is_convex
+    return cost.is_quadratic and cost.is_convex
 
 
 def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary:
@@ -308,10 +302,13 @@ def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary
     graph = agent.graph
     known = agent.robot, graph, agent.numbers, agent.owners
     edges = np.arange(graph.num_edges)
-    weights = agent.cost
+    problem = agent.problem
+    weights = problem.weights
+    final = None
     if has_two_costs:
-        weights = convex_cost(proper_information(graph), graph.d)
-    final = agent.cost if has_two_costs else None
+        final = weights
+        weights = convex_cost(problem.information, graph.d)
+    del agent.problem
     agent.subgraph = Subgraph(*known, *placement.of(*known), edges, weights, final)
     agent.interior = interior_of(agent.subgraph, agent.backend)
     return replace(agent.subgraph.summary, part=None)
@@ -364,7 +361,7 @@ def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> MovedAnswer:
     problem = agent.interior.problem
     poses = _interior_answer(agent, agent.interior)
     graph = problem.graph
-    F = PartProblem(graph, problem.backend, isotropic_weights(graph)).objective(poses)
+    F = PartProblem(graph, problem.backend, Weighting.ISOTROPIC).objective(poses)
     return MovedAnswer(problem.objective(poses), objective_rounding(problem, poses), F)
 
 

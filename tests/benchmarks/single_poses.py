@@ -106,21 +106,6 @@ def edges_of(graph: pgo.PoseGraph, pose: int) -> np.ndarray:
     return edges[np.argsort(-earlier, kind="stable")]
 
 
-def part_of(graph: pgo.PoseGraph, edges: np.ndarray) -> pgo.PoseGraph:
-    """Graph of some edges and their poses, with their numbers for ids."""
-    poses = np.unique(np.concatenate([graph.i[edges], graph.j[edges]]))
-    return pgo.PoseGraph(
-        len(poses),
-        np.searchsorted(poses, graph.i[edges]),
-        np.searchsorted(poses, graph.j[edges]),
-        graph.R_ij[edges],
-        graph.t_ij[edges],
-        graph.kappa[edges],
-        graph.tau[edges],
-        ids=poses,
-    )
-
-
 def row(graph: pgo.PoseGraph) -> list[str]:
     """Figures of one graph, as they are printed."""
     n = graph.num_poses
@@ -135,7 +120,7 @@ def row(graph: pgo.PoseGraph) -> list[str]:
     for pose in range(num_before, n):
         edges = edges_of(graph, pose)
         is_closure.append(len(edges) > 1)
-        part = part_of(graph, edges)
+        part = graph.edge_subgraph(edges)
         whole = graph.subgraph(np.arange(pose + 1))
         began = time.process_time()
         growing = growing.with_edges(part)
