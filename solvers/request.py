@@ -55,8 +55,8 @@ class Pipeline:
     The first stage is SOC, from which Newton takes over. Where the certificate is wider than the
     relative `gap`, another attempt starts from prefixes of the graph that grow, and a second one
     runs SOC to a fine tolerance and Newton again. The solve keeps the better poses and the better
-    bound. Where it is still wider, the staircase solves the
-    semidefinite relaxation from the best poses, and Newton starts from what it rounds to.
+    bound. Where it is still wider, the staircase solves the semidefinite relaxation from the best
+    poses, and Newton starts from what it rounds to. In space, handedness terms follow.
 
     Parameters
     ----------
