@@ -45,8 +45,7 @@ from solvers.distributed.stages import (
     ClimbByRobots,
     NewtonByRobots,
     RobotJob,
-    SOCByRobots,
-    StartByRobots,
+    stages_before_newton,
 )
 from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
@@ -364,10 +363,8 @@ class _FolderJob:
 
     def _attempt(self, soc: SOC | PaperSOC | None, newton: Newton) -> None:
         """Start, SOC, Newton and bound."""
-        planned: list[PlannedStage] = [StartByRobots(self.shared)]
-        if soc is not None:
-            assert isinstance(soc, SOC)  # `_check_first_stage` refuses another
-            planned.append(SOCByRobots(self.shared, soc))
+        assert soc is None or isinstance(soc, SOC)  # `_check_first_stage` refuses another
+        planned = stages_before_newton(self.shared, soc)
         planned.append(NewtonByRobots(self.shared, newton))
         self._judge(run_stages(planned, Answer()))
 

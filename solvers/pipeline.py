@@ -21,7 +21,6 @@ from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.loop import RunMonitor
 from solvers.network.engine import Engine, InProcess
 from solvers.request import (
-    WARM_START,
     Pipeline,
     SolveRequest,
     plan_improvements,
@@ -30,7 +29,7 @@ from solvers.request import (
 from solvers.result import Record, Stage
 from solvers.riemannian.newton import Newton, needs_no_soc
 from solvers.soc.paper import PaperSOC
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution
 from solvers.stages import (
     Answer,

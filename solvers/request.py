@@ -24,7 +24,7 @@ from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
 from solvers.soc.paper import PaperSOC
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution, choose_gauge, note_of
 from solvers.stages import (
     Answer,
@@ -42,10 +42,6 @@ if TYPE_CHECKING:  # what a solve in one place does not need
     from solvers.distributed.checkpoint import Checkpoint
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
-
-# Relative residual from which Newton needs one or two factorisations, on all graphs tried.
-WARM_START_TOLERANCE = 5e-3
-WARM_START = SOC(tolerance=WARM_START_TOLERANCE, max_iterations=100)
 
 
 @dataclass(frozen=True)

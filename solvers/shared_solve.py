@@ -23,9 +23,9 @@ from solvers.distributed.stages import (
     RecallAttempt,
     RobotJob,
     SetPoses,
-    SOCByRobots,
     StartByRobots,
     open_driver,
+    stages_before_newton,
 )
 from solvers.network.engine import InProcess
 from solvers.request import Pipeline, SolveRequest, plan_improvements, solution_of
@@ -100,17 +100,14 @@ def _plan_attempt_by_robots(
         return [RecallAttempt(*outcome)]
     assert not isinstance(soc, PaperSOC)  # `robots_of_solve` refuses it
     problem = job.problem
-    planned: list[PlannedStage] = []
+    first = None
     if start is not None:
-        planned.append(StartByRobots(shared, "given start", lambda: problem.seen_poses(start)))
+        first = StartByRobots(shared, "given start", partial(problem.seen_poses, start))
     elif problem.graph.is_world_loose:
         # The rotation of the world depends on positions alone.
         find = partial(chordal_start, problem.convex_part)
-        planned.append(StartByRobots(shared, "chordal start, in one place", find))
-    else:
-        planned.append(StartByRobots(shared))
-    if soc is not None:
-        planned.append(SOCByRobots(shared, soc, pipeline.faults))
+        first = StartByRobots(shared, "chordal start, in one place", find)
+    planned = stages_before_newton(shared, soc, first, pipeline.faults)
     newton = NewtonByRobots(shared, pipeline.newton)
     return [*planned, newton, CertifyByRobots(shared, problem, job.gap)]
 

@@ -14,7 +14,7 @@ from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.graphs.trajectories import read_times
 from pgo_models.problem.weighting import Weighting
-from solvers.request import WARM_START_TOLERANCE
+from solvers.soc.soc import WARM_START_TOLERANCE
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 

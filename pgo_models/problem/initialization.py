@@ -16,6 +16,7 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.problem.cholesky import analyze, factorize_damped
+from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.matrices import rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
@@ -177,8 +178,10 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
         factor = factorize_damped(analysis, K_RR)
         Y = factor.solve(b[n:])
     R = project_to_rotations(unstack_transposes(Y))
-    if averaged:
-        R = _averaged(problem, R)
+    stiffness = largest_stiffness(problem.weights, problem.d) if averaged else None
+    if stiffness is not None:
+        pull = averaging_pull(problem, R, stiffness)
+        R = R @ exp_map(problem.solve_translations(pull))
     return problem.with_best_translations(R)
 
 
@@ -196,27 +199,32 @@ def _start_with_loose_world(problem: PGOProblem, world: int, averaged: bool) -> 
     return problem.with_best_translations(fitted.R)
 
 
-def _averaged(problem: PGOProblem, R: Array) -> Array:
-    """Rotations, (n, 2, 2), at the minimum of a majorant of sum_e kappa ||R_j - R_i R_ij||^2.
+def largest_stiffness(weights: EdgeCost, d: int) -> float | None:
+    """Largest kappa / tau of edges, 0 if there are none.
 
-    The sum is no larger there than at the given R.
+    None if their rotations cannot be averaged by `averaging_pull`.
+    """
+    if d != 2 or weights.rotation.has_own_axes or not (weights.tau > 0.0).all():
+        return None
+    return float((weights.kappa / weights.tau).max(initial=0.0))
 
-    An edge with the residual angle r costs 4 kappa (1 - cos r), whose second derivative is at most
-    4 kappa. The majorant has 4 s tau in its place, s the largest kappa / tau, so that its minimum
-    solves a system with the matrix of the translations, M_tt, whose factor is known.
+
+def averaging_pull(problem: PGOProblem, R: Array, stiffness: float) -> Array:
+    """b, (n, 1), for a step of rotation averaging in the plane: turn R_i by x_i, M_tt x = b.
+
+    Turned so, the rotations (n, 2, 2) are at the minimum of a majorant of sum_e kappa ||R_j - R_i
+    R_ij||^2, which is no larger there than before. An edge with the residual angle r costs
+    4 kappa (1 - cos r), whose second derivative is at most 4 kappa. The majorant has 4 s tau in its
+    place, s the `stiffness`, at least kappa / tau of every edge, so that its minimum solves a
+    system with the matrix of the translations, M_tt, whose factor is known.
     """
     graph = problem.graph
-    weights = problem.weights
-    incidence = problem.incidence
-    if problem.d != 2 or weights.rotation.has_own_axes or not (weights.tau > 0.0).all():
-        return R
+    kappa = problem.weights.kappa
     predicted_R_j = R[graph.i] @ graph.R_ij
     sine = vee(np.swapaxes(predicted_R_j, 1, 2) @ R[graph.j])
-    largest_ratio = (weights.kappa / weights.tau).max()
-    of_edges = weights.kappa[:, None] * sine / largest_ratio
-    right_hand_side = incidence.begins @ of_edges - incidence.ends @ of_edges
-    angles = problem.solve_translations(right_hand_side)
-    return R @ exp_map(angles)
+    of_edges = kappa[:, None] * sine / stiffness
+    incidence = problem.incidence
+    return np.asarray(incidence.begins @ of_edges - incidence.ends @ of_edges)
 
 
 def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array, Array]:

@@ -11,12 +11,12 @@ from pgo_models.problem.initialization import chordal_start, odometry_start, spa
 from pgo_models.problem.problem import PGOProblem
 from solvers.cli.options import BackEndName, FirstStage, Robust, Runner, Start
 from solvers.network.engine import DEFAULT_MEMORY, Engine, InProcess
-from solvers.request import WARM_START, Pipeline
+from solvers.request import Pipeline
 from solvers.riemannian.newton import gauss_newton
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 
 if TYPE_CHECKING:
     from solvers.robust.consistency import PCM

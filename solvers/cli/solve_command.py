@@ -71,9 +71,9 @@ from solvers.cli.shell import (
 from solvers.network.engine import Engine
 from solvers.pipeline import solve
 from solvers.progress_bars import JobBar
-from solvers.request import WARM_START, Pipeline
+from solvers.request import Pipeline
 from solvers.result import Status
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution, check_format, check_target
 
 if TYPE_CHECKING:

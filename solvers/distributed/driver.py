@@ -56,6 +56,7 @@ from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
+    exp_map,
     project_to_rotations,
     stack_transposes,
     unstack_transposes,
@@ -210,6 +211,9 @@ class Driver:
         self._parts = [robot.part for robot in with_edges]
         self.has_two_costs = any(robot.has_two_costs for robot in summaries)
         self.has_translations = all(robot.has_translations for robot in summaries)
+        stiffness = [robot.stiffness for robot in summaries]
+        known = [largest for largest in stiffness if largest is not None]
+        self._stiffness = max(known) if len(known) == len(stiffness) else None
         # Whether the process of the driver has the graph, too.
         self.has_whole = all(robot.part is not None for robot in summaries)
 
@@ -266,6 +270,11 @@ class Driver:
         self._laplacian = None  # its matrix has the weights of before
         self.diagonal = self.gather_diagonal([answer.diagonal for answer in answers])
         self.current = self.with_cost(self.current, [answer.at for answer in answers])
+
+    @property
+    def can_average(self) -> bool:
+        """Whether there is an averaged start: in the plane, for weights that allow it."""
+        return self._stiffness is not None and self.has_translations
 
     def close(self) -> None:
         """Close the pool."""
@@ -380,11 +389,12 @@ class Driver:
 
     # Poses.
 
-    def go_to_chordal_start(self) -> None:
+    def go_to_chordal_start(self, averaged: bool = False) -> None:
         """Go to the chordal relaxation of the rotations, with the best translations: two rounds.
 
         The first round gathers the systems of the relaxation and scatters its solution; the second
-        gathers those of the translations and scatters the best ones.
+        gathers those of the translations and scatters the best ones. An `averaged` start, where
+        `can_average`, takes a round more, for a step of rotation averaging (`chordal_start`).
         """
         answers = self.ask(Interior.chordal, None, Count.PIGGYBACKED)
         # Unknowns of these widths are solved for at the start alone: the factor is not kept.
@@ -392,7 +402,14 @@ class Driver:
         factor = interface.factorize([answer.schur for answer in answers])
         Y, parts, _ = factor.solve([answer.right.b for answer in answers])
         self.current = replace(self.current, R=project_to_rotations(unstack_transposes(Y)))
-        self.set_translations(self.ask_each(Interior.project, parts, is_along=True))
+        self.ask_each(Interior.project, parts, is_along=True)
+        if averaged:
+            assert self._stiffness is not None
+            pulls = self.ask(Interior.average, self._stiffness, Count.PIGGYBACKED)
+            angles, parts = self.best_translations(pulls)  # the same matrix
+            self.current = replace(self.current, R=self.current.R @ exp_map(angles))
+            self.ask_each(Interior.turn_by, parts, is_along=True)
+        self.set_translations(self.ask(Interior.translations, None, Count.PIGGYBACKED))
 
     def set_poses(self, poses: Poses) -> None:
         """Take all poses as they are, with F and M X on the cover, gathered with the next round.

@@ -47,9 +47,9 @@ from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import Staircase
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 from solvers.soc.subgraph import middle_separator, split_graph
-from solvers.stages import Answer
+from solvers.stages import Answer, PlannedStage
 
 
 def open_driver(
@@ -111,12 +111,14 @@ class RecallAttempt:
 class StartByRobots:
     """Start, unless a checkpoint is of a later stage.
 
-    The robots relax the rotations (chordal start), or are given the poses that `find` returns.
+    The robots relax the rotations (chordal start), and may average them, or are given the poses
+    that `find` returns.
     """
 
     job: RobotJob
     name: str = "chordal start"
     find: Callable[[], Poses] | None = None
+    averaged: bool = False
 
     def run(self, answer: Answer) -> Answer:
         """Start the robots."""
@@ -128,7 +130,7 @@ class StartByRobots:
         began = time.perf_counter()
         with self.job.monitor.showing(self.name):
             if poses is None:
-                driver.go_to_chordal_start()
+                driver.go_to_chordal_start(self.averaged)
             else:
                 driver.set_poses(poses)
             objective = _final_objective(driver)
@@ -136,6 +138,23 @@ class StartByRobots:
         seconds = time.perf_counter() - began
         self.job.stages.append(Stage(self.name, Status.CONVERGED, 0, objective, seconds, History()))
         return Answer()
+
+
+def stages_before_newton(
+    job: RobotJob,
+    soc: SOC | None,
+    start: StartByRobots | None = None,
+    faults: Faults | None = None,
+) -> list[PlannedStage]:
+    """Start and SOC, until Newton can take over.
+
+    Unless another start is given, these are in the plane the averaged start alone, as in one place,
+    if SOC has its default settings: from there Newton's method needs fewer rounds than both.
+    """
+    if start is None and soc == WARM_START and job.driver.can_average:
+        return [StartByRobots(job, "averaged start", averaged=True)]
+    first = start if start is not None else StartByRobots(job)
+    return [first] if soc is None else [first, SOCByRobots(job, soc, faults)]
 
 
 @dataclass(frozen=True, eq=False)

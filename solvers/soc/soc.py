@@ -351,3 +351,8 @@ class SOC(SOCSettings):
         from solvers.soc.consensus import LocalConsensus  # with robots, copies and links
 
         return LocalConsensus(self)
+
+
+# Relative residual from which Newton needs one or two factorisations, on all graphs tried.
+WARM_START_TOLERANCE = 5e-3
+WARM_START = SOC(tolerance=WARM_START_TOLERANCE, max_iterations=100)

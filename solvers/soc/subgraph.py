@@ -14,6 +14,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
 from pgo_models.graphs.separators import cover_of_edges
 from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.initialization import largest_stiffness
 from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.soc.subdomains import Subdomains, find_subdomains, poses_to_leave
 
@@ -162,6 +163,7 @@ class Subgraph:
             has_translations=self.weights.has_translations,
             part=self.poses[poses_of_part],
             coupled=self._coupled,
+            stiffness=largest_stiffness(self.weights.of_edges(self.is_counted), self.graph.d),
         )
 
     @property
@@ -198,6 +200,9 @@ class RobotSummary:
     coupled : (k, 2) array or None
         Pairs of positions in `touched`, the larger first, of poses that are coupled in the Schur
         complement of the robot; None where it is dense.
+    stiffness : float or None
+        Largest kappa / tau of the counted edges, see `largest_stiffness`; None where their
+        rotations cannot be averaged.
     """
 
     robot: int
@@ -209,6 +214,7 @@ class RobotSummary:
     has_translations: bool
     part: IntArray | None
     coupled: IntArray | None = None
+    stiffness: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

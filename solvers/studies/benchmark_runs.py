@@ -21,14 +21,14 @@ from solvers.baselines.sweep_order import Sweep, schedule
 from solvers.loop import Solver, run
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solve
-from solvers.request import WARM_START, Pipeline
+from solvers.request import Pipeline
 from solvers.result import OUT_OF_TIME, History, Record, Run, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.staircase import Staircase
 from solvers.soc.paper import PaperSOC, PaperState
 from solvers.soc.penalty import BalancedPenalty
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
 

@@ -172,7 +172,7 @@ def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
 @pytest.fixture
 def broken_off(tmp_path):
     """Graph, and path of the checkpoint of a solve of it by three robots."""
-    graph = varied_graph(9, 30, 2)
+    graph = varied_graph(9, 30, 3)
     path = tmp_path / "run.ckpt"
     with pytest.raises(Killed):
         solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
@@ -302,7 +302,7 @@ def test_a_checkpoint_holds_no_pickle(broken_off):
 
 
 def test_room_on_the_disk_again_means_checkpoints_again(tmp_path, monkeypatch, caplog):
-    graph = varied_graph(6, 30, 2)
+    graph = varied_graph(6, 30, 3)
     path = tmp_path / "run.ckpt"
     written = []
     write = checkpoint._write
@@ -343,7 +343,7 @@ def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path
 
 @pytest.mark.parametrize("is_there", [False, True])
 def test_a_second_run_on_a_checkpoint_is_refused(is_there, tmp_path):
-    graph = varied_graph(9, 30, 2)
+    graph = varied_graph(9, 30, 3)
     path = tmp_path / "run.ckpt"
     if is_there:
         with pytest.raises(Killed):

@@ -1,5 +1,7 @@
 """The driver and its robots: their results, their messages, and how these are counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from budget import examples
@@ -42,6 +44,7 @@ from solvers.distributed.stages import open_driver
 from solvers.network.engine import InProcess
 from solvers.pipeline import solve
 from solvers.request import Pipeline
+from solvers.soc.soc import SOC, WARM_START
 from solvers.soc.subgraph import split_graph
 from solvers.solution import Solution
 
@@ -99,6 +102,33 @@ def test_the_translations_are_asked_for_again_when_their_first_factorisation_fai
     assert driver.current.objective == pytest.approx(expected, rel=1e-9)
 
 
+@settings(max_examples=examples(20))
+@given(seed=SEEDS, n=SIZES, noise=NOISES, partitioner=PARTITIONERS, backend=BACKENDS)
+def test_the_averaged_start_is_the_central_one(
+    seed: int, n: int, noise: NoiseModel, partitioner: Partitioner, backend: CholeskyBackend
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, 2, noise), backend)
+    driver = open_driver(problem, partitioner(problem.graph, seed), InProcess())
+    assert driver.can_average
+    driver.go_to_chordal_start(averaged=True)
+    expected = chordal_start(problem, averaged=True)
+    found, _ = collect(driver)
+    size = 1 + np.abs(expected.t).max()
+    np.testing.assert_allclose(found.R, expected.R, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.t - found.t[0], expected.t, rtol=0, atol=1e-9 * size)
+    assert driver.network.ledger.rounds == 3
+
+
+def test_no_averaged_start_where_an_edge_has_no_tau() -> None:
+    graph = varied_graph(3, 12, 2)
+    tau = graph.tau.copy()
+    tau[-1] = 0.0
+    problem = PGOProblem(replace(graph, tau=tau))
+    assert not open_driver(problem, metis(graph, 3), InProcess()).can_average
+    in_space = varied_problem(3, 12, 3)
+    assert not open_driver(in_space, metis(in_space.graph, 3), InProcess()).can_average
+
+
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
 def test_the_chordal_start_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
     check_start(PGOProblem(graph), parts)
@@ -140,13 +170,12 @@ def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> No
 
 
 def solved(
-    seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel
+    seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel, soc: SOC = WARM_START
 ) -> tuple[Solution, Recording]:
     graph = varied_graph(seed, n, d, noise)
     engine = Recording()
-    solution = solve(
-        graph, Pipeline(staircase=None), robots=partitioner(graph, seed), engine=engine
-    )
+    pipeline = Pipeline(soc=soc, staircase=None)
+    solution = solve(graph, pipeline, robots=partitioner(graph, seed), engine=engine)
     assert engine.is_closed
     return solution, engine
 
@@ -187,6 +216,7 @@ def test_the_ledger_counts_what_was_sent(
     counted = (
         *(
             Interior.project,
+            Interior.turn_by,
             Interior.set_translations,
             Interior.penalize,
             Interior.rescale,
@@ -227,9 +257,11 @@ def lower(g: int, width: int) -> tuple[int]:
 
 
 @pytest.mark.parametrize("noise", [MILD_NOISE, LOUD_NOISE])
-@pytest.mark.parametrize("d", [2, 3])
-def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) -> None:
-    solution, engine = solved(7, 40, d, metis, noise)
+@pytest.mark.parametrize(
+    ("d", "soc"), [(2, WARM_START), (2, replace(WARM_START, max_iterations=99)), (3, WARM_START)]
+)
+def test_what_crosses_has_the_size_of_the_separators(d: int, soc: SOC, noise: NoiseModel) -> None:
+    solution, engine = solved(7, 40, d, metis, noise, soc)
     graph = solution.problem.graph
     parts = solution.robots
     tangent = d + tangent_dimension(d)
@@ -243,7 +275,8 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
         g = len(part.boundary)
         inside = len(part.interior)
         assert inside not in (0, g)
-        any_side = {(width * g, k) for width, k in ((1, d), (d, d), (d + 1, d), (tangent, 1))}
+        sides = ((1, 1), (1, d), (d, d), (d + 1, d), (tangent, 1))
+        any_side = {(width * g, k) for width, k in sides}
         allowed = {
             "schur": {lower(g, 1), lower(g, d), lower(g, d + 1), lower(g, tangent)},
             "diagonal": {(d * g,), ((d + 1) * g,), (tangent * g,)},
@@ -262,6 +295,7 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
         values = {  # of orders that take or give one array
             "Interior.describe": {((d + 1) * g,)},
             "Interior.project": any_side,
+            "Interior.turn_by": {(g, 1)},
             "Interior.set_translations": {(g, d)},
             "Interior.evaluate_trial": {(g, d)},
             "Interior.solve": any_side | sums,
@@ -278,7 +312,11 @@ def test_what_crosses_has_the_size_of_the_separators(d: int, noise: NoiseModel) 
                     plain = values.get(order, {()}) if name == "value" else {()}
                     assert np.shape(value) in allowed.get(name, plain), (order, name)
                     seen.add(name)
-    assert {"schur", "b", "x", "value", "force", "sums", "gamma", "norms", "scale"} <= seen
+    assert {"schur", "b", "x", "value", "force"} <= seen
+    if any(stage.name == "SOC" for stage in solution.stages):
+        assert {"sums", "gamma", "norms", "scale"} <= seen
+    else:
+        assert solution.stages[0].name == "averaged start"
 
 
 @settings(max_examples=examples(15))

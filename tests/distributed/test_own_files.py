@@ -29,9 +29,9 @@ from solvers.distributed.robots import climbing
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.stages import ClimbByRobots, NewtonByRobots, SOCByRobots
 from solvers.folder_solve import FolderSolution, solve_folder
-from solvers.request import WARM_START
 from solvers.result import Status
 from solvers.soc.settings import Coupling
+from solvers.soc.soc import WARM_START
 from solvers.stages import Answer
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
@@ -407,7 +407,8 @@ def test_the_staircase_climbs_from_the_best(
     def worse(stage: NewtonByRobots, answer: Answer) -> Answer:
         refined = newton(stage, answer)
         driver = stage.job.driver
-        if len(began) == 0 and tolerances[-1] < WARM_START.tolerance:  # of the second try
+        # Of the second try, which alone runs SOC in the plane.
+        if not began and tolerances and tolerances[-1] < WARM_START.tolerance:
             driver.adopt(np.broadcast_to(project_to_rotations(away), driver.current.R.shape))
         return refined
 

@@ -40,13 +40,13 @@ from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.pipeline import solve
-from solvers.request import WARM_START, Pipeline
+from solvers.request import Pipeline
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.polish import polish, relative_decrement
 from solvers.soc.anderson import Anderson
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end

@@ -20,6 +20,7 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
+    exp_map,
     project_to_rotations,
     stack_transposes,
     unstack_transposes,
@@ -27,7 +28,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout
-from pgo_models.problem.initialization import relaxed_rotations
+from pgo_models.problem.initialization import averaging_pull, relaxed_rotations
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.low_rank import gradient_at, hessian_at, tangent_widths
 from solvers.distributed.robots.factors import Eliminated, Factors
@@ -102,10 +103,21 @@ class Interior:
         of_rotations = K[p:, p:].tocsc()
         return self._eliminate(of_rotations, (part.problem.d,), b[p:])
 
-    def project(self, x: Array) -> tuple[Interior, ReducedTranslations]:
-        """Back-substitute the relaxation and project its rotations; then `translations`."""
+    def project(self, x: Array) -> tuple[Interior, None]:
+        """Back-substitute the relaxation, and go to its rotations, projected."""
         relaxed = unstack_transposes(self.back_substitute(x))
-        return self._at(project_to_rotations(relaxed)).translations(None)
+        return self._at(project_to_rotations(relaxed)), None
+
+    def average(self, stiffness: float) -> tuple[Interior, ReducedTranslations]:
+        """Pull of a step of rotation averaging, and its matrix, M_tt, once."""
+        pull = averaging_pull(self.part.problem, self.state.poses.R, stiffness)
+        following, right = self._reduced_laplacian(pull)
+        return following.with_changes(b=pull), right
+
+    def turn_by(self, angles: Array) -> tuple[Interior, None]:
+        """Take the step of `average`, from its angles on the boundary, (g, 1)."""
+        all_angles = self.factors.laplacian.back_substitute(self.state.b, angles)
+        return self._at(self.state.poses.R @ exp_map(all_angles)), None
 
     def choose_cost(self, final: bool) -> tuple[Interior, CostParts]:
         """Go over to the cost that is solved, or back: its parts at the current poses."""
@@ -403,9 +415,13 @@ class Interior:
         return R
 
     def _reduced_translations(self, R: Array) -> tuple[Interior, ReducedTranslations]:
-        """Reduce the best translations of rotations; their matrix is sent once."""
+        """Reduce the best translations of rotations."""
+        return self._reduced_laplacian(self._coupling_rhs(R))
+
+    def _reduced_laplacian(self, right: Array) -> tuple[Interior, ReducedTranslations]:
+        """Reduce a right-hand side of M_tt, (p, k); the matrix is sent once."""
         laplacian = self.factors.laplacian
-        b, _ = laplacian.reduce(self._coupling_rhs(R))
+        b, _ = laplacian.reduce(right)
         schur = None if self.state.has_laplacian else laplacian.schur
         return self.with_changes(has_laplacian=True), ReducedTranslations(b, schur)
 
