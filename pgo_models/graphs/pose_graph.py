@@ -1045,19 +1045,24 @@ def is_ascending(times: Array) -> bool:
 
 
 def middle_pose(graph: PoseGraph) -> int:
-    """Pose half-way along a long shortest path of a connected graph.
+    """Pose half-way along a long shortest path of a connected graph, see `middle_node`."""
+    return middle_node(graph.adjacency)
 
-    The path ends at the pose farthest from pose 0, and at the pose farthest from that one. Two
+
+def middle_node(adjacency: csr_array) -> int:
+    """Node half-way along a long shortest path of a connected graph with this adjacency matrix.
+
+    The path ends at the node farthest from node 0, and at the node farthest from that one. Two
     breadth-first searches find them.
     """
-    end = poses_by_distance(graph, 0)[-1]
-    order, parents = breadth_first_order(graph.adjacency, end)
+    end = int(breadth_first_order(adjacency, 0, return_predecessors=False)[-1])
+    order, parents = breadth_first_order(adjacency, end)
     parent = parents.tolist()
-    pose = int(order[-1])
-    path = [pose]
-    while pose != end:
-        pose = parent[pose]
-        path.append(pose)
+    node = int(order[-1])
+    path = [node]
+    while node != end:
+        node = parent[node]
+        path.append(node)
     return path[len(path) // 2]
 
 

@@ -289,6 +289,13 @@ class Driver:
             self._interfaces[widths] = replace(self._any_widths, widths=widths)
         return self._interfaces[widths]
 
+    def release_newton(self) -> None:
+        """Let go of the interface of Newton's unknowns, whose memory a proof may need.
+
+        Only a sparse one holds a factor of its own; the next step of Newton builds it again.
+        """
+        self._interfaces.pop(self.tangent, None)
+
     @property
     def tangent(self) -> tuple[int, int]:
         """Widths of the tangent space at the current poses."""

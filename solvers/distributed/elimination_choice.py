@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.graphs.pose_graph import IntArray, edge_counts, middle_node
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners, flops_of_fronts
@@ -72,6 +72,26 @@ class CoverSystem:
         """Pattern of a sparse system."""
         assert self.coupled is not None
         return CoverPattern.of(self.touched, self.coupled, len(self.cover), self.width - 1)
+
+    @property
+    def middle(self) -> int:
+        """Position in the cover of a pose in the middle, by the number of steps between poses.
+
+        A step joins two poses that the robots couple, or where the driver is not told these, two
+        that a robot touches. Bounds are proved with that pose left out: the smallest eigenvalue of
+        what remains is much smaller where a pose at the rim is.
+        """
+        g = len(self.cover)
+        if self.coupled is not None:
+            smaller, larger = self.pattern.lower.tocoo().coords
+            return middle_node(edge_counts(smaller, larger, g))
+        # A node for every robot, which joins the poses that it touches.
+        robots = np.repeat(np.arange(len(self.touched)), [len(poses) for poses in self.touched])
+        adjacency = edge_counts(np.concatenate(self.touched), g + robots, g + len(self.touched))
+        middle = middle_node(adjacency)
+        if middle < g:
+            return middle
+        return int(adjacency.indices[adjacency.indptr[middle]])
 
     def interface(self, widths: Widths) -> Interface:
         """The system for unknowns with these numbers per pose; all fronts are with the driver."""

@@ -55,6 +55,7 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
     is_near_zero = driver.current.objective <= driver.current.rounding_level
     if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
         return central.NO_BOUND  # the poses are exact
+    driver.release_newton()
     if driver.is_final:
         driver.describe(Count.PIGGYBACKED)
     has_scale = bool((driver.diagonal > 0.0).all())

@@ -428,8 +428,7 @@ def open_files(
         summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
         if memory != 0:
             summaries = _chosen_elimination(network, summaries)
-        last = max(int(summary.in_cover.max(initial=0)) for summary in summaries)
-        grounded = (last + 1) // 2  # a pose in the middle of the cover
+        grounded = CoverSystem.of(summaries).middle
         driver = Driver(summaries, num_poses, lambda: network, memory, grounded)
         return OpenedFiles(driver, sizes, weighting, has_indefinite)
     except BaseException:  # also Ctrl-C: no robot stays behind

@@ -9,9 +9,11 @@ from robots import Recording, arrays_in, scattered, sparse_elimination
 
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import elimination_choice
-from solvers.distributed.elimination_choice import CoverSystem, choose_elimination
+from solvers.distributed.elimination_choice import CoverSystem, choose_elimination, leave_poses
+from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.sparse_interface import SparseInterface
 from solvers.distributed.stages import open_driver
 from solvers.network.engine import InProcess
@@ -119,3 +121,32 @@ def test_memory_is_known_before_it_is_spent() -> None:
     factor = width**2 * int(interface.pattern.counts.sum())
     sent = sum(len(positions) for positions in held.robots)
     assert interface.num_bytes >= 8 * (factor + held.lower.nnz) + 12 * sent
+
+
+@pytest.mark.parametrize("is_sparse", [False, True])
+def test_the_middle_of_a_row_of_robots_is_half_way(is_sparse: bool) -> None:
+    # Poses in a row; every robot has a stretch of it, but the robots are numbered at random.
+    num_robots = 9
+    n = 10 * num_robots
+    i = np.arange(n - 1)
+    turns = np.tile(np.eye(2), (n - 1, 1, 1))
+    steps = np.tile([1.0, 0.0], (n - 1, 1))
+    graph = PoseGraph(n, i, i + 1, turns, steps, np.ones(n - 1), np.ones(n - 1))
+    robot = np.repeat(np.random.default_rng(0).permutation(num_robots), 10)
+    subgraphs = split_graph(PGOProblem(graph), Partition(robot, PartitionMethod.GIVEN))
+    if is_sparse:
+        subgraphs = leave_poses(subgraphs, 2)
+    system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
+    assert (system.coupled is not None) == is_sparse
+    assert abs(int(system.cover[system.middle]) - n // 2) <= 10
+
+
+def test_a_proof_lets_go_of_the_factor_of_newton() -> None:
+    graph = grid_world(4, 60, np.random.default_rng(0), d=2)
+    with sparse_elimination(8):
+        driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
+    driver.go_to_chordal_start()
+    newton = driver.interface(*driver.tangent)
+    best_bound_distributed(driver, 1e-6)
+    assert driver.interface(*driver.tangent) is not newton
+    assert driver.interface(1, 2) is driver.interface(1, 2)
