@@ -80,8 +80,9 @@ def chosen_pipeline(
     )
     if isinstance(soc, PaperSOC):
         return Pipeline(soc=soc, newton=gauss_newton(), gap=gap, driver_memory=memory)
-    coupling = None if method is FirstStage.JOINT else Coupling[method.name]
-    return Pipeline(soc=replace(soc, coupling=coupling), gap=gap, driver_memory=memory)
+    if method is FirstStage.CONSENSUS:
+        soc = replace(soc, coupling=Coupling.CONSENSUS)
+    return Pipeline(soc=soc, gap=gap, driver_memory=memory)
 
 
 def _check_without_soc(
