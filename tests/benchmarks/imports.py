@@ -7,7 +7,8 @@ scipy.sparse.linalg.
 The first command prints a table of commands. The second prints what one command, here `pgo solve
 sphere`, imports beyond numpy and scipy.sparse.linalg, by packages, as `-X importtime` has it. CPU
 seconds are those of user and system, of interpreters of their own: the least of ten, one after the
-other in turn, with one thread and with the bytecode compiled before, as of an installed package.
+other in turn, with one thread and with the bytecode compiled before, as of an installed package. MB
+are the largest resident memory of that run.
 """
 
 from __future__ import annotations
@@ -58,15 +59,15 @@ def environment(folder: str) -> dict[str, str]:
     return variables
 
 
-def seconds(arguments: list[str], variables: dict[str, str]) -> float:
-    """CPU seconds, of user and system, of one interpreter, whose command has to end well."""
+def costs(arguments: list[str], variables: dict[str, str]) -> tuple[float, float]:
+    """CPU seconds, of user and system, and MB of one interpreter, whose command has to end well."""
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     process = subprocess.Popen([sys.executable, *arguments], env=variables, **quiet)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in (0, 3):  # 3: no certificate
         sys.exit(f"{shlex.join(arguments)} ended with {process.returncode}")
-    return usage.ru_utime + usage.ru_stime
+    return usage.ru_utime + usage.ru_stime, 1e-3 * usage.ru_maxrss
 
 
 def import_times(arguments: list[str], variables: dict[str, str]) -> dict[str, float]:
@@ -102,18 +103,20 @@ def print_commands(variables: dict[str, str]) -> None:
     for command in (*COMMANDS, *(f"solve {name} --cost isotropic" for name in large)):
         rows[f"`pgo {command}`"] = ["-c", ENTRY, *shlex.split(command)]
     modules = {name: len(import_times(row, variables)) for name, row in rows.items()}
-    runs = [[seconds(row, variables) for row in rows.values()] for _ in range(RUNS)]
+    runs = [[costs(row, variables) for row in rows.values()] for _ in range(RUNS)]
     least = [min(column) for column in zip(*runs, strict=True)]
-    print("| command | CPU s | multiple of the first | modules |\n|---|---|---|---|")
-    for name, time in zip(rows, least, strict=True):
-        print(f"| {name} | {time:.3f} | {time / least[0]:.2f} | {modules[name]} |")
+    first = least[0][0]
+    print("| command | CPU s | multiple of the first | MB | modules |\n|---|---|---|---|---|")
+    for name, (time, megabytes) in zip(rows, least, strict=True):
+        figures = f"{time:.3f} | {time / first:.2f} | {megabytes:.0f} | {modules[name]}"
+        print(f"| {name} | {figures} |")
 
 
 def print_imports(command: list[str], variables: dict[str, str]) -> None:
     """Print what a command imports beyond numpy and scipy.sparse.linalg."""
     rows = [["-c", BASE], ["-c", ENTRY, *command]]
     for row in rows:
-        seconds(row, variables)  # compiles
+        costs(row, variables)  # compiles
     base, times = (import_times(row, variables) for row in rows)
     spent: Counter[str] = Counter()
     count: Counter[str] = Counter()
