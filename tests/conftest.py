@@ -1,5 +1,6 @@
 """Fixtures that several test files share."""
 
+import inspect
 import os
 from collections.abc import Callable
 from functools import cache
@@ -23,9 +24,8 @@ settings.register_profile(PROFILE, max_examples=EXAMPLES, deadline=None)
 settings.load_profile(PROFILE)
 
 
-# A test that asks for one of these may come out otherwise with the benchmark files; `request` can
-# ask for any of them.
-BENCHMARK_FIXTURES = {"benchmark_data", "benchmark_problem", "benchmark_optimum", "request"}
+# A test that asks for one of these may come out otherwise with the benchmark files.
+BENCHMARK_FIXTURES = {"benchmark_data", "benchmark_problem", "benchmark_optimum"}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -44,6 +44,12 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.markexpr = ""  # instead of "not slow"
 
 
+def parameters_of(item: pytest.Item) -> tuple[str, ...]:
+    """Names of the fixtures and parameters that the function of a test itself asks for."""
+    test = getattr(item, "function", None)
+    return () if test is None else tuple(inspect.signature(test).parameters)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--rest"):
         return
@@ -52,6 +58,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         is_drawn = getattr(getattr(item, "obj", None), "is_hypothesis_test", False)
         is_measured = bool(BENCHMARK_FIXTURES & set(getattr(item, "fixturenames", ())))
+        # `request` can ask for any of them. Fixtures of pytest, as `tmp_path`, ask for it, too, so
+        # that it counts only where the test itself does.
+        is_measured |= "request" in parameters_of(item)
         is_slow = item.get_closest_marker("slow") is not None
         (chosen if is_drawn or is_measured or is_slow else left_out).append(item)
     config.hook.pytest_deselected(items=left_out)
