@@ -42,6 +42,12 @@ EQUATIONS = {
     "relaxation rotation": 18,
 }
 
+# What is run instead where a notebook takes long, and no assert speaks of all of it: one graph at
+# every level of the noise, not four.
+SHORTENED = {
+    "05_sdp_and_certificates": ("np.deg2rad(degrees), 4, np", "np.deg2rad(degrees), 1, np"),
+}
+
 each_source = pytest.mark.parametrize("source", SOURCES, ids=NAMES)
 
 
@@ -76,7 +82,12 @@ def with_answers(source: Path) -> str:
             if kind == "code"
             else [code for answer in ANSWER.findall(text) for code in code_of(answer)]
         )
-    return "\n\n".join(parts)
+    code = "\n\n".join(parts)
+    if source.stem in SHORTENED:
+        whole, part = SHORTENED[source.stem]
+        assert code.count(whole) == 1
+        code = code.replace(whole, part)
+    return code
 
 
 def code_of(answer: str) -> list[str]:
