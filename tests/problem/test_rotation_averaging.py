@@ -147,7 +147,7 @@ def test_rotations_are_certified_and_the_bound_is_tight(seed: int, n: int, d: in
 
 
 @given(seed=SEEDS, d=DIMENSIONS, spread=st.sampled_from([1.0, 1e6]))
-@settings(max_examples=examples(20))
+@settings(max_examples=examples(12))
 def test_translations_that_are_given_change_nothing(seed: int, d: int, spread: float) -> None:
     graph = varied_graph(seed, 8, d)
     problem = averaging(graph)

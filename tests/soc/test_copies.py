@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, random_poses, translation_scale, varied_problem
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner
 
 from pgo_models.geometry.poses import Poses
@@ -230,6 +231,7 @@ def stiffness_of(problem: PGOProblem, parts: Partition) -> float:
     return started(problem, parts, chordal_start(problem), soc).shared.separators.translation / 0.6
 
 
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, exponent=st.integers(-10, 10))
 def test_stiffness_has_no_unit(
     seed: int, n: int, d: int, partitioner: Partitioner, exponent: int
@@ -273,6 +275,7 @@ def test_stiffness_is_that_of_springs_in_series(links: int) -> None:
     assert state.shared.separators.translation / 0.6 == pytest.approx(3.0 / np.trace(C), rel=0.5)
 
 
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=st.integers(3, 12), d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_separator_penalties_follow_from_the_stiffness(
     seed: int, n: int, d: int, partitioner: Partitioner

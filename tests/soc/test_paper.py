@@ -232,6 +232,7 @@ def test_boyd_s_rule_is_section_3_4_1_to_the_letter(
         np.testing.assert_allclose(state.rho * state.B, literal, rtol=0, atol=1e-9 * before.rho)
 
 
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_as_published_rho_follows_the_paper_s_rule_and_only_p_res_stops(
     seed: int, n: int, d: int

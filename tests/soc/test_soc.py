@@ -144,6 +144,7 @@ def local_passes_of(
     return x, z, B
 
 
+@settings(max_examples=examples(40))
 @given(
     seed=SEEDS,
     n=SIZES,
@@ -220,6 +221,7 @@ def test_what_a_state_says_of_itself(seed: int, n: int, d: int, accelerated: boo
             )
 
 
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
 def test_anderson_per_robot_sums_nothing_over_the_robots(
     seed: int, n: int, d: int, method: PartitionMethod
