@@ -37,6 +37,10 @@ from solvers.soc.subgraph import Subgraph
 Partitioner = Callable[[PoseGraph, int], Partition]
 
 
+class Killed(BaseException):
+    """Ends a solve as a kill does: nothing of ours catches it."""
+
+
 def contiguous(graph: PoseGraph, seed: int) -> Partition:
     return partition(graph, _number(graph, seed), PartitionMethod.CONTIGUOUS)
 

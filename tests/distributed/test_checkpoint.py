@@ -10,6 +10,7 @@ import pytest
 from budget import examples
 from graphs import varied_graph
 from hypothesis import HealthCheck, given, settings as hypothesis_settings, strategies as st
+from robots import Killed
 
 import pgo_models as pgo
 import solvers
@@ -27,10 +28,6 @@ pytestmark = pytest.mark.slow  # solves by robots from end to end
 
 MEASURED = ("R_ij", "t_ij", "kappa", "tau")
 PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]
-
-
-class Killed(BaseException):
-    """Ends a solve as a kill does: nothing of ours catches it."""
 
 
 def killed_after(steps):

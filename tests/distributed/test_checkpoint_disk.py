@@ -1,10 +1,11 @@
-import os
-import subprocess
+import signal
 import sys
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import pytest
 from graphs import varied_graph
+from robots import Killed
 
 import pgo_models as pgo
 import solvers
@@ -13,50 +14,55 @@ from solvers.distributed.checkpoint import Checkpoint
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 
-LIMITED = """
-import resource, signal, sys
-import pgo_models as pgo, solvers
-# A write beyond the limit is an error, as on a full disk.
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-graph, seen = pgo.load("circle"), []
-def fill(state, record):
-    seen.append(record.k)
-    if len(seen) == int(sys.argv[2]):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.RLIM_INFINITY))
-    if len(seen) == 40:
-        raise SystemExit(7)
-soc = solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300)
-checkpoint = solvers.Checkpoint(sys.argv[1], rounds=3)
-solvers.solve(graph, solvers.Pipeline(soc=soc), robots=3, checkpoint=checkpoint, callback=fill)
-"""
+SUBSTRUCTURED = solvers.Pipeline(
+    soc=solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300)
+)
+
+
+@contextmanager
+def full_disk_later() -> Iterator[Callable[[int], None]]:
+    """What is called fills the disk: from then on a write beyond so many bytes of a file fails."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # an error, as on a full disk
+    try:
+        yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of the size of files are POSIX")
 @pytest.mark.parametrize("size", [0, 60, 5000, 30_000])
 @pytest.mark.parametrize("full_after", [1, 20])
-def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after, tmp_path):
+def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after, tmp_path, caplog):
     path = tmp_path / "run.ckpt"
-    command = [sys.executable, "-c", LIMITED, str(path), str(full_after), str(size)]
-    environment = {**os.environ, "PYTHONPATH": str(Path(solvers.__file__).parent.parent)}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert ended.returncode == 7, ended.stderr
-    assert (
-        ended.stderr
-        == f"the solve goes on without a new checkpoint: cannot write {path}: File too large;"
-        " choose a place that can be written\n"
-    )
-    assert [one.name for one in tmp_path.iterdir()] == ["run.ckpt"]
     graph = pgo.load("circle")
     seen = []
-    soc = solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED, tolerance=1e-300)
+
+    def fill(state, record):
+        seen.append(record.k)
+        if len(seen) == full_after:
+            fill_disk(size)
+        if len(seen) == 40:
+            raise Killed
+
+    with full_disk_later() as fill_disk, pytest.raises(Killed):
+        solvers.solve(
+            graph, SUBSTRUCTURED, robots=3, checkpoint=Checkpoint(path, rounds=3), callback=fill
+        )
+    assert caplog.messages == [
+        f"the solve goes on without a new checkpoint: cannot write {path}: File too large;"
+        " choose a place that can be written"
+    ]
+    assert [one.name for one in tmp_path.iterdir()] == ["run.ckpt"]
+    seen.clear()
 
     def look(state, record):
         seen.append(record.k)
         return True
 
-    solvers.solve(
-        graph, solvers.Pipeline(soc=soc), robots=3, checkpoint=Checkpoint(path), callback=look
-    )
+    solvers.solve(graph, SUBSTRUCTURED, robots=3, checkpoint=Checkpoint(path), callback=look)
     # it goes on from the last one before the disk was full
     assert full_after - 4 <= seen[0] < full_after
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graphs import varied_graph
-from robots import Recording, arrays_in
+from robots import Killed, Recording, arrays_in
 
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -164,10 +164,6 @@ def test_large_fronts_are_robots_and_few_or_small_ones_the_driver_s(
         driver = open_driver(PGOProblem(graph), parts, InProcess())
         fronts = driver.interface(1).fronts
         assert (set(fronts.owner) != {DRIVER}) == expected
-
-
-class Killed(BaseException):
-    """The process of the driver is gone."""
 
 
 def test_a_run_that_was_broken_off_goes_on_with_fronts_on_robots(

@@ -342,7 +342,7 @@ def test_files_that_are_no_robots_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
-    graph = varied_graph(1, 30, d, NoiseModel(translation_std=1.0, rotation_std=1.5))
+    graph = varied_graph(1, 20, d, NoiseModel(translation_std=1.0, rotation_std=1.5))
     graph = graph.with_robots(pgo.partition(graph, 4).robot)
     write_g2o_folder(graph, tmp_path / "in")
     isotropic = pgo.Weighting.ISOTROPIC

@@ -34,8 +34,6 @@ from solvers.soc.subgraph import split_graph
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 
-COUPLINGS = (solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS)
-
 
 @pytest.fixture(scope="module")
 def wrong() -> tuple[pgo.PoseGraph, np.ndarray]:
@@ -46,8 +44,13 @@ def allowed(problem: pgo.PGOProblem) -> np.ndarray:
     return np.where(known_inliers(problem.graph, None), np.inf, chi2_thresholds(problem))
 
 
-@pytest.mark.parametrize("coupling", COUPLINGS)
-@pytest.mark.parametrize("weighting", pgo.Weighting)
+@pytest.mark.parametrize(
+    ("weighting", "coupling"),
+    [
+        *((weighting, solvers.Coupling.SUBSTRUCTURED) for weighting in pgo.Weighting),
+        (pgo.Weighting.OWN, solvers.Coupling.CONSENSUS),
+    ],
+)
 def test_it_is_the_central_run(wrong, weighting: pgo.Weighting, coupling: solvers.Coupling) -> None:
     graph, is_wrong = wrong
     problem = pgo.PGOProblem(graph, weighting=weighting)

@@ -173,7 +173,7 @@ def test_an_ascent_by_robots_is_that_of_one_place(scene: SweptScene, degrees: fl
 @pytest.mark.slow  # solves from end to end
 @pytest.mark.parametrize(
     ("scene", "degrees", "seed"),
-    [(SweptScene.CIRCLE, 60, 0), (SweptScene.CIRCLE, 80, 2), (SweptScene.GRID, 60, 1)],
+    [(SweptScene.CIRCLE, 60, 0), (SweptScene.GRID, 60, 1)],
 )
 def test_robots_certify_what_the_relaxation_leaves_open(
     scene: SweptScene, degrees: float, seed: int
