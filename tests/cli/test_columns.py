@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from wrong_edges import spoiled
 
-from pgo_models.graphs.g2o import write_g2o
+from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.grid_worlds import grid_world
 
 Call = Callable[..., tuple[int, str, str]]
@@ -79,9 +79,13 @@ def test_what_is_printed_stays_within_80_columns(arguments: tuple[str, ...], col
 def test_and_so_does_that_of_public_graphs(
     name: str, options: tuple[str, ...], columns: Call, benchmark_data: Path
 ) -> None:
+    path = benchmark_data / f"{name}.g2o"
     if name == "cubicle" and "--information" in options:
         options += ("--drop-coupling",)  # with indefinite matrices it has no chi2
-    code, out, _ = columns("solve", benchmark_data / f"{name}.g2o", *options)
+        beginning = read_g2o(path).subgraph(np.arange(600))  # says as much of its open gap as all
+        path = Path("cubicle.g2o")
+        write_g2o(beginning, path)
+    code, out, _ = columns("solve", path, *options)
     assert code in (0, 3)
     assert_narrow(out)
 

@@ -132,10 +132,9 @@ def test_no_poses_cost_less_than_a_bound_of_any_state(seed: int, n: int) -> None
 
 
 @pytest.mark.slow  # a semidefinite program of 78 rows and 54 cones
-@pytest.mark.parametrize(("scene", "degrees", "seed"), [("grid", 60, 0), ("grid", 80, 1)])
-def test_its_bound_is_that_of_the_model_of_cvxpy(scene: str, degrees: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    problem = PGOProblem(noisy_scene(SweptScene(scene), np.deg2rad(degrees), rng))
+def test_its_bound_is_that_of_the_model_of_cvxpy() -> None:
+    rng = np.random.default_rng(0)
+    problem = PGOProblem(noisy_scene(SweptScene.GRID, np.deg2rad(60), rng))
     poses = solve(problem, Pipeline(handedness=None)).poses
     outcome = run(HullLagrangian(), problem, poses)
     assert outcome.status is Status.STALLED

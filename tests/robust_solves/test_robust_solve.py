@@ -414,7 +414,7 @@ def test_what_pairwise_consistency_left_out_comes_back():
 
 def test_robots_take_back_what_one_place_does():
     graph, wrong = spoiled(few_closures(1, 200, noise=NoiseModel(0.02, 0.1)), 0.5, "random", 1)
-    solution = solvers.solve(graph, robust=solvers.GNC(), robots=3)
+    solution = solvers.solve(graph, robust=solvers.GNC(), robots=2)
     assert "that they can follow" in solution.robust.start
     np.testing.assert_array_equal(solution.robust.kept, ~wrong)
     assert solution.is_certified
