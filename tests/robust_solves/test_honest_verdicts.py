@@ -295,8 +295,17 @@ def test_half_of_the_closures_of_a_large_world_are_wrong() -> None:
     assert_not_silent(solution, is_wrong)
 
 
-@KINDS
-@pytest.mark.parametrize("name", ["kitti_07", "kitti_00", "MIT"])
+# On MIT, which takes ten times as long, closures of one kind alone.
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("kitti_07", "random"),
+        ("kitti_07", "aliased"),
+        ("kitti_00", "random"),
+        ("kitti_00", "aliased"),
+        ("MIT", "random"),
+    ],
+)
 def test_nine_closures_of_ten_are_wrong(benchmark_problem, name: str, kind: str) -> None:
     graph, is_wrong = spoiled(benchmark_problem(name).graph, 0.9, kind, 0)
     solution = solvers.solve(graph, robust=solvers.GNC())
