@@ -111,7 +111,10 @@ def scipy_optimum(objective: Callable[[Poses], float], near: Poses) -> float:
         result = minimize(
             lambda x: objective(moved(x)), x, method="BFGS", options={"gtol": 1e-9, "maxiter": 5000}
         )
+        is_settled = least - result.fun <= 1e-12 * abs(result.fun)
         least = min(least, float(result.fun))
+        if is_settled:
+            break
         near = moved(result.x)
     return least
 

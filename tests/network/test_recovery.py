@@ -81,8 +81,15 @@ def pipeline(coupling, robots):
     )
 
 
-@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
-@pytest.mark.parametrize("orders", [1, 7, 1000])
+@pytest.mark.parametrize(
+    ("coupling", "orders"),
+    [
+        (solvers.Coupling.SUBSTRUCTURED, 1),
+        (solvers.Coupling.SUBSTRUCTURED, 7),
+        (solvers.Coupling.SUBSTRUCTURED, 1000),
+        (solvers.Coupling.CONSENSUS, 7),
+    ],
+)
 @pytest.mark.parametrize(
     ("is_before", "least", "groups"),
     [

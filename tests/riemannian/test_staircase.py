@@ -106,7 +106,7 @@ def test_on_its_way_the_relaxation_only_falls_and_the_rank_only_rises() -> None:
 
 @pytest.mark.parametrize(
     ("scene", "degrees", "seed"),
-    [(SweptScene.CIRCLE, 70.0, 0), (SweptScene.CIRCLE, 120.0, 1), (SweptScene.GRID, 70.0, 0)],
+    [(SweptScene.CIRCLE, 120.0, 1), (SweptScene.GRID, 70.0, 0)],
 )
 def test_where_the_relaxation_is_not_tight_its_optimum_is_that_of_the_semidefinite_program(
     scene: SweptScene, degrees: float, seed: int
