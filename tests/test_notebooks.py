@@ -42,8 +42,8 @@ EQUATIONS = {
     "relaxation rotation": 18,
 }
 
-# What is run in place of a part of a notebook that takes long: a sweep over the noise with one graph
-# at every level, not four, of which the asserts at its end hold as well.
+# What is run in place of a part of a notebook that takes long: a sweep over the noise with one
+# graph at every level, not four. The asserts at the end of the notebook hold of it, too.
 SHORTENED = {
     "05_sdp_and_certificates": ("np.deg2rad(degrees), 4, np", "np.deg2rad(degrees), 1, np"),
 }

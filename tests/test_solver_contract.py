@@ -121,7 +121,7 @@ def assert_same(one: Any, other: Any, where: str = "state") -> None:
 
 
 @EVERY
-@settings(max_examples=examples(20))
+@settings(max_examples=examples(12))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_a_step_leaves_its_state_alone(make: Make, seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)

@@ -32,6 +32,7 @@ from solvers.soc.soc import SOC
 
 SIZES = st.integers(2, 14)
 RHO = 3.0
+FEWER = settings(max_examples=examples(40))  # each example splits a graph and starts a run
 
 
 def started(
@@ -71,6 +72,7 @@ def held_by(problem: PGOProblem, robots: tuple[ConsensusRobot, ...]) -> Array:
     return sums_over(problem, robots, [robot.layout.held[:, 0].astype(float) for robot in robots])
 
 
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_every_edge_is_shared_completely(
     seed: int, n: int, d: int, partitioner: Partitioner
@@ -89,6 +91,7 @@ def test_every_edge_is_shared_completely(
     )
 
 
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_held_rows_are_rotations_and_separator_translations(
     seed: int, n: int, d: int, partitioner: Partitioner
@@ -113,6 +116,7 @@ def test_held_rows_are_rotations_and_separator_translations(
         )
 
 
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_the_penalty_of_a_pose_is_shared_among_its_copies(
     seed: int, n: int, d: int, partitioner: Partitioner
@@ -128,6 +132,7 @@ def test_the_penalty_of_a_pose_is_shared_among_its_copies(
     assert state.shared.size == pytest.approx(np.sqrt(d * RHO * n), rel=1e-12)
 
 
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_every_robot_minimises_its_own_subproblem(
     seed: int, n: int, d: int, partitioner: Partitioner
@@ -145,6 +150,7 @@ def test_every_robot_minimises_its_own_subproblem(
         np.testing.assert_allclose(x, expected, rtol=0, atol=1e-8 * (1 + np.abs(expected).max()))
 
 
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_agreement_is_the_mean_and_its_nearest_rotation(
     seed: int, n: int, d: int, partitioner: Partitioner
@@ -175,6 +181,7 @@ def test_agreement_is_the_mean_and_its_nearest_rotation(
     np.testing.assert_allclose(stack_transposes(omega), mean[n:], rtol=0, atol=1e-9)
 
 
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_balanced_multipliers_have_the_stationary_mean_and_pull_all_copies_alike(
     seed: int, n: int, d: int, partitioner: Partitioner
@@ -206,6 +213,7 @@ def test_balanced_multipliers_have_the_stationary_mean_and_pull_all_copies_alike
     assert (count[n:] > 0).all()
 
 
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_at_an_optimum_nothing_pulls_at_any_copy(
     seed: int, n: int, d: int, partitioner: Partitioner
@@ -231,7 +239,7 @@ def stiffness_of(problem: PGOProblem, parts: Partition) -> float:
     return started(problem, parts, chordal_start(problem), soc).shared.separators.translation / 0.6
 
 
-@settings(max_examples=examples(40))
+@FEWER
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS, exponent=st.integers(-10, 10))
 def test_stiffness_has_no_unit(
     seed: int, n: int, d: int, partitioner: Partitioner, exponent: int
@@ -275,7 +283,7 @@ def test_stiffness_is_that_of_springs_in_series(links: int) -> None:
     assert state.shared.separators.translation / 0.6 == pytest.approx(3.0 / np.trace(C), rel=0.5)
 
 
-@settings(max_examples=examples(40))
+@FEWER
 @given(seed=SEEDS, n=st.integers(3, 12), d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_separator_penalties_follow_from_the_stiffness(
     seed: int, n: int, d: int, partitioner: Partitioner

@@ -48,6 +48,7 @@ def largest_difference(solutions: list[Array]) -> float:
 
 @pytest.mark.parametrize("back_end", [RStep.FACTORIZED, RStep.FISTA])
 @pytest.mark.parametrize("backend", CholeskyBackend)
+@settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, translations=st.booleans())
 def test_the_solution_satisfies_the_normal_equations(
     back_end: RStep, backend: CholeskyBackend, seed: int, n: int, d: int, translations: bool
