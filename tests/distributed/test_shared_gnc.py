@@ -40,6 +40,11 @@ def wrong() -> tuple[pgo.PoseGraph, np.ndarray]:
     return spoiled(pgo.grid_world(1, 100, np.random.default_rng(0), d=3), 0.3, "aliased", 0)
 
 
+@pytest.fixture(scope="module")
+def by_two_robots(wrong) -> solvers.Solution:
+    return solvers.solve(wrong[0], robust=GNC(), robots=2)
+
+
 def allowed(problem: pgo.PGOProblem) -> np.ndarray:
     return np.where(known_inliers(problem.graph, None), np.inf, chi2_thresholds(problem))
 
@@ -145,8 +150,8 @@ def subgraph_known(problem: pgo.PGOProblem) -> np.ndarray:
     return known_inliers(problem.graph, None)
 
 
-def test_attempts_are_added_up_on_the_ledger(wrong) -> None:
-    solution = solvers.solve(wrong[0], robust=GNC(), robots=2)
+def test_attempts_are_added_up_on_the_ledger(by_two_robots) -> None:
+    solution = by_two_robots
     assert len(solution.robust.attempts) > 1
     assert solution.ledger.rounds > 2 * sum(
         stage.iterations for stage in solution.stages if "GNC" in stage.name
@@ -160,12 +165,12 @@ def num_rejected(solution: solvers.Solution) -> list[int]:
     return [attempt.rejected for attempt in solution.robust.attempts]
 
 
-def test_the_plain_solve_before_the_attempts_is_on_the_ledger(wrong) -> None:
+def test_the_plain_solve_before_the_attempts_is_on_the_ledger(wrong, by_two_robots) -> None:
     graph = wrong[0]
     few = solvers.Pipeline().with_newton_alone(solvers.Newton(max_iterations=10))
     plain = solvers.solve(graph, few, robots=2)
     start = first_poses(graph, subgraph_known(pgo.PGOProblem(graph)))
-    whole = solvers.solve(graph, robust=GNC(), robots=2)
+    whole = by_two_robots
     attempts = solvers.solve(graph, robust=GNC(), robots=2, start=start)
     assert num_rejected(whole) == num_rejected(attempts)
     assert whole.ledger.rounds >= plain.ledger.rounds + attempts.ledger.rounds

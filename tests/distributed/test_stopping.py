@@ -121,9 +121,9 @@ def test_the_gradient_is_within_tolerance_at_the_poses_returned(
 
 
 @pytest.mark.slow
-def test_the_gradient_is_within_tolerance_on_60_graphs() -> None:
-    ended = [check_claim(*random_case(seed), alone) for seed in range(60)]
-    assert ended.count(Status.CONVERGED) >= 54
+def test_the_gradient_is_within_tolerance_on_50_graphs() -> None:
+    ended = [check_claim(*random_case(seed), alone) for seed in range(50)]
+    assert ended.count(Status.CONVERGED) >= 45
 
 
 def ring(step: float, noise: NoiseModel, seed: int) -> PoseGraph:
