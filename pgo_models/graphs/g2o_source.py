@@ -50,10 +50,15 @@ class Source:
 
     def take(self, first_line: int, lines: list[str]) -> None:
         """Parse lines, of which the first has the number `first_line` in the file."""
-        num_taken = self._take_runs(first_line, lines)
-        self._take_groups(first_line + num_taken, lines[num_taken:])
+        numbers = np.arange(first_line, first_line + len(lines))
+        if "" in lines:
+            is_blank = np.array([not line for line in lines])
+            numbers = numbers[~is_blank]
+            lines = [line for line in lines if line]
+        num_taken = self._take_runs(numbers, lines)
+        self._take_groups(numbers[num_taken:], lines[num_taken:])
 
-    def _take_runs(self, first_line: int, lines: list[str]) -> int:
+    def _take_runs(self, numbers: IntArray, lines: list[str]) -> int:
         """Parse long runs of lines of one tag; return how many lines these are."""
         start = 0
         while start < len(lines):
@@ -65,27 +70,26 @@ class Source:
             is_simple = tag in TAGS and not TAGS[tag].num_offsets
             if not is_simple or end - start < _LONG_RUN:
                 break
-            numbers = np.arange(first_line + start, first_line + end)
-            is_sound = self._parse(tag, tag, numbers, lines[start:end])
+            is_sound = self._parse(tag, tag, numbers[start:end], lines[start:end])
             if not is_sound:
                 break
             start = end
         return start
 
-    def _take_groups(self, first_line: int, lines: list[str]) -> None:
+    def _take_groups(self, numbers: IntArray, lines: list[str]) -> None:
         """Sort lines by their tags, and parse the lines of each tag."""
         places: dict[str, list[int]] = {}
         for place, line in enumerate(lines):
             if words := line.split(None, 1):
                 places.setdefault(words[0], []).append(place)
         for written_tag, places_of_tag in places.items():
-            numbers = np.array(places_of_tag) + first_line
+            numbers_of_tag = numbers[places_of_tag]
             lines_of_tag = [lines[place] for place in places_of_tag]
             tag = ALIASES.get(written_tag, written_tag)
             if tag in TAGS:
-                self._take_measurements(tag, written_tag, numbers, lines_of_tag)
+                self._take_measurements(tag, written_tag, numbers_of_tag, lines_of_tag)
             elif not written_tag.startswith("#"):
-                self._take_others(written_tag, numbers.tolist(), lines_of_tag)
+                self._take_others(written_tag, numbers_of_tag.tolist(), lines_of_tag)
 
     def _take_measurements(
         self, tag: str, written_tag: str, numbers: IntArray, lines: list[str]
@@ -184,7 +188,7 @@ class Source:
         row_type = np.dtype([("tag", f"S{len(written_tag) + 1}"), ids_field, numbers_field])
         own_ends = lines
         if shared_end:
-            own_ends = [line.removesuffix(shared_end) for line in lines]
+            own_ends = [line.rstrip().removesuffix(shared_end) for line in lines]
         shared = np.zeros((1, 0))
         try:
             # NumPy warns of an id like 1.0, which is none.
@@ -282,13 +286,13 @@ def _has_hypotheses(line: str) -> bool:
 
 
 def _shared_end(lines: list[str], most: int) -> str:
-    """Words that all lines end with, as information matrices are often the same.
+    """Words that all lines end with but for blanks, as information matrices are often the same.
 
     It is empty where these words are more than `most`.
     """
     # The first and the last line are compared word by word, from the end on.
-    first = lines[0].split(" ")[::-1]
-    last = lines[-1].split(" ")[::-1]
+    first = lines[0].rstrip().split(" ")[::-1]
+    last = lines[-1].rstrip().split(" ")[::-1]
     pairs = enumerate(zip(first, last, strict=False))
     differences = (place for place, (a, b) in pairs if a != b)
     count = next(differences, 0)
@@ -297,5 +301,5 @@ def _shared_end(lines: list[str], most: int) -> str:
     num_shared = len(shared_end.split())
     if not 0 < num_shared <= most:
         return ""
-    is_shared = all(line.endswith(shared_end) for line in lines)
+    is_shared = all(line.rstrip().endswith(shared_end) for line in lines)
     return shared_end if is_shared else ""

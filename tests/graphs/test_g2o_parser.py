@@ -129,6 +129,9 @@ def test_numbers_that_all_lines_end_with_are_read_like_others(tmp_path: Path) ->
     np.testing.assert_array_equal(
         read_lines(write(tmp_path, *(f"{line} " for line in lines))).edges, expected
     )
+    np.testing.assert_array_equal(
+        read_lines(write(tmp_path, lines[0], f"{lines[1]} ", f"{lines[2]}  ")).edges, expected
+    )
     for end, words in (
         ("4 0 x", "'x' is no number"),
         ("4 0 inf", "not finite"),
@@ -152,6 +155,17 @@ def test_a_block_of_a_file_knows_its_lines(tmp_path: Path, monkeypatch: pytest.M
     path.write_bytes(path.read_bytes() + b"# \xff\n")
     with pytest.raises(FileFormatError, match=r":40: bytes that are no text"):
         read_lines(path)
+
+
+def test_blank_lines_count(tmp_path: Path) -> None:
+    vertices = [f"VERTEX_SE2 {k} {k} 0 0" for k in range(20)]
+    edges = [f"EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1" for k in range(19)]
+    lines = ["", *vertices, "", "", *edges[:10], "", *edges[10:], ""]
+    found = read_lines(write(tmp_path, *lines))
+    np.testing.assert_array_equal(found.vertex_lines, np.arange(2, 22))
+    np.testing.assert_array_equal(found.edge_lines, [*range(24, 34), *range(35, 44)])
+    with pytest.raises(FileFormatError, match=r":45: 'x' is no number"):
+        read_lines(write(tmp_path, *lines, "EDGE_SE2 0 1 x 0 0 1 0 0 1 0 1"))
 
 
 def test_large_ids_are_exact(tmp_path: Path) -> None:
