@@ -118,10 +118,11 @@ class SymbolicCholesky(ABC):
     """A sparsity pattern, ordered and analysed once.
 
     Matrices passed to `factorize` are symmetric, canonical CSC, and have the analysed pattern,
-    explicit zeros included.
+    explicit zeros included. They are Hermitian where the analysed matrix has complex numbers.
     """
 
     def __init__(self, pattern: csc_array) -> None:
+        self.dtype = pattern.dtype
         self._indptr = pattern.indptr
         self._indices = pattern.indices
         self._shape = pattern.shape
@@ -188,9 +189,8 @@ class SymbolicCholesky(ABC):
 
     def _pattern(self) -> csc_array:
         """Matrix of zeros, all stored, from which a copy of the analysis is made."""
-        return csc_array(
-            (np.zeros(len(self._indices)), self._indices, self._indptr), shape=self._shape
-        )
+        zeros = np.zeros(len(self._indices), dtype=self.dtype)
+        return csc_array((zeros, self._indices, self._indptr), shape=self._shape)
 
 
 def analyze(
@@ -201,6 +201,7 @@ def analyze(
 ) -> SymbolicCholesky:
     """Analyse the pattern of a symmetric matrix, whose diagonal must be stored in full.
 
+    The matrix may be Hermitian, too. Bounds on the rounding are those of real factors.
     Rows are eliminated in the `order` given, (N,), as of `pgo_models.problem.ordering`, or in one
     of minimum degree. `most_counts` finds cheaply how many non-zeros the factors have at most. With
     `default_backend()` unless one is given; a MissingExtraError when CHOLMOD is, without the extra
@@ -323,8 +324,8 @@ class _SuperLUFactor(CholeskyFactor):
 
     def solve(self, right_hand_side: Array) -> Array:
         order = self._analysis.order
-        permuted = np.asfortranarray(right_hand_side[order], dtype=float)
-        solution = np.empty_like(right_hand_side, dtype=float)
+        permuted = np.asfortranarray(right_hand_side[order], dtype=self._analysis.dtype)
+        solution = np.empty_like(permuted)
         solution[order] = self._lu.solve(permuted)
         return solution
 
@@ -379,7 +380,7 @@ class _SuperLU(SymbolicCholesky):
             raise NotPositiveDefiniteError("the matrix is singular") from error
         if not np.array_equal(lu.perm_r, lu.perm_c):
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
-        check_pivots(lu.U.diagonal())
+        check_pivots(lu.U.diagonal().real)
         return _SuperLUFactor(lu, self, matrix)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -446,12 +447,12 @@ class _CholmodFactor(CholeskyFactor):
 
     def row_order(self) -> IntArray:
         rows = np.arange(self._analysis.side, dtype=float)
-        return self._solved(rows, _PERMUTE).astype(np.int64)
+        return self._solved(rows, _PERMUTE).real.astype(np.int64)
 
     def _solved(self, right_hand_side: Array, *systems: int) -> Array:
         cvxopt, cholmod = import_cvxopt()
         numeric = self._current()
-        solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=float))
+        solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=self._analysis.dtype))
         for system in systems:
             cholmod.solve(numeric, solution, sys=system)
         return np.array(solution).reshape(right_hand_side.shape)
@@ -628,7 +629,7 @@ class _Cholmod(SymbolicCholesky):
         with supernodal(), doing(self._factorisation):
             cholmod.numeric(self._matrix, capsule)
         # A ValueError here would mean L D L^T, which indefinite matrices have, too.
-        return np.array(cholmod.diag(capsule)).ravel()
+        return np.array(cholmod.diag(capsule)).ravel().real
 
     def __reduce__(self) -> tuple[Any, ...]:
         known = {"_counts": self._counts, "_error_before": self._error_before}

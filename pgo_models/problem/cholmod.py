@@ -24,7 +24,7 @@ _ROOM_FOR_AN_ENTRY = 100
 
 
 def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
-    """CVXOPT's matrix of ones on the lower triangle of a pattern.
+    """CVXOPT's matrix of ones on the lower triangle of a pattern, real or complex as that is.
 
     Returned as well are the positions of its entries in the pattern, and which are diagonal.
     """
@@ -35,8 +35,9 @@ def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
     lower = np.flatnonzero(pattern.indices >= columns)
     lower_rows = pattern.indices[lower].astype(np.int64)
     lower_columns = columns[lower].astype(np.int64)
+    one = pattern.dtype.type(1.0).item()
     matrix = cvxopt.spmatrix(
-        1.0, cvxopt.matrix(lower_rows), cvxopt.matrix(lower_columns), pattern.shape
+        one, cvxopt.matrix(lower_rows), cvxopt.matrix(lower_columns), pattern.shape
     )
     return matrix, lower, lower_rows == lower_columns
 

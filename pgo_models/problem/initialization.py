@@ -17,7 +17,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.problem.cholesky import analyze, factorize_damped
 from pgo_models.problem.edge_cost import EdgeCost
-from pgo_models.problem.matrices import rotation_columns
+from pgo_models.problem.matrices import assemble, rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
@@ -166,6 +166,19 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
     graph = problem.graph
     if graph.world is not None and graph.is_world_loose:
         return _start_with_loose_world(problem, graph.world, averaged)
+    if problem.d == 2 and not problem.weights.rotation.has_own_axes:
+        R = _chordal_rotations_in_the_plane(problem)
+    else:
+        R = _chordal_rotations(problem)
+    stiffness = largest_stiffness(problem.weights, problem.d) if averaged else None
+    if stiffness is not None:
+        pull = averaging_pull(problem, R, stiffness)
+        R = R @ exp_map(problem.solve_translations(pull))
+    return problem.with_best_translations(R)
+
+
+def _chordal_rotations(problem: PGOProblem) -> Array:
+    """Rotations, (n, d, d), of the chordal relaxation with R_0 = I, projected."""
     n = problem.num_poses
     K, b = relaxed_rotations(problem, 0)
     if n <= _SHARED:
@@ -177,12 +190,37 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
         analysis = analyze(K_RR, problem.backend, order)
         factor = factorize_damped(analysis, K_RR)
         Y = factor.solve(b[n:])
-    R = project_to_rotations(unstack_transposes(Y))
-    stiffness = largest_stiffness(problem.weights, problem.d) if averaged else None
-    if stiffness is not None:
-        pull = averaging_pull(problem, R, stiffness)
-        R = R @ exp_map(problem.solve_translations(pull))
-    return problem.with_best_translations(R)
+    return project_to_rotations(unstack_transposes(Y))
+
+
+def _chordal_rotations_in_the_plane(problem: PGOProblem) -> Array:
+    """The same, (n, 2, 2), in the plane with W = kappa I, where rotations are complex numbers.
+
+    A rotation is z of modulus one. The sum, 2 sum_e kappa |z_j - z_i z_ij|^2, is a Hermitian form
+    z^* H z of n numbers. With the diagonal entry of pose 0 doubled, H z = e_0 has the solution
+    with z_0 = 1 times a positive number, which angles do not see: what is left of the rows of the
+    other poses is H z = 0.
+    """
+    graph = problem.graph
+    incidence = problem.incidence
+    kappa = problem.weights.kappa
+    z_ij = graph.R_ij[:, 0, 0] + 1j * graph.R_ij[:, 1, 0]
+    coupling = -kappa * z_ij
+    diagonal = incidence.begins @ kappa + incidence.ends @ kappa
+    diagonal[0] *= 2.0
+    poses = np.arange(problem.num_poses)
+    blocks = [
+        (poses, poses, diagonal),
+        (graph.j, graph.i, coupling),
+        (graph.i, graph.j, coupling.conj()),
+    ]
+    H = assemble(blocks, problem.num_poses)
+    analysis = analyze(H, problem.backend, problem.pose_order)
+    e_0 = np.zeros(problem.num_poses, dtype=complex)
+    e_0[0] = diagonal[0]
+    z = factorize_damped(analysis, H).solve(e_0)
+    angles = np.angle(z)
+    return exp_map((angles - angles[0])[:, None])
 
 
 def _start_with_loose_world(problem: PGOProblem, world: int, averaged: bool) -> Poses:

@@ -1,3 +1,4 @@
+import pickle
 import sys
 
 import numpy as np
@@ -43,6 +44,28 @@ def definite(pattern: csc_array, rng: np.random.Generator, scale: float = 1.0) -
     return csc_array(
         (dense[pattern.indices, columns], pattern.indices, pattern.indptr), shape=pattern.shape
     )
+
+
+@BACKENDS
+@pytest.mark.parametrize("seed", range(20))
+def test_hermitian_matrices_are_factored_as_symmetric_ones(
+    backend: CholeskyBackend, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    pattern = pattern_of(seed, 12)
+    dense = pattern.toarray() * np.exp(1j * rng.uniform(0.0, 6.0, pattern.shape))
+    hermitian = dense + dense.conj().T
+    np.fill_diagonal(hermitian, 1.0 + np.abs(hermitian).sum(axis=1))
+    rows = pattern.indices
+    columns = np.repeat(np.arange(12), np.diff(pattern.indptr))
+    A = csc_array((hermitian[rows, columns], rows, pattern.indptr), shape=pattern.shape)
+    b = rng.standard_normal(12) + 1j * rng.standard_normal(12)
+    analysis = pickle.loads(pickle.dumps(analyze(A, backend, rng.permutation(12))))
+    np.testing.assert_allclose(analysis.factorize(A).solve(b), np.linalg.solve(hermitian, b), 1e-12)
+    indefinite = A.copy()
+    indefinite.setdiag(-A.diagonal())
+    with pytest.raises(NotPositiveDefiniteError):
+        analysis.factorize(indefinite)
 
 
 def is_positive_definite(matrix: csc_array, backend: CholeskyBackend) -> bool:
