@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -54,6 +53,8 @@ class Poses(ReadOnly):
 
     R: Array
     t: Array
+    # largest max(||R_i^T R_i - I||_F, 1 - det R_i) of the stored rotations
+    orthogonality_error: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         R = real_array(self.R, "R")
@@ -66,13 +67,10 @@ class Poses(ReadOnly):
             )
         _check_finite(R, "R")
         _check_finite(t, "t")
-        object.__setattr__(self, "R", rotations_to_rounding(R, "R of pose {}".format))
+        R, error = rotations_to_rounding(R, "R of pose {}".format)
+        object.__setattr__(self, "R", R)
         object.__setattr__(self, "t", t)
-
-    @cached_property
-    def orthogonality_error(self) -> float:
-        """Largest max(||R_i^T R_i - I||_F, 1 - det R_i) of the stored rotations."""
-        return float(orthogonality_error(self.R).max(initial=0.0))
+        object.__setattr__(self, "orthogonality_error", error)
 
     @classmethod
     def identity(cls, n: int, d: int) -> Poses:
@@ -279,25 +277,27 @@ def _check_finite(array: Array, name: str) -> None:
         raise GraphError(f"{name} of pose {pose} has nan or inf; poses must be finite")
 
 
-def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> Array:
+def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> tuple[Array, float]:
     """R, (n, d, d), with matrices projected that are rotations to `ROTATION_TOLERANCE` alone.
 
-    Matrices that are rotations to rounding are kept. The result is read-only. A GraphError for a
-    matrix that is no rotation; `name` gives the k-th matrix a name.
+    Matrices that are rotations to rounding are kept. The result is read-only, and the largest
+    `orthogonality_error` of its matrices comes with it. A GraphError for a matrix that is no
+    rotation; `name` gives the k-th matrix a name.
     """
     error = orthogonality_error(R)
     is_rough = ~(error <= _ROUNDING)
-    if not is_rough.any():
-        return R
-    worst = int(np.argmax(error))
-    if not error[worst] <= ROTATION_TOLERANCE:
-        raise GraphError(
-            f"{name(worst)} is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; "
-            "see pgo_models.project_to_rotations()"
-        )
-    R = R.copy()
-    R[is_rough] = project_to_rotations(R[is_rough])
-    return read_only(R)
+    if is_rough.any():
+        worst = int(np.argmax(error))
+        if not error[worst] <= ROTATION_TOLERANCE:
+            raise GraphError(
+                f"{name(worst)} is no rotation: ||R^T R - I|| or 1 - det R is {error[worst]:.3g}; "
+                "see pgo_models.project_to_rotations()"
+            )
+        R = R.copy()
+        R[is_rough] = project_to_rotations(R[is_rough])
+        error[is_rough] = orthogonality_error(R[is_rough])
+        read_only(R)
+    return R, float(error.max(initial=0.0))
 
 
 def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:

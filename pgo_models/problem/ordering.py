@@ -14,6 +14,7 @@ from scipy.sparse import csc_array, csr_array, tril
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
+    CholeskyFactor,
     SymbolicCholesky,
     analyze,
     minimum_degree,
@@ -70,26 +71,34 @@ def row_order(poses: IntArray, *widths: int) -> IntArray:
 
     The unknowns are stacked field by field; a field has `widths[f]` numbers a pose.
     """
-    rank = np.argsort(poses)
-    row_ranks = np.concatenate([np.repeat(rank, width) for width in widths])
-    return np.argsort(row_ranks, kind="stable")
+    starts = len(poses) * np.cumsum((0, *widths[:-1]))
+    of_fields = []
+    for start, width in zip(starts, widths, strict=True):
+        of_fields.append(start + width * poses[:, None] + np.arange(width))
+    return np.concatenate(of_fields, axis=1).ravel()
 
 
 def most_counts(poses: SymbolicCholesky, *widths: int) -> FactorCounts:
+    """`counts_of_blocks` for the analysis of a matrix with one entry for each of the blocks."""
+    return counts_of_blocks(poses.factorize(poses.identity()), *widths)
+
+
+def counts_of_blocks(of_poses: CholeskyFactor, *widths: int) -> FactorCounts:
     """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
 
-    The analysis is that of a matrix with one entry for each of the blocks, in that order of the
-    poses. All entries of every block that fills in are counted. CHOLMOD stores further zeros to
-    have wider supernodes; they are exact and add no rounding.
+    The factor is one of a matrix with one entry for each of the blocks, in that order of the poses;
+    it is taken apart (`CholeskyFactor.take_apart`). All entries of every block that fills in are
+    counted. CHOLMOD stores further zeros to have wider supernodes; they are exact and add no
+    rounding.
     """
     width = sum(widths)
-    L, order = poses.factorize(poses.identity()).take_apart()
-    of_poses = FactorCounts.of(L.indptr, L.indices, order)
+    L, order = of_poses.take_apart()
+    counts = FactorCounts.of(L.indptr, L.indices, order)
     # A block that fills in has `width` rows and columns, all of which count as non-zeros.
     return FactorCounts(
-        in_column=np.repeat(width * of_poses.in_column, width),
-        in_row=np.repeat(width * of_poses.in_row, width),
-        widest=np.repeat(width * of_poses.widest, width),
+        in_column=np.repeat(width * counts.in_column, width),
+        in_row=np.repeat(width * counts.in_row, width),
+        widest=np.repeat(width * counts.widest, width),
         order=row_order(order, *widths),
     )
 
