@@ -72,22 +72,19 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     weights = problem.weights
     t = X[:n]
     P = X[n:].reshape(n, d, d)
-    P_i = P[graph.i]
-    # Residuals.
+    P_i = P.take(graph.i, axis=0)
+    P_j = P.take(graph.j, axis=0)
+    # Residuals: what is at j, less the rows t_ij^T and R_ij^T times R_i^T.
     offsets = weights.seen_offsets(graph.t_ij)[:, None, :]
-    transposed = np.swapaxes(graph.R_ij, 1, 2)
-    high_difference = t[graph.j] - t[graph.i]
-    low_difference = low[graph.j] - low[graph.i]
+    measured_rows = np.concatenate([offsets, np.swapaxes(graph.R_ij, 1, 2)], axis=1)
+    high_difference = t.take(graph.j, axis=0) - t.take(graph.i, axis=0)
+    low_difference = low.take(graph.j, axis=0) - low.take(graph.i, axis=0)
     difference = high_difference + low_difference
-    rho_t = difference[:, None] - offsets @ P_i
-    rho_R = P[graph.j] - transposed @ P_i
-    rho = np.concatenate([rho_t, rho_R], axis=1)
+    rho = np.concatenate([difference[:, None], P_j], axis=1)
+    rho -= measured_rows @ P_i
     # Bounds on their errors: a product is a sum of d products, and every difference is rounded once
     # more.
-    P_i_size = np.abs(P_i)
-    sizes_t = np.abs(offsets) @ P_i_size
-    sizes_R = np.abs(transposed) @ P_i_size
-    product_sizes = np.concatenate([sizes_t, sizes_R], axis=1)
+    product_sizes = np.abs(measured_rows) @ np.abs(P_i)
     errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(rho)
     # The translations take two more differences and their sum.
     difference_sizes = np.abs(high_difference) + np.abs(low_difference) + np.abs(difference)
@@ -245,7 +242,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     graph = problem.graph
     d = problem.d
     m = problem.graph.num_edges
-    offsets = poses.t[graph.j] - poses.t[graph.i]
+    offsets = poses.t.take(graph.j, axis=0) - poses.t.take(graph.i, axis=0)
     distances = block_norms(offsets)
     e_t, e_R = _residual_errors(problem, poses, distances)
     _, residuals = problem.evaluated(poses)

@@ -95,8 +95,8 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     graph = problem.graph
     incidence = problem.incidence
     d = problem.d
-    R_i = poses.R[graph.i]
-    R_j = poses.R[graph.j]
+    R_i = poses.R.take(graph.i, axis=0)
+    R_j = poses.R.take(graph.j, axis=0)
     # Blocks of M. For the Hessian of chi2 they are those of its tangent; the Gauss-Newton matrix of
     # the excess is added below in either case.
     weights = problem.weights if Lambda is None else problem.tangent_at(poses).weights

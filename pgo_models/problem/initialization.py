@@ -258,8 +258,8 @@ def averaging_pull(problem: PGOProblem, R: Array, stiffness: float) -> Array:
     """
     graph = problem.graph
     kappa = problem.weights.kappa
-    predicted_R_j = R[graph.i] @ graph.R_ij
-    sine = vee(np.swapaxes(predicted_R_j, 1, 2) @ R[graph.j])
+    predicted_R_j = R.take(graph.i, axis=0) @ graph.R_ij
+    sine = vee(np.swapaxes(predicted_R_j, 1, 2) @ R.take(graph.j, axis=0))
     of_edges = kappa[:, None] * sine / stiffness
     incidence = problem.incidence
     return np.asarray(incidence.begins @ of_edges - incidence.ends @ of_edges)
