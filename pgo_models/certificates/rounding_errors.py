@@ -113,7 +113,8 @@ def evaluate_multipliers(Lambda: Array, P: Array) -> Evaluation:
     Lambda is symmetric, and P_i = R_i^T.
     """
     d = P.shape[-1]
-    transposed = np.swapaxes(P, 1, 2)
+    # a copy: products of stacked matrices take twice as long with a view
+    transposed = np.ascontiguousarray(np.swapaxes(P, 1, 2))
     P_size = np.abs(P)
     Lambda_size = np.abs(Lambda)
     defect = np.eye(d) - P @ transposed

@@ -295,6 +295,11 @@ class PGOProblem(ReadOnly):
         return WeakKeyDictionary()
 
     @cached_property
+    def _objectives(self) -> "WeakKeyDictionary[Poses, float]":
+        """`objective` of the poses that are still in use: it goes when they do."""
+        return WeakKeyDictionary()
+
+    @cached_property
     def _half_gradients(self) -> "WeakKeyDictionary[Poses, Array]":
         """`apply_M_at` of the poses that are still in use: it goes when they do."""
         return WeakKeyDictionary()
@@ -458,7 +463,11 @@ class PGOProblem(ReadOnly):
         >>> bool(np.isclose(problem.objective(graph.truth), problem.edge_costs(graph.truth).sum()))
         True
         """
-        return self.weights.value_at(self, poses)
+        objective = self._objectives.get(poses)
+        if objective is None:
+            objective = self.weights.value_at(self, poses)
+            self._objectives[poses] = objective
+        return objective
 
     def edge_costs(self, poses: Poses) -> Array:
         """Return the share of every edge in the cost.
