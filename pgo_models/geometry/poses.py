@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -53,8 +54,6 @@ class Poses(ReadOnly):
 
     R: Array
     t: Array
-    # largest max(||R_i^T R_i - I||_F, 1 - det R_i) of the stored rotations
-    orthogonality_error: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         R = real_array(self.R, "R")
@@ -70,7 +69,12 @@ class Poses(ReadOnly):
         R, error = rotations_to_rounding(R, "R of pose {}".format)
         object.__setattr__(self, "R", R)
         object.__setattr__(self, "t", t)
-        object.__setattr__(self, "orthogonality_error", error)
+        object.__setattr__(self, "orthogonality_error", error)  # the cached property
+
+    @cached_property
+    def orthogonality_error(self) -> float:
+        """Largest max(||R_i^T R_i - I||_F, 1 - det R_i) of the stored rotations."""
+        return float(orthogonality_error(self.R).max(initial=0.0))
 
     @classmethod
     def identity(cls, n: int, d: int) -> Poses:
@@ -149,6 +153,8 @@ class Poses(ReadOnly):
         """
         poses = copy(self)
         object.__setattr__(poses, "t", real_array(t, "t"))
+        # A copy computes its cached properties again; this one is the same.
+        object.__setattr__(poses, "orthogonality_error", self.orthogonality_error)
         return poses
 
     def moved(self, R: Array, t: Array) -> Poses:

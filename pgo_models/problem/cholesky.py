@@ -122,7 +122,7 @@ class SymbolicCholesky(ABC):
     """
 
     def __init__(self, pattern: csc_array) -> None:
-        self.dtype = pattern.dtype
+        self.dtype = np.result_type(pattern.dtype, np.float64)  # of factors and solutions
         self._indptr = pattern.indptr
         self._indices = pattern.indices
         self._shape = pattern.shape
@@ -544,9 +544,9 @@ class _Cholmod(SymbolicCholesky):
         """
         self._taken = [(user, other) for user, other in self._taken if other is not capsule]
         cvxopt, cholmod = import_cvxopt()
-        order = cvxopt.matrix(np.arange(self._shape[0], dtype=float))
+        order = cvxopt.matrix(np.arange(self._shape[0], dtype=self.dtype))
         cholmod.solve(capsule, order, sys=_PERMUTE)
-        return cholmod.getfactor(capsule).CCS, np.array(order).ravel().astype(np.int64)
+        return cholmod.getfactor(capsule).CCS, np.array(order).ravel().real.astype(np.int64)
 
     def _analyze(self) -> _Capsule:
         analysis = replace(self._factorisation, name="analysis")

@@ -35,7 +35,7 @@ def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
     lower = np.flatnonzero(pattern.indices >= columns)
     lower_rows = pattern.indices[lower].astype(np.int64)
     lower_columns = columns[lower].astype(np.int64)
-    one = pattern.dtype.type(1.0).item()
+    one = 1.0 + 0.0j if np.iscomplexobj(pattern.data) else 1.0
     matrix = cvxopt.spmatrix(
         one, cvxopt.matrix(lower_rows), cvxopt.matrix(lower_columns), pattern.shape
     )

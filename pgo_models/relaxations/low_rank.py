@@ -26,19 +26,20 @@ from pgo_models.problem.problem import PGOProblem
 
 @dataclass(frozen=True, eq=False)
 class LiftedPoses(Poses):
-    """n poses of rank r: R, (n, r, d), and t, (n, r), as they are given.
-
-    Their `orthogonality_error` is the largest ||R_i^T R_i - I||_F.
-    """
+    """n poses of rank r: R, (n, r, d), and t, (n, r), as they are given."""
 
     def __post_init__(self) -> None:
         for name in ("R", "t"):
             array = real_array(getattr(self, name), name)
             object.__setattr__(self, name, array)
+
+    @cached_property
+    def orthogonality_error(self) -> float:
+        """Largest ||R_i^T R_i - I||_F."""
         products = np.swapaxes(self.R, 1, 2) @ self.R
         differences = products - np.eye(self.d)
         errors = np.linalg.norm(differences, axis=(1, 2))
-        object.__setattr__(self, "orthogonality_error", float(errors.max(initial=0.0)))
+        return float(errors.max(initial=0.0))
 
     @property
     def layout(self) -> TangentLayout:

@@ -61,7 +61,11 @@ def test_hermitian_matrices_are_factored_as_symmetric_ones(
     A = csc_array((hermitian[rows, columns], rows, pattern.indptr), shape=pattern.shape)
     b = rng.standard_normal(12) + 1j * rng.standard_normal(12)
     analysis = pickle.loads(pickle.dumps(analyze(A, backend, rng.permutation(12))))
-    np.testing.assert_allclose(analysis.factorize(A).solve(b), np.linalg.solve(hermitian, b), 1e-12)
+    factor = analysis.factorize(A)
+    np.testing.assert_allclose(factor.solve(b), np.linalg.solve(hermitian, b), 1e-12)
+    L, order = factor.take_apart()
+    ordered = hermitian[np.ix_(order, order)]
+    np.testing.assert_allclose((L @ L.conj().T).toarray(), ordered, rtol=0, atol=1e-12)
     indefinite = A.copy()
     indefinite.setdiag(-A.diagonal())
     with pytest.raises(NotPositiveDefiniteError):
