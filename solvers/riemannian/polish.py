@@ -75,6 +75,20 @@ class PolishTrial:
     objective: float
 
 
+@dataclass(frozen=True, eq=False)
+class Secant:
+    """A move, and the change of g along it, for L-BFGS."""
+
+    move: Array  # (side,)
+    change: Array  # (side,)
+    curvature: float  # their inner product
+
+    @classmethod
+    def of(cls, move: Array, change: Array) -> "Secant":
+        """Secant of a move and the change of g."""
+        return cls(move, change, inner(move, change))
+
+
 class CentralAlgebra:
     """`newton_step.NewtonAlgebra` in one place, of one step: from poses, with sparse Cholesky.
 
@@ -89,7 +103,7 @@ class CentralAlgebra:
         self.analysis = state.analysis
         self.rounding_level = rounding_level(problem, state.poses)  # hardly moves with them
         self.has_secants = has_secants
-        self._secants: list[tuple[Array, Array]] = []  # moves, and changes of g along them
+        self._secants: list[Secant] = []  # of the moves so far
         self._short_move_factor: CholeskyFactor | None = None  # of translations
 
     def factorize(self, order: ModelOrder) -> CentralModel | None:
@@ -154,7 +168,7 @@ class CentralAlgebra:
         if self.has_secants:
             w = vee(np.swapaxes(model.poses.R, 1, 2) @ trial.poses.R)
             move = self.layout.join(w, trial.poses.t - model.poses.t)
-            self._secants.append((move, gradient - model.gradient))
+            self._secants.append(Secant.of(move, gradient - model.gradient))
         step = -_apply_inverse(model.factor, self._secants, gradient)
         return replace(
             model,
@@ -327,20 +341,19 @@ def factorize_gauss_newton(problem: PGOProblem, poses: Poses) -> CholeskyFactor:
     return factorize_definite(CentralAlgebra(problem, state, has_secants=False), rules).factor
 
 
-def _apply_inverse(
-    factor: CholeskyFactor, secants: list[tuple[Array, Array]], gradient: Array
-) -> Array:
+def _apply_inverse(factor: CholeskyFactor, secants: list[Secant], gradient: Array) -> Array:
     """Compute H^-1 g by the two loops of L-BFGS, from the factored matrix.
 
-    Secants are moves, and the changes of g along them; those of negative curvature are left out.
+    Secants of negative curvature are left out.
     """
-    curved = [(move, change) for move, change in secants if inner(move, change) > 0.0]
+    curved = [secant for secant in secants if secant.curvature > 0.0]
     g = gradient.copy()
     shares = []
-    for move, change in reversed(curved):
-        shares.append(inner(move, g) / inner(move, change))
-        g -= shares[-1] * change
+    for secant in reversed(curved):
+        share = inner(secant.move, g) / secant.curvature
+        g -= share * secant.change
+        shares.append(share)
     step = factor.solve(g)
-    for (move, change), share in zip(curved, reversed(shares), strict=True):
-        step += (share - inner(change, step) / inner(move, change)) * move
+    for secant, share in zip(curved, reversed(shares), strict=True):
+        step += (share - inner(secant.change, step) / secant.curvature) * secant.move
     return step

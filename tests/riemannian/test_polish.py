@@ -31,6 +31,7 @@ from pgo_models.problem.weighting import Weighting
 from solvers.loop import run
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.polish import (
+    Secant,
     _apply_inverse,
     polish,
     polish_step,
@@ -214,9 +215,9 @@ def test_a_move_is_learned_from(seed: int, n: int, d: int) -> None:
     factor = factorize(matrix)
     rng = np.random.default_rng(seed)
     moves = rng.standard_normal((3, layout.side))
-    curved = [(move, matrix @ move + 0.1 * rng.uniform() * move) for move in moves]
-    level = (moves[0], -moves[0])  # of negative curvature: left out
-    _, g = curved[-1]
+    curved = [Secant.of(move, matrix @ move + 0.1 * rng.uniform() * move) for move in moves]
+    level = Secant.of(moves[0], -moves[0])  # of negative curvature: left out
+    g = curved[-1].change
     np.testing.assert_allclose(_apply_inverse(factor, curved, g), moves[-1], rtol=0, atol=1e-6)
     np.testing.assert_array_equal(_apply_inverse(factor, [level], g), factor.solve(g))
 
