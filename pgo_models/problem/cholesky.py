@@ -290,9 +290,10 @@ class _SuperLUFactor(CholeskyFactor):
 
         U is only about diag(u) L^T.
 
-        A = L U - E with |E| <= gamma |L| |U|, so that |R^T R - A| <= |L| (|diag(u) L^T - U| + gamma
-        |U|). Both factors are at hand, and v^T |L| |W| v <= (s^-1 |v^T |L| diag(u)^(1/2)|^2 + s
-        |diag(u)^(-1/2) |W| v|^2) / 2 for any s.
+        A = L U - E with |E| <= gamma |L| |U|, so that |R^T R - A| <= |L| W, W = |diag(u) L^T - U| +
+        gamma |U|. Both factors are at hand, and for any s_k > 0
+
+            |v|^T |L| W |v| <= sum_k (u_k / s_k (|v|^T |L|)_k^2 + s_k / u_k (W |v|)_k^2) / 2.
         """
         # matrices of SciPy 1.14, whose sums are two-dimensional
         L = csr_array(self._lu.L)
@@ -313,11 +314,16 @@ class _SuperLUFactor(CholeskyFactor):
         in_columns_of_L = L.astype(bool).sum(axis=0)
         in_rows_of_W = W.astype(bool).sum(axis=1)
         most = np.maximum(in_columns_of_L, in_rows_of_W)
-        of_L = (L @ (pivots * most)) / a
-        of_W = ((most / pivots) @ W) / a
-        balance = np.sqrt(of_L.mean() / max(of_W.mean(), np.finfo(float).tiny))
+        of_L = pivots * most
+        of_W = most / pivots
+        # The s_k with which the shares of all rows sum to least. One s for all would suit the
+        # smallest pivots alone.
+        sum_of_L = of_L * ((1.0 / a) @ L)
+        sum_of_W = of_W * (W @ (1.0 / a))
+        s = np.sqrt(sum_of_L / np.maximum(sum_of_W, 1e-100 * sum_of_L))
+        both = L @ (of_L / s) + (s * of_W) @ W
         error = np.empty(len(a))
-        error[self._rows] = OUTWARD * 0.5 * (of_L / balance + balance * of_W)
+        error[self._rows] = OUTWARD * 0.5 * both / a
         if np.any(beside):
             error[self._rows] += error_of_counts(np.diff(L.indptr), self.most_in_row(beside))
         return error

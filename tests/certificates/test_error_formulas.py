@@ -214,10 +214,10 @@ def test_errors_of_superlu(beside: int) -> None:
     DL = pivots[:, None] * L.T
     W = abs(DL - U) + u * abs(DL) + abs(U) * gamma((U != 0).sum(axis=0) + 3.0)
     most = np.maximum((L != 0).sum(axis=0), (W != 0).sum(axis=1))
-    of_L = (L**2 @ (pivots * most)) / a
-    of_W = ((most / pivots) @ W**2) / a
-    balance = np.sqrt(of_L.mean() / of_W.mean())
-    formula = 0.5 * (of_L / balance + balance * of_W)
+    of_L = pivots * most
+    of_W = most / pivots
+    s = np.sqrt(of_L * ((1.0 / a) @ L**2) / (of_W * (W**2 @ (1.0 / a))))
+    formula = 0.5 * (L**2 @ (of_L / s) + (s * of_W) @ W**2) / a
     if beside:
         formula = formula + error_of_counts(
             (L != 0).sum(axis=1).astype(float), float((L != 0).sum(axis=0).max() + beside)
