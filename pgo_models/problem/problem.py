@@ -463,6 +463,7 @@ class PGOProblem(ReadOnly):
         >>> bool(np.isclose(problem.objective(graph.truth), problem.edge_costs(graph.truth).sum()))
         True
         """
+        self._check_poses(poses)
         objective = self._objectives.get(poses)
         if objective is None:
             objective = self.weights.value_at(self, poses)
