@@ -88,10 +88,9 @@ def solve(
 
     In one place, SOC with its default settings is left out where Newton alone is faster: in the
     plane, where the start is averaged; on small graphs; for rotations alone; and for chi2 that is
-    not quadratic and convex, where SOC would run on its `convex_part`. Robots leave it out in the
-    plane, where every edge has a tau > 0. For such a chi2 the second
+    not quadratic and convex, where SOC would run on its `convex_part`. For such a chi2 the second
     attempt starts at the optimum of F, and smaller information matrices take the place of the
-    staircase.
+    staircase. Robots leave SOC out in the plane, where every edge has a tau > 0.
 
     Parameters
     ----------

@@ -194,12 +194,12 @@ def _chordal_rotations(problem: PGOProblem) -> Array:
 
 
 def _chordal_rotations_in_the_plane(problem: PGOProblem) -> Array:
-    """The same, (n, 2, 2), in the plane with W = kappa I, where rotations are complex numbers.
+    """Rotations, (n, 2, 2), of the chordal relaxation in the plane, from n complex numbers.
 
-    A rotation is z of modulus one. The sum, 2 sum_e kappa |z_j - z_i z_ij|^2, is a Hermitian form
-    z^* H z of n numbers. With the diagonal entry of pose 0 doubled, H z = e_0 has the solution
-    with z_0 = 1 times a positive number, which angles do not see: what is left of the rows of the
-    other poses is H z = 0.
+    W is kappa I, and a rotation is z of modulus one. The sum, 2 sum_e kappa |z_j - z_i z_ij|^2, is
+    a Hermitian form z^* H z of n numbers. With the diagonal entry of pose 0 doubled, H z = e_0 has
+    the solution with z_0 = 1 times a positive number, which angles do not see: what is left of the
+    rows of the other poses is H z = 0.
     """
     graph = problem.graph
     incidence = problem.incidence

@@ -156,17 +156,17 @@ class Driver:
         num_poses: int,
         open_pool: Callable[[], WorkerPool | CountedPool],
         memory: float = DEFAULT_MEMORY,
-        grounded_position: int = 0,
+        grounded_position: int | None = None,
     ) -> None:
         """Start the robots, unless `open_pool` returns a pool whose robots are at work already.
 
         `memory` is the largest number of bytes that the interface may take; a SettingError if it
         would take more. The value 0 selects a run without a driver (`leaderless`): no interface is
-        built or solved, and this object only carries the messages of the robots and adds up.
+        built or solved, and this object only carries the messages of the robots and adds up. Bounds
+        are grounded in the middle of the cover unless a position is given.
         """
         self.num_poses = num_poses
         self.d = summaries[0].d
-        self.grounded_position = grounded_position
         self.memory = memory
         self._read_cover(summaries)
         g = len(self.cover)
@@ -181,6 +181,7 @@ class Driver:
 
         has_interface = memory != 0
         system = CoverSystem.of(summaries)
+        self.grounded_position = system.middle if grounded_position is None else grounded_position
         if has_interface:
             self._any_widths = system.interface(())  # `interface` sets the widths
         else:

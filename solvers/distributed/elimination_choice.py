@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -67,7 +68,7 @@ class CoverSystem:
             return flops_of_fronts(FrontOwners(self.touched, len(self.cover)), self.width)
         return self.pattern.flops(self.width)
 
-    @property
+    @cached_property
     def pattern(self) -> CoverPattern:
         """Pattern of a sparse system."""
         assert self.coupled is not None
@@ -83,8 +84,8 @@ class CoverSystem:
         """
         g = len(self.cover)
         if self.coupled is not None:
-            smaller, larger = self.pattern.lower.tocoo().coords
-            return middle_node(edge_counts(smaller, larger, g))
+            rows, columns = self.pattern.lower.tocoo().coords
+            return middle_node(edge_counts(rows, columns, g))
         # A node for every robot, which joins the poses that it touches.
         robots = np.repeat(np.arange(len(self.touched)), [len(poses) for poses in self.touched])
         adjacency = edge_counts(np.concatenate(self.touched), g + robots, g + len(self.touched))

@@ -428,8 +428,7 @@ def open_files(
         summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
         if memory != 0:
             summaries = _chosen_elimination(network, summaries)
-        grounded = CoverSystem.of(summaries).middle
-        driver = Driver(summaries, num_poses, lambda: network, memory, grounded)
+        driver = Driver(summaries, num_poses, lambda: network, memory)
         return OpenedFiles(driver, sizes, weighting, has_indefinite)
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()

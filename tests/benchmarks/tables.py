@@ -52,18 +52,23 @@ ROUNDS = 7  # of a process of each tree
 MAX_ITERATIONS = 400
 
 
+def solve_in_F(name: str) -> "solvers.Solution":
+    """Read a graph, solve and certify it; commit 032ba88 has no other cost, and no `Weighting`."""
+    path = Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
+    weighting = getattr(pgo, "Weighting", None)
+    cost = {} if weighting is None else {"weighting": weighting.ISOTROPIC}
+    return solvers.solve(pgo.PGOProblem(pgo.read_g2o(path), **cost))
+
+
 def one_job(name: str) -> None:
     """Read, solve and certify a graph 1 + REPEATS times; print the figures as JSON."""
-    path = Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
     solvers.solve(pgo.load("grid"))  # import time is apart
     seconds = []
     cpu = []
     for _ in range(1 + REPEATS):
         begin = time.perf_counter()
         began = time.process_time()
-        solution = solvers.solve(
-            pgo.PGOProblem(pgo.read_g2o(path), weighting=pgo.Weighting.ISOTROPIC)
-        )
+        solution = solve_in_F(name)
         seconds.append(time.perf_counter() - begin)
         cpu.append(time.process_time() - began)
     figures = {
@@ -82,18 +87,12 @@ def one_job(name: str) -> None:
 
 
 def cpu_job(name: str) -> None:
-    """Print the least CPU seconds to read a graph, solve and certify it, in F.
-
-    Commit 032ba88 runs it, too, which has no other cost and no `Weighting`.
-    """
-    path = Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
-    weighting = getattr(pgo, "Weighting", None)
-    cost = {} if weighting is None else {"weighting": weighting.ISOTROPIC}
+    """Print the least CPU seconds of `solve_in_F`, which commit 032ba88 has as well."""
     solvers.solve(pgo.load("grid"))  # import time is apart
     cpu = []
     for _ in range(1 + REPEATS):
         began = time.process_time()
-        solvers.solve(pgo.PGOProblem(pgo.read_g2o(path), **cost))
+        solve_in_F(name)
         cpu.append(time.process_time() - began)
     print(min(cpu))
 
