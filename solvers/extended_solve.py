@@ -5,7 +5,7 @@ Priors are certified, and the note of the solution says which terms the bound le
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cvxpy as cp
 
@@ -19,11 +19,11 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.convex.extended_newton import ExtendedNewton, kinks
 from solvers.convex.extended_soc import ExtendedSOC, with_priors
 from solvers.loop import RunMonitor
+from solvers.place import Attempt
 from solvers.result import Stage
 from solvers.riemannian.newton import Newton
 from solvers.robust_solves.attempts import SolveOnce
 from solvers.solution import Solution, note_of_coupling
-from solvers.stages import Answer, Job
 
 
 def solve_extended(
@@ -66,19 +66,19 @@ def solve_extended(
     solution = solve_once(with_known_priors, start=known_start, time_limit=monitor.left)
     if not left_out:
         return solution
-    job = Job(problem, solution.certificate.wanted_gap, monitor, list(solution.stages))
-    answer = Answer(solution.poses, decrement=math.nan)
-    if not job.is_out_of_time:
-        answer = RunWithTerms(job, model, soc).run(Answer(start))
-    rough = _atoms_with_kinks(model, answer.current_poses)
+    stages = list(solution.stages)
+    answer = Attempt(solution.poses, solution.status, decrement=math.nan)
+    if not answer.is_out_of_time:
+        answer = _run_with_terms(problem, model, soc, start, monitor, stages)
+    rough = _atoms_with_kinks(model, answer.known_poses)
     if rough:
         left_out[-1] += (
             "; SOC is the last stage, as Newton needs smooth terms alone, "
             f"and there are {', '.join(rough)}"
         )
-    elif not job.is_out_of_time:
+    elif not answer.is_out_of_time:
         second = ExtendedNewton(soc.changer, newton.tolerance, newton.max_iterations)
-        answer = RunWithTerms(job, model, second).run(answer)
+        answer = _run_with_terms(problem, model, second, answer.poses, monitor, stages)
     certificate = _certificate_with_terms(
         solution.certificate, model, answer, with_known_priors, is_F=not other_terms
     )
@@ -86,46 +86,39 @@ def solve_extended(
     return replace(
         solution,
         problem=problem,
-        poses=answer.current_poses,
+        poses=answer.known_poses,
         objective=certificate.objective,
         certificate=certificate,
-        status=job.status,
-        stages=tuple(job.stages),
+        status=answer.status,
+        stages=tuple(stages),
         seconds=time.perf_counter() - monitor.began,
         note="; ".join(note for note in notes if note),
         frame="that of the added terms",
     )
 
 
-@dataclass(frozen=True, eq=False)
-class RunWithTerms:
-    """SOC or Newton with added terms; the objective of the stage has all of them."""
-
-    job: Job
-    model: GraphQP
-    method: ExtendedSOC | ExtendedNewton
-
-    @property
-    def name(self) -> str:
-        """Name of the method."""
-        return type(self.method).__name__
-
-    def run(self, answer: Answer) -> Answer:
-        """Return the poses of the method, from the given ones or from its own start."""
-        job = self.job
-        decrement = math.nan
-        if isinstance(self.method, ExtendedNewton):
-            second = job.monitor.run(self.method, job.problem, answer.poses)
-            stage = Stage.of(second)
-            poses = second.poses
-            decrement = second.state.decrement
-        else:
-            first = job.monitor.run(self.method, job.problem, answer.poses)
-            stage = Stage.of(first)
-            poses = first.poses
-        objective = self.model.cost(poses.stacked())
-        job.stages.append(replace(stage, objective=objective))
-        return Answer(poses, decrement=decrement)
+def _run_with_terms(
+    problem: PGOProblem,
+    model: GraphQP,
+    method: ExtendedSOC | ExtendedNewton,
+    start: Poses | None,
+    monitor: RunMonitor,
+    stages: list[Stage],
+) -> Attempt:
+    """SOC or Newton with added terms, which the objective of its stage has, too."""
+    decrement = math.nan
+    if isinstance(method, ExtendedNewton):
+        second = monitor.run(method, problem, start)
+        stage = Stage.of(second)
+        poses = second.poses
+        decrement = second.state.decrement
+    else:
+        first = monitor.run(method, problem, start)
+        stage = Stage.of(first)
+        poses = first.poses
+    objective = model.cost(poses.stacked())
+    stages.append(replace(stage, objective=objective))
+    return Attempt(poses, stage.status, decrement)
 
 
 def _left_out(change: ModelChange, terms: list[cp.Expression]) -> list[str]:
@@ -149,14 +142,14 @@ def _atoms_with_kinks(model: GraphQP, poses: Poses) -> list[str]:
 
 
 def _certificate_with_terms(
-    certificate: Certificate, model: GraphQP, answer: Answer, priors: PGOProblem, is_F: bool
+    certificate: Certificate, model: GraphQP, answer: Attempt, priors: PGOProblem, is_F: bool
 ) -> Certificate:
     """Certificate of poses whose objective has all terms.
 
     `certificate` bounds the problem with the `priors` alone. `is_F` says whether there are no other
     terms. Nothing is known of the rounding error of terms of one's own.
     """
-    poses = answer.current_poses
+    poses = answer.known_poses
     objective = model.cost(poses.stacked())
     has_replaced_edges = bool(model.change.replaced_edges)
     bound = NO_BOUND if has_replaced_edges else certificate.bound

@@ -8,59 +8,35 @@ bound and sums.
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, judge_cost
-from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound
-from pgo_models.certificates.rounding_errors import ObjectiveRounding
-from pgo_models.errors import NotPositiveDefiniteError, PGOError, SettingError
+from pgo_models.certificates.certificate import Certificate
+from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
-from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Journal
-from solvers.distributed.driver import CoverPoses
-from solvers.distributed.lower_bound import best_bound_distributed
-from solvers.distributed.own_files import (
-    READ_HERE,
-    Answer as RobotAnswer,
-    OpenedFiles,
-    keep_answer,
-    move_answer,
-    open_files,
-    return_to_answer,
-    write_answer,
-)
-from solvers.distributed.stages import (
-    ClimbByRobots,
-    NewtonByRobots,
-    RobotJob,
-    stages_before_newton,
-)
+from solvers.distributed.own_files import READ_HERE, OpenedFiles, open_files, write_answer
+from solvers.distributed.robots_with_files import RobotsWithFiles
 from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import Ledger
 from solvers.network.ray_engine import RayEngine
+from solvers.place import AUTO, FirstStage
+from solvers.plan import solve_at
 from solvers.request import Pipeline
-from solvers.result import OUT_OF_TIME, Record, Stage, Status
-from solvers.riemannian.newton import Newton
-from solvers.riemannian.staircase import Staircase
-from solvers.soc.paper import PaperSOC
+from solvers.result import Record, Stage, Status
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
-from solvers.stages import Answer, PlannedStage, finer, run_stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +53,8 @@ class FolderSolution:
         Cost, lower bound, gap and verdict, without poses and multipliers.
     sizes : IntArray, shape (2, num_robots)
         How many poses, and edges, every robot has.
+    status : Status
+        How the run ended that found the poses, or what broke the solve off.
     stages : tuple of Stage
         What every stage did.
     ledger : Ledger
@@ -95,17 +73,13 @@ class FolderSolution:
     name: str
     certificate: Certificate
     sizes: IntArray
+    status: Status
     stages: tuple[Stage, ...]
     ledger: Ledger
     frame: str
     F: float
     seconds: float
     note: str = ""
-
-    @property
-    def status(self) -> Status:
-        """How the last stage ended."""
-        return self.stages[-1].status
 
     def __str__(self) -> str:
         num_poses, num_edges = self.sizes
@@ -205,53 +179,45 @@ def solve_folder(
     files = list(enumerate(g2o_files(folder)))
     if out is not None:
         check_g2o_folder(out, len(files))
-    place = _place_of_robots(engine, len(files))
     stages: list[Stage] = []
-    opened = open_files(files, place, pipeline.driver_memory, weighting)
+    opened = open_files(
+        files, _engine_of_robots(engine, len(files)), pipeline.driver_memory, weighting
+    )
     driver = opened.driver
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
-        shared = RobotJob(driver, journal, monitor)
-        job = _FolderJob(folder.name, pipeline.gap, opened.weighting, shared)
-        try:
-            job.run(pipeline)
-        except NotPositiveDefiniteError as error:
-            raise PGOError(
-                f"{folder}: weights too far apart for doubles ({error}); see pgo info FILE"
-            ) from error
-        except KeyboardInterrupt:  # between two loops: the loops answer it themselves
-            if job.best is None:
-                raise
-            stages.append(Stage.interruption(job.best.objective))
-        frame, F = job.move_to_frame()
-        certificate = job.certificate
+        place = RobotsWithFiles(
+            monitor, stages, driver, journal, None, folder.name, pipeline.gap, opened.weighting
+        )
+        best = solve_at(place, pipeline, None)
+        best, frame, F = place.move_to_frame(best)
         if out is not None:
             write = partial(write_answer, Path(out).absolute())
             driver.network.ask(write, [None] * len(files), Count.PIGGYBACKED)
     return FolderSolution(
         name=folder.name,
-        certificate=certificate,
+        certificate=best.proof,
         sizes=opened.sizes,
+        status=best.status,
         stages=tuple(stages),
         ledger=driver.network.ledger,
         frame=frame,
         F=F,
-        note=_note(weighting, opened, certificate),
+        note=_note(weighting, opened, place.note(best)),
         seconds=time.perf_counter() - monitor.began,
     )
 
 
-def _note(weighting: Weighting, opened: OpenedFiles, certificate: Certificate) -> str:
-    """Why the cost is F where that was not asked for, or what a proof of chi2 needs; or ""."""
-    if weighting is Weighting.OWN and opened.has_indefinite:
-        return "the cost is F, as some information matrices are indefinite: chi2 can be negative"
-    if certificate.is_certified or not opened.driver.has_two_costs:
-        return ""
-    return f"smaller information matrices may prove more; for these {READ_HERE}"
+def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:
+    """Why the cost is F where that was not asked for, and the note of the place; or ""."""
+    if not (weighting is Weighting.OWN and opened.has_indefinite):
+        return note
+    why = "the cost is F, as some information matrices are indefinite: chi2 can be negative"
+    return f"{why}; {note}" if note else why
 
 
-def _check_first_stage(soc: SOC | PaperSOC | None) -> None:
+def _check_first_stage(soc: FirstStage) -> None:
     """Raise a SettingError for a first stage that robots with own files cannot run."""
-    if soc is None:
+    if soc is None or soc is AUTO:
         return
     if type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS:
         raise SettingError(
@@ -263,7 +229,7 @@ def _check_first_stage(soc: SOC | PaperSOC | None) -> None:
         )
 
 
-def _place_of_robots(engine: Engine | None, num_robots: int) -> Engine:
+def _engine_of_robots(engine: Engine | None, num_robots: int) -> Engine:
     """Where robots with own files run: with Ray one process for every robot, and no snapshots.
 
     The process of the driver would keep the snapshots, which hold all that the robots know.
@@ -274,149 +240,3 @@ def _place_of_robots(engine: Engine | None, num_robots: int) -> Engine:
         return engine
     recovery = replace(engine.recovery, orders_between_snapshots=sys.maxsize)
     return replace(engine, recovery=recovery, actors=engine.actors or num_robots)
-
-
-@dataclass(frozen=True, eq=False)
-class _Best:
-    """The best answer so far, as the driver knows it; the poses are with the robots.
-
-    `cover` are the poses of the driver, `bound` and `source` the best bound of all attempts.
-    """
-
-    objective: float
-    decrement: float
-    rounding: ObjectiveRounding
-    robots: Sequence[RobotAnswer]
-    cover: CoverPoses
-    bound: LowerBound = NO_BOUND
-    source: BoundSource = BoundSource.GIVEN
-
-
-@dataclass(eq=False)
-class _FolderJob:
-    """A solve by robots with own files that is under way.
-
-    `best` is None before the first answer.
-    """
-
-    name: str
-    gap: float
-    weighting: Weighting
-    shared: RobotJob
-    best: _Best | None = None
-
-    def run(self, pipeline: Pipeline) -> None:
-        """Make attempts, and climb the staircase, until the certificate cannot improve.
-
-        The staircase is that of a cost on which SOC can run.
-        """
-        self._attempt(pipeline.soc, pipeline.newton)
-        stages = self.shared.stages
-        if pipeline.second_try and stages[-1].status.is_success and self.certificate.can_improve:
-            soc = pipeline.soc if pipeline.soc is not None else SOC()
-            self._attempt(finer(soc), pipeline.newton)
-        if pipeline.staircase is None or self.shared.driver.has_two_costs:
-            return
-        if stages[-1].status in OUT_OF_TIME:
-            return
-        if self.certificate.can_improve:
-            self._climb(replace(pipeline.staircase, gap=self.gap), pipeline.newton)
-
-    @property
-    def certificate(self) -> Certificate:
-        """Certificate of the best answer, without poses and multipliers."""
-        best = self.best
-        assert best is not None
-        d = self.shared.driver.d
-        no_poses = Poses(np.zeros((0, d, d)), np.zeros((0, d)))
-        unjudged = Certificate(
-            objective=best.objective,
-            bound=best.bound,
-            gap=math.nan,
-            rounding_level=best.rounding.level,
-            stationarity=best.decrement,
-            source=best.source,
-            poses=no_poses,
-            poses_objective=best.objective,
-            Lambda=no_poses.R,
-            wanted_gap=self.gap,
-            verdict=Verdict.TRIVIAL,
-            weighting=self.weighting,
-        )
-        return judge_cost(self.name, unjudged, best.objective, best.rounding)
-
-    def move_to_frame(self) -> tuple[str, float]:
-        """Move the poses of the best answer to their frame; return which that is, and F there.
-
-        A frame far away rounds the poses, so that their cost is found anew: the certificate is of
-        the poses that are written.
-        """
-        best = self.best
-        assert best is not None
-        turn, shift, frame = _frame(best.robots)
-        network = self.shared.driver.network
-        parts = network.ask(move_answer, [(turn, shift)] * len(best.robots), Count.ROUND)
-        objective = math.fsum(part.cost for part in parts)
-        rounding = _sum_of_roundings([part.rounding for part in parts])
-        self.best = replace(best, objective=objective, rounding=rounding)
-        return frame, math.fsum(part.F for part in parts)
-
-    def _attempt(self, soc: SOC | PaperSOC | None, newton: Newton) -> None:
-        """Start, SOC, Newton and bound."""
-        assert soc is None or isinstance(soc, SOC)  # `_check_first_stage` refuses another
-        planned = stages_before_newton(self.shared, soc)
-        planned.append(NewtonByRobots(self.shared, newton))
-        self._judge(run_stages(planned, Answer()))
-
-    def _climb(self, staircase: Staircase, newton: Newton) -> None:
-        """Staircase from the best answer, Newton and bound."""
-        best = self.best
-        assert best is not None
-        driver = self.shared.driver
-        driver.network.ask(return_to_answer, [None] * len(best.robots), Count.PIGGYBACKED)
-        driver.current = best.cover
-        planned: list[PlannedStage] = [
-            ClimbByRobots(self.shared, staircase),
-            NewtonByRobots(self.shared, newton),
-        ]
-        self._judge(run_stages(planned, Answer()))
-
-    def _judge(self, answer: Answer) -> None:
-        """Find a bound at the current poses, and keep the better poses and the better bound."""
-        driver = self.shared.driver
-        best = self.best
-        bound = best_bound_distributed(driver, self.gap)
-        source = BoundSource.GIVEN
-        if best is not None and best.bound.value >= bound.value:
-            bound = best.bound
-        if answer.dual_bound is not None and answer.dual_bound.lower_bound > bound.value:
-            bound = answer.dual_bound.bound
-            source = BoundSource.RELAXATION
-        if best is None or driver.current.objective < best.objective:
-            robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
-            rounding = _sum_of_roundings([robot.rounding for robot in robots])
-            best = _Best(
-                driver.current.objective, answer.decrement, rounding, robots, driver.current
-            )
-        self.best = replace(best, bound=bound, source=source)
-
-
-def _sum_of_roundings(parts: Sequence[ObjectiveRounding]) -> ObjectiveRounding:
-    """How accurately a sum is known of whose parts that is known."""
-    level = math.fsum(part.level for part in parts)
-    error = math.fsum(part.error for part in parts)
-    return ObjectiveRounding(level, error, all(part.is_exact for part in parts))
-
-
-def _frame(answers: Sequence[RobotAnswer]) -> tuple[Array, Array, str]:
-    """Motion (R, t) to the frame of the answer, and which frame that is."""
-    first = min(answers, key=lambda answer: (not answer.held[0], answer.held[1]))
-    d = first.given.shape[1]
-    target = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    place = "at the identity"
-    if np.isfinite(first.given).all():
-        target = first.given
-        place = "where its file has it"
-    R = target[1:].T @ first.solved[1:]
-    t = target[0] - R @ first.solved[0]
-    return R, t, f"pose {first.held[2]} {place}"

@@ -1,9 +1,11 @@
-"""solve(problem): a list of stages, from the start to the certificate, in one Solution."""
+"""solve(problem): from the start to the certificate, in one Solution.
+
+`solvers.plan` has the steps of a solve in their order; here it is decided where they are taken.
+"""
 
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,37 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pgo_models.errors import GraphWarning, NotPositiveDefiniteError
+from pgo_models.errors import GraphWarning
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem
+from solvers.here import Here
 from solvers.loop import RunMonitor
 from solvers.network.engine import Engine, InProcess
-from solvers.request import (
-    Pipeline,
-    SolveRequest,
-    plan_improvements,
-    solution_of,
-)
-from solvers.result import Record, Stage
-from solvers.riemannian.newton import Newton, needs_no_soc
-from solvers.soc.paper import PaperSOC
-from solvers.soc.soc import SOC, WARM_START
+from solvers.plan import solve_at
+from solvers.request import Pipeline, SolveRequest, solution_of
+from solvers.result import Record
 from solvers.solution import Solution
-from solvers.stages import (
-    Answer,
-    AscentInOnePlace,
-    FindCertificate,
-    FindStart,
-    Job,
-    PlannedStage,
-    RunNewton,
-    RunSOC,
-    RunStaircase,
-    run_stages,
-)
 
 if TYPE_CHECKING:  # what a solve in one place does not need
     from solvers.distributed.checkpoint import Checkpoint
@@ -50,9 +33,6 @@ if TYPE_CHECKING:  # what a solve in one place does not need
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
 
-# Newton steps of a first attempt on graphs with landmarks. On all graphs tried, those that ended at
-# the global minimum took at most as many, and the others 17 to 100.
-LANDMARK_STEPS = 16
 _NUM_NAMED = 5  # landmarks that a warning names
 
 
@@ -295,81 +275,14 @@ def _solve_without_wrong_edges(request: SolveRequest, robust: GNC | PCM) -> Solu
 
 
 def _solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
-    """Solution by robots and a driver."""
+    """Solution by robots, with or without a driver."""
     from solvers.shared_solve import solve_by_robots
 
     return solve_by_robots(request, robots)
 
 
 def _solve_in_one_place(request: SolveRequest) -> Solution:
-    """Solution by the stages of `solvers.stages`."""
+    """Solution in this process."""
     pipeline = request.pipeline
-    monitor = request.monitor
-    job = Job(request.problem, pipeline.gap, monitor)
-    plan = partial(_plan_attempt, job, pipeline.newton)
-    climb = _plan_climb(job, pipeline)
-    try:
-        first_newton = _first_newton(pipeline, request.problem.graph)
-        first = _plan_attempt(job, first_newton, pipeline.soc, request.start)
-        further = plan_improvements(pipeline, job, plan, climb, AscentInOnePlace(job))
-        answer = run_stages([*first, *further], Answer())
-    except KeyboardInterrupt:  # between two loops: the loops answer it themselves
-        if not monitor.poses_found:
-            raise
-        answer = job.broken_off(Stage.interruption)
-    except NotPositiveDefiniteError:
-        answer = job.broken_off(Stage.without_factor)
-    return solution_of(request, job, answer)
-
-
-def _plan_attempt(
-    job: Job, newton: Newton, soc: SOC | PaperSOC | None, start: Poses | None
-) -> list[PlannedStage]:
-    """Stages of an attempt in one place, without SOC where Newton alone is faster."""
-    began = time.perf_counter()
-    problem = job.problem
-    is_convex = problem.convex_part is problem
-    # The minimum of the convex part is no nearer to that of chi2 than the start is.
-    newton_alone = not is_convex or (start is None and needs_no_soc(problem))
-    is_averaged = False
-    if soc == WARM_START and newton_alone:
-        soc = None
-        is_averaged = problem.d == 2
-    name, find = _choose_start(problem, soc, start, is_averaged)
-    planned: list[PlannedStage] = [FindStart(job, name, find, began)]
-    if soc is not None:
-        planned.append(RunSOC(job, soc))
-    planned += [RunNewton(job, newton), FindCertificate(job)]
-    job.monitor.plan[:] = [stage.name for stage in planned]
-    return planned
-
-
-def _first_newton(pipeline: Pipeline, graph: PoseGraph) -> Newton:
-    """Newton of the first attempt, with few steps where a growing start may follow soon."""
-    newton = pipeline.newton
-    if pipeline.growing is None or not len(graph.landmarks):
-        return newton
-    return replace(newton, max_iterations=min(newton.max_iterations, LANDMARK_STEPS))
-
-
-def _plan_climb(job: Job, pipeline: Pipeline) -> list[PlannedStage]:
-    """Stages of a climb in one place."""
-    if pipeline.staircase is None:
-        return []
-    return [
-        RunStaircase(job, replace(pipeline.staircase, gap=pipeline.gap)),
-        RunNewton(job, pipeline.newton),
-        FindCertificate(job),
-    ]
-
-
-def _choose_start(
-    problem: PGOProblem, soc: SOC | PaperSOC | None, start: Poses | None, is_averaged: bool
-) -> tuple[str, Callable[[], Poses]]:
-    """Name of a start, and the function that finds its poses."""
-    if start is not None:
-        return "given start", lambda: problem.seen_poses(start)
-    if isinstance(soc, PaperSOC):
-        return "spanning tree", partial(spanning_tree_start, problem.convex_part.graph)
-    name = "averaged start" if is_averaged else "chordal start"
-    return name, partial(chordal_start, problem.convex_part, is_averaged)
+    place = Here(request.monitor, [], request.problem, pipeline.gap)
+    return solution_of(request, place, solve_at(place, pipeline, request.start))

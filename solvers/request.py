@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -19,24 +18,13 @@ from solvers.loop import RunMonitor
 from solvers.network.engine import DEFAULT_MEMORY, Engine
 from solvers.network.faults import Faults
 from solvers.network.ledger import Ledger
+from solvers.place import AUTO, Attempt, FirstStage, Place, Step
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
-from solvers.soc.paper import PaperSOC
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, WARM_START
+from solvers.soc.soc import SOC
 from solvers.solution import Solution, choose_gauge, note_of
-from solvers.stages import (
-    Answer,
-    AscentOfTerms,
-    GrowingAttempt,
-    ImproveBound,
-    Job,
-    Plan,
-    PlannedStage,
-    SecondAttempt,
-    SeekHandednessTerms,
-)
 
 if TYPE_CHECKING:  # what a solve in one place does not need
     from solvers.distributed.checkpoint import Checkpoint
@@ -56,9 +44,10 @@ class Pipeline:
 
     Parameters
     ----------
-    soc : SOC, PaperSOC, ExtendedSOC or None
+    soc : SOC, PaperSOC, ExtendedSOC, AUTO or None
         The first stage, whose tolerance says when Newton takes over. None goes from the start
-        straight to Newton. The default is `WARM_START`, a SOC with a coarse tolerance.
+        straight to Newton. With AUTO, the default, the place chooses: a SOC with a coarse
+        tolerance, or none where Newton alone is faster.
     newton : Newton
         The second stage, which goes down to rounding level.
     gap : float
@@ -78,7 +67,7 @@ class Pipeline:
     driver_memory : float
         Bytes that the driver of a solve by robots may take with its fronts. A solve that needs more
         is refused before it begins. 0 stands for no driver: CONSENSUS alone
-        (`solvers.distributed.leaderless`), which finds poses and no certificate.
+        (`solvers.distributed.robots_alone`), which finds poses and no certificate.
 
     Raises
     ------
@@ -95,7 +84,7 @@ class Pipeline:
     ['chordal start', 'SOC', 'Newton']
     """
 
-    soc: SOC | PaperSOC | None = field(default_factory=lambda: WARM_START)
+    soc: FirstStage = AUTO
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     growing: GrowingStart | None = field(default_factory=GrowingStart)
@@ -149,6 +138,34 @@ class Pipeline:
             staircase=None,
             handedness=None,
         )
+
+    def asks_for(self, step: Step, d: int) -> bool:
+        """Whether a step after the first attempt is to be taken, where the answer is open.
+
+        Handedness terms are for graphs in space: in the plane they add nothing.
+
+        Parameters
+        ----------
+        step : Step
+            One of the steps that may improve the answer.
+        d : int
+            Dimension of the space, 2 or 3.
+
+        Returns
+        -------
+        bool
+            Whether there are settings for it.
+        """
+        seeks_terms = self.handedness is not None and d == 3
+        return {
+            Step.GROWING: self.growing is not None,
+            Step.LAST_STEPS: True,
+            Step.SECOND: self.second_try,
+            Step.STAIRCASE: self.staircase is not None,
+            Step.SMALLER_MATRICES: self.staircase is not None,
+            Step.TERMS: seeks_terms,
+            Step.HULLS: seeks_terms,
+        }[step]
 
     @property
     def default_weighting(self) -> Weighting:
@@ -240,58 +257,31 @@ class SolveRequest:
             )
 
 
-def plan_improvements(
-    pipeline: Pipeline,
-    job: Job,
-    plan: Plan,
-    climb: Sequence[PlannedStage],
-    ascent: AscentOfTerms,
-) -> list[PlannedStage]:
-    """Stages that follow the first attempt.
-
-    They leave an answer as it is whose certificate has the gap that was asked for.
-    """
-    planned: list[PlannedStage] = []
-    if pipeline.growing is not None:
-        planned.append(GrowingAttempt(job, pipeline.growing, pipeline.newton))
-    if pipeline.second_try:
-        planned.append(SecondAttempt(job, plan, pipeline.soc))
-    if pipeline.staircase is not None:
-        planned.append(ImproveBound(job, climb))
-    if pipeline.handedness is not None:
-        planned.append(SeekHandednessTerms(job, pipeline.handedness, ascent))
-    return planned
-
-
 def solution_of(
     request: SolveRequest,
-    job: Job,
-    answer: Answer,
+    place: Place,
+    best: Attempt,
     ledger: Ledger | None = None,
     robots: Partition | None = None,
-    missing: str = "",
 ) -> Solution:
-    """Solution with the answer in the frame that was asked for.
-
-    `missing` says what its certificate lacks for want of a driver.
-    """
+    """Solution with the best attempt, in the frame that was asked for."""
     problem = request.problem
-    current = problem.seen_poses(answer.current_poses)
+    current = problem.seen_poses(best.known_poses)
     poses, frame, held = choose_gauge(current, problem.graph, request.anchor)
     poses = problem.seen_poses(poses)  # a frame has an origin, too
     # A frame far away rounds the poses: the certificate is of those that are returned.
-    certificate = judge(problem, poses, answer.current_certificate)
+    certificate = judge(problem, poses, best.proof)
     return Solution(
         problem=problem,
         poses=poses,
         objective=certificate.objective,
         certificate=certificate,
-        status=job.status,
-        stages=tuple(job.stages),
+        status=best.status,
+        stages=tuple(place.stages),
         seconds=time.perf_counter() - request.monitor.began,
         ledger=ledger,
         robots=robots,
-        note=note_of(problem, certificate, missing),
+        note=note_of(problem, certificate, place.note(best)),
         frame=frame,
         anchor=held,
     )

@@ -28,6 +28,7 @@ class Status(enum.Enum):
         "give another start or tolerance"
     )
     NOT_FINITE = "the iterate contains nan or inf; raise the penalty"
+    FAILED = "a numerical failure ended this step; the answer before it stands"
     NOT_FACTORED = "a matrix has no Cholesky factor in doubles; its weights are too far apart"
 
     @property
@@ -282,6 +283,24 @@ class Stage:
             With `Status.NOT_FACTORED`.
         """
         return cls("factorisation", Status.NOT_FACTORED, 0, objective, 0.0, History())
+
+    @classmethod
+    def failure(cls, name: str, objective: float) -> "Stage":
+        """Return a stage that says that a step which may only improve the answer has failed.
+
+        Parameters
+        ----------
+        name : str
+            Name of the step.
+        objective : float
+            Cost of the poses that stand.
+
+        Returns
+        -------
+        Stage
+            With `Status.FAILED`.
+        """
+        return cls(name, Status.FAILED, 0, objective, 0.0, History(), finds_poses=False)
 
     @classmethod
     def interruption(cls, objective: float) -> "Stage":

@@ -1,52 +1,27 @@
-"""A solve by robots and a driver, by the stages of `solvers.distributed.stages`."""
+"""A solve by robots of one graph: with a driver, or alone."""
 
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
-from functools import partial
 
-from pgo_models.errors import NotPositiveDefiniteError
-from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.initialization import chordal_start
 from solvers.distributed.checkpoint import Journal, run_fingerprint
 from solvers.distributed.chosen_robots import robots_of_solve
-from solvers.distributed.driver import collect
-from solvers.distributed.leaderless import note_without_driver
-from solvers.distributed.stages import (
-    AscentByRobots,
-    CertifyByRobots,
-    ClimbByRobots,
-    ConsensusAlone,
-    NewtonByRobots,
-    RecallAttempt,
-    RobotJob,
-    SetPoses,
-    StartByRobots,
-    open_driver,
-    stages_before_newton,
-)
+from solvers.distributed.robots_alone import RobotsAlone
+from solvers.distributed.robots_of_graph import RobotsOfGraph, open_driver
+from solvers.here import Here
 from solvers.network.engine import InProcess
-from solvers.request import Pipeline, SolveRequest, plan_improvements, solution_of
+from solvers.place import Place
+from solvers.plan import solve_at
+from solvers.request import SolveRequest, solution_of
 from solvers.result import Stage
-from solvers.soc.paper import PaperSOC
-from solvers.soc.soc import SOC
 from solvers.solution import Solution
-from solvers.stages import Answer, Job, Plan, PlannedStage, run_stages
 
 
 def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
-    """Solution by the stages of `solvers.distributed.stages`.
-
-    Without a driver these are the start and CONSENSUS alone.
-    """
+    """Solution by robots of one graph and their driver, or by these robots alone."""
     pipeline = request.pipeline
     problem = request.problem
-    monitor = request.monitor
-    pipeline = replace(pipeline, growing=None)
-    if not pipeline.has_driver:
-        pipeline = replace(pipeline, second_try=False, staircase=None, handedness=None)
     partition = robots_of_solve(pipeline.soc, robots, problem.graph)
     settings = (
         pipeline.soc,
@@ -58,81 +33,17 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
     )
     mark = run_fingerprint(problem, partition, settings, request.start)
     engine = request.engine if request.engine is not None else InProcess()
-    job = Job(problem, pipeline.gap, monitor)
+    stages: list[Stage] = []
+    shown = request.monitor, stages
+    here = Here(*shown, problem, pipeline.gap, where=", in one place")
     with (
-        closing(Journal(request.checkpoint, mark, job.stages)) as journal,
+        closing(Journal(request.checkpoint, mark, stages)) as journal,
         closing(open_driver(problem, partition, engine, pipeline.driver_memory)) as driver,
     ):
-        shared = RobotJob(driver, journal, monitor)
-        plan: Plan = partial(_plan_attempt_by_robots, job, shared, pipeline)
-        if not pipeline.has_driver:
-            plan = partial(_plan_attempt_alone, job, shared, pipeline, partition)
-        climb = _plan_climb_by_robots(job, shared.without_checkpoints(), pipeline)
-        ascent = AscentByRobots(shared.without_checkpoints(), problem, job.gap)
-        try:
-            first = plan(pipeline.soc, request.start)
-            further = plan_improvements(pipeline, job, plan, climb, ascent)
-            answer = run_stages([*first, *further], Answer())
-        except KeyboardInterrupt:
-            if not job.stages:
-                raise
-            if pipeline.has_driver:
-                monitor.poses_found.append(collect(driver)[0])
-            answer = job.broken_off(Stage.interruption)
-        except NotPositiveDefiniteError:
-            answer = job.broken_off(Stage.without_factor)
-        if job.stages[-1].status.is_success:
+        place: Place = RobotsAlone(*shown, driver, journal, pipeline.faults, here, partition)
+        if pipeline.has_driver:
+            place = RobotsOfGraph(*shown, driver, journal, pipeline.faults, here)
+        best = solve_at(place, pipeline, request.start)
+        if best.status.is_success:
             journal.end()
-    missing = "" if pipeline.has_driver else note_without_driver(problem)
-    return solution_of(request, job, answer, driver.network.ledger, partition, missing)
-
-
-def _plan_attempt_by_robots(
-    job: Job,
-    shared: RobotJob,
-    pipeline: Pipeline,
-    soc: SOC | PaperSOC | None,
-    start: Poses | None,
-) -> list[PlannedStage]:
-    """Stages of an attempt by robots, or its outcome where a checkpoint is of a later attempt."""
-    outcome = shared.journal.take_outcome()
-    if outcome is not None:
-        return [RecallAttempt(*outcome)]
-    assert not isinstance(soc, PaperSOC)  # `robots_of_solve` refuses it
-    problem = job.problem
-    first = None
-    if start is not None:
-        first = StartByRobots(shared, "given start", partial(problem.seen_poses, start))
-    elif problem.graph.is_world_loose:
-        # The rotation of the world depends on positions alone.
-        find = partial(chordal_start, problem.convex_part)
-        first = StartByRobots(shared, "chordal start, in one place", find)
-    planned = stages_before_newton(shared, soc, first, pipeline.faults)
-    newton = NewtonByRobots(shared, pipeline.newton)
-    return [*planned, newton, CertifyByRobots(shared, problem, job.gap)]
-
-
-def _plan_climb_by_robots(job: Job, shared: RobotJob, pipeline: Pipeline) -> list[PlannedStage]:
-    """Stages of a climb by robots from poses that the driver has."""
-    if pipeline.staircase is None:
-        return []
-    return [
-        SetPoses(shared),
-        ClimbByRobots(shared, replace(pipeline.staircase, gap=pipeline.gap)),
-        NewtonByRobots(shared, pipeline.newton),
-        CertifyByRobots(shared, job.problem, job.gap),
-    ]
-
-
-def _plan_attempt_alone(
-    job: Job,
-    shared: RobotJob,
-    pipeline: Pipeline,
-    robots: Partition,
-    soc: SOC | PaperSOC | None,
-    start: Poses | None,
-) -> list[PlannedStage]:
-    """The one stage of robots without a driver: start and CONSENSUS."""
-    assert isinstance(soc, SOC)  # as `Pipeline` has checked
-    faults = pipeline.faults
-    return [ConsensusAlone(shared, job.problem, job.gap, robots, soc, faults, start)]
+    return solution_of(request, place, best, driver.network.ledger, partition)

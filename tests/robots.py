@@ -21,15 +21,15 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed import stages
+from solvers.distributed import robots_of_graph
 from solvers.distributed.driver import Driver
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import Agent
 from solvers.distributed.robots.elimination import Elimination, unpacked
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
-from solvers.distributed.stages import open_driver
 from solvers.network.engine import Engine, InProcess, WorkerPool
 from solvers.network.messages import Idle
 from solvers.soc.subgraph import Subgraph
@@ -156,7 +156,7 @@ def sparse_elimination(most_coupled: int) -> Iterator[None]:
         return leave_poses(subgraphs, most_coupled)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stages, "choose_elimination", left)
+        patch.setattr(robots_of_graph, "choose_elimination", left)
         yield
 
 

@@ -138,7 +138,7 @@ ROOMS_OF_AN_ITERATION = (
     "solvers.distributed.robots.agent",
     "solvers.distributed.robots.interior",
     "solvers.distributed.robots.records",
-    "solvers.distributed.stages",
+    "solvers.distributed.robots_of_graph",
     "solvers.distributed.substructured",
     "solvers.network.counted_pool",
     "solvers.network.engine",

@@ -402,7 +402,7 @@ def test_a_matrix_without_a_factor_is_a_status(monkeypatch):
     def refuse(*_):
         raise NotPositiveDefiniteError("no")
 
-    monkeypatch.setattr("solvers.pipeline.chordal_start", refuse)
+    monkeypatch.setattr("solvers.here.chordal_start", refuse)
     solution = solvers.solve(problem, progress=False)
     assert solution.status is solvers.Status.NOT_FACTORED
     assert not solution.status.is_success

@@ -51,11 +51,13 @@ def chosen_pipeline(
     max_iterations: int | None,
     tolerance: float | None,
     driver_memory: float | None = None,
+    is_asked_for: bool = True,
 ) -> Pipeline:
     """Pipeline of the options of `pgo solve`.
 
-    The `robots` are those of CONSENSUS and PAPER; `driver_memory` is in GB. A SettingError when the
-    options do not go together.
+    The `robots` are those of CONSENSUS and PAPER; `driver_memory` is in GB. Where the method was
+    not asked for, and no option is about SOC, the place of the solve chooses whether it runs SOC. A
+    SettingError when the options do not go together.
     """
     if driver_memory is not None and method not in ON_ROBOTS:
         raise SettingError(
@@ -70,6 +72,9 @@ def chosen_pipeline(
             f"--method substructured factors, got --r-step {r_step.value}; "
             "use joint, consensus or paper"
         )
+    options_of_soc = (r_step, max_iterations, tolerance)
+    if not is_asked_for and all(option is None for option in options_of_soc):
+        return Pipeline(gap=gap, driver_memory=memory)
     soc = _default_soc(method, has_driver=memory > 0)
     soc = replace(
         soc,

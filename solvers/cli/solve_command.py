@@ -290,6 +290,7 @@ class StageOptions:
             self.max_iterations,
             self.tolerance,
             driver_memory,
+            is_asked_for=self.method is not None,
         )
 
 

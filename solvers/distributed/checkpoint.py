@@ -37,6 +37,7 @@ from solvers.network.ledger import Ledger, Traffic
 from solvers.network.serialization import deserialize, serialize
 from solvers.result import History, Measurement, Outcome, Record, Stage, Status
 from solvers.riemannian.newton import Newton
+from solvers.riemannian.prefixes import GrowingStart
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.copies import SeparatorPenalty
@@ -150,6 +151,7 @@ _CLASSES = (
     # Settings of methods.
     SOC,
     Newton,
+    GrowingStart,
     Anderson,
     Coupling,
     RStep,
@@ -184,6 +186,7 @@ class Journal:
         self._saved: Saved | None = None  # the checkpoint, until a run goes on from it
         self._snapshots: list[dict[str, NDArray[Any]]] = []  # the robots', of the same
         self._has_warned = False
+        self._writes = checkpoint is not None
         self._lock: RunLock | None = None
         if checkpoint is None:
             return
@@ -219,6 +222,10 @@ class Journal:
         """Remember the outcome of an attempt."""
         self._finished.append(outcome)
 
+    def stop_writing(self) -> None:
+        """Write no checkpoint from now on: what follows goes on from poses that none holds."""
+        self._writes = False
+
     def goes_on_with(self, method: type | None = None) -> bool:
         """Whether there is a checkpoint from which no run has gone on yet.
 
@@ -242,7 +249,7 @@ class Journal:
             earlier = self._saved.records
             self._saved = None
             self._snapshots = []
-        if self._checkpoint is None:
+        if self._checkpoint is None or not self._writes:
             return monitor.run(method, driver, start, earlier)
         name = type(method).__name__
         callback = self._writing(self._checkpoint, name, driver, monitor, earlier, start is None)

@@ -6,19 +6,18 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.pose_graph import PoseGraph
+from solvers.place import Automatic, FirstStage
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC
 
 
-def robots_of_solve(
-    soc: SOC | PaperSOC | None, robots: Partition | int, graph: PoseGraph
-) -> Partition:
+def robots_of_solve(soc: FirstStage, robots: Partition | int, graph: PoseGraph) -> Partition:
     """Robots of a solve, which are also those of its SOC.
 
     A number stands for the robots of SOC if they are so many, else for the default partition. A
     SettingError when SOC has other robots, or cannot be run by robots.
     """
+    soc = None if isinstance(soc, Automatic) else soc
     of_soc = soc.robots if soc is not None else None
     if not isinstance(robots, Partition):
         num_robots = whole_number(robots, "robots", SettingError)

@@ -161,9 +161,9 @@ class Driver:
         """Start the robots, unless `open_pool` returns a pool whose robots are at work already.
 
         `memory` is the largest number of bytes that the interface may take; a SettingError if it
-        would take more. The value 0 selects a run without a driver (`leaderless`): no interface is
-        built or solved, and this object only carries the messages of the robots and adds up. Bounds
-        are grounded in the middle of the cover unless a position is given.
+        would take more. The value 0 selects a run without a driver (`robots_alone`): no interface
+        is built or solved, and this object only carries the messages of the robots and adds up.
+        Bounds are grounded in the middle of the cover unless a position is given.
         """
         self.num_poses = num_poses
         self.d = summaries[0].d

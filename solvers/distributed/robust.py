@@ -18,11 +18,11 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import bridges
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
-from solvers.distributed.leaderless import tree_traffic
 from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
 from solvers.distributed.robots.records import Reweigh
 from solvers.distributed.robots.reweighting import count_below, edges_within, sum_ratios
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_alone import tree_traffic
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine

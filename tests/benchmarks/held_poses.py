@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import pgo_models as pgo
 import solvers
 from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.leaderless import collect_copies
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_alone import collect_copies
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.engine import InProcess
 from solvers.soc.consensus import ConsensusState

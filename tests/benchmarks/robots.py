@@ -36,7 +36,7 @@ from pgo_models.figures import rounded_up
 from pgo_models.graphs.separators import vertex_cover
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.consensus import RobotsOfDriver
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess

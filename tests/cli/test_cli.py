@@ -17,6 +17,7 @@ from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import read_times
 from solvers.cli import app as cli, choices
 from solvers.distributed.forecast import forecast
+from solvers.soc.soc import WARM_START
 
 ROOT = Path(__file__).parents[2]
 PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]
@@ -103,7 +104,7 @@ def test_the_command_and_the_function_have_the_same_defaults():
         choices.chosen_pipeline(method, None, None, 1e-6, None, None)
         for method in (choices.FirstStage.JOINT, choices.FirstStage.PAPER)
     )
-    default = solvers.Pipeline().soc
+    default = WARM_START
     assert (joint.soc.max_iterations, joint.soc.tolerance) == (
         default.max_iterations,
         default.tolerance,

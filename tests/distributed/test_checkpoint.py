@@ -23,6 +23,7 @@ from solvers.cli.options import BackEndName, FirstStage
 from solvers.distributed import checkpoint
 from solvers.distributed.checkpoint import Checkpoint, Journal
 from solvers.network.engine import InProcess
+from solvers.soc.soc import WARM_START
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 
@@ -43,10 +44,8 @@ def killed_after(steps):
 
 
 def pipeline(coupling, robots, gap=1e-6):
-    chosen = solvers.Pipeline(gap=gap, staircase=None)
-    return replace(
-        chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-6)
-    )
+    soc = replace(WARM_START, coupling=coupling, robots=robots, tolerance=1e-6)
+    return solvers.Pipeline(soc=soc, gap=gap, growing=None, staircase=None)
 
 
 def assert_same(found, expected):
@@ -95,13 +94,28 @@ def test_a_run_that_was_broken_off_goes_on_to_the_same_numbers(coupling, part, t
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("part", [0.3, 0.8])
-def test_a_second_attempt_goes_on_too(part, tmp_path):
-    graph = varied_graph(1, 14, 2, NoiseModel(0.5, 1.2))  # the relaxation is not tight
+def line_with_closures(seed, n, num_closures):
+    """Odometry through n poses in the plane, and closures that fit no map."""
+    rng = np.random.default_rng(seed)
+    along = np.arange(n - 1)
+    far = np.array([rng.choice(n, 2, replace=False) for _ in range(num_closures)])
+    ends = np.concatenate([np.stack([along, along + 1], axis=1), far])
+    R_ij = pgo.random_rotations(len(ends), 2, rng)
+    t_ij = rng.standard_normal((len(ends), 2))
+    ones = np.ones(len(ends))
+    return pgo.PoseGraph(n, *ends.T, R_ij, t_ij, ones, ones)
+
+
+@pytest.mark.parametrize("growing", [None, solvers.GrowingStart(first_size=6)])
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.8])
+def test_a_second_attempt_goes_on_too(part, growing, tmp_path):
+    graph = line_with_closures(1, 14, 12)  # the relaxation is not tight
     settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
-    settings = replace(settings, soc=replace(settings.soc, tolerance=1e-2))
+    settings = replace(settings, soc=replace(settings.soc, tolerance=1e-2), growing=growing)
     expected = solvers.solve(graph, settings, robots=3)
-    assert [stage.name for stage in expected.stages] == 2 * ["chordal start", "SOC", "Newton"]
+    attempt = ["chordal start", "SOC", "Newton"]
+    grown = [] if growing is None else ["growing start, in one place", "Newton"]
+    assert [stage.name for stage in expected.stages] == [*attempt, *grown, *attempt]
     first = sum(len(stage.history) for stage in expected.stages[:3])
     second = sum(len(stage.history) for stage in expected.stages[3:])
     checkpoint = Checkpoint(tmp_path / "run.ckpt", rounds=1)
@@ -119,7 +133,9 @@ def test_a_second_attempt_goes_on_too(part, tmp_path):
         callback=lambda state, record: seen.append(record.k),
     )
     assert_same(found, expected)
-    assert len(seen) <= first + second - after + 1
+    # Prefixes are solved again where the solve was broken off among them.
+    again = 0 if growing is None else len(expected.stages[3].history)
+    assert len(seen) <= first + second - after + 1 + again
 
 
 def test_without_soc_newton_goes_on(tmp_path):

@@ -18,7 +18,7 @@ from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.loop import run
 from solvers.network.engine import InProcess

@@ -40,11 +40,12 @@ from solvers.distributed.driver import collect
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.network.engine import InProcess
 from solvers.pipeline import solve
+from solvers.place import AUTO, FirstStage
 from solvers.request import Pipeline
-from solvers.soc.soc import SOC, WARM_START
+from solvers.soc.soc import WARM_START
 from solvers.soc.subgraph import split_graph
 from solvers.solution import Solution
 
@@ -170,7 +171,7 @@ def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> No
 
 
 def solved(
-    seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel, soc: SOC = WARM_START
+    seed: int, n: int, d: int, partitioner: Partitioner, noise: NoiseModel, soc: FirstStage = AUTO
 ) -> tuple[Solution, Recording]:
     graph = varied_graph(seed, n, d, noise)
     engine = Recording()
@@ -257,10 +258,10 @@ def lower(g: int, width: int) -> tuple[int]:
 
 
 @pytest.mark.parametrize("noise", [MILD_NOISE, LOUD_NOISE])
-@pytest.mark.parametrize(
-    ("d", "soc"), [(2, WARM_START), (2, replace(WARM_START, max_iterations=99)), (3, WARM_START)]
-)
-def test_what_crosses_has_the_size_of_the_separators(d: int, soc: SOC, noise: NoiseModel) -> None:
+@pytest.mark.parametrize(("d", "soc"), [(2, AUTO), (2, WARM_START), (3, AUTO)])
+def test_what_crosses_has_the_size_of_the_separators(
+    d: int, soc: FirstStage, noise: NoiseModel
+) -> None:
     solution, engine = solved(7, 40, d, metis, noise, soc)
     graph = solution.problem.graph
     parts = solution.robots

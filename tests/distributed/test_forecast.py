@@ -11,7 +11,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import elimination_choice, forecast as forecasts
 from solvers.distributed.forecast import advice, forecast
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_of_graph import open_driver
 
 pytest.importorskip("cvxopt")
 

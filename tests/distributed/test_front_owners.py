@@ -19,7 +19,7 @@ from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.elimination import HeldFront
 from solvers.distributed.robots.records import ALONG_TREE
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve

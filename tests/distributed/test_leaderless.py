@@ -28,8 +28,13 @@ from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.leaderless import NO_CERTIFICATE, collect_copies, robot_tree, tree_traffic
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_alone import (
+    NO_CERTIFICATE,
+    collect_copies,
+    robot_tree,
+    tree_traffic,
+)
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import InProcess

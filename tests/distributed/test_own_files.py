@@ -23,16 +23,21 @@ from pgo_models.geometry.rotations import exp_map, project_to_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel, observe
-from solvers import folder_solve
-from solvers.distributed import elimination_choice, own_files, staircase, substructured
+from solvers.distributed import (
+    elimination_choice,
+    own_files,
+    robots_with_files,
+    staircase,
+    substructured,
+)
+from solvers.distributed.driver_place import DriverPlace
 from solvers.distributed.robots import climbing
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.stages import ClimbByRobots, NewtonByRobots, SOCByRobots
 from solvers.folder_solve import FolderSolution, solve_folder
+from solvers.place import Attempt
 from solvers.result import Status
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import WARM_START
-from solvers.stages import Answer
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 
@@ -348,7 +353,7 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
     isotropic = pgo.Weighting.ISOTROPIC
     solution = solve_folder(tmp_path / "in", weighting=isotropic, out=tmp_path / "out")
     problem = pgo.PGOProblem(graph, weighting=isotropic)
-    pipeline = solvers.Pipeline(handedness=None)
+    pipeline = solvers.Pipeline(growing=None, handedness=None)
     central = solvers.solve(problem, pipeline, robots=pgo.partition(graph, 4))
     assert [stage.name for stage in solution.stages] == [stage.name for stage in central.stages]
     assert "Staircase" in [stage.name for stage in solution.stages]
@@ -384,37 +389,37 @@ def test_the_staircase_climbs_from_the_best(
     graph = graph.with_robots(pgo.partition(graph, 4).robot)
     write_g2o_folder(graph, tmp_path / "in")
     began: list[float] = []
-    climb = ClimbByRobots.run
-    soc = SOCByRobots.run
-    newton = NewtonByRobots.run
+    climb = DriverPlace.climb_from_current
+    soc = DriverPlace.run_soc
+    newton = DriverPlace.run_newton
     tolerances: list[float] = []
     away = np.random.default_rng(0).standard_normal((2, 2))
 
-    def noted(stage: ClimbByRobots, answer: Answer) -> Answer:
-        driver = stage.job.driver
+    def noted(place: DriverPlace, staircase: solvers.Staircase) -> Attempt:
+        driver = place.driver
         began.extend(
             [
                 driver.current.objective,
                 math.fsum(part.objective for part in driver.ask(Interior.evaluate, None)),
             ]
         )
-        return climb(stage, answer)
+        return climb(place, staircase)
 
-    def remembered(stage: SOCByRobots, answer: Answer) -> Answer:
-        tolerances.append(stage.soc.tolerance)
-        return soc(stage, answer)
+    def remembered(place: DriverPlace, attempt: Attempt, settings: solvers.SOC) -> Attempt:
+        tolerances.append(settings.tolerance)
+        return soc(place, attempt, settings)
 
-    def worse(stage: NewtonByRobots, answer: Answer) -> Answer:
-        refined = newton(stage, answer)
-        driver = stage.job.driver
+    def worse(place: DriverPlace, attempt: Attempt, settings: solvers.Newton) -> Attempt:
+        refined = newton(place, attempt, settings)
+        driver = place.driver
         # Of the second try, which alone runs SOC in the plane.
         if not began and tolerances and tolerances[-1] < WARM_START.tolerance:
             driver.adopt(np.broadcast_to(project_to_rotations(away), driver.current.R.shape))
         return refined
 
-    monkeypatch.setattr(ClimbByRobots, "run", noted)
-    monkeypatch.setattr(SOCByRobots, "run", remembered)
-    monkeypatch.setattr(NewtonByRobots, "run", worse)
+    monkeypatch.setattr(DriverPlace, "climb_from_current", noted)
+    monkeypatch.setattr(DriverPlace, "run_soc", remembered)
+    monkeypatch.setattr(DriverPlace, "run_newton", worse)
     solution = solve_folder(tmp_path / "in")
     best = min(stage.objective for stage in solution.stages if stage.name == "Newton")
     assert began == pytest.approx([best, best], rel=1e-9)
@@ -425,7 +430,7 @@ def test_ctrl_c_between_the_loops_keeps_what_was_found(
 ) -> None:
     graph = varied_graph(1, 30, 2, NoiseModel(translation_std=1.0, rotation_std=1.5))
     write_g2o_folder(graph.with_robots(pgo.partition(graph, 4).robot), tmp_path / "in")
-    bound = folder_solve.best_bound_distributed
+    bound = robots_with_files.best_bound_distributed
     calls = list[int]()
 
     def interrupted(*args: Any) -> Any:
@@ -434,7 +439,7 @@ def test_ctrl_c_between_the_loops_keeps_what_was_found(
             raise KeyboardInterrupt
         return bound(*args)
 
-    monkeypatch.setattr(folder_solve, "best_bound_distributed", interrupted)
+    monkeypatch.setattr(robots_with_files, "best_bound_distributed", interrupted)
     solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
     assert solution.status is Status.INTERRUPTED
     written = read_g2o(tmp_path / "out")

@@ -21,8 +21,8 @@ from solvers.distributed.robots.agent import CLASSES, Agent, order_interior
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Reweigh
 from solvers.distributed.robots.reweighting import reweigh, sum_ratios
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.robust import SharedGNC
-from solvers.distributed.stages import open_driver
 from solvers.network.counted_pool import Count
 from solvers.network.engine import InProcess
 from solvers.network.messages import count_numbers

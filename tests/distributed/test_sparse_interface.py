@@ -14,8 +14,8 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import elimination_choice
 from solvers.distributed.elimination_choice import CoverSystem, choose_elimination, leave_poses
 from solvers.distributed.lower_bound import best_bound_distributed
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.sparse_interface import SparseInterface
-from solvers.distributed.stages import open_driver
 from solvers.network.engine import InProcess
 from solvers.pipeline import solve
 from solvers.request import Pipeline

@@ -40,6 +40,7 @@ from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.pipeline import solve
+from solvers.place import AUTO
 from solvers.request import Pipeline
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
@@ -54,9 +55,7 @@ pytestmark = pytest.mark.slow  # solves by robots from end to end
 ROOT = Path(__file__).parents[2]
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
-# in one place, too, where the default goes to Newton at once
-BY_SOC = replace(WARM_START, max_iterations=99)
-SHORT = replace(Pipeline().with_newton_alone(Newton()), soc=BY_SOC)
+SHORT = replace(Pipeline().with_newton_alone(Newton()), soc=WARM_START)
 
 
 def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> None:
@@ -194,7 +193,7 @@ def test_the_solution_is_the_central_one(
 @pytest.mark.parametrize(
     "pipeline",
     [
-        Pipeline(soc=BY_SOC),
+        Pipeline(soc=WARM_START),
         Pipeline(soc=None),
         Pipeline(soc=None, newton=gauss_newton()),
         Pipeline(soc=SOC(tolerance=1e-8)),
@@ -234,8 +233,8 @@ def test_a_second_try_and_the_staircase_follow_where_the_gap_stays_wide(d: int) 
     # relaxation is loose.
     problem = PGOProblem(varied_graph(11, 14, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
     solution = solve(problem, robots=3)
-    in_one_place = WARM_START if d == 2 else BY_SOC
-    central = solve(problem, Pipeline(soc=in_one_place, growing=None))
+    in_one_place = AUTO if d == 2 else WARM_START
+    central = solve(problem, Pipeline(soc=in_one_place))
     names = [stage.name.removesuffix(", in one place") for stage in solution.stages]
     assert names == [stage.name for stage in central.stages]
     assert solution.lower_bound <= min(solution.objective, central.objective)
@@ -399,7 +398,7 @@ def check_folder(folder: Path) -> None:
     assert solution.is_certified
     assert solution.ledger is not None
     assert solution.ledger.num_robots == graph.num_robots
-    check_equal(solution, solve(graph, Pipeline(soc=BY_SOC)))
+    check_equal(solution, solve(graph, Pipeline(soc=WARM_START)))
 
 
 def test_the_folder_of_robots_that_comes_along_solves_and_certifies() -> None:

@@ -22,8 +22,8 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.leaderless import cheaper_end, collect_copies
-from solvers.distributed.stages import open_driver
+from solvers.distributed.robots_alone import cheaper_end, collect_copies
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults

@@ -1,0 +1,174 @@
+"""What a driver and its robots do of a solve, whether the calling process has the graph or not.
+
+Between two of them the robots hold the poses, and an
+attempt has none until its certificate is found. `robots_of_graph` and `robots_with_files` are the
+places that have these verbs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
+from solvers.distributed.checkpoint import Journal
+from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
+from solvers.distributed.driver import Driver
+from solvers.distributed.newton import SubstructuredNewton
+from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
+from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
+from solvers.network.faults import Faults
+from solvers.place import AUTO, Attempt, FirstStage, Place
+from solvers.result import History, Outcome, Stage, Status
+from solvers.riemannian.newton import Newton
+from solvers.riemannian.staircase import Staircase
+from solvers.soc.consensus import ConsensusState
+from solvers.soc.settings import Coupling
+from solvers.soc.soc import SOC, WARM_START
+
+
+@dataclass(frozen=True, eq=False)
+class DriverPlace(Place):
+    """Start, SOC, Newton and staircase by a driver and its robots.
+
+    Where a checkpoint is of a later stage, what comes before it is passed over (`Journal`). The
+    `faults` go wrong between the robots of a CONSENSUS stage, which then does not wait.
+    """
+
+    driver: Driver
+    journal: Journal
+    faults: Faults | None
+
+    @property
+    def d(self) -> int:
+        """Dimension of the space, 2 or 3."""
+        return self.driver.d
+
+    def chordal_start(self, soc: FirstStage) -> tuple[Attempt, SOC | None]:
+        """Have the robots relax the rotations; with the start goes the SOC to run from there.
+
+        AUTO is in the plane the averaged start and no SOC, as in one place: from there Newton's
+        method needs fewer rounds than both. In space it is SOC with a coarse tolerance.
+        """
+        is_averaged = soc is AUTO and self.driver.can_average
+        name = "averaged start" if is_averaged else "chordal start"
+
+        def go() -> None:
+            self.driver.go_to_chordal_start(is_averaged)
+
+        return self.begin(name, go), None if is_averaged else chosen_soc(soc)
+
+    def begin(self, name: str, go_to_start: Callable[[], None]) -> Attempt:
+        """Bring the robots to a start."""
+        if self.journal.goes_on_with():
+            return Attempt()
+        driver = self.driver
+        driver.choose_cost(final=False)
+        began = time.perf_counter()
+        with self.monitor.showing(name):
+            go_to_start()
+            objective = self._final_objective()
+            driver.choose_cost(final=False)
+        seconds = time.perf_counter() - began
+        self.stages.append(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
+        return Attempt()
+
+    def run_soc(self, attempt: Attempt, soc: SOC) -> Attempt:
+        """Run SOC from the current poses, which stay where it finds none that cost less."""
+        journal = self.journal
+        if journal.goes_on_with(SubstructuredNewton):
+            return attempt
+        driver = self.driver
+        began = time.perf_counter()
+        if not journal.goes_on_with():
+            driver.save_poses()
+        finished = self._run_coupling(soc)
+        if not driver.current.objective <= driver.saved.objective:
+            driver.restore_poses()
+        objective = self._final_objective()
+        seconds = time.perf_counter() - began
+        name = "SOC, convex" if driver.is_final else "SOC"
+        stage = Stage(
+            name,
+            finished.status,
+            finished.iterations,
+            objective,
+            seconds,
+            finished.history,
+            soc,
+        )
+        self.stages.append(stage)
+        return replace(attempt, status=finished.status)
+
+    def _run_coupling(
+        self, soc: SOC
+    ) -> Outcome[AsynchronousState] | Outcome[ConsensusState] | Outcome[SubstructuredState]:
+        """Run the coupling that the settings name; its factors go with it."""
+        driver = self.driver
+        if soc.effective_coupling is not Coupling.CONSENSUS:
+            substructured = SubstructuredSOC(soc)
+            finished = self.journal.run(substructured, driver, self.monitor)
+            substructured.finish(driver)
+            return finished
+        if self.faults is None:
+            waiting = self.journal.run(ConsensusSOC(soc), driver, self.monitor)
+            RobotsOfDriver(driver).finish()
+            return waiting
+        # No checkpoint can hold the messages that are under way.
+        asynchronous = self.monitor.run(AsynchronousSOC(soc, self.faults), driver)
+        RobotsOfDriver(driver).finish()
+        return asynchronous
+
+    def run_newton(self, attempt: Attempt, newton: Newton) -> Attempt:
+        """Run Newton from the current poses."""
+        driver = self.driver
+        driver.choose_cost(final=True)  # again, where a checkpoint is from before
+        finished = self.journal.run(SubstructuredNewton(newton), driver, self.monitor)
+        stage = Stage(
+            "Newton",
+            finished.status,
+            finished.iterations,
+            driver.current.objective,
+            finished.seconds,
+            finished.history,
+            newton,
+        )
+        self.stages.append(stage)
+        return replace(attempt, status=finished.status, decrement=finished.state.decrement)
+
+    def climb_from_current(self, staircase: Staircase) -> Attempt:
+        """Run the staircase from the current poses, and have the robots round its solution."""
+        driver = self.driver
+        self.journal.stop_writing()
+        driver.save_poses()
+        finished = self.monitor.run(SubstructuredStaircase(staircase), driver)
+        if finished.status is Status.INTERRUPTED:
+            # Some robots may have one dimension more than others.
+            driver.restore_poses()
+        else:
+            round_lifted(driver)
+        stage = Stage(
+            "Staircase",
+            finished.status,
+            finished.iterations,
+            driver.current.objective,
+            finished.seconds,
+            finished.history,
+            staircase,
+        )
+        self.stages.append(stage)
+        return Attempt(status=finished.status, dual_bound=finished.state.bound)
+
+    def _final_objective(self) -> float:
+        """The cost that is solved, at the current poses; the driver stays with that cost."""
+        self.driver.choose_cost(final=True)
+        return self.driver.current.objective
+
+
+def chosen_soc(soc: FirstStage) -> SOC | None:
+    """SOC of robots that is asked for; AUTO stands for one with a coarse tolerance."""
+    if soc is AUTO:
+        return WARM_START
+    assert soc is None or isinstance(soc, SOC)  # as the places have checked
+    return soc

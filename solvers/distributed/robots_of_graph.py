@@ -1,0 +1,203 @@
+"""The place where robots of one graph and a driver solve: each robot has the edges of its poses.
+
+The calling process has the whole graph, cuts it into the robots' parts, and asks the result of
+them. Robots hold the poses between two steps. What they are asked is counted (`solvers.network`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+from pgo_models.certificates.certificate import BoundSource, certify_with
+from pgo_models.certificates.handedness import distinct_pairs
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.driver import Driver, collect
+from solvers.distributed.driver_place import DriverPlace, chosen_soc
+from solvers.distributed.elimination_choice import choose_elimination
+from solvers.distributed.handedness import (
+    RobotsPoint,
+    begin_without_terms,
+    hand_out_terms,
+    return_to_best,
+)
+from solvers.distributed.lower_bound import best_bound_distributed, best_bound_with_terms
+from solvers.distributed.robots.agent import Agent
+from solvers.distributed.robots.interior import Interior
+from solvers.handedness.ascent import AscentState
+from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
+from solvers.handedness.search import HandednessSearch, stage_of_search
+from solvers.here import Here
+from solvers.network.counted_pool import Count
+from solvers.network.engine import DEFAULT_MEMORY, Engine
+from solvers.place import Attempt, Ending, FirstStage, after_search
+from solvers.result import Outcome, Stage
+from solvers.riemannian.prefixes import GrowingStart
+from solvers.riemannian.staircase import Staircase
+from solvers.soc.soc import SOC
+from solvers.soc.subgraph import middle_separator, split_graph
+
+
+def open_driver(
+    problem: PGOProblem,
+    robots: Partition,
+    engine: Engine,
+    memory: float = DEFAULT_MEMORY,
+    thresholds: Array | None = None,
+) -> Driver:
+    """Driver and robots for a problem.
+
+    A robust solve gives the `thresholds`, (m,), of its edges.
+    """
+    subgraphs = split_graph(problem, robots, thresholds)
+    if memory != 0:
+        subgraphs = choose_elimination(subgraphs)
+    grounded = middle_separator(problem.graph, subgraphs)
+    summaries = [subgraph.summary for subgraph in subgraphs]
+    start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
+    return Driver(summaries, problem.num_poses, start, memory, grounded)
+
+
+@dataclass(frozen=True, eq=False)
+class RobotsOfGraph(DriverPlace):
+    """A solve by a driver and robots of one graph.
+
+    What has no counterpart by robots is done `here`, in the calling process, and the name of its
+    stage says so.
+    """
+
+    here: Here
+
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether the graph has landmarks."""
+        return self.here.has_landmarks
+
+    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, SOC | None]:
+        """Start at given poses, the chordal relaxation, or the outcome that a checkpoint has."""
+        known = self._known_outcome()
+        if known is not None:
+            return known, None
+        problem = self.here.problem
+        if given is not None:
+            poses = problem.seen_poses(given)
+            return self.begin("given start", partial(self.driver.set_poses, poses)), chosen_soc(soc)
+        if problem.graph.is_world_loose:
+            # The rotation of the world depends on positions alone.
+            poses = chordal_start(problem.convex_part)
+            set_poses = partial(self.driver.set_poses, poses)
+            return self.begin("chordal start, in one place", set_poses), chosen_soc(soc)
+        return self.chordal_start(soc)
+
+    def _known_outcome(self) -> Attempt | None:
+        """Outcome of the attempt that begins, if a checkpoint is of a later one."""
+        outcome = self.journal.take_outcome()
+        if outcome is None:
+            return None
+        poses, certificate = outcome
+        return Attempt(poses, certificate=certificate)
+
+    def certify(self, attempt: Attempt) -> Attempt:
+        """Collect the poses from the robots, and find their certificate by driver and robots.
+
+        Of the whole problem nothing is used but F of these poses.
+        """
+        here = self.here
+        with self.monitor.showing("certificate"):
+            bound = best_bound_distributed(self.driver, here.gap)
+            poses, Lambda = collect(self.driver)
+            certificate = certify_with(
+                here.problem, poses, Lambda, here.gap, attempt.decrement, BoundSource.GIVEN, bound
+            )
+        self.journal.end_attempt((poses, certificate))
+        return replace(attempt, poses=poses, certificate=certificate)
+
+    def better(self, best: Attempt, other: Attempt) -> Attempt:
+        """Return the cheaper poses with the best bound that either has."""
+        return self.here.better(best, other)
+
+    def start_grown(self, growing: GrowingStart) -> Attempt | None:
+        """Start the robots at poses that prefixes lead to, which are solved in one place."""
+        known = self._known_outcome()
+        if known is not None:
+            return known
+        if self.journal.goes_on_with():
+            return Attempt()
+        grown = self.here.start_grown(growing)
+        if grown is None:
+            return None
+        self.driver.choose_cost(final=True)
+        self.driver.set_poses(grown.known_poses)
+        return Attempt(status=grown.status)
+
+    def start_again(self) -> Poses | None:
+        """The optimum of F, found in one place, where the cost is another; else None."""
+        return self.here.start_again()
+
+    def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
+        """Have the robots climb the staircase from the best poses, and round its solution."""
+        problem = self.here.problem
+        if problem.convex_part is not problem:
+            return None
+        self.driver.set_poses(best.known_poses)
+        return self.climb_from_current(staircase)
+
+    def soften(self, best: Attempt) -> Attempt:
+        """Try smaller information matrices, in one place."""
+        return self.here.soften(best)
+
+    def ascend(self, best: Attempt, search: HandednessSearch, Pi: Array | None = None) -> Attempt:
+        """Return the same poses, with the bound of terms that the robots have of their edges."""
+        driver = self.driver
+        here = self.here
+        poses = best.known_poses
+        driver.choose_cost(final=True)
+        driver.set_poses(poses)
+        driver.set_translations(driver.ask(Interior.translations, None, Count.PIGGYBACKED))
+        driver.describe(Count.PIGGYBACKED)
+        if Pi is None:
+            begin_without_terms(driver)
+        else:
+            hand_out_terms(driver, distinct_pairs(here.problem.graph), poses, Pi)
+        first = RobotsPoint.first(driver, search.ascent.num_eigenvalues)
+        outcome: Outcome[AscentState[RobotsPoint]] = self.monitor.run(search.ascent, first)
+        stage = stage_of_search(outcome)
+        self.stages.append(stage)
+        bound = best_bound_with_terms(driver, here.gap, return_to_best(driver))
+        certificate = best.proof
+        if bound.value > certificate.lower_bound:
+            certificate = certify_with(
+                here.problem,
+                poses,
+                collect(driver)[1],
+                here.gap,
+                certificate.stationarity,
+                BoundSource.GIVEN,
+                bound,
+            )
+        return after_search(best, certificate, stage)
+
+    def hulls(self, search: HandednessSearch) -> HullLagrangian | None:
+        """Return the method for the relaxation with hulls, if it suits the graph."""
+        return self.here.hulls(search)
+
+    def solve_hulls(
+        self, best: Attempt, method: HullLagrangian, start: HullState | None
+    ) -> tuple[Attempt, HullState]:
+        """Solve the relaxation with hulls in one place."""
+        return self.here.solve_hulls(best, method, start)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether the robots have begun."""
+        return bool(self.stages)
+
+    def salvage(self, ending: Ending) -> Attempt:
+        """The best poses known, those of the robots among them, with the bound F >= 0."""
+        if ending == Stage.interruption:
+            self.monitor.poses_found.append(collect(self.driver)[0])
+        return self.here.salvage(ending)

@@ -1,0 +1,206 @@
+"""The place where robots solve that have read their own files: no process has the whole graph.
+
+The driver knows the interface between the robots (`solvers.distributed.own_files`), and of the
+answer its cost and bound. The robots keep the poses of the cheapest attempt so far. A certificate
+is always one of these, and has neither poses nor multipliers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, judge_cost
+from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound
+from pgo_models.certificates.rounding_errors import ObjectiveRounding
+from pgo_models.errors import PGOError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.weighting import Weighting
+from solvers.distributed.driver import CoverPoses
+from solvers.distributed.driver_place import DriverPlace
+from solvers.distributed.lower_bound import best_bound_distributed
+from solvers.distributed.own_files import (
+    READ_HERE,
+    Answer,
+    keep_answer,
+    move_answer,
+    return_to_answer,
+)
+from solvers.network.counted_pool import Count
+from solvers.place import BROKEN_OFF, Attempt, Ending, FirstStage, Step
+from solvers.result import Status
+from solvers.riemannian.staircase import Staircase
+from solvers.soc.soc import SOC
+
+
+@dataclass(frozen=True, eq=False)
+class KeptAnswer:
+    """The cheapest poses so far, which the robots keep, as the driver knows them.
+
+    `cover` are the poses of the driver, `status` how the run ended that found them.
+    """
+
+    objective: float
+    decrement: float
+    rounding: ObjectiveRounding
+    robots: Sequence[Answer]
+    cover: CoverPoses
+    status: Status
+
+
+@dataclass(frozen=True, eq=False)
+class RobotsWithFiles(DriverPlace):
+    """A solve by robots with own files: of the folder `name`, to a relative `gap`.
+
+    `kept` are the answers that the robots have kept, the last of which is theirs.
+    """
+
+    name: str
+    gap: float
+    weighting: Weighting
+    kept: list[KeptAnswer] = field(default_factory=list)
+
+    @property
+    def has_landmarks(self) -> bool:
+        """Files with landmarks are refused when they are read."""
+        return False
+
+    @property
+    def missing(self) -> frozenset[Step]:
+        """Steps for which one process needs the whole graph."""
+        steps = {Step.GROWING, Step.HULLS, Step.TERMS}
+        if self.driver.has_two_costs:
+            steps.add(Step.SMALLER_MATRICES)
+        return frozenset(steps)
+
+    @property
+    def way_out(self) -> str:
+        """How to have the missing steps taken."""
+        return READ_HERE
+
+    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, SOC | None]:
+        """Start at the chordal relaxation: nobody could give the poses of all robots."""
+        return self.chordal_start(soc)
+
+    def certify(self, attempt: Attempt) -> Attempt:
+        """Find a bound, and have the robots keep the current poses if these are the cheapest."""
+        driver = self.driver
+        bound = best_bound_distributed(driver, self.gap)
+        source = BoundSource.GIVEN
+        dual = attempt.dual_bound
+        if dual is not None and dual.lower_bound > bound.value:
+            bound = dual.bound
+            source = BoundSource.RELAXATION
+        if not self.kept or driver.current.objective < self.kept[-1].objective:
+            robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
+            answer = KeptAnswer(
+                driver.current.objective,
+                attempt.decrement,
+                _sum_of_roundings([robot.rounding for robot in robots]),
+                robots,
+                driver.current,
+                attempt.status,
+            )
+            self.kept.append(answer)
+        return replace(attempt, certificate=self.certificate(bound, source))
+
+    def certificate(self, bound: LowerBound, source: BoundSource) -> Certificate:
+        """Certificate of the poses that the robots keep."""
+        kept = self.kept[-1]
+        no_poses = Poses(np.zeros((0, self.d, self.d)), np.zeros((0, self.d)))
+        unjudged = Certificate(
+            objective=kept.objective,
+            bound=bound,
+            gap=math.nan,
+            rounding_level=kept.rounding.level,
+            stationarity=kept.decrement,
+            source=source,
+            poses=no_poses,
+            poses_objective=kept.objective,
+            Lambda=no_poses.R,
+            wanted_gap=self.gap,
+            verdict=Verdict.TRIVIAL,
+            weighting=self.weighting,
+        )
+        return judge_cost(self.name, unjudged, kept.objective, kept.rounding)
+
+    def better(self, best: Attempt, other: Attempt) -> Attempt:
+        """Return the poses that the robots keep, with the best bound that either has."""
+        highest = max(best.proof, other.proof, key=lambda known: known.lower_bound)
+        certificate = self.certificate(highest.bound, highest.source)
+        status = other.status if other.status in BROKEN_OFF else self.kept[-1].status
+        return replace(best, certificate=certificate, status=status)
+
+    def start_again(self) -> Poses | None:
+        """A second attempt runs SOC once more."""
+        return None
+
+    def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
+        """Have the robots climb from the poses that they keep, where SOC can run on the cost."""
+        driver = self.driver
+        if driver.has_two_costs:
+            return None
+        kept = self.kept[-1]
+        driver.network.ask(return_to_answer, [None] * len(kept.robots), Count.PIGGYBACKED)
+        driver.current = kept.cover
+        return self.climb_from_current(staircase)
+
+    def soften(self, best: Attempt) -> Attempt:
+        """Return the same answer: the cost is F, for which smaller matrices change nothing."""
+        return best
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether the robots have kept any."""
+        return bool(self.kept)
+
+    def salvage(self, ending: Ending) -> Attempt:
+        """The poses that the robots keep; a PGOError where a matrix had no factor before any."""
+        if not self.kept:
+            raise PGOError(f"{self.name}: weights too far apart for doubles; see pgo info FILE")
+        stage = ending(self.kept[-1].objective)
+        self.stages.append(stage)
+        certificate = self.certificate(NO_BOUND, BoundSource.GIVEN)
+        return Attempt(status=stage.status, certificate=certificate)
+
+    def move_to_frame(self, best: Attempt) -> tuple[Attempt, str, float]:
+        """Have the robots move the answer to its frame; which that is, and F there.
+
+        A frame far away rounds the poses, so that their cost is found anew: the certificate is of
+        the poses that are written.
+        """
+        kept = self.kept[-1]
+        turn, shift, frame = _frame(kept.robots)
+        network = self.driver.network
+        parts = network.ask(move_answer, [(turn, shift)] * len(kept.robots), Count.ROUND)
+        objective = math.fsum(part.cost for part in parts)
+        rounding = _sum_of_roundings([part.rounding for part in parts])
+        self.kept.append(replace(kept, objective=objective, rounding=rounding))
+        certificate = self.certificate(best.proof.bound, best.proof.source)
+        F = math.fsum(part.F for part in parts)
+        return replace(best, certificate=certificate), frame, F
+
+
+def _sum_of_roundings(parts: Sequence[ObjectiveRounding]) -> ObjectiveRounding:
+    """How accurately a sum is known of whose parts that is known."""
+    level = math.fsum(part.level for part in parts)
+    error = math.fsum(part.error for part in parts)
+    return ObjectiveRounding(level, error, all(part.is_exact for part in parts))
+
+
+def _frame(answers: Sequence[Answer]) -> tuple[Array, Array, str]:
+    """Motion (R, t) to the frame of the answer, and which frame that is."""
+    first = min(answers, key=lambda answer: (not answer.held[0], answer.held[1]))
+    d = first.given.shape[1]
+    target = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    place = "at the identity"
+    if np.isfinite(first.given).all():
+        target = first.given
+        place = "where its file has it"
+    R = target[1:].T @ first.solved[1:]
+    t = target[0] - R @ first.solved[0]
+    return R, t, f"pose {first.held[2]} {place}"

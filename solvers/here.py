@@ -1,0 +1,263 @@
+"""The place that every other is held against: a solve in one process, which has the whole graph."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from pgo_models.certificates.certificate import (
+    BoundSource,
+    certify_at,
+    certify_with,
+    judge,
+    with_terms,
+)
+from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.problem.initialization import chordal_start, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from pgo_models.relaxations.rounding import round_factor
+from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
+from solvers.handedness.search import HandednessSearch, stage_of_search
+from solvers.place import AUTO, BROKEN_OFF, Attempt, Ending, FirstStage, Place, after_search
+from solvers.result import History, Outcome, Record, Run, Stage, Status
+from solvers.riemannian.certify import with_shrunk_information
+from solvers.riemannian.newton import Newton, needs_no_soc
+from solvers.riemannian.polish import polish
+from solvers.riemannian.prefixes import GrowingStart
+from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
+from solvers.soc.paper import PaperSOC
+from solvers.soc.soc import SOC, WARM_START
+
+# Poses from which SOC gives the memory of its factor up: a fifth of the most that a solve takes.
+MANY_POSES = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Here(Place):
+    """A solve of a problem in this process, to a relative `gap`.
+
+    `where` is added to the names of searches, where robots leave these to one process.
+    """
+
+    problem: PGOProblem
+    gap: float
+    where: str = ""
+
+    @property
+    def d(self) -> int:
+        """Dimension of the space, 2 or 3."""
+        return self.problem.d
+
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether the graph has landmarks."""
+        return len(self.problem.graph.landmarks) > 0
+
+    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, SOC | PaperSOC | None]:
+        """Find a start, or take the given one; with it goes the SOC to run from there, if any."""
+        began = time.perf_counter()
+        chosen = self._chosen_soc(given, soc)
+        name, find = self._start_named(given, soc, chosen)
+        between = [] if chosen is None else [type(chosen).__name__]
+        self.monitor.plan[:] = [name, *between, Newton.__name__, "certificate"]
+        with self.monitor.showing(name, self.problem.side):
+            poses = find()
+        seconds = time.perf_counter() - began
+        objective = self.problem.objective(poses)
+        self.stages.append(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
+        self.monitor.poses_found.append(poses)
+        return Attempt(poses), chosen
+
+    def _chosen_soc(self, given: Poses | None, soc: FirstStage) -> SOC | PaperSOC | None:
+        """SOC that is asked for; of AUTO none where Newton alone is faster."""
+        if soc is not AUTO:
+            return soc
+        # The minimum of the convex part is no nearer to that of chi2 than the start is.
+        is_convex = self.problem.convex_part is self.problem
+        newton_alone = not is_convex or (given is None and needs_no_soc(self.problem))
+        return None if newton_alone else WARM_START
+
+    def _start_named(
+        self, given: Poses | None, soc: FirstStage, chosen: SOC | PaperSOC | None
+    ) -> tuple[str, Callable[[], Poses]]:
+        """Name of a start, and the function that finds its poses."""
+        problem = self.problem
+        if given is not None:
+            return "given start", partial(problem.seen_poses, given)
+        if isinstance(chosen, PaperSOC):
+            return "spanning tree", partial(spanning_tree_start, problem.convex_part.graph)
+        is_averaged = soc is AUTO and chosen is None and problem.d == 2
+        name = "averaged start" if is_averaged else "chordal start"
+        return name, partial(chordal_start, problem.convex_part, is_averaged)
+
+    def run_soc(self, attempt: Attempt, soc: SOC | PaperSOC) -> Attempt:
+        """Run SOC on the convex part of the problem.
+
+        The given poses stay where they cost less in that part. This happens: on the data set CSAIL
+        the chordal start costs less than every iterate of SOC.
+        """
+        problem = self.problem
+        convex_part = problem.convex_part
+        poses = attempt.known_poses
+        finished: Run[Any] = self.monitor.run(soc, convex_part, poses)
+        if finished.objective <= convex_part.objective(poses):
+            poses = finished.poses
+        stage = Stage.of(finished)
+        if convex_part is not problem:
+            objective = problem.objective(poses)
+            stage = replace(stage, name=f"{stage.name}, convex", objective=objective)
+        self.stages.append(stage)
+        del finished  # its state has the factor, and Newton's is far larger
+        if problem.num_poses > MANY_POSES:
+            problem.analysis.release_memory()
+        return replace(attempt, poses=poses, status=stage.status)
+
+    def run_newton(self, attempt: Attempt, newton: Newton) -> Attempt:
+        """Run Newton from the poses."""
+        finished = self.monitor.run(newton, self.problem, attempt.known_poses)
+        self.stages.append(Stage.of(finished))
+        decrement = finished.state.polish.decrement
+        return replace(attempt, poses=finished.poses, status=finished.status, decrement=decrement)
+
+    def certify(self, attempt: Attempt) -> Attempt:
+        """Find the dual certificate at the poses as they are."""
+        poses = attempt.known_poses
+        with self.monitor.showing("certificate", self.problem.side):
+            certificate = certify_at(self.problem, poses, self.gap, attempt.decrement)
+        return replace(attempt, certificate=certificate)
+
+    def better(self, best: Attempt, other: Attempt) -> Attempt:
+        """Return the cheaper poses with the best bound: of either, or of the relaxation."""
+        is_cheaper = other.proof.poses_objective < best.proof.objective
+        cheaper = other if is_cheaper else best
+        poses = other.proof.poses if is_cheaper else best.known_poses
+        highest = max(best.proof, other.proof, key=lambda known: known.lower_bound)
+        judged = judge(self.problem, poses, highest)
+        judged = replace(judged, stationarity=cheaper.proof.stationarity)
+        dual = other.dual_bound
+        if dual is not None and not judged.is_certified:
+            relaxed = certify_with(
+                self.problem,
+                poses,
+                dual.Lambda,
+                self.gap,
+                judged.stationarity,
+                BoundSource.RELAXATION,
+                dual.bound,
+            )
+            judged = max(judged, relaxed, key=lambda known: known.lower_bound)
+        status = other.status if other.status in BROKEN_OFF else cheaper.status
+        return replace(best, poses=poses, certificate=judged, status=status)
+
+    def start_grown(self, growing: GrowingStart) -> Attempt | None:
+        """Start at poses that prefixes lead to; None where odometry does not join the poses."""
+        if not growing.has_prefixes(self.problem.graph):
+            return None
+        finished = self.monitor.run(growing, self.problem)
+        self.stages.append(replace(Stage.of(finished), name=f"growing start{self.where}"))
+        return Attempt(finished.poses, status=finished.status)
+
+    def start_again(self) -> Poses | None:
+        """The optimum of F where the cost is another; None where SOC can run on the cost itself."""
+        problem = self.problem
+        if problem.is_quadratic:
+            return None
+        isotropic = PGOProblem(problem.graph, problem.backend, Weighting.ISOTROPIC)
+        return polish(isotropic, chordal_start(isotropic))
+
+    def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
+        """Run the Riemannian staircase from the best poses, and round its solution.
+
+        Of a run that was cut short the state with the best poses is kept, not the one with the best
+        bound: so the bound is that of the last state that was seen.
+        """
+        if self.problem.convex_part is not self.problem:
+            return None
+        bounds: list[DualBound | None] = [None]
+        asked = self.monitor.callback
+
+        def remember_bound(state: StaircaseState, record: Record) -> bool | None:
+            bounds.append(state.bound)
+            return asked(state, record) if asked is not None else None
+
+        monitor = replace(self.monitor, callback=remember_bound)
+        finished = monitor.run(staircase, self.problem, best.known_poses)
+        self.stages.append(Stage.of(finished))
+        return Attempt(finished.poses, finished.status, dual_bound=bounds[-1])
+
+    def soften(self, best: Attempt) -> Attempt:
+        """Return the same poses, with the bound of smaller information matrices if it is better."""
+        return replace(best, certificate=with_shrunk_information(self.problem, best.proof))
+
+    def ascend(self, best: Attempt, search: HandednessSearch, Pi: Array | None = None) -> Attempt:
+        """Return the same poses, with the bound of handedness terms if it is better."""
+        problem = self.problem
+        ground = problem.at_best_translations(best.known_poses)
+        terms, stage = search.run(problem, ground, self.monitor, Pi)
+        self.stages.append(stage)
+        judged = judge(problem, best.known_poses, best.proof)
+        return after_search(best, with_terms(problem, judged, terms, ground), stage)
+
+    def hulls(self, search: HandednessSearch) -> HullLagrangian | None:
+        """Return the method for the relaxation with hulls of rotations, if it suits the graph."""
+        return search.relaxation(self.problem, self.gap)
+
+    def solve_hulls(
+        self, best: Attempt, method: HullLagrangian, start: HullState | None
+    ) -> tuple[Attempt, HullState]:
+        """Solve that relaxation, and return the better poses and the better bound."""
+        problem = self.problem
+        begin = best.known_poses if start is None else start
+        finished: Outcome[HullState] = self.monitor.run(method, problem, begin)
+        stage = stage_of_search(finished)
+        self.stages.append(replace(stage, name=f"{stage.name}{self.where}"))
+        state = finished.state
+        if state.bound is not None:
+            poses = polish(problem, round_factor(problem, state.point.Y)[0])
+            relaxed = certify_with(
+                problem,
+                poses,
+                state.bound.Lambda,
+                self.gap,
+                math.nan,
+                BoundSource.HULLS,
+                state.bound.bound,
+            )
+            best = self.better(best, Attempt(poses, best.status, certificate=relaxed))
+        return after_search(best, best.proof, stage), state
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether any poses were found."""
+        return bool(self.monitor.poses_found)
+
+    def salvage(self, ending: Ending) -> Attempt:
+        """The best poses found so far, or those along a spanning tree, with the bound F >= 0."""
+        candidates = self.monitor.poses_found or [spanning_tree_start(self.problem.graph)]
+        poses = min(candidates, key=self.problem.objective)
+        stage = ending(self.problem.objective(poses))
+        self.stages.append(stage)
+        return self.without_bound(Attempt(poses, stage.status))
+
+    def without_bound(self, attempt: Attempt) -> Attempt:
+        """Certificate of the poses with the bound F >= 0, which needs no proof."""
+        poses = attempt.known_poses
+        certificate = certify_with(
+            self.problem,
+            poses,
+            np.zeros_like(poses.R),
+            self.gap,
+            attempt.decrement,
+            BoundSource.GIVEN,
+            NO_BOUND,
+        )
+        return replace(attempt, certificate=certificate)

@@ -1,0 +1,156 @@
+"""The plan of a solve: the answer stands whatever goes wrong in a step that may improve it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graphs import informed, varied_graph
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.graphs.g2o import write_g2o_folder
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from solvers.distributed.robots_of_graph import RobotsOfGraph
+from solvers.distributed.robots_with_files import RobotsWithFiles
+from solvers.handedness.ascent import HandednessAscent
+from solvers.handedness.hull_lagrangian import HullLagrangian
+from solvers.handedness.search import HandednessSearch
+from solvers.here import Here
+from solvers.place import Place, Step
+from solvers.result import Status
+
+LOUD = NoiseModel(translation_std=1.0, rotation_std=1.0)
+FIRST_ALONE = solvers.Pipeline(growing=None, second_try=False, staircase=None, handedness=None)
+SHORT_SEARCH = HandednessSearch(
+    HandednessAscent(max_iterations=2), HullLagrangian(max_iterations=2)
+)
+# Settings with which a step follows the first attempt at once, and the verb that it begins with.
+PIPELINES = {
+    Step.GROWING: replace(FIRST_ALONE, growing=solvers.GrowingStart()),
+    Step.SECOND: replace(FIRST_ALONE, second_try=True),
+    Step.STAIRCASE: replace(FIRST_ALONE, staircase=solvers.Staircase()),
+    Step.SMALLER_MATRICES: replace(FIRST_ALONE, staircase=solvers.Staircase(max_iterations=1)),
+    Step.TERMS: replace(FIRST_ALONE, handedness=SHORT_SEARCH),
+    Step.HULLS: replace(FIRST_ALONE, handedness=SHORT_SEARCH),
+}
+
+
+def loose_problem() -> PGOProblem:
+    """F of a graph whose certificate stays open through all steps."""
+    return PGOProblem(varied_graph(1, 10, 3, LOUD), weighting=Weighting.ISOTROPIC)
+
+
+def loose_problem_of_chi2() -> PGOProblem:
+    graph = informed(4, 10, 3, False, 2.0, NoiseModel(1.0, 0.7))
+    return PGOProblem(graph, weighting=Weighting.INFORMATION)
+
+
+VERBS = {
+    Step.GROWING: "start_grown",
+    Step.SECOND: "start_again",
+    Step.STAIRCASE: "climb",
+    Step.SMALLER_MATRICES: "soften",
+    Step.TERMS: "ascend",
+    Step.HULLS: "solve_hulls",
+}
+FAILURES = [
+    np.linalg.LinAlgError("the leading minor of order 3 of B is not positive definite"),
+    ZeroDivisionError("float division by zero"),
+    MemoryError("no room for the factor"),
+    RuntimeError("Factor is exactly singular"),
+    NotPositiveDefiniteError("no shift makes the matrix positive definite"),
+]
+
+
+def failing(error: BaseException) -> Callable[..., None]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("place", [Here, RobotsOfGraph])
+@pytest.mark.parametrize("step", VERBS)
+def test_a_step_that_fails_leaves_the_answer_before_it(
+    step: Step, place: type[Place], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = loose_problem()
+    robots = 2 if place is RobotsOfGraph else None
+    before = solvers.solve(problem, FIRST_ALONE, robots=robots)
+    assert before.certificate.can_improve  # else the step would not be taken
+    error = FAILURES[list(VERBS).index(step) % len(FAILURES)]
+    monkeypatch.setattr(place, VERBS[step], failing(error))
+    solution = solvers.solve(problem, PIPELINES[step], robots=robots)
+    assert step.value in [stage.name for stage in solution.stages if stage.status is Status.FAILED]
+    assert f"{step.value} failed ({error}); the answer before it stands" in solution.note
+    assert solution.objective <= before.objective * (1 + 1e-12)
+    assert solution.lower_bound >= before.lower_bound * (1 - 1e-9)
+    assert solution.status is before.status
+    assert str(error) in str(solution)
+
+
+@pytest.mark.parametrize("error", FAILURES)
+def test_no_failure_in_any_step_loses_the_answer(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = loose_problem()
+    for verb in VERBS.values():
+        monkeypatch.setattr(Here, verb, failing(error))
+    solution = solvers.solve(problem)
+    first = solvers.solve(problem, FIRST_ALONE)
+    np.testing.assert_array_equal(solution.poses.t, first.poses.t)
+    assert solution.certificate.verdict is first.certificate.verdict
+
+
+@pytest.mark.parametrize("step", [Step.SECOND, Step.STAIRCASE])
+def test_robots_with_own_files_keep_their_answer_too(
+    step: Step, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = varied_graph(1, 10, 3, LOUD)
+    write_g2o_folder(graph.with_robots(pgo.partition(graph, 3).robot), tmp_path)
+    isotropic = Weighting.ISOTROPIC
+    before = solvers.solve_folder(tmp_path, FIRST_ALONE, weighting=isotropic)
+    monkeypatch.setattr(RobotsWithFiles, VERBS[step], failing(FAILURES[0]))
+    solution = solvers.solve_folder(tmp_path, PIPELINES[step], weighting=isotropic)
+    assert step.value in [stage.name for stage in solution.stages]
+    assert f"{step.value} failed" in solution.note
+    assert solution.certificate.objective <= before.certificate.objective * (1 + 1e-12)
+    assert solution.status is before.status
+
+
+@pytest.mark.parametrize("step", VERBS)
+def test_ctrl_c_in_a_step_leaves_the_answer_and_its_bound(
+    step: Step, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = loose_problem()
+    before = solvers.solve(problem, FIRST_ALONE)
+    monkeypatch.setattr(Here, VERBS[step], failing(KeyboardInterrupt()))
+    solution = solvers.solve(problem, PIPELINES[step])
+    assert solution.status is Status.INTERRUPTED
+    assert solution.lower_bound >= before.lower_bound > 0.0
+    assert solution.stages[-1].name == "interruption"
+
+
+def test_an_error_of_the_program_is_not_taken_for_a_failure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Here, "climb", failing(TypeError("a defect")))
+    with pytest.raises(TypeError, match="a defect"):
+        solvers.solve(loose_problem(), PIPELINES[Step.STAIRCASE])
+
+
+def test_a_failure_in_smaller_matrices_leaves_the_bound_on_chi2(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = loose_problem_of_chi2()
+    before = solvers.solve(problem, FIRST_ALONE)
+    assert before.certificate.can_improve
+    monkeypatch.setattr("solvers.here.with_shrunk_information", failing(FAILURES[0]))
+    solution = solvers.solve(problem, PIPELINES[Step.SMALLER_MATRICES])
+    assert Step.SMALLER_MATRICES.value in [stage.name for stage in solution.stages]
+    assert solution.lower_bound >= before.lower_bound
