@@ -197,18 +197,19 @@ by_rule = {
     for mu in (10.0, 2.0)
     for rescale in (True, False)
 }
-print("iterations, and the last alpha, where alpha starts at", *(f"{a:>12g}" for a in starts))
-print(f"{'alpha fixed':53}", *(f"{len(residuals(alpha, 1)):12}" for alpha in starts))
+print(f"{'alpha starts at':25}", *(f"{alpha:10g}" for alpha in starts))
+print(f"{'alpha fixed':25}", *(f"{len(residuals(alpha, 1)):10}" for alpha in starts))
 for (mu, rescale), ends in by_rule.items():
     name = f"mu = {mu:g}, b {'rescaled' if rescale else 'not rescaled'}"
-    print(f"{name:53}", *(f"{f'{k} ({last:.2g})':>12}" for k, last in ends))
+    print(f"{name:25}", *(f"{f'{k} ({last:.2g})':>10}" for k, last in ends))
 
 # %% [markdown]
-# With $\mu = 10$ the rule needs 104 to 148 iterations from every initial $\alpha$, where a fixed one
-# may need thousands. It seldom moves $\alpha$, and so the forgotten rescaling does no harm yet: 81 to
-# 148 iterations. With $\mu = 2$ it follows the residuals closely and needs 71 to 79 iterations, but
-# only with the rescaling. Without it no run ends within the limit of 1000: every change of $\alpha$
-# changes the multiplier, which changes the residuals, which change $\alpha$ again.
+# The table has the iterations, and the last $\alpha$ in brackets. With $\mu = 10$ the rule needs 104 to
+# 148 iterations from every initial $\alpha$, where a fixed one may need thousands. It seldom moves
+# $\alpha$, and so the forgotten rescaling does no harm yet: 81 to 148 iterations. With $\mu = 2$ it
+# follows the residuals closely and needs 71 to 79 iterations, but only with the rescaling. Without it
+# no run ends within the limit of 1000: every change of $\alpha$ changes the multiplier, which changes
+# the residuals, which change $\alpha$ again.
 #
 # The library has this rule, with $\mu = 10$, as `BoydPenalty`, for SOC as in the paper. Its dual residual has
 # the unit of the weights, so its result depends on that unit. `BalancedPenalty` compares relative
