@@ -9,10 +9,10 @@ One iteration is
     (c) Bregman     B     = B + x - omega
 
 F is the cost of rotations and translations, here evaluated at matrices x. Step (a) is a convex
-quadratic program over all matrices x_i and all translations t_i. Step (b) projects every
-pose on its own (`project_to_rotations`): in the plane by an angle, in space by an SVD, or from 20
-poses on by Newton's polar iteration, whose limit is the same. `Joint.step` is one iteration. The
-parts around it have files of their own:
+quadratic program over all matrices x_i and all translations t_i. Step (b) projects every pose on
+its own (`project_to_rotations`): in the plane by an angle, in space by an SVD, or from 20 poses on
+by Newton's polar iteration, whose limit is the same. `Joint.step` is one iteration. The parts
+around it have files of their own:
 
 - `anderson`: over-relaxation and acceleration, which replace x by `x_ahead` in (b) and (c);
 - `penalty`: the rules that choose the penalties rho;
