@@ -7,31 +7,27 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PGO = [sys.executable, "-c", "from pgo_command import main; main()"]
+PROGRAM = "from pgo_command import main; main()"
+PGO = [sys.executable, "-c", PROGRAM]
 
 
-def as_in_a_terminal() -> None:
-    """Let the signals of this process do what they do in a terminal; for `preexec_fn`.
+def with_hangup(program: str, hangup: signal.Handlers = signal.SIG_DFL) -> list[str]:
+    """Command that runs a program which sets the action of SIGHUP first; a terminal's by default.
 
-    Tests under nohup, or in the background of a script, pass ignored signals on to what they start.
+    Under nohup tests ignore the signal, and without this the processes that they start would, too.
     """
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
+    first = f"import signal; signal.signal(signal.SIGHUP, {hangup:d})"
+    return [sys.executable, "-c", f"{first}; {program}"]
 
 
-def started(*arguments: object, **streams: object) -> subprocess.Popen[str]:
-    """Start `pgo`; its output is piped unless `streams` say otherwise.
-
-    Its signals are those `as_in_a_terminal`, unless `streams` have another `preexec_fn`.
-    """
+def started(
+    *arguments: object, hangup: signal.Handlers = signal.SIG_DFL, **streams: object
+) -> subprocess.Popen[str]:
+    """Start `pgo`; its output is piped unless `streams` say otherwise."""
+    command = [*with_hangup(PROGRAM, hangup), *map(str, arguments)]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    settings = {
-        "stdout": subprocess.PIPE,
-        "stderr": subprocess.PIPE,
-        "preexec_fn": as_in_a_terminal,
-        **streams,
-    }
-    return subprocess.Popen([*PGO, *map(str, arguments)], env=env, text=True, **settings)  # type: ignore[call-overload]
+    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
+    return subprocess.Popen(command, env=env, text=True, **piped)  # type: ignore[call-overload]
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
