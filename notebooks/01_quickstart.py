@@ -36,8 +36,7 @@ pgo.compare_poses(graph, [("truth", graph.truth), ("GPS and IMU", graph.initial)
 # ## The cost
 #
 # An edge $(i, j)$ measures $R_{ij} \approx R_i^\top R_j$ and $t_{ij} \approx R_i^\top (t_j - t_i)$.
-# The cost of poses is the paper's equation (16), `min overall`, with weights
-# $\kappa_{ij}, \tau_{ij}$ for each edge:
+# The cost of poses is the paper's equation (16), with weights $\kappa_{ij}, \tau_{ij}$ for each edge:
 #
 # $$F(R, t) = \sum_{(i,j)} \kappa_{ij} \lVert R_j - R_i R_{ij} \rVert_F^2
 #   + \tau_{ij} \lVert t_j - t_i - R_i t_{ij} \rVert_2^2, \qquad R_i \in \mathrm{SO}(d).$$

@@ -5,9 +5,9 @@
 # `pip install -e '.[notebooks,fast]'` installs it.
 #
 # The constraint $R^\top R = I$ is the only difficulty of pose graph optimisation: without it,
-# equation (16), `min overall`, of the paper is a least-squares problem. *Splitting of orthogonality
-# constraints* (SOC, Lai and Osher 2014; the paper's Algorithm 1, `algo1: SOC`) gives every $R$ a
-# copy $\omega$ that carries the constraint, and Bregman iteration makes the two equal.
+# equation (16) of the paper is a least-squares problem. *Splitting of orthogonality constraints*
+# (SOC, Lai and Osher 2014; the paper's Algorithm 1) gives every $R$ a copy $\omega$ that carries the
+# constraint, and Bregman iteration makes the two equal.
 
 # %%
 import itertools
@@ -68,8 +68,8 @@ print(f"closed form {closed_form:.8f}, SOC {found.objective:.8f}")
 #   \text{(b)}\; \omega = \text{nearest rotation to } R + B, \qquad
 #   \text{(c)}\; B \leftarrow B + R - \omega.$$
 #
-# Here $f$ is the complete cost of equation (16), `min overall`, in rotations *and* translations.
-# (The paper's step (a) has rotations only, and each robot keeps its neighbours fixed;
+# Here $f$ is the complete cost of equation (16) in rotations *and* translations. (The paper's step (a)
+# has rotations only, and each robot keeps its neighbours fixed;
 # [notebook 7](07_the_papers_tables.ipynb) runs this version.) Its residuals are linear in $X$,
 # which stacks the $t_i$ and the rows of all $R_i^\top$. (a) is a convex quadratic program; cvxpy
 # compiles it once, with $V = \omega - B$ as a parameter.
@@ -126,11 +126,12 @@ for _ in range(20):
     by_hand.append(omega)
 
 # %% [markdown]
-# ## The library agrees, with three back ends
+# ## The library agrees, with four back ends
 #
 # A convex QP without constraints is a linear system: $(M + \tfrac\rho2 D) X = \tfrac\rho2 D V$,
-# with the same matrix at every iteration. One can factor it once (`FACTORIZED`), use accelerated
-# gradients as the paper does (`FISTA`), or use an interior-point method (`CLARABEL`).
+# with the same matrix at every iteration. One can factor it once (`FACTORIZED`), use gradients that
+# are accelerated as the paper does it (`FISTA`, Beck and Teboulle 2009) or by the constant momentum
+# that suits a strongly convex function (`NESTEROV`), or use an interior-point method (`CLARABEL`).
 
 # %%
 best = solvers.solve(problem)
@@ -150,8 +151,8 @@ for back_end in solvers.RStep:
 
 # %% [markdown]
 # The iterates do not depend on the back end, but the time does. Two triangular solves are the
-# fastest, because the matrix never changes. FISTA is useful where the matrix cannot be factored,
-# and Clarabel where you add constraints or terms to step (a) (`solvers.ExtendedSOC`).
+# fastest, because the matrix never changes. Gradients are useful where it cannot be factored, and
+# Clarabel where you add constraints or terms to step (a) (`solvers.ExtendedSOC`).
 #
 # ## How large must rho be?
 #

@@ -34,8 +34,7 @@ plt.rcParams["figure.dpi"] = 150
 # ## The relaxation
 #
 # Given rotations, the best translations solve a linear system. With these translations, equation
-# (16), `min overall`, becomes a quadratic form in the rotations alone. With $Y$ the rows of all
-# $R_i^\top$,
+# (16) becomes a quadratic form in the rotations alone. With $Y$ the rows of all $R_i^\top$,
 #
 # $$\min_t F(R, t) = \operatorname{tr}(Y^\top Q Y) = \operatorname{tr}(Q Z), \qquad Z = Y Y^\top.$$
 #
@@ -439,8 +438,11 @@ for name, relaxation in (("without hulls", loose_relaxed), ("with hulls", with_h
 # Lochman, Malmport and Zach (2025) add that hull to the semidefinite program of rotation averaging.
 # `solve` needs no model of cvxpy for it: an augmented Lagrangian on a low-rank factor of $Z$
 # (`HullLagrangian`) takes graphs of a thousand poses. Where no $P_e$ on the edges suffices, as on
-# most graphs of the grid at 70 degrees, the gap stays open. In the plane there is nothing to gain:
-# the hull of $\mathrm{SO}(2)$ is a disc, which the mirror images of rotations fill, too.
+# most graphs of the grid at 70 degrees, the gap stays open. In the plane there is nothing to gain.
+# The 2 by 2 matrices are the sum of two planes at right angles: one holds the rotations, the other
+# the reflections. The measured $R_{ij}$ is a rotation, so the cost sees of $Z_{ij}$ only the part in
+# the first plane, and that part is never outside the hull of $\mathrm{SO}(2)$, the unit disc: for a
+# rotation it is on the circle, for a reflection at the centre.
 
 # %% [markdown]
 # ## Exercises

@@ -31,7 +31,7 @@ plt.rcParams["figure.dpi"] = 150
 # measurement of a robot's own motion, and a dotted line connects two robots that meet. The right
 # picture has only two robots, and shows what has to cross between them. A pose with a dotted line
 # is a *separator*, and the other robot holds a *copy* of it. In each round, each robot sends the
-# other its current values of the poses that both hold; nothing else leaves a robot.
+# other its current values of the poses that both hold; the method needs nothing else.
 
 
 # %%
@@ -281,9 +281,14 @@ print(f"all measurements sent to one place once: {pooled} bytes")
 # %% [markdown]
 # The last number is the alternative to exchanging messages: collecting all measurements in one
 # place. Here it is smaller, because this graph is small, and a certified solution takes more bytes
-# than its measurements. The advantage of the messages is that nobody needs to hold all
+# than its measurements. The advantage of the messages is that no robot needs to hold all
 # measurements. The bytes of the messages grow with the boundaries between robots and with the
 # rounds; the bytes of pooling grow with the whole graph.
+#
+# That is true of the robots, and not of the process that calls `solve`. In this notebook it has read
+# the whole graph. Where robots read files of their own (`pgo solve FOLDER`), it never has the
+# measurements within a robot, but those between two robots pass through it, as all messages do. And
+# a solve without a driver (`--driver-memory 0`) collects all poses in it, to evaluate $F$.
 #
 # ## Lost messages
 #

@@ -75,7 +75,7 @@ shown(
 #
 # The algorithm has rotations only, and each pose is a robot. Every robot minimises step (a) over
 # its own $R_i$ while its neighbours keep the values of the last iterate (the superscripts $k - 1$
-# in `algo1: SOC`). With one unknown matrix the minimum has a closed form. An edge $(i, j)$ pulls
+# in Algorithm 1). With one unknown matrix the minimum has a closed form. An edge $(i, j)$ pulls
 # $R_i$ to $R_j R_{ij}^\top$, an edge $(j, i)$ to $R_j R_{ji}$, so
 #
 # $$R_i = \frac{2 \sum_{(i,j)} \kappa_{ij} R_j R_{ij}^\top + 2 \sum_{(j,i)} \kappa_{ji} R_j R_{ji}
@@ -84,7 +84,7 @@ shown(
 #
 # an average of the neighbours' estimates and of $\omega_i - B_i$. The initial estimate comes from
 # GPS and IMU, as in the paper. Three things differ from the paper: $\rho$ is constant, the edges
-# have weights, and $\omega$ is a rotation, where `algo1: SOC` takes any orthogonal matrix.
+# have weights, and $\omega$ is a rotation, where Algorithm 1 takes any orthogonal matrix.
 # `PaperSOC` lists all differences.
 
 

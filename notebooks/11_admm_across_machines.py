@@ -34,8 +34,8 @@ rng = np.random.default_rng(0)
 # $$\min_x \sum_a \tfrac12 \lVert A_a x - b_a \rVert^2 + w \lVert x \rVert_1 .$$
 #
 # Give each hospital its own $x_a$, and one $z$ to which all must be equal: $x_a - z = 0$ is the
-# constraint $\mathcal{K} x = f$ of equation (1), `problem bregman`. Minimise over all $x_a$ (they
-# share no term), then over $z$, then add the residual back:
+# constraint $\mathcal{K} x = f$ of equation (1). Minimise over all $x_a$ (they share no term), then
+# over $z$, then add the residual back:
 #
 # $$\begin{aligned}
 #   x_a &= \arg\min_x f_a(x) + \tfrac\rho2 \lVert x - z + u_a \rVert^2 && \text{each machine alone} \\
@@ -43,8 +43,8 @@ rng = np.random.default_rng(0)
 #   u_a &\leftarrow u_a + x_a - z && \text{each machine alone}
 # \end{aligned}$$
 #
-# A machine need not hold all of $z$ (Boyd's *general form*, 7.2): `held[a]` lists the rows of which
-# it has copies.
+# A machine need not hold all of $z$ (Boyd's *general form*, section 7.2): `held[a]` lists the rows of
+# which it has copies.
 
 
 # %%
@@ -98,8 +98,8 @@ print(
 # %% [markdown]
 # ## The library agrees
 #
-# `AlternatingBregman` with $T = 1$ is equation (9), `bregman ADMM`, over the blocks that the
-# problem names: five $x_a$ and $z$.
+# `AlternatingBregman` with $T = 1$ is equation (9) over the blocks that the problem names: five $x_a$
+# and $z$.
 
 # %%
 blocks = [cp.Variable(size, name=f"x_{a}") for a in range(machines)]
@@ -127,8 +127,8 @@ print(f"differs from ours by {difference:.0e} in 10 rounds")
 #   f_a(x) = \tfrac{q_a}2 \lVert x \rVert^2 \text{ on } [0, c_a], \quad
 #   g(s) = \tfrac w2 \lVert s - \text{demand} \rVert^2 .$$
 #
-# No station needs to see the plan of another one, only the *mean* (7.3): with $\bar x$ the mean of
-# the plans and $\bar z$ its target value,
+# No station needs to see the plan of another one, only the *mean* (section 7.3): with $\bar x$ the
+# mean of the plans and $\bar z$ its target value,
 #
 # $$x_a \leftarrow \operatorname{prox}_{f_a / \rho}\bigl(x_a + \bar z - \bar x - u\bigr), \qquad
 #   \bar z \leftarrow \arg\min_{\bar z} g(N \bar z) + \tfrac{N \rho}2 \lVert \bar z - u - \bar x \rVert^2, \qquad
@@ -218,7 +218,7 @@ _ = right.set(xlabel="round", ylabel="price", title="dotted: cvxpy's multiplier"
 # Now the machines are robots and $z$ is poses. The cost $f_a$ contains the edges that robot $a$
 # knows, with half of those that it shares with the other robot. The robot holds its own poses and
 # copies of the other's separators (`held`). Instead of the soft threshold, $z$ is projected to
-# rotations, which is the constraint of equation (18), `relaxation rotation`, on the consensus
+# rotations, which is the constraint of equation (18), on the consensus
 # variable. The rest is the function `consensus` from above, unchanged. This is the coupling
 # `CONSENSUS`.
 

@@ -54,8 +54,8 @@ def show(panels, height=2.3):
 # $$\min_{u, d} \; \tfrac12 \lVert u - f \rVert^2 + w \sum_p \lVert d_p \rVert_2
 #   \quad \text{subject to} \quad D u - d = 0.$$
 #
-# This is equation (1), `problem bregman`. One pass over its two blocks before each update of $b$,
-# equation (9), `bregman ADMM`, is the *split Bregman* method of Goldstein and Osher (2009):
+# This is equation (1). One pass over its two blocks before each update of $b$, equation (9), is the
+# *split Bregman* method of Goldstein and Osher (2009):
 #
 # $$\begin{aligned}
 #   u &= (I + \alpha D^\top D)^{-1} \bigl(f + \alpha D^\top (d - b)\bigr) && \text{diagonal in Fourier space, if } D
@@ -129,7 +129,7 @@ print(f"differs from ours by {difference:.0e} in 10 iterations")
 #
 # The denoised picture has less contrast than the original, because a lower contrast reduces the
 # total variation of an edge. In $f - u$ one can see the face. Osher et al. (2005) add it back, by
-# equation (4), `bregman update`, with $\mathcal{K} = I$: denoise $f + b$ with too *large* a weight,
+# equation (4) with $\mathcal{K} = I$: denoise $f + b$ with too *large* a weight,
 # add $b \leftarrow b + f - u$, and stop when $\lVert f - u \rVert$ is the size of the noise. (The
 # weight 0.08 above was chosen with knowledge of the truth, and no other weight does better. Here
 # any weight that is too large works, and only the size of the noise has to be known.)

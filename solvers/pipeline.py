@@ -131,10 +131,11 @@ def solve(
 
     References
     ----------
-    M. Ebrahimi and M. Deghat, "Pose graph optimisation by splitting orthogonality constraints",
-    Algorithm 1 (stage 2); D. M. Rosen, L. Carlone, A. S. Bandeira and J. J. Leonard, "SE-Sync: A
-    certifiably correct algorithm for synchronization over the special Euclidean group", IJRR 2019
-    (stages 4 and 7).
+    Z. Ebrahimi and M. Deghat, "Distributed Pose Graph Optimization using the Splitting Method based
+    on the Alternating Direction Method of Multipliers" (stage 2; `solvers.soc.soc` says how it
+    differs from their Algorithm 1). D. M. Rosen, L. Carlone, A. S. Bandeira and J. J. Leonard,
+    "SE-Sync: A certifiably correct algorithm for synchronization over the special Euclidean group",
+    IJRR 2019 (stages 4 and 7).
 
     Examples
     --------

@@ -6,6 +6,7 @@ Their commands and examples are run; notebooks, files and names of the code are 
 import doctest
 import importlib
 import re
+import runpy
 import shlex
 from pathlib import Path
 
@@ -19,6 +20,21 @@ SITE = ROOT / "notebooks" / "site"
 PAGES = [*sorted(SITE.glob("guide/*.md")), SITE / "proved.md"]
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.M | re.S)
+
+# Labels of equations and of the algorithm in the LaTeX source of the paper. A reader of the printed
+# paper has their numbers alone.
+LABELS = (
+    "problem bregman",
+    "update B",
+    "bregman update",
+    "minbregman",
+    "bregman ADMM",
+    "min overall",
+    "rotation subproblem with constraint",
+    "relaxation rotation",
+    "algo1: SOC",
+)
+NUM_EQUATIONS = 20
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
@@ -49,6 +65,21 @@ def test_every_page_of_the_guide_is_in_its_table_of_contents():
     assert set(re.findall(r"^\w+$", index, re.M)) - {"Guide"} == pages
 
 
+def texts_about_the_paper() -> list[Path]:
+    """Sources, pages and notebooks."""
+    kinds = ("pgo_models/**/*.py", "solvers/**/*.py", "notebooks/*.py", "notebooks/*.ipynb")
+    texts = [path for kind in kinds for path in ROOT.glob(kind)]
+    return [*texts, *PAGES, ROOT / "README.md", ROOT / "tests" / "benchmarks" / "README.md"]
+
+
+def test_the_paper_is_cited_by_what_is_printed_in_it():
+    for path in texts_about_the_paper():
+        text = " ".join(path.read_text(encoding="utf-8").split())
+        assert [label for label in LABELS if f"`{label}`" in text] == [], path
+        numbers = re.findall(r"\bequations? \((\d+)\)", text)
+        assert all(1 <= int(number) <= NUM_EQUATIONS for number in numbers), path
+
+
 @pytest.mark.slow
 @each_page
 def test_a_page_shows_what_is_printed(page, pgo_command, monkeypatch, tmp_path):
@@ -72,16 +103,37 @@ def test_a_page_shows_what_is_printed(page, pgo_command, monkeypatch, tmp_path):
     assert report == []
 
 
+BUILD = runpy.run_path(str(SITE / "build.py"))  # the script is not run
+
+
+def assert_links_lead_somewhere(page: Path, text: str) -> None:
+    """Check the links of a page of the site, into which notebooks and pictures are copied."""
+    copied = (SITE / "notebooks", SITE / "notebooks" / "pictures")
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        if target.startswith("http"):
+            continue
+        path = (page.parent / target).resolve()
+        assert path.is_relative_to(SITE), target
+        at_home = ROOT / path.relative_to(SITE) if path.parent in copied else path
+        assert at_home.exists() or path.name in BUILD["PAGES"].values(), target
+
+
+@pytest.mark.parametrize("page", sorted(SITE.glob("*.md")), ids=lambda page: page.stem)
+def test_what_a_page_around_the_guide_links_to_is_there(page):
+    assert_links_lead_somewhere(page, page.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", BUILD["PAGES"])
+def test_what_a_page_of_the_repository_links_to_is_on_the_site(page):
+    text = BUILD["relinked"]((ROOT / page).read_text(encoding="utf-8"), page)
+    assert_links_lead_somewhere(SITE / BUILD["PAGES"][page], text)
+
+
 @each_page
 def test_what_a_page_links_to_is_there(page):
     text = page.read_text(encoding="utf-8")
     assert text.isascii()
-    for target in re.findall(r"\]\(([^)#]+)\)", text):
-        if not target.startswith("http"):
-            path = (page.parent / target).resolve()
-            at_home = ROOT / "notebooks" / path.name if path.suffix == ".ipynb" else path
-            made = {SITE / name for name in ("benchmarks.md", "changelog.md", "data.md")}
-            assert at_home.exists() or path in made, target
+    assert_links_lead_somewhere(page, text)
     for path in re.findall(r"`((?:pgo_models|solvers|tests|notebooks|data)/[\w./-]+)`", text):
         assert (ROOT / path).exists(), path
 

@@ -27,21 +27,6 @@ ANSWER = re.compile(r"<details><summary>Answer</summary>\n\n(.*?)\n\n</details>"
 EXERCISES = 3
 MOST_BYTES = 400_000
 
-# Equations of the paper that have a label, by the number that they are printed with.
-EQUATIONS = {
-    "problem bregman": 1,
-    "update B": 2,
-    "bregman update": 4,
-    "minbregman": 8,
-    "bregman ADMM": 9,
-    "min": 13,
-    "translation": 14,
-    "rotation": 15,
-    "min overall": 16,
-    "rotation subproblem with constraint": 17,
-    "relaxation rotation": 18,
-}
-
 # What is run in place of parts of a notebook that take long: a sweep over four levels of the noise,
 # not eight, with one graph at each, not four. The asserts of the notebook hold of it, too.
 SHORTENED = {
@@ -175,15 +160,6 @@ def test_a_source_says_how_to_open_it_and_has_exercises_with_hidden_answers(sour
     answers = ANSWER.findall(exercises)
     assert len(answers) == exercises.count("<details>") == EXERCISES
     assert all(any("assert " in code for code in code_of(answer)) for answer in answers)
-
-
-@each_source
-def test_equations_of_the_paper_have_their_numbers(source):
-    text = "\n".join(text for kind, text in cells(source) if kind == "markdown")
-    for label, number in EQUATIONS.items():
-        assert text.count(f"`{label}`") == len(re.findall(rf"\({number}\),\s`{label}`", text)), (
-            label
-        )
 
 
 @each_source

@@ -1,6 +1,7 @@
 import re
 import shlex
 import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -109,6 +110,19 @@ def check_line(line: dict[str, str], pgo_command) -> None:
 @pytest.mark.parametrize("marker", ["ci:solve", "ci:tests"])
 def test_ci_finds_its_lines(marker):
     assert re.search(rf"<!-- {marker} -->\n```sh\n.*\.venv/bin/.*\n```", README)
+
+
+def test_ci_has_an_environment_of_its_own():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert ".venv" not in script.replace(".venv-ci", "")
+    assert "apt-get" not in script
+    venv = re.search(r"^venv=.*$", script, re.M)[0]
+    function = re.search(r"^line\(\) \{.*?^\}$", script, re.M | re.S)[0]
+    for marker in ("ci:solve", "ci:tests"):
+        shown = re.search(rf"<!-- {marker} -->\n```sh\n(.*)\n", README)[1]
+        run = ["bash", "-c", f"{venv}\n{function}\nline {marker}"]
+        done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert done.stdout == shown.replace(".venv", ".venv-ci") + "\n"
 
 
 def test_pictures_and_files_that_the_benchmarks_name_are_there():

@@ -33,7 +33,7 @@ PAGES = {
     "data/README.md": "data.md",
 }
 # Files of the repository that are no page of the site, and the page that a link to them opens.
-INSTEAD = {"README.md": "index.md", "notebooks/site/proved.md": "proved.md"}
+INSTEAD = {"README.md": "index.md"}
 
 
 def relinked(text: str, page: str) -> str:
@@ -51,7 +51,7 @@ def relinked(text: str, page: str) -> str:
         if path in PAGES or path in INSTEAD:
             return f"[{label}]({PAGES.get(path) or INSTEAD[path]})"
         if path.startswith("notebooks/"):
-            return f"[{label}]({path})"
+            return f"[{label}]({path.removeprefix('notebooks/site/')})"
         return f"{label} (`{path}`)"
 
     return re.sub(r"\[([^\]]+)\]\(([^)]+)\)", link, text)

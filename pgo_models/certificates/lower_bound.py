@@ -45,7 +45,7 @@ H in place of S_r the bound also loses eta times the squared norm of the rotatio
 where P_i is the rotation block of X' for pose i, and P^_i the rotation at which it began: the
 rotations R_i^T and P^_i Q are at most sqrt(8) apart, in the plane and in space. Another form asks
 nothing of poses: if S + eta blockdiag(0, I) is positive definite without the row and column of one
-translation, F >= tr(Lambda) + constant - eta n d (Rosen et al. 2019, theorem 7; Carlone et al.
+translation, F >= tr(Lambda) + constant - eta n d (weak duality: Rosen et al. 2019; Carlone et al.
 2015).
 
 **Rotations alone.** A problem without translations (`PGOProblem.has_translations`) is bounded in

@@ -1,9 +1,8 @@
 """Minimise a convex cvxpy J(x) subject to K x = f, and the subproblems of Bregman iteration on it.
 
-Equations of the paper's section 2 by label: `problem bregman` is the problem; `update B`, `bregman
-update` and `minbregman` are the three forms of the iteration whose subproblems are compiled here,
-each with one Parameter (DPP); `bregman ADMM` alternates over the blocks of x. The iterations
-themselves are in solvers/convex/bregman.py.
+Equation (1) of the paper is the problem. Equations (2), (4) and (8) are the three forms of the
+iteration whose subproblems are compiled here, each with one Parameter (DPP); (9) alternates over
+the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
 """
 
 import math
@@ -48,7 +47,7 @@ class BregmanPoint(ReadOnly):
 
 @dataclass(frozen=True, eq=False)
 class BregmanProblem(HoldsModel):
-    """Minimise J(x) subject to K x = f (paper: `problem bregman`).
+    """Minimise J(x) subject to K x = f (equation (1) of the paper).
 
     x, (m,), stacks the variables, each flattened row by row: the blocks over which
     `AlternatingBregman` alternates.
@@ -234,7 +233,7 @@ class Subproblem(HoldsModel):
 
 
 def bregman_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
-    """Compile p -> argmin J(x) - <p, x> + alpha/2 ||K x - f||^2 (paper: `update B`).
+    """Compile p -> argmin J(x) - <p, x> + alpha/2 ||K x - f||^2 (equation (2) of the paper).
 
     The constants J(x^k) and <p, x^k> are dropped.
     """
@@ -250,7 +249,7 @@ def bregman_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
 
 
 def two_line_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
-    """Compile f - b -> argmin J(x) + alpha/2 ||K x - f + b||^2 (paper: `bregman update`)."""
+    """Compile f - b -> argmin J(x) + alpha/2 ||K x - f + b||^2 (equation (4) of the paper)."""
     root = float(np.sqrt(alpha / 2))
     s, _ = problem.K.shape
     shift = cp.Parameter(s, name="shift")
@@ -262,7 +261,7 @@ def two_line_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
 
 
 def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
-    """Compile lam -> argmin J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2 (paper: `minbregman`)."""
+    """Compile lam -> argmin J(x) + <lam, f - K x> + alpha/2 ||f - K x||^2 (equation (8))."""
     s, _ = problem.K.shape
     lam = cp.Parameter(s, name="lam")
     x = _stack(problem.variables)
@@ -277,7 +276,7 @@ def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float) -> Su
 def block_subproblems(problem: BregmanProblem, alpha: float) -> tuple[Subproblem, ...]:
     """Compile c -> argmin J_i(x_i) + alpha/2 ||K_i x_i - c||^2 for every block i.
 
-    This is the x-step of the paper's `bregman ADMM`: it minimises the augmented Lagrangian over x_i
+    This is the x-step of the paper's equation (9): it minimises the augmented Lagrangian over x_i
     when c = f + lam / alpha - sum of K_j x_j over the other blocks. A SettingError when J is not a
     sum of terms of one variable each.
     """

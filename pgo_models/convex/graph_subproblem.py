@@ -3,8 +3,8 @@
     minimise   sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2
                + rho/2 ||R - omega + B||^2
 
-Step (a) of the paper's Algorithm 1 (`algo1: SOC`): rotations only as the paper has it, or joint in
-(R, t). Terms and constraints are written on poses and edges by their numbers.
+Step (a) of the paper's Algorithm 1: rotations only as the paper has it, or joint in (R, t).
+Terms and constraints are written on poses and edges by their numbers.
 """
 
 import enum

@@ -1,6 +1,6 @@
 """SO(d), d = 2 or 3, for many poses at once: projection, exponential, logarithm, random draws.
 
-The projection is step (b) of the paper's Algorithm 1 (`algo1: SOC`), with det = +1 enforced.
+The projection is step (b) of the paper's Algorithm 1, with det = +1 enforced.
 """
 
 import numpy as np
@@ -63,7 +63,7 @@ def project_to_rotations(A: Array) -> Array:
 
     References
     ----------
-    Ebrahimi & Deghat, Algorithm 1, steps 4 and 5; Higham, Functions of Matrices, 2008, section 8.3.
+    Ebrahimi & Deghat, Algorithm 1, lines 4 and 5; Higham, Functions of Matrices, 2008, section 8.3.
 
     Examples
     --------

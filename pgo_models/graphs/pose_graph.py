@@ -1,7 +1,7 @@
 """PoseGraph: measured edges between poses, checked once, and the parts and edits of such a graph.
 
 The measurements and their precisions kappa and tau are those of the cost F (Ebrahimi & Deghat,
-`min overall`; Rosen et al. 2019, equation 11).
+equation (16); Rosen et al. 2019, equation 11).
 """
 
 from __future__ import annotations
@@ -752,7 +752,7 @@ class PoseGraph(ReadOnly):
 
         References
         ----------
-        Ebrahimi & Deghat, problem `min overall`.
+        Ebrahimi & Deghat, equation (16).
         """
         kappa = (self.kappa > 0).astype(float)
         tau = (self.tau > 0).astype(float)

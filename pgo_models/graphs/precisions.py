@@ -1,6 +1,6 @@
 """Information matrices as the precisions kappa and tau of the isotropic cost, and back.
 
-The formulas are those of SE-Sync (Rosen et al. 2019, section 2 and its code).
+The formulas are those of the code of SE-Sync (Rosen et al. 2019).
 """
 
 import enum

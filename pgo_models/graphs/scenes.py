@@ -1,6 +1,6 @@
 """Generated pose graphs with known truth: the paper's networks, random graphs, and landmarks.
 
-The networks circle, grid and sphere follow the paper's section `SIMULATION RESULTS` and, for the
+The networks circle, grid and sphere follow the paper's section *Simulation results* and, for the
 geometry, Cristofalo et al. 2020 (GeoD); the figures stand in data/reference.json under "scenes".
 Every function takes its random generator.
 """
@@ -95,7 +95,7 @@ def circle(rng: np.random.Generator) -> PoseGraph:
 
     References
     ----------
-    Ebrahimi & Deghat, section `SIMULATION RESULTS`.
+    Ebrahimi & Deghat, section *Simulation results*.
 
     Examples
     --------
@@ -127,7 +127,7 @@ def grid(rng: np.random.Generator) -> PoseGraph:
 
     References
     ----------
-    Ebrahimi & Deghat, section `SIMULATION RESULTS`.
+    Ebrahimi & Deghat, section *Simulation results*.
 
     Examples
     --------
@@ -163,7 +163,7 @@ def sphere(rng: np.random.Generator) -> PoseGraph:
 
     References
     ----------
-    Ebrahimi & Deghat, section `SIMULATION RESULTS`; Deserno, How to generate equidistributed
+    Ebrahimi & Deghat, section *Simulation results*; Deserno, How to generate equidistributed
     points on the surface of a sphere, 2004.
 
     Examples
@@ -340,7 +340,7 @@ def observe(
 
     t_ij = R_i^T (t_j - t_i) + N(0, s_t^2 I) and R_ij = Exp(N(0, s_R^2 I)) R_i^T R_j. The initial
     guess, as by GPS and IMU, is t_i + N(0, s_t^2 I) and R_i Exp(N(0, s_R^2 I)). All draws are
-    independent (Ebrahimi & Deghat, `SIMULATION RESULTS`).
+    independent (Ebrahimi & Deghat, *Simulation results*).
     """
     R_i_inverse = np.swapaxes(truth.R[i], 1, 2)
     shift = truth.t[j] - truth.t[i]

@@ -15,7 +15,7 @@ cost here has the quadratic part
 A, ((d + 1) m, N), is the residual matrix: its first m rows give rho_t of all edges, with w = tau,
 and the d rows of every edge that follow give U^T rho_R, with w = kappa. Where W = kappa I, U = I.
 
-`EdgeCost` is a cost without any other part: F (equation `min overall` of the paper) for W = kappa
+`EdgeCost` is a cost without any other part: F (equation (16) of the paper) for W = kappa
 I, or chi2 where it is quadratic in the poses. Costs with another part are subclasses
 (`pgo_models.problem.information_costs`): they override the methods below and call them for the
 quadratic part. A cost does not hold the graph; the problem is passed to the methods that need it.

@@ -1,6 +1,6 @@
 """The matrices of the problem: A, L, M and Q, one equation each.
 
-They follow from the paper's equation `min overall`.
+They follow from the paper's equation (16).
 
 Unknowns are stacked in X, (N, d) with N = (d+1) n: first the n rows t_i, then the d rows of every
 R_i^T.

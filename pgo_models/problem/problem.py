@@ -1,6 +1,6 @@
 """PGOProblem: the cost of a pose graph with its gradients, matrices and exact translations.
 
-The cost is equation `min overall` of the paper, weighted, or chi2 of information matrices.
+The cost is equation (16) of the paper, weighted, or chi2 of information matrices.
 """
 
 from dataclasses import dataclass, field, replace
@@ -438,7 +438,7 @@ class PGOProblem(ReadOnly):
         return self.weights.value(self, X, residuals)
 
     def objective(self, poses: Poses) -> float:
-        """Return the cost of poses: F (paper: `min overall`, weighted), or chi2.
+        """Return the cost of poses: F (equation (16) of the paper, weighted), or chi2.
 
         Parameters
         ----------

@@ -1,6 +1,6 @@
 """Rotation averaging: the rotations alone, min sum_e kappa ||R_j - R_i R_ij||_F^2 over SO(d)^n.
 
-It is the rotation part tr(Y^T L Y) of F (the paper's equation `min overall` without translations;
+It is the rotation part tr(Y^T L Y) of F (the paper's equation (16) without translations;
 Rosen et al. 2019, section 4; Dellaert et al. 2020, *Shonan Rotation Averaging*).
 
 X and M keep the layout that they have for poses, so that every method for F applies. X has zeros

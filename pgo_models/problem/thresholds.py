@@ -82,7 +82,7 @@ class EdgeResiduals:
 def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResiduals:
     """Compute and test the residuals and the cost of every edge at poses.
 
-    The costs are the summands of `min overall` in the paper. The expectation of their sum is sum_e
+    The costs are the summands of the paper's equation (16). The expectation of their sum is sum_e
     sum w (1 - u / r), with r the rank of all information, u the number of unknowns, and w as in
     `chi2_thresholds`.
 

@@ -1,9 +1,10 @@
 """The rank-restricted relaxation: F of lifted poses, and f(Y) = min F over their translations.
 
-It is section 4.2 of Rosen et al. (2019). Lifted poses are R_i, (r, d), with orthonormal columns,
-Y_i = R_i^T in St(d, r), and t_i, (r,), for some r >= d. They move to R_i + B_i w_i, brought back to
-orthonormal columns, and t_i + v_i, with B_i a basis of the tangent space. In f(Y) = tr(Y^T Q Y) the
-translations are the best ones for Y, one sparse solve, and Q is never formed.
+It is the step of the Riemannian staircase of Rosen et al. (2019), section 4. Lifted poses are R_i,
+(r, d), with orthonormal columns, Y_i = R_i^T in St(d, r), and t_i, (r,), for some r >= d. They move
+to R_i + B_i w_i, brought back to orthonormal columns, and t_i + v_i, with B_i a basis of the
+tangent space. In f(Y) = tr(Y^T Q Y) the translations are the best ones for Y, one sparse solve, and
+Q is never formed.
 """
 
 from __future__ import annotations

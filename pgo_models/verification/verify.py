@@ -49,7 +49,7 @@ is H again, and (A) with zero in place of eta is
 
 The larger of the two is taken. (For comparison with the literature alone: where all of
 S + eta blockdiag(0, I) is positive semidefinite, (B) is at least tr(Lambda) + constant - eta n d
-with n rotations, the bound of Rosen et al. 2019, theorem 7.)
+with n rotations, the bound of weak duality in Rosen et al. 2019.)
 
 **Rotations alone.** Where no edge has a weight for its translation, the cost and q depend on the
 rows R_i^T alone. Then the rows t_i^T are left out of S, G and Z as those of pose r are, and the

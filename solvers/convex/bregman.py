@@ -7,9 +7,9 @@ Each form is a class, to step through and to compare:
     MethodOfMultipliers lam <- lam + alpha (f - K x)      x minimises the augmented Lagrangian
     AlternatingBregman  lam <- lam + alpha (f - K x)      x by T passes over its blocks
 
-The equations are `update B`, `bregman update`, `minbregman` and `bregman ADMM` of the paper. The
-first three forms have the same x, with p = K^T lam and lam = -alpha b; the last one is ADMM for
-T = 1. Osher et al. 2005; Yin et al. 2008; Esser 2009.
+These are the paper's equations (2), (4), (8), and (9) with (10). The first three forms have the
+same x, with p = K^T lam and lam = -alpha b; the last one is ADMM for T = 1. Osher et al. 2005; Yin
+et al. 2008; Esser 2009.
 """
 
 import math
@@ -120,7 +120,7 @@ class BregmanSettings:
 
 @dataclass(frozen=True)
 class Bregman(BregmanSettings):
-    """Bregman iteration with subgradients (paper: `update B`; Osher et al. 2005).
+    """Bregman iteration with subgradients (equation (2) of the paper; Osher et al. 2005).
 
         x^{k+1} = argmin J(x) - J(x^k) - <p^k, x - x^k> + alpha/2 ||K x - f||^2
         p^{k+1} = p^k - alpha K^T (K x^{k+1} - f), a subgradient of J at x^{k+1}
@@ -200,7 +200,7 @@ class Bregman(BregmanSettings):
 
 @dataclass(frozen=True)
 class TwoLineBregman(BregmanSettings):
-    """Bregman iteration in two lines (paper: `bregman update`; Yin et al. 2008).
+    """Bregman iteration in two lines (equation (4) of the paper; Yin et al. 2008).
 
         x^{k+1} = argmin J(x) + alpha/2 ||K x - f + b^k||^2
         b^{k+1} = b^k + K x^{k+1} - f
@@ -248,7 +248,7 @@ class TwoLineBregman(BregmanSettings):
 
 @dataclass(frozen=True)
 class MethodOfMultipliers(BregmanSettings):
-    """Method of multipliers (paper: `minbregman`).
+    """Method of multipliers (equation (8) of the paper).
 
         x^{k+1} = argmin L_alpha(x, lam^k)
         lam^{k+1} = lam^k + alpha (f - K x^{k+1})
@@ -293,7 +293,9 @@ class MethodOfMultipliers(BregmanSettings):
 
 @dataclass(frozen=True)
 class AlternatingBregman(BregmanSettings):
-    """Method of multipliers whose x-step is T passes over the blocks of x (paper: `bregman ADMM`).
+    """Method of multipliers whose x-step is T passes over the blocks of x.
+
+    Equations (9) and (10) of the paper:
 
         T times, for every block i:   x_i = argmin over x_i of L_alpha(x, lam^k)
         lam^{k+1} = lam^k + alpha (f - K x^{k+1})
@@ -380,7 +382,8 @@ class AlternatingBregman(BregmanSettings):
         """||r|| with r_i = alpha K_i^T sum_{j > i} K_j dx_j, dx the change of the last pass.
 
         Block i was minimised with the old x_j of this pass, j > i. Its optimality condition is that
-        K_i^T lam^{k+1} + r_i is in the subdifferential of J_i at x_i (Boyd et al. 2011, 3.3).
+        K_i^T lam^{k+1} + r_i is in the subdifferential of J_i at x_i (Boyd et al. 2011,
+        section 3.3).
         """
         change_of_later_blocks = problem.K @ change
         squares = 0.0

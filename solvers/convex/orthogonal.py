@@ -8,7 +8,7 @@ This is the paper's Algorithm 1 without the pose graph:
 
 A variable may be in two sets; it then has a copy P and a multiplier B for each.
 
-Ebrahimi & Deghat, Algorithm 1 (`algo1: SOC`); Lai & Osher 2014, Algorithm 1.
+Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014, Algorithm 1.
 """
 
 import math
@@ -97,9 +97,10 @@ class OrthogonalSOC:
     ----------
     penalty : float or None
         rho, fixed, as in Algorithm 1. Unless given, rho starts at `safeguard` times the norm of the
-        gradient at the start and is adapted: residuals are balanced (Boyd et al. 2011, 3.4.1, as in
-        the paper), and rho is at least `safeguard` times the least penalty at which the copies are
-        fixed points of their projection, the largest eigenvalue of the multiplier Lambda.
+        gradient at the start and is adapted: residuals are balanced (Boyd et al. 2011, section
+        3.4.1, as in the paper), and rho is at least `safeguard` times the least penalty at which
+        the copies are fixed points of their projection, the largest eigenvalue of the multiplier
+        Lambda.
     alpha : float in (0, 2)
         Over-relaxation.
     safeguard : float above 1

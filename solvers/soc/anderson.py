@@ -2,10 +2,10 @@
 
     s' = g(s) - sum_k gamma_k dg_k,   gamma = argmin || f - sum_k gamma_k df_k ||,   f = g(s) - s
 
-over the last differences df_k of residuals and dg_k of images (Walker & Ni 2011; Zhang et al.
-2020). The vectors may be spread over parties: each has its rows (`AndersonShare`), and sums over
-the parties give all of them the same coefficients (`AndersonSums`). `extrapolate` is the whole
-procedure where one party has all rows.
+over the last differences df_k of residuals and dg_k of images: the type II of Fang & Saad 2009, as
+in Walker & Ni 2011. The vectors may be spread over parties: each has its rows (`AndersonShare`),
+and sums over the parties give all of them the same coefficients (`AndersonSums`). `extrapolate` is
+the whole procedure where one party has all rows.
 """
 
 from __future__ import annotations
@@ -54,8 +54,10 @@ class Anderson:
 
     References
     ----------
+    Fang & Saad, Two classes of multisecant methods for nonlinear acceleration, 2009.
     Walker & Ni, Anderson acceleration for fixed-point iterations, 2011.
-    Zhang, O'Donoghue & Boyd, Globally convergent type-I Anderson acceleration, 2020.
+    Fu, Zhang & Boyd, Anderson accelerated Douglas-Rachford splitting, 2020, regularise type II as
+    well.
 
     Examples
     --------

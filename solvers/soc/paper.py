@@ -1,8 +1,8 @@
 """SOC as the paper has it: rotations only, every robot with its neighbours frozen.
 
-This is Algorithm 1 (`algo1: SOC`) to the letter; `solvers.soc.soc` is the faster variant. All
-robots' subproblems (a) are solved together: they are the diagonal blocks of L, one a robot, so that
-with the neighbours of the last iterate on the right-hand side
+This is Algorithm 1; `PaperSOC` lists where it differs from the paper's text, and `solvers.soc.soc`
+is the faster variant. All robots' subproblems (a) are solved together: they are the diagonal blocks
+of L, one a robot, so that with the neighbours of the last iterate on the right-hand side
 
     (L_blocks + rho/2) Y = rho/2 (omega - B) - L_between Y_last,     L = L_blocks + L_between.
 
@@ -11,8 +11,8 @@ is at Y
 
     2 L Y + rho B = 2 L_between (Y - Y_last) - rho (omega - omega_last),
 
-the dual residual: beside the change of omega, as in Boyd et al. 2011 (3.6), that of the frozen
-neighbours counts. `PaperSOC` lists where this differs from the paper's text.
+the dual residual: beside the change of omega, as in Boyd et al. 2011, section 3.3, that of the
+frozen neighbours counts.
 """
 
 import enum
@@ -126,7 +126,7 @@ class PaperStop(enum.Enum):
 
 @dataclass(frozen=True)
 class PaperSOC:
-    """Algorithm 1 (`algo1: SOC`): rotations only, each robot with its neighbours frozen.
+    """Algorithm 1 of the paper: rotations only, each robot with its neighbours frozen.
 
     Parameters
     ----------
@@ -158,17 +158,18 @@ class PaperSOC:
     - *Weights* (line 3). The paper's sum has none; here the edges have the kappa of F, which
       `graph.unit_weights()` makes 1. The sum over (i, j) is taken over all edges of pose i, in
       either direction: without the incoming ones (a) would not descend on the whole sum.
-    - *R-step* (the text after line (c)). The paper says that FISTA can solve it; the default
-      factors the matrix once per rho. The minimiser is the same to 1e-8.
-    - *Determinant* (line 5). Algorithm and `relaxation rotation` drop det = 1, a sentence below
-      says that the SVD projects to SO(3). Omega is a rotation here.
+    - *R-step* (the text after equation (19)). The paper says that FISTA of Beck and Teboulle can
+      solve it, which is `RStep.FISTA`; the default factors the matrix once per rho. The minimiser
+      is the same to 1e-8.
+    - *Determinant* (line 5). Algorithm and equation (18) drop det = 1, a sentence below says that
+      the SVD projects to SO(3). Omega is a rotation here.
     - *Penalty* (before the first remark). "Boyd's adaptive scheme", which doubles or halves rho, is
       said to be that of Choudhary et al. 2015, with no constant and no first rho. `BoydPenalty` is
       that rule with Boyd's constants, 10 and 2, from the mean of m_i on, and B rescaled with rho as
       Boyd asks, which the paper does not mention. The default, `BalancedPenalty`, compares relative
       residuals instead, moves rho seldom, and raises it for good when the residuals stay up: on the
       paper's scenes Boyd's rule lowers rho until the recursion no longer settles.
-    - *Stopping* (the equation of p_res). The paper stops when p_res is at most the residual, which
+    - *Stopping* (equation (20)). The paper stops when p_res is at most the residual, which
       is the wrong way round, names no tolerance, and leaves out the stationarity that the text asks
       for. Here both residuals count, unless `stop` says otherwise.
     - *Start and output*. The paper starts at GPS and IMU estimates or at a spanning tree, which is

@@ -1,4 +1,4 @@
-"""Back ends of step (a), the R-subproblem, behind one function V -> X (Algorithm 1, step 3).
+"""Back ends of step (a), the R-subproblem, behind one function V -> X (Algorithm 1, line 3).
 
     X(V) = argmin  sum_rows w ||A X||^2 + 1/2 ||sqrt(D) (X - V)||_F^2
 
@@ -6,6 +6,7 @@ With M = A^T diag(w) A this is the solution of (M + D/2) X = D/2 V.
 """
 
 import enum
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
@@ -17,7 +18,7 @@ from pgo_models.geometry.rotations import Array, stack_transposes, unstack_trans
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, factorize
 from pgo_models.problem.matrices import entry_positions
 from pgo_models.problem.problem import PGOProblem
-from solvers.soc.fista import minimize_with_fista
+from solvers.soc.accelerated_gradients import minimize_with_fista, minimize_with_nesterov
 
 if TYPE_CHECKING:
     from pgo_models.convex.convex_solver import ConvexSolver
@@ -32,7 +33,8 @@ class RStep(enum.Enum):
     """Which back end solves the R-subproblem."""
 
     FACTORIZED = "one sparse Cholesky factorisation, then two triangular solves an iteration"
-    FISTA = "accelerated gradients, the paper's choice"
+    FISTA = "gradients with the growing momentum of Beck and Teboulle, the paper's choice"
+    NESTEROV = "gradients with the constant momentum of strongly convex functions, and restarts"
     CLARABEL = "the cvxpy quadratic program, solved by Clarabel"
 
 
@@ -138,6 +140,8 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
         return _Factorized(factor, 0.5 * subproblem.penalty[:, None])
     if back_end is RStep.FISTA:
         return _Fista(subproblem)
+    if back_end is RStep.NESTEROV:
+        return _Nesterov(subproblem)
     return CvxpyStep().prepare(subproblem)
 
 
@@ -232,13 +236,12 @@ class _Factorized:
         return self.factor.solve(self.half_penalty * V)
 
 
-class _Fista:
-    """FISTA on the rotations alone.
+class _Gradients(ABC):
+    """Accelerated gradients on the rotations alone.
 
-    The best translations of an iterate come from one factorised Laplacian. In the variable
-    D^(1/2) R, with H = D^(-1/2) (K_RR - K_Rt K_tt^-1 K_tR) D^(-1/2), the strong convexity is at
-    least 1/2 because Q is positive semidefinite. The Lipschitz constant is a bound on the largest
-    eigenvalue.
+    The best translations of an iterate come from one factorised Laplacian. The variable is
+    D^(1/2) R, with H = D^(-1/2) (K_RR - K_Rt K_tt^-1 K_tR) D^(-1/2). The Lipschitz constant is a
+    bound on the largest eigenvalue.
     """
 
     def __init__(self, subproblem: RSubproblem) -> None:
@@ -261,10 +264,12 @@ class _Fista:
         b_t = b[:count]
         reduced = self._scale * (b[count:] - self._K_tR.T @ self._solve_tt(b_t))
         start = V[count:] / self._scale
-        R = self._scale * minimize_with_fista(
-            self._apply, reduced, start, self._lipschitz, strong_convexity=0.5
-        )
+        R = self._scale * self._minimize(reduced, start)
         return np.concatenate([self._solve_tt(b_t - self._K_tR @ R), R])
+
+    @abstractmethod
+    def _minimize(self, b: Array, start: Array) -> Array:
+        """Y with H Y = b."""
 
     def _apply(self, Y: Array) -> Array:
         t = self._solve_tt(self._K_tR @ (self._scale * Y))
@@ -272,6 +277,17 @@ class _Fista:
 
     def _solve_tt(self, b: Array) -> Array:
         return b if self._factor_tt is None else self._factor_tt.solve(b)
+
+
+class _Fista(_Gradients):
+    def _minimize(self, b: Array, start: Array) -> Array:
+        return minimize_with_fista(self._apply, b, start, self._lipschitz)
+
+
+class _Nesterov(_Gradients):
+    def _minimize(self, b: Array, start: Array) -> Array:
+        # H is half the identity and a positive semidefinite matrix.
+        return minimize_with_nesterov(self._apply, b, start, self._lipschitz, strong_convexity=0.5)
 
 
 @dataclass(frozen=True, eq=False)

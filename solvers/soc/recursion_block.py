@@ -154,7 +154,7 @@ def block_at(
 
 
 def nearest_rotations(rows: Array) -> Array:
-    """Project rows of R_i^T, (dk, d), to the nearest rotations: step (b), in closed form by SVD."""
+    """Project rows of R_i^T, (dk, d), to the nearest rotations: step (b), in closed form."""
     return stack_transposes(project_to_rotations(unstack_transposes(rows)))
 
 

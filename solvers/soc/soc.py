@@ -1,4 +1,4 @@
-"""SOC, splitting of orthogonality constraints: the paper's Algorithm 1 (`algo1: SOC`).
+"""SOC, splitting of orthogonality constraints, on rotations and translations together.
 
 Every rotation R_i is split in two: a d x d matrix x_i that enters the cost and need not be a
 rotation, and a rotation omega_i, with the constraint x_i = omega_i and its scaled multiplier B_i.
@@ -9,8 +9,10 @@ One iteration is
     (c) Bregman     B     = B + x - omega
 
 F is the cost of rotations and translations, here evaluated at matrices x. Step (a) is a convex
-quadratic program over all matrices x_i and all translations t_i; step (b) is an SVD for every pose.
-`Joint.step` is one iteration. The parts around it have files of their own:
+quadratic program over all matrices x_i and all translations t_i. Step (b) projects every pose on
+its own (`project_to_rotations`): in the plane by an angle, in space by an SVD, or from 20 poses on
+by Newton's polar iteration, whose limit is the same. `Joint.step` is one iteration. The parts
+around it have files of their own:
 
 - `anderson`: over-relaxation and acceleration, which replace x by `x_ahead` in (b) and (c);
 - `penalty`: the rules that choose the penalties rho;
@@ -19,6 +21,11 @@ quadratic program over all matrices x_i and all translations t_i; step (b) is an
 The norm in which the recursion measures is ||v||_rho = sqrt(sum_i rho_i ||v_i||_F^2).
 
 The coupling CONSENSUS, in which robots hold copies of their neighbours' poses, is `consensus`.
+
+These are the three steps of the paper's Algorithm 1, whose (a) has the rotations alone, every robot
+with its neighbours frozen, one rho for all poses and edges without weights. Here (a) has the
+translations as well, all poses move at once, every pose has a rho_i, and edges have the precisions
+kappa and tau. `solvers.soc.paper` is Algorithm 1 itself.
 
 Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014.
 """
@@ -45,7 +52,7 @@ from solvers.soc.settings import SOCSettings
 
 @dataclass(frozen=True, eq=False)
 class SOCState(Steps):
-    """Iterate k of JOINT: x, omega, B and rho of Algorithm 1, acceleration and safeguard.
+    """Iterate k of JOINT: x, omega, B and rho as above, acceleration and safeguard.
 
     The fields of `Steps` (k, residuals, merits) come on top of these.
 
@@ -81,7 +88,7 @@ class SOCState(Steps):
 
 @dataclass(frozen=True)
 class Joint:
-    """Algorithm 1 on the whole graph, with one quadratic program; `soc` has the settings."""
+    """The recursion on the whole graph, with one quadratic program; `soc` has the settings."""
 
     soc: SOCSettings
 
@@ -91,7 +98,7 @@ class Joint:
         return self._state_at(problem, start, treat_as_stationary=False)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
-        """One iteration of Algorithm 1.
+        """One iteration: (a), (b) and (c).
 
         `x_ahead` is x after over-relaxation and acceleration; it is x itself without them.
         """
@@ -220,7 +227,9 @@ class Joint:
 
 @dataclass(frozen=True)
 class SOC(SOCSettings):
-    """Splitting of orthogonality constraints (Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014).
+    """Splitting of orthogonality constraints, after Ebrahimi & Deghat and Lai & Osher 2014.
+
+    `PaperSOC` is Ebrahimi and Deghat's own Algorithm 1.
 
     Parameters
     ----------
@@ -289,7 +298,7 @@ class SOC(SOCSettings):
     >>> result.status.name, round(result.objective, 2)
     ('CONVERGED', 97.01)
 
-    The recursion of the paper, without acceleration and with one penalty for all poses:
+    Without acceleration and with one penalty for all poses, as in the paper:
 
     >>> from solvers import FixedPenalty
     >>> plain = SOC(penalty=FixedPenalty(30.0), acceleration=None)

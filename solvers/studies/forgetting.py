@@ -1,7 +1,7 @@
 """Bregman iteration forgets the errors of its steps: a disturbed run beside an undisturbed one.
 
-Yin & Osher, Error forgetting of Bregman iteration, 2013; the two-line form is the paper's `bregman
-update`.
+Yin & Osher, Error forgetting of Bregman iteration, 2013; the two-line form is equation (4) of
+the paper.
 """
 
 from collections.abc import Sequence

@@ -82,6 +82,7 @@ def test_solve_prints_cost_bound_and_gap_and_ends_with_0(pgo_command):
         ("--method", "paper", "--robots", "3"),
         ("--method", "paper", "--split", "singletons"),
         ("--r-step", "fista"),
+        ("--r-step", "nesterov"),
         ("--r-step", "clarabel"),
         ("--start", "tree"),
         ("--start", "file"),

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pgo_command
 import pytest
-from commands import ended, one_line, started
+from commands import ended, one_line, started, with_hangup
 
 import pgo_models as pgo
 from pgo_models.graphs import scenes
@@ -58,9 +58,14 @@ def test_a_signal_in_the_loop_leaves_the_best_iterate_and_one_line(tmp_path, num
 
 
 def test_what_nohup_has_ignored_stays_ignored(tmp_path):
-    ignored = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)}
     process = started(
-        *ENDLESS, "--verbose", "--time-limit", "2", "--out", tmp_path / "x.json", **ignored
+        *ENDLESS,
+        "--verbose",
+        "--time-limit",
+        "2",
+        "--out",
+        tmp_path / "x.json",
+        hangup=signal.SIG_IGN,
     )
     for _ in range(12):
         process.stdout.readline()
@@ -70,8 +75,16 @@ def test_what_nohup_has_ignored_stays_ignored(tmp_path):
     assert json.loads((tmp_path / "x.json").read_text())["status"] == "TIME_LIMIT"
 
 
+@pytest.fixture(params=[signal.SIG_DFL, signal.SIG_IGN], ids=["terminal", "nohup"])
+def hangup_of_the_tests(request):
+    """What a hang-up does to the process of the tests, and so to a process that it starts."""
+    earlier = signal.signal(signal.SIGHUP, request.param)
+    yield
+    signal.signal(signal.SIGHUP, earlier)
+
+
 @SIGNALS
-def test_a_signal_before_the_loop_is_one_line(tmp_path, number, code):
+def test_a_signal_before_the_loop_is_one_line(tmp_path, number, code, hangup_of_the_tests):
     os.mkfifo(tmp_path / "graph")
     process = started("solve", tmp_path / "graph", "--out", tmp_path / "x.tum")
     with open(tmp_path / "graph", "w") as graph:  # opens when the command reads
@@ -97,7 +110,7 @@ def test_a_signal_while_it_is_imported_is_one_line(number, code):
         "from pgo_command import main; main()"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", program, "info"],
+        [*with_hangup(program), "info"],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -46,7 +46,7 @@ def largest_difference(solutions: list[Array]) -> float:
     return max(float(np.abs(solution - solutions[0]).max()) for solution in solutions)
 
 
-@pytest.mark.parametrize("back_end", [RStep.FACTORIZED, RStep.FISTA])
+@pytest.mark.parametrize("back_end", [RStep.FACTORIZED, RStep.FISTA, RStep.NESTEROV])
 @pytest.mark.parametrize("backend", CholeskyBackend)
 @settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, translations=st.booleans())
@@ -136,7 +136,7 @@ def test_the_back_ends_agree_on_the_paper_s_blocks(
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_measurements_without_a_turn_hide_nothing_from_fista(d: int) -> None:
+def test_measurements_without_a_turn_hide_nothing_from_the_gradients(d: int) -> None:
     # The eigenvector that an estimate of the Lipschitz constant starts from is orthogonal to the
     # one it looks for.
     i = np.arange(5)
@@ -152,7 +152,7 @@ def test_measurements_without_a_turn_hide_nothing_from_fista(d: int) -> None:
 
 @pytest.mark.parametrize("translation_penalty", [0.0, 1e4])
 @pytest.mark.parametrize(("d", "num_poses"), [(2, 400), (3, 100)])
-def test_a_loop_along_a_diagonal_hides_nothing_from_fista(
+def test_a_loop_along_a_diagonal_hides_nothing_from_the_gradients(
     d: int, num_poses: int, translation_penalty: float
 ) -> None:
     # There and back along (1, -1, 0): the top eigenvectors are orthogonal to ones, and the stiff
