@@ -155,8 +155,8 @@ MUTANTS = (
     Mutant(
         "the rounding of the entries of S is not counted",
         "pgo_models/certificates/definiteness.py",
-        "self.entries + self.factor_error()",
-        "0.0 * self.entries + self.factor_error()",
+        "error = OUTWARD * (self.entries + factor_error)",
+        "error = OUTWARD * (0.0 * self.entries + factor_error)",
         BOUNDS,
     ),
     # Cholesky factors and floating point.

@@ -379,10 +379,9 @@ def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBoun
     fixed = np.arange(1 if problem.has_translations else problem.num_poses)
     proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
     if proof is not None and proof.slack() is None:
-        # The margin was too small for the rounding of the factorisation, which nobody knew yet. It
-        # depends on the pattern alone: the second proof begins with it and has a slack.
-        error = proof.factor_error()
-        proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN, factor_error=error)
+        # The margin was too small for the rounding of the factorisation, which nobody knew yet:
+        # the second proof begins with it and has a slack.
+        proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
     if proof is None:
         return None
     trace = _trace(Lambda)
@@ -407,16 +406,10 @@ def bound_with_eta(
 
 
 def _prove_grounded(
-    problem: PGOProblem,
-    Lambda: Array,
-    eta: float,
-    ground: _Ground,
-    factor_error: Array | None = None,
+    problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground
 ) -> LowerBound | None:
     """Form grounded at a pose; None where S_r + eta blockdiag(0, I) is not shown to be definite."""
-    proof = prove_definite(
-        problem, Lambda, eta, ground.rows, turned=ground.X, factor_error=factor_error
-    )
+    proof = prove_definite(problem, Lambda, eta, ground.rows, turned=ground.X)
     if proof is None:
         return None
 
@@ -426,10 +419,9 @@ def _prove_grounded(
     point = move_until_settled(_first_point(problem, Lambda, ground.X), move)
     slack = proof.slack()
     if slack is None:
-        # The margin was too small for the rounding of the factorisation, which nobody knew yet. It
-        # depends on the pattern alone, and the backend keeps it: every proof that is found from now
-        # on has a slack, so that this happens once.
-        return _prove_grounded(problem, Lambda, eta, ground, proof.factor_error())
+        # The margin was too small for the rounding of the factorisation, which nobody knew yet:
+        # every proof that is found from now on has a slack, so that this happens once.
+        return _prove_grounded(problem, Lambda, eta, ground)
     evaluation = point.evaluation
     if evaluation is None:
         evaluation = evaluate_certificate(problem, Lambda, point.X, point.low)
