@@ -246,7 +246,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     offsets = poses.t.take(graph.j, axis=0) - poses.t.take(graph.i, axis=0)
     distances = block_norms(offsets)
     e_t, e_R = _residual_errors(problem, poses, distances)
-    _, residuals = problem.evaluated(poses)
+    residuals = problem.at(poses).residuals
     _, w = problem.residual_matrix
     # sum ||D r|| e, the terms that are linear in the errors. Along the axes of W, which turn no
     # norm, kappa weighs row by row.

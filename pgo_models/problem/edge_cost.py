@@ -157,10 +157,10 @@ class EdgeCost:
         """The constant that a quadratic cost adds to tr(X^T M X), and a bound on its error."""
         return 0.0, 0.0
 
-    def minorant(self, problem: EdgeProblem, poses: Poses) -> "EdgeCost":
-        """A quadratic cost that is at most this one everywhere and equal to it at the poses.
+    def minorant(self, problem: EdgeProblem, X: Array, residuals: Array) -> "EdgeCost":
+        """A quadratic cost that is at most this one everywhere and equal to it at X, (N, d).
 
-        Of a quadratic cost it is the cost itself.
+        The residuals are A X. Of a quadratic cost it is the cost itself.
         """
         return self
 
@@ -176,9 +176,9 @@ class EdgeCost:
         # numpy sums in pairs: the result is off by a few dozen roundings, not by one an edge.
         return float(np.sum(weighted_squares))
 
-    def value_at(self, problem: EdgeProblem, poses: Poses) -> float:
-        """Sum of the costs at poses."""
-        return self.value(problem, *problem.evaluated(poses))
+    def value_at_contact(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
+        """Value at the X where this cost, a `minorant`, touches the one that it was made of."""
+        return self.value(problem, X, residuals)
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """Cost of every edge, (m,)."""
@@ -405,7 +405,7 @@ class EdgeCost:
         and e_R; subclasses need these.
         """
         m = len(self.tau)
-        _, residuals = problem.evaluated(poses)
+        residuals = problem.residuals(poses.stacked())
         return [self.rotation.error_of_rows(residuals[m:])]
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:

@@ -64,9 +64,8 @@ class ExcessCost(EdgeCost):
         """True: only chi2 has an excess."""
         return True
 
-    def minorant(self, problem: EdgeProblem, poses: Poses) -> "TangentCost":
-        """The cost with the excess replaced by its tangent at the poses."""
-        X, residuals = problem.evaluated(poses)
+    def minorant(self, problem: EdgeProblem, X: Array, residuals: Array) -> "TangentCost":
+        """The cost with the excess replaced by its tangent at X."""
         Z = self.edge_products(problem.graph, X, residuals)
         tangent = self.excess.tangent(Z)
         return TangentCost(self.tau, self.rotation, tangent)
@@ -77,11 +76,6 @@ class ExcessCost(EdgeCost):
         quadratic_part = super().value(problem, X, residuals)
         excess, _ = self.excess.evaluate(Z)
         return quadratic_part + float(np.sum(excess))
-
-    def value_at(self, problem: EdgeProblem, poses: Poses) -> float:
-        """chi2 at poses, whose excess the tangent there has."""
-        quadratic_part = super().value(problem, *problem.evaluated(poses))
-        return quadratic_part + float(np.sum(problem.tangent_of_excess(poses).value))
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """chi2 of every edge, (m,)."""
@@ -119,7 +113,8 @@ class ExcessCost(EdgeCost):
         m = graph.num_edges
         if factor is None:
             factor = self.translation_factor(problem, poses)
-        X, residuals = problem.evaluated(poses)
+        X = poses.stacked()
+        residuals = problem.residuals(X)
         Z = self.edge_products(graph, X, residuals)
         u = self.excess.argument(Z)
         J_u_t = np.einsum("mab,mb->ma", self.excess.J[:, :d], u)
@@ -150,7 +145,8 @@ class ExcessCost(EdgeCost):
         rounding of the excess.
         """
         d = problem.d
-        tangent = problem.tangent_of_excess(poses)
+        X = poses.stacked()
+        tangent = self.minorant(problem, X, problem.residuals(X)).tangent
         C = tangent.C
         C_norm_t = block_norms(C[:, 0])
         C_norm_R = block_norms(C[:, 1:])
@@ -267,6 +263,11 @@ class TangentCost(EdgeCost):
         quadratic_part = super().value(problem, X, residuals)
         tangent = float(np.sum(self.tangent.values(Z)))
         return quadratic_part + tangent
+
+    def value_at_contact(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
+        """chi2 at the X of the tangent, which has the excess there."""
+        quadratic_part = super().value(problem, X, residuals)
+        return quadratic_part + float(np.sum(self.tangent.value))
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """The minorant of every edge, (m,)."""

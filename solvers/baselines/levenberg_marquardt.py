@@ -183,7 +183,7 @@ def _linearized(
     mu: float,
     analysis: SymbolicCholesky | None = None,
 ) -> LevenbergMarquardtState:
-    matrix = riemannian_hessian(problem, poses, None)
+    matrix = riemannian_hessian(problem.at(poses), None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
     if analysis is None:
