@@ -78,11 +78,6 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     root : int
         The pose at (I, 0).
 
-    Returns
-    -------
-    Poses
-        The start.
-
     Raises
     ------
     GraphError
@@ -149,11 +144,6 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
         Whether the rotations in the plane take a step of rotation averaging. The result is often
         near the constrained minimum of the same sum, and on large graphs Newton's method needs a
         factorisation less from there.
-
-    Returns
-    -------
-    Poses
-        The start.
 
     Examples
     --------

@@ -136,20 +136,7 @@ class LevenbergMarquardt:
         return Measurement(state.objective, 0.0, state.decrement)
 
     def poses(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Poses:
-        """Return the poses of a state.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : LevenbergMarquardtState
-            A state of this solver.
-
-        Returns
-        -------
-        Poses
-            Its poses.
-        """
+        """Return the poses of a state."""
         return state.poses
 
     def converged(self, state: LevenbergMarquardtState, measurement: Measurement) -> Status | None:

@@ -182,13 +182,6 @@ class Bregman(BregmanSettings):
     def point(self, problem: BregmanProblem, state: BregmanState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
 
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : BregmanState
-            A state of this solver.
-
         Returns
         -------
         BregmanPoint
@@ -231,13 +224,6 @@ class TwoLineBregman(BregmanSettings):
     def point(self, problem: BregmanProblem, state: TwoLineState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
 
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : TwoLineState
-            A state of this solver.
-
         Returns
         -------
         BregmanPoint
@@ -275,13 +261,6 @@ class MethodOfMultipliers(BregmanSettings):
 
     def point(self, problem: BregmanProblem, state: MultiplierState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
-
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : MultiplierState
-            A state of this solver.
 
         Returns
         -------
@@ -351,13 +330,6 @@ class AlternatingBregman(BregmanSettings):
 
     def point(self, problem: BregmanProblem, state: AlternatingState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
-
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : AlternatingState
-            A state of this solver.
 
         Returns
         -------

@@ -156,13 +156,6 @@ class ExtendedSOC:
     def poses(self, problem: PGOProblem, state: SOCState) -> Poses:
         """Return the poses that a state stands for.
 
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : SOCState
-            A state of this solver.
-
         Returns
         -------
         Poses

@@ -221,11 +221,6 @@ class GrowingStart:
     def has_prefixes(self, graph: PoseGraph) -> bool:
         """Return whether a graph has shorter prefixes to begin with, joined by odometry.
 
-        Parameters
-        ----------
-        graph : PoseGraph
-            The graph.
-
         Returns
         -------
         bool
@@ -281,13 +276,6 @@ class GrowingStart:
 
     def poses(self, problem: PGOProblem, state: PrefixState) -> Poses:
         """Return the poses of a state.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : PrefixState
-            A state of this method.
 
         Returns
         -------
