@@ -2,8 +2,8 @@
 
 Equations of the paper's section 2 by label: `problem bregman` is the problem; `update B`, `bregman
 update` and `minbregman` are the three forms of the iteration whose subproblems are compiled here,
-each with one Parameter (DPP); `bregman ADMM` alternates over the blocks of x. The iterations
-themselves are in solvers/convex/bregman.py.
+each with one Parameter (DPP); `bregman ADMM` alternates over the blocks of x. As in the paper,
+alpha is the penalty here. The iterations themselves are in solvers/convex/bregman.py.
 """
 
 import math

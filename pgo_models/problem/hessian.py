@@ -194,7 +194,7 @@ def _curvature_blocks(
 
 
 def double_cross(A: Array, B: Array) -> Array:
-    """K with u^T K v = <hat(u) A hat(v)^T, B>: (n, 3, 3) in space, (n, 1, 1) in the plane.
+    """Phi with u^T Phi v = <hat(u) A hat(v)^T, B>: (n, 3, 3) in space, (n, 1, 1) in the plane.
 
     For B = A it is 2 cof(A).
 

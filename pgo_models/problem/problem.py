@@ -224,7 +224,7 @@ class PGOProblem(ReadOnly):
         return self.at(poses).tangent
 
     def with_rotation_terms(self, i: IntArray, j: IntArray, R_ij: Array, W: Array) -> "PGOProblem":
-        """Return the problem with terms tr(W rho_R rho_R^T), rho_R = R_j^T - R_ij^T R_i^T.
+        """Return the problem with terms tr(W delta_R delta_R^T), delta_R = R_j^T - R_ij^T R_i^T.
 
         Parameters
         ----------

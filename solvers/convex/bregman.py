@@ -7,9 +7,9 @@ Each form is a class, to step through and to compare:
     MethodOfMultipliers lam <- lam + alpha (f - K x)      x minimises the augmented Lagrangian
     AlternatingBregman  lam <- lam + alpha (f - K x)      x by T passes over its blocks
 
-The equations are `update B`, `bregman update`, `minbregman` and `bregman ADMM` of the paper. The
-first three forms have the same x, with p = K^T lam and lam = -alpha b; the last one is ADMM for
-T = 1. Osher et al. 2005; Yin et al. 2008; Esser 2009.
+The equations are `update B`, `bregman update`, `minbregman` and `bregman ADMM` of the paper, whose
+alpha is the penalty. The first three forms have the same x, with p = K^T lam and lam = -alpha b;
+the last one is ADMM for T = 1. Osher et al. 2005; Yin et al. 2008; Esser 2009.
 """
 
 import math

@@ -2,7 +2,7 @@
 
 The chordal relaxation, a spanning tree and odometry give poses of the whole graph at once. Where
 odometry is poor, or landmarks tie the poses together, Newton goes from them to a local minimum that
-may cost many times the least. A prefix has the poses 0 .. K - 1 alone. Its start is the solution of
+may cost many times the least. A prefix has the poses 0 .. k - 1 alone. Its start is the solution of
 a shorter prefix, continued by odometry over so few poses that it has no time to drift away.
 
 Whether it has is seen: where S_r, the certificate matrix grounded at a pose, is positive definite,

@@ -100,8 +100,8 @@ class Interior:
         part = self.part
         p = len(part.poses)
         fixed = 0 if part.poses[0] == 0 else None
-        K, b = relaxed_rotations(part.problem, fixed)
-        of_rotations = K[p:, p:].tocsc()
+        matrix, b = relaxed_rotations(part.problem, fixed)
+        of_rotations = matrix[p:, p:].tocsc()
         return self._eliminate(of_rotations, (part.problem.d,), b[p:])
 
     def project(self, x: Array) -> tuple[Interior, None]:
