@@ -242,8 +242,8 @@ MUTANTS = (
     Mutant(
         "the rounding of residuals is not counted in S X",
         "pgo_models/certificates/rounding_errors.py",
-        "errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(rho)",
-        "errors = UNIT_ROUNDOFF * np.abs(rho)",
+        "errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(delta)",
+        "errors = UNIT_ROUNDOFF * np.abs(delta)",
         ("tests/certificates/test_rounding_errors.py", "tests/certificates/test_error_formulas.py"),
     ),
     # Handedness terms.
