@@ -79,7 +79,7 @@ from pgo_models.problem.initialization import (
     spanning_tree_start as spanning_tree_start,
 )
 from pgo_models.problem.marginals import Marginals as Marginals
-from pgo_models.problem.problem import PGOProblem as PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses as EvaluatedPoses, PGOProblem as PGOProblem
 from pgo_models.problem.thresholds import (
     EdgeResiduals as EdgeResiduals,
     chi2_thresholds as chi2_thresholds,
@@ -113,7 +113,7 @@ __all__ += ["Partition", "PartitionMethod", "partition"]
 __all__ += ["known_datasets", "load", "read_g2o", "read_jrl", "write_g2o"]
 __all__ += ["read_kitti", "read_tum", "write_tum"]
 __all__ += ["circle", "grid", "grid_world", "random_geometric", "sphere", "victoria_park"]
-__all__ += ["CholeskyBackend", "Marginals", "PGOProblem", "Weighting"]
+__all__ += ["CholeskyBackend", "EvaluatedPoses", "Marginals", "PGOProblem", "Weighting"]
 __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]
 __all__ += ["Certificate", "Verdict", "certificate_matrix", "certify_at"]
 __all__ += ["multipliers", "prove_bound"]

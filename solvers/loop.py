@@ -69,13 +69,6 @@ class Method(Protocol[P, X, S]):
     def measure(self, problem: P, state: S) -> Measurement:
         """Return figures of a state.
 
-        Parameters
-        ----------
-        problem : P
-            What is to be solved.
-        state : S
-            Any state.
-
         Returns
         -------
         Measurement
@@ -104,13 +97,6 @@ class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
 
     def poses(self, problem: PGOProblem, state: S) -> Poses:
         """Return the feasible poses of a state.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            What is to be solved.
-        state : S
-            Any state.
 
         Returns
         -------

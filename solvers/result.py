@@ -246,18 +246,7 @@ class Stage:
 
     @classmethod
     def of(cls, run: Run[S]) -> "Stage":
-        """Return the stage of a finished run.
-
-        Parameters
-        ----------
-        run : Run
-            A run of a solver.
-
-        Returns
-        -------
-        Stage
-            Its figures.
-        """
+        """Return the stage of a finished run."""
         return cls(
             run.name,
             run.status,

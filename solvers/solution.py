@@ -179,7 +179,7 @@ class Solution:
             p = d(d-1)/2 for rotations.
         """
         hessian = riemannian_hessian(
-            self.problem, self.poses, multipliers(self.problem, self.poses)
+            self.problem.at(self.poses), multipliers(self.problem, self.poses)
         )
         hessian, layout = unknowns_of(self.problem, hessian)
         anchor = self.anchor if anchor is None else anchor

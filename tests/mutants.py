@@ -155,8 +155,8 @@ MUTANTS = (
     Mutant(
         "the rounding of the entries of S is not counted",
         "pgo_models/certificates/definiteness.py",
-        "self.entries + self.factor_error()",
-        "0.0 * self.entries + self.factor_error()",
+        "error = OUTWARD * (self.entries + factor_error)",
+        "error = OUTWARD * (0.0 * self.entries + factor_error)",
         BOUNDS,
     ),
     # Cholesky factors and floating point.
@@ -242,8 +242,8 @@ MUTANTS = (
     Mutant(
         "the rounding of residuals is not counted in S X",
         "pgo_models/certificates/rounding_errors.py",
-        "errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(rho)",
-        "errors = UNIT_ROUNDOFF * np.abs(rho)",
+        "errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(delta)",
+        "errors = UNIT_ROUNDOFF * np.abs(delta)",
         ("tests/certificates/test_rounding_errors.py", "tests/certificates/test_error_formulas.py"),
     ),
     # Handedness terms.

@@ -59,7 +59,7 @@ def solved(backend: pgo.CholeskyBackend = pgo.CholeskyBackend.CHOLMOD) -> solver
 def marginals() -> pgo.Marginals:
     problem = solved().problem
     poses = solved().poses
-    hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
+    hessian = riemannian_hessian(problem.at(poses), multipliers(problem, poses))
     found = pgo.Marginals(hessian, TangentLayout(problem.num_poses, problem.d))
     found.joint(1, 2)
     assert found.diagonal.size
@@ -108,6 +108,7 @@ def subproblem() -> solvers.RSubproblem:
 # Everything that is made, by the name of its public class; what no name stands for is a result of a
 # public function.
 MADE: dict[str, Make] = {
+    "EvaluatedPoses": lambda: pgo.PGOProblem(GRAPH).at(pgo.chordal_start(pgo.PGOProblem(GRAPH))),
     "PGOError": lambda: pgo.PGOError("a reason"),
     "Poses": lambda: solved().poses,
     "PoseGraph": lambda: solved().problem.graph,

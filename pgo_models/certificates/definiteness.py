@@ -25,7 +25,7 @@ from pgo_models.certificates.rounding_errors import matrix_errors
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import CholeskyFactor
+from pgo_models.problem.cholesky import CholeskyFactor, NonZeros
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
 
@@ -61,8 +61,8 @@ class DefiniteProof:
     entries: Array  # share that the rounding of the entries takes, (N,)
     # whether a larger margin failed: the factor may be far from one of the matrix without a margin
     is_marginal: bool
-    # share that the rounding of the factorisation takes, where the factor need not be asked
-    error: Array | None = None
+    # share that the rounding of the factorisation takes, (N,), where the factor need not be asked
+    factor_error: Array | None = None
 
     @property
     def free(self) -> BoolArray:
@@ -73,21 +73,21 @@ class DefiniteProof:
         """Diagonal that can be subtracted from the exact matrix, (N,), positive in free rows.
 
         The exact matrix less diag(slack) is positive semidefinite in the free rows. It is None if
-        rounding takes over half of the margin.
+        rounding takes over half of the margin. What the factorisation takes of it depends on the
+        pattern alone then, and is counted from now on: the same proof, made once more, has a slack.
 
         The stored matrix is at least (margin - factor's error) diag, and the exact one differs from
         it by at most entries diag. The factor may be taken apart for it, so that solving first is
         cheaper.
         """
-        error = OUTWARD * (self.entries + self.factor_error())
+        factor_error = self.factor_error
+        if factor_error is None:
+            factor_error = self.factor.backward_error()
+        error = OUTWARD * (self.entries + factor_error)
         if (2.0 * error <= self.margin).all():
             share_left = (self.margin - error) / OUTWARD
             return share_left * self.diagonal
         return None
-
-    def factor_error(self) -> Array:
-        """Share of the diagonal that the rounding of the factorisation takes, (N,)."""
-        return self.error if self.error is not None else self.factor.last_error()
 
     def solve(self, product: Array) -> Array:
         """About S^-1 product, (N, d), in the rows that are not left out, and zero in those.
@@ -117,7 +117,6 @@ def prove_definite(
     fixed: IntArray,
     first_margin: float = FIRST_MARGIN,
     turned: Array | None = None,
-    factor_error: Array | None = None,
 ) -> DefiniteProof | None:
     """Proof that S + eta blockdiag(0, I) is definite without the rows `fixed`, or None.
 
@@ -127,8 +126,6 @@ def prove_definite(
     energy is small, and the margin has to take little of it. A bound on the rounding of the
     factorisation may be known for any number of non-zeros in the factor, or for the most that there
     can be; where the margin for that takes little enough, the non-zeros are not counted.
-    `factor_error`, (N,), is the share that the rounding of the factorisation takes, as of
-    `DefiniteProof.factor_error`, where it is known from another factor of the same pattern.
     """
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = eta
@@ -145,21 +142,20 @@ def prove_definite(
     free_diagonal = diagonal.copy()
     free_diagonal[fixed] = 0.0
     entries = matrix_errors(problem, diagonal)
-    expected = factor_error
-    if expected is None:
-        expected = problem.analysis.expected_error()
+    expected = problem.analysis.backward_error(NonZeros.COUNTED)
+    is_counted = bool(np.isfinite(expected).all())
     if turned is not None:
         softness = _softness(stored, free_diagonal, turned)
         # A uniform margin takes margin * sum(weights) of each energy: little of the softest one.
         weight_sums = softness.weights.sum(axis=0)
         softest = float(np.min(SHRINK * softness.energies / weight_sums))
         first_margin = min(first_margin, max(softest, LEAST_MARGIN))
-        if expected is None:
+        if not is_counted:
             uncounted = _factor_without_counts(problem, attempt, entries, first_margin, softness)
             if uncounted is not None:
                 factor, margin, error = uncounted
                 return DefiniteProof(stored, factor, free_diagonal, margin, entries, False, error)
-    if expected is None:
+    if not is_counted:
         expected = np.zeros_like(entries)
     chosen = search_margin(attempt, entries, expected, first_margin)
     if chosen is None:
@@ -194,10 +190,9 @@ def _factor_without_counts(
 
     None where the margin for such a bound takes too much of the softest energy, or does not factor.
     """
-    analysis = problem.analysis
     room = ROOM * softness.energies
-    for bound_error in (analysis.crude_error, analysis.error_before):
-        error = bound_error()
+    for non_zeros in (NonZeros.ALL, NonZeros.MOST):
+        error = problem.analysis.backward_error(non_zeros)
         margin = np.maximum(first_margin, ROUNDING_MULTIPLE * (entries + error))
         is_small = np.isfinite(margin).all() and (margin @ softness.weights <= room).all()
         factor = attempt(margin) if is_small else None
@@ -260,8 +255,8 @@ def search_margin(
 
     Returned with it are the margin, (N,), and whether a larger one failed.
 
-    A factor with the first margin whose error is not known before it is taken apart
-    (`CholeskyFactor.known_error`) is returned as it is. `attempt` factors with shares, (N,), of the
+    A factor with the first margin that would have to be taken apart for its error (one that is not
+    `CholeskyFactor.is_counted`) is returned as it is. `attempt` factors with shares, (N,), of the
     diagonal subtracted, or gives None when that does not go through; `entries` and `expected`,
     (N,), are the shares that rounding the entries takes, and factoring may take.
     """
@@ -274,10 +269,9 @@ def search_margin(
             uniform = SHRINK * uniform
             is_marginal = True
             continue
-        known = factor.backward_error() if is_marginal else factor.known_error()
-        if known is None:
+        if not (is_marginal or factor.is_counted):
             return factor, margin, is_marginal
-        error = OUTWARD * (entries + known)
+        error = OUTWARD * (entries + factor.backward_error())
         if (2.0 * error <= margin).all():
             return factor, margin, is_marginal
         expected = np.maximum(expected, error)

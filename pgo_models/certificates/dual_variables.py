@@ -7,7 +7,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import CholeskyFactor
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 
 def multipliers(problem: PGOProblem, poses: Poses) -> Array:
@@ -35,11 +35,15 @@ def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     >>> multipliers(problem, problem.graph.truth).shape
     (27, 3, 3)
     """
-    n = problem.num_poses
-    d = problem.d
-    half_gradient = problem.apply_M_at(poses)
-    rotation_blocks = half_gradient[n:].reshape(n, d, -1)
-    product = rotation_blocks @ poses.R
+    return multipliers_at(problem.at(poses))
+
+
+def multipliers_at(here: EvaluatedPoses) -> Array:
+    """`multipliers` of poses whose gradient may be known."""
+    R = here.poses.R
+    n, _, d = R.shape
+    rotation_blocks = here.half_gradient[n:].reshape(n, d, -1)
+    product = rotation_blocks @ R
     transposed = np.swapaxes(product, 1, 2)
     return 0.5 * (product + transposed)
 

@@ -98,15 +98,15 @@ class HandednessTerms(ReadOnly):
     def loss(self) -> float:
         """Bound on what all terms can be below zero on rotations, as T and P are rounded.
 
-        Let T be off by D from the nearest rotation, ||D||_F <= omega and ||T^T T - I||_F <= omega.
+        Let T be off by D from the nearest rotation, ||D||_F <= slant and ||T^T T - I||_F <= slant.
         Then the term of T is off by tr(W (T^T T - I)) and 2 tr(W R_j^T R_i D) from that of the
-        rotation, 3 omega ||W||_* at most, ||W||_* <= sqrt(3) ||W||_F. The P that belongs to the
+        rotation, 3 slant ||W||_* at most, ||W||_* <= sqrt(3) ||W||_F. The P that belongs to the
         stored W is 4 (tr(W) I - W), off by a few roundings from the P that is stored, whose
         smallest eigenvalue, where it is negative, is a bound on v^T P v, |v| <= 1.
         """
-        omega = orthogonality_error(self.T) + 3.0 * gamma(5.0)
+        slant = orthogonality_error(self.T) + 3.0 * gamma(5.0)
         W_size = np.linalg.norm(self.W, axis=(1, 2))
-        of_T = 3.0 * omega * math.sqrt(3.0) * W_size
+        of_T = 3.0 * slant * math.sqrt(3.0) * W_size
         P_size = np.linalg.norm(self.P, axis=(1, 2))
         least = np.linalg.eigvalsh(self.P)[:, 0] - _EIGENVALUE_ERROR * UNIT_ROUNDOFF * P_size
         of_P = np.maximum(0.0, -least)

@@ -12,12 +12,12 @@ feasible X has
 **Grounded at pose r.** Let X' be any matrix whose rows of pose r are (0, I), feasible elsewhere or
 not, and G = S X'. An index r on S, G and Z means that pose r is left out: S_r is S without the rows
 and columns of pose r, G_r is G without its rows. Shift a feasible X so that its pose r is at the
-origin; that leaves S X and F as they are. With the rotation Q = R_r^T, X and X' Q have the same
-rows of pose r, so that Z = X - X' Q vanishes there. As Q Q^T = I,
+origin; that leaves S X and F as they are. With the rotation V = R_r^T, X and X' V have the same
+rows of pose r, so that Z = X - X' V vanishes there. As V V^T = I,
 
-    tr(X^T S X) = tr(X'^T S X') + 2 tr((G_r Q)^T Z_r) + tr(Z_r^T S_r Z_r).
+    tr(X^T S X) = tr(X'^T S X') + 2 tr((G_r V)^T Z_r) + tr(Z_r^T S_r Z_r).
 
-If S_r is positive definite, the right side is least at Z_r = -S_r^-1 G_r Q, and Q cancels there:
+If S_r is positive definite, the right side is least at Z_r = -S_r^-1 G_r V, and V cancels there:
 
     tr(X^T S X) >= tr(X'^T S X') - tr(G_r^T S_r^-1 G_r).
 
@@ -40,10 +40,10 @@ tangent made there is stationary, too.
 **With a shift eta.** Where S_r is not positive definite, H = S_r + eta blockdiag(0, I) may be. With
 H in place of S_r the bound also loses eta times the squared norm of the rotation blocks of Z,
 
-    sum_i ||R_i^T - P_i Q||_F^2 <= sum_i (sqrt(8) + ||P_i - P^_i||_F)^2,
+    sum_i ||R_i^T - P_i V||_F^2 <= sum_i (sqrt(8) + ||P_i - P^_i||_F)^2,
 
 where P_i is the rotation block of X' for pose i, and P^_i the rotation at which it began: the
-rotations R_i^T and P^_i Q are at most sqrt(8) apart, in the plane and in space. Another form asks
+rotations R_i^T and P^_i V are at most sqrt(8) apart, in the plane and in space. Another form asks
 nothing of poses: if S + eta blockdiag(0, I) is positive definite without the row and column of one
 translation, F >= tr(Lambda) + constant - eta n d (weak duality: Rosen et al. 2019; Carlone et al.
 2015).
@@ -314,7 +314,7 @@ def quadratic_loss(product: Array, error: Array | float, slack: Array) -> float:
 
 
 def squared_distances(moved: Array, rotations: Array) -> float:
-    """Bound on sum_i ||R_i^T - P_i Q||_F^2 over all rotations R_i and Q, rounded up.
+    """Bound on sum_i ||R_i^T - P_i V||_F^2 over all rotations R_i and V, rounded up.
 
     The blocks P_i were moved away from stored rotations P^_i; rows of both, (d n, d), are given.
 
@@ -379,10 +379,9 @@ def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBoun
     fixed = np.arange(1 if problem.has_translations else problem.num_poses)
     proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
     if proof is not None and proof.slack() is None:
-        # The margin was too small for the rounding of the factorisation, which nobody knew yet. It
-        # depends on the pattern alone: the second proof begins with it and has a slack.
-        error = proof.factor_error()
-        proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN, factor_error=error)
+        # The margin was too small for the rounding of the factorisation, which nobody knew yet:
+        # the second proof begins with it and has a slack.
+        proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
     if proof is None:
         return None
     trace = _trace(Lambda)
@@ -407,16 +406,10 @@ def bound_with_eta(
 
 
 def _prove_grounded(
-    problem: PGOProblem,
-    Lambda: Array,
-    eta: float,
-    ground: _Ground,
-    factor_error: Array | None = None,
+    problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground
 ) -> LowerBound | None:
     """Form grounded at a pose; None where S_r + eta blockdiag(0, I) is not shown to be definite."""
-    proof = prove_definite(
-        problem, Lambda, eta, ground.rows, turned=ground.X, factor_error=factor_error
-    )
+    proof = prove_definite(problem, Lambda, eta, ground.rows, turned=ground.X)
     if proof is None:
         return None
 
@@ -426,17 +419,16 @@ def _prove_grounded(
     point = move_until_settled(_first_point(problem, Lambda, ground.X), move)
     slack = proof.slack()
     if slack is None:
-        # The margin was too small for the rounding of the factorisation, which nobody knew yet. It
-        # depends on the pattern alone, and the backend keeps it: every proof that is found from now
-        # on has a slack, so that this happens once.
-        return _prove_grounded(problem, Lambda, eta, ground, proof.factor_error())
+        # The margin was too small for the rounding of the factorisation, which nobody knew yet:
+        # every proof that is found from now on has a slack, so that this happens once.
+        return _prove_grounded(problem, Lambda, eta, ground)
     evaluation = point.evaluation
     if evaluation is None:
         evaluation = evaluate_certificate(problem, Lambda, point.X, point.low)
     free = proof.free
     product = evaluation.product[free]
     product_error = evaluation.product_error[free]
-    # The bound is value - tr(G_r^T H^-1 G_r) - eta sum_i ||R_i^T - P_i Q||_F^2 with G = S X' after
+    # The bound is value - tr(G_r^T H^-1 G_r) - eta sum_i ||R_i^T - P_i V||_F^2 with G = S X' after
     # the last move (this file's opening). Both losses, and the error of the value, are replaced by
     # upper bounds: H - diag(slack) is positive semidefinite.
     quadratic = quadratic_loss(product, product_error, slack[free])

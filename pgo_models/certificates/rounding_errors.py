@@ -80,16 +80,16 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     high_difference = t.take(graph.j, axis=0) - t.take(graph.i, axis=0)
     low_difference = low.take(graph.j, axis=0) - low.take(graph.i, axis=0)
     difference = high_difference + low_difference
-    rho = np.concatenate([difference[:, None], P_j], axis=1)
-    rho -= measured_rows @ P_i
+    delta = np.concatenate([difference[:, None], P_j], axis=1)
+    delta -= measured_rows @ P_i
     # Bounds on their errors: a product is a sum of d products, and every difference is rounded once
     # more.
     product_sizes = np.abs(measured_rows) @ np.abs(P_i)
-    errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(rho)
+    errors = gamma(d) * product_sizes + UNIT_ROUNDOFF * np.abs(delta)
     # The translations take two more differences and their sum.
     difference_sizes = np.abs(high_difference) + np.abs(low_difference) + np.abs(difference)
     errors[:, 0] += UNIT_ROUNDOFF * difference_sizes
-    terms = weights.evaluate_edges(rho, errors, P_i)
+    terms = weights.evaluate_edges(delta, errors, P_i)
     # M X = A^T G: an entry is a sum over the edges of a pose of products of an entry of A and G,
     # which is itself a sum of at most d + 1 terms.
     A = problem.plain_residual_matrix
@@ -226,8 +226,8 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     As computed, a residual is off by its evaluation and by the `orthogonality_error` of the stored
     R, at most
 
-        e_t = (2 d + 3) u (||t_j - t_i|| + ||t_ij||) + omega ||t_ij||,
-        e_R = 2 sqrt(d) (2 d + 3) u + 2 omega
+        e_t = (2 d + 3) u (||t_j - t_i|| + ||t_ij||) + slant ||t_ij||,
+        e_R = 2 sqrt(d) (2 d + 3) u + 2 slant
 
     in the Euclidean norm of its d, or d^2, numbers; the error is sum tau (2 ||r_t|| e_t + e_t^2) +
     kappa (2 ||r_R|| e_R + e_R^2) and the rounding of the sum. The level is sum tau e_t^2 + kappa
@@ -246,7 +246,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     offsets = poses.t.take(graph.j, axis=0) - poses.t.take(graph.i, axis=0)
     distances = block_norms(offsets)
     e_t, e_R = _residual_errors(problem, poses, distances)
-    _, residuals = problem.evaluated(poses)
+    residuals = problem.at(poses).residuals
     _, w = problem.residual_matrix
     # sum ||D r|| e, the terms that are linear in the errors. Along the axes of W, which turn no
     # norm, kappa weighs row by row.
@@ -351,9 +351,9 @@ def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tupl
     """Errors e_t, (m,), and e_R of `objective_rounding`, with distances for ||t_j - t_i||, (m,)."""
     d = problem.d
     share = (2 * d + 3) * UNIT_ROUNDOFF
-    omega = poses.orthogonality_error + d * gamma(d + 2)
+    slant = poses.orthogonality_error + d * gamma(d + 2)
     offsets = problem.weights.seen_offsets(problem.graph.t_ij)
     length = block_norms(offsets)
-    e_t = share * (distance + length) + omega * length
-    e_R = 2.0 * math.sqrt(d) * share + 2.0 * omega
+    e_t = share * (distance + length) + slant * length
+    e_R = 2.0 * math.sqrt(d) * share + 2.0 * slant
     return e_t, e_R

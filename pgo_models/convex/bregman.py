@@ -2,7 +2,8 @@
 
 Equation (1) of the paper is the problem. Equations (2), (4) and (8) are the three forms of the
 iteration whose subproblems are compiled here, each with one Parameter (DPP); (9) alternates over
-the blocks of x. The iterations themselves are in solvers/convex/bregman.py.
+the blocks of x. As in the paper, alpha is the penalty here. The iterations themselves are in
+solvers/convex/bregman.py.
 """
 
 import math

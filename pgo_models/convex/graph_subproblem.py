@@ -233,11 +233,6 @@ class GraphQP:
         ----------
         X : Array, (N_a, d)
             Any point; it need not be feasible.
-
-        Returns
-        -------
-        float
-            The cost.
         """
         residuals = self.A @ X
         self.variables.X.value = X

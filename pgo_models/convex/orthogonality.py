@@ -365,11 +365,6 @@ class OrthogonalProblem(HoldsModel):
     def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
         """Compile the convex subproblem of the split form, step (a).
 
-        Parameters
-        ----------
-        solver : ConvexSolver or str
-            What solves it.
-
         Returns
         -------
         SplitProblem

@@ -60,6 +60,14 @@ def default_backend() -> CholeskyBackend:
     return CholeskyBackend.CHOLMOD if installed else CholeskyBackend.SUPERLU
 
 
+class NonZeros(enum.Enum):
+    """Which non-zeros of R a bound on the rounding of a factorisation counts, cheapest first."""
+
+    ALL = "every entry, as if R were full"
+    MOST = "the most that there can be, as `analyze` was told"
+    COUNTED = "those of the pattern, counted in a factor that was made before"
+
+
 class CholeskyFactor(ABC):
     """A factorisation of one symmetric positive definite matrix."""
 
@@ -88,8 +96,14 @@ class CholeskyFactor(ABC):
         argument (`pgo_models.problem.floating_point`) holds for diagonals between 1e-150 and 1e150,
         where nothing that counts underflows. `beside`, an int or (N,), are non-zeros of further
         columns of R in its rows, as of `half_solve`: with them A is the leading block of a larger
-        matrix, their own columns' share of E is apart (`column_error`).
+        matrix, their own columns' share of E is apart (`column_error`). As `take_apart`, it may
+        make the next solve factor again, unless the factor `is_counted`.
         """
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether `backward_error` leaves the factor as it is."""
+        return True
 
     @abstractmethod
     def take_apart(self) -> tuple[csc_array, np.ndarray]:
@@ -98,20 +112,9 @@ class CholeskyFactor(ABC):
         It may give up the numbers that solves are made with: the next solve factors A again.
         """
 
-    def known_error(self) -> Array | None:
-        """`backward_error` where it costs nothing but a look at the factor."""
-        return self.backward_error()
-
-    def last_error(self) -> Array:
-        """`backward_error` of a factor that is hardly used any more, which may make it cheaper.
-
-        As `take_apart`, it may make the next solve factor again.
-        """
-        return self.backward_error()
-
     @abstractmethod
     def most_in_row(self, beside: Array | int = 0) -> float:
-        """Most non-zeros in a row of R."""
+        """Most non-zeros in a row of R; it costs what `backward_error` does."""
 
 
 class SymbolicCholesky(ABC):
@@ -147,21 +150,11 @@ class SymbolicCholesky(ABC):
         The next one costs another symbolic analysis.
         """
 
-    def expected_error(self, beside: int = 0) -> Array | None:
-        """What `CholeskyFactor.backward_error` will be about; None before a factor was counted."""
-        return None
+    def backward_error(self, non_zeros: NonZeros, beside: Array | int = 0) -> Array:
+        """Bound on `CholeskyFactor.backward_error` of every factor of the pattern, (N,).
 
-    def crude_error(self) -> Array:
-        """Bound on `CholeskyFactor.backward_error` for any number of non-zeros.
-
-        It is inf if there is none.
-        """
-        return np.full(self._shape[0], np.inf)
-
-    def error_before(self) -> Array:
-        """Bound on `CholeskyFactor.backward_error` for the most non-zeros that there can be.
-
-        These were given to `analyze`; it is inf if they were not.
+        It is inf where these non-zeros are not known, and with a backend whose rounding depends on
+        the numbers.
         """
         return np.full(self._shape[0], np.inf)
 
@@ -470,19 +463,20 @@ class _CholmodFactor(CholeskyFactor):
         L = csc_array((values, rows, pointers), shape=(side, side))
         return L, order
 
-    def known_error(self) -> Array | None:
-        return self._analysis.expected_error()
-
-    def last_error(self) -> Array:
-        if self._numeric is not None and self.known_error() is None:
-            self._analysis.count(self._give_up())
-        return self.backward_error()
+    @property
+    def is_counted(self) -> bool:
+        return self._analysis.is_counted
 
     def most_in_row(self, beside: Array | int = 0) -> float:
-        return self._analysis.counts().most_in_row(beside)
+        return self._counts().most_in_row(beside)
 
     def backward_error(self, beside: Array | int = 0) -> Array:
-        return self._analysis.counts().error(beside)
+        return self._counts().error(beside)
+
+    def _counts(self) -> FactorCounts:
+        if self._numeric is not None and not self.is_counted:
+            return self._analysis.count(self._give_up())
+        return self._analysis.counts()
 
 
 class _Cholmod(SymbolicCholesky):
@@ -494,40 +488,37 @@ class _Cholmod(SymbolicCholesky):
         super().__init__(pattern)
         self._order = order
         self._most_counts = most
-        self._error_before: Array | None = None
+        self._known: dict[NonZeros, FactorCounts] = {}
         self._matrix, self._lower, self._is_diagonal = lower_triangle(pattern)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one
         # would be lost.
         self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [
             (None, self._analyze())
         ]
-        self._counts: FactorCounts | None = None
 
     @property
     def side(self) -> int:
         """Number of rows."""
         return int(self._shape[0])
 
-    def expected_error(self, beside: int = 0) -> Array | None:
-        return self._counts.error(beside) if self._counts is not None else None
+    @property
+    def is_counted(self) -> bool:
+        """Whether the non-zeros of a factor were counted."""
+        return NonZeros.COUNTED in self._known
 
-    def crude_error(self) -> Array:
-        side = self._shape[0]
-        full_columns = np.full(side, float(side))
-        return error_of_counts(full_columns, side)
-
-    def error_before(self) -> Array:
-        if self._error_before is None:
-            if self._most_counts is None:
-                self._error_before = super().error_before()
-            else:
-                self._error_before = self._most_counts().error(0)
-        return self._error_before
+    def backward_error(self, non_zeros: NonZeros, beside: Array | int = 0) -> Array:
+        if non_zeros is NonZeros.ALL:
+            return FactorCounts.of_full_factor(self.side).error(beside)
+        is_first_time = non_zeros not in self._known
+        if is_first_time and non_zeros is NonZeros.MOST and self._most_counts is not None:
+            self._known[non_zeros] = self._most_counts()
+        counts = self._known.get(non_zeros)
+        return super().backward_error(non_zeros) if counts is None else counts.error(beside)
 
     def counts(self) -> FactorCounts:
         """Counts of every factor with this pattern, if need be of one that is out of use."""
-        if self._counts is not None:
-            return self._counts
+        if self.is_counted:
+            return self._known[NonZeros.COUNTED]
         return self.count(self._spare())
 
     def count(self, capsule: _Capsule) -> FactorCounts:
@@ -540,8 +531,9 @@ class _Cholmod(SymbolicCholesky):
             self._fill(identity, capsule)
             parts, order = self.take_apart(capsule)
         pointers, rows, _ = parts
-        self._counts = FactorCounts.of(np.array(pointers).ravel(), np.array(rows).ravel(), order)
-        return self._counts
+        counts = FactorCounts.of(np.array(pointers).ravel(), np.array(rows).ravel(), order)
+        self._known[NonZeros.COUNTED] = counts
+        return counts
 
     def take_apart(self, capsule: _Capsule) -> tuple[tuple[object, object, object], np.ndarray]:
         """Pointers, rows and values of L, and its order.
@@ -638,5 +630,5 @@ class _Cholmod(SymbolicCholesky):
         return np.array(cholmod.diag(capsule)).ravel().real
 
     def __reduce__(self) -> tuple[Any, ...]:
-        known = {"_counts": self._counts, "_error_before": self._error_before}
-        return _Cholmod, (self._pattern(), self._order, self._most_counts), known
+        state = {"_known": self._known}
+        return _Cholmod, (self._pattern(), self._order, self._most_counts), state

@@ -3,17 +3,17 @@
 Notation. X, (N, d) with N = (d + 1) n, stacks the n rows t_i^T and then the d rows of every R_i^T.
 Edge e = (i, j), of m, has the residuals
 
-    rho_t = t_j^T - t_i^T - t_ij^T R_i^T,  (1, d),     rho_R = R_j^T - R_ij^T R_i^T,  (d, d),
+    delta_t = t_j^T - t_i^T - t_ij^T R_i^T,  (1, d),     delta_R = R_j^T - R_ij^T R_i^T,  (d, d),
 
-which are stacked as rho = (rho_t; rho_R), (d + 1, d). Its weights are a scalar tau and a symmetric
-matrix W, (d, d), with the eigenvectors U and the eigenvalues kappa: W = U diag(kappa) U^T. Every
-cost here has the quadratic part
+which are stacked as delta = (delta_t; delta_R), (d + 1, d). Its weights are a scalar tau and a
+symmetric matrix W, (d, d), with the eigenvectors U and the eigenvalues kappa: W = U diag(kappa)
+U^T. Every cost here has the quadratic part
 
-    sum_e tau ||rho_t||^2 + tr(W rho_R rho_R^T) = sum_rows w ||A X||^2 = tr(X^T M X),
+    sum_e tau ||delta_t||^2 + tr(W delta_R delta_R^T) = sum_rows w ||A X||^2 = tr(X^T M X),
     M = A^T diag(w) A.
 
-A, ((d + 1) m, N), is the residual matrix: its first m rows give rho_t of all edges, with w = tau,
-and the d rows of every edge that follow give U^T rho_R, with w = kappa. Where W = kappa I, U = I.
+A, ((d + 1) m, N), is the residual matrix: its first m rows give delta_t of all edges, with w = tau,
+and the d rows of every edge that follow give U^T delta_R, with w = kappa. Where W = kappa I, U = I.
 
 `EdgeCost` is a cost without any other part: F (equation (16) of the paper) for W = kappa
 I, or chi2 where it is quadratic in the poses. Costs with another part are subclasses
@@ -40,13 +40,13 @@ from pgo_models.problem.rotation_weights import RotationWeights, ScaledIdentitie
 
 @dataclass(frozen=True, eq=False)
 class EdgeTerms:
-    """Computed costs of the edges and their half gradients in rho, with bounds on their errors."""
+    """Computed costs of edges and their half gradients in delta, with bounds on their errors."""
 
     value: Array  # (m,): cost of every edge
     # Bound on the difference between the sum of `value` and the sum of the costs in exact
     # arithmetic.
     value_error: float
-    G: Array  # (m, d + 1, d): half the gradient of the cost in rho
+    G: Array  # (m, d + 1, d): half the gradient of the cost in delta
     # (m, d + 1, d): bound on the error of G, entry by entry, but for the rounding of the sum that
     # an entry of G is. The caller bounds that rounding by a gamma times `G_size`.
     G_error: Array
@@ -61,17 +61,17 @@ class EdgeTerms:
     ) -> tuple[Array, Array]:
         """Half gradient in X, (N, d), and a bound on its error, from A^T G and a bound on its.
 
-        This is a hook. A cost that depends on X through rho alone has the half gradient A^T G,
-        which is returned as it is. `TangentTerms`, whose cost depends on R_i beside rho, overrides
-        the method and adds the derivative in R_i; `relative_error` bounds the relative error of a
-        sum over the edges of a pose.
+        This is a hook. A cost that depends on X through delta alone has the half gradient A^T G,
+        which is returned as it is. `TangentTerms`, whose cost depends on R_i beside delta,
+        overrides the method and adds the derivative in R_i; `relative_error` bounds the relative
+        error of a sum over the edges of a pose.
         """
         return half_gradient, half_gradient_error
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeCost:
-    """Cost tau ||rho_t||^2 + tr(W rho_R rho_R^T) of every edge.
+    """Cost tau ||delta_t||^2 + tr(W delta_R delta_R^T) of every edge.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class EdgeCost:
         return True
 
     def seen_offsets(self, t_ij: Array) -> Array:
-        """The vectors, (m, d), that take the place of t_ij in rho_t: here t_ij itself."""
+        """The vectors, (m, d), that take the place of t_ij in delta_t: here t_ij itself."""
         return t_ij
 
     def seen_poses(self, poses: Poses) -> Poses:
@@ -157,10 +157,10 @@ class EdgeCost:
         """The constant that a quadratic cost adds to tr(X^T M X), and a bound on its error."""
         return 0.0, 0.0
 
-    def minorant(self, problem: EdgeProblem, poses: Poses) -> "EdgeCost":
-        """A quadratic cost that is at most this one everywhere and equal to it at the poses.
+    def minorant(self, problem: EdgeProblem, X: Array, residuals: Array) -> "EdgeCost":
+        """A quadratic cost that is at most this one everywhere and equal to it at X, (N, d).
 
-        Of a quadratic cost it is the cost itself.
+        The residuals are A X. Of a quadratic cost it is the cost itself.
         """
         return self
 
@@ -176,9 +176,9 @@ class EdgeCost:
         # numpy sums in pairs: the result is off by a few dozen roundings, not by one an edge.
         return float(np.sum(weighted_squares))
 
-    def value_at(self, problem: EdgeProblem, poses: Poses) -> float:
-        """Sum of the costs at poses."""
-        return self.value(problem, *problem.evaluated(poses))
+    def value_at_contact(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
+        """Value at the X where this cost, a `minorant`, touches the one that it was made of."""
+        return self.value(problem, X, residuals)
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """Cost of every edge, (m,)."""
@@ -196,11 +196,11 @@ class EdgeCost:
         return np.asarray(problem.residual_adjoint @ weighted)
 
     def edge_products(self, graph: PoseGraph, X: Array, residuals: Array) -> Array:
-        """Z = rho R_i, (m, d + 1, d): the residuals of every edge in the frame of pose i."""
-        rho = self.residual_blocks(residuals)
+        """Z = delta R_i, (m, d + 1, d): the residuals of every edge in the frame of pose i."""
+        delta = self.residual_blocks(residuals)
         R = np.ascontiguousarray(unstack_transposes(X[graph.num_poses :]))
         R_i = R[graph.i]
-        return np.asarray(rho @ R_i)
+        return np.asarray(delta @ R_i)
 
     def translation_factor(self, problem: EdgeProblem, poses: Poses) -> CholeskyFactor | None:
         """Factor of the matrix of the translations, where that depends on the rotations.
@@ -224,7 +224,7 @@ class EdgeCost:
     def with_unit_weights(self) -> "EdgeCost":
         """Return this cost with W = I and the same tau.
 
-        Its residual matrix has rho_R itself in the rotation rows, as U = I.
+        Its residual matrix has delta_R itself in the rotation rows, as U = I.
         """
         ones = np.ones(len(self.tau))
         return replace(self, rotation=ScaledIdentities(ones))
@@ -232,30 +232,30 @@ class EdgeCost:
     def row_weights(self, d: int) -> Array:
         """Weights w, ((d + 1) m,), of the rows of A.
 
-        First come the m weights tau of the rows rho_t, then for every edge the d eigenvalues kappa
-        of W, which are the weights of the rows U^T rho_R: with W = U diag(kappa) U^T the sum
-        sum_rows kappa ||U^T rho_R||^2 is tr(W rho_R rho_R^T).
+        First come the m weights tau of the rows delta_t, then for every edge the d eigenvalues
+        kappa of W, which are the weights of the rows U^T delta_R: with W = U diag(kappa) U^T the
+        sum sum_rows kappa ||U^T delta_R||^2 is tr(W delta_R delta_R^T).
         """
         return np.concatenate([self.tau, self.rotation.row_weights(d)])
 
     def residual_blocks(self, rows: Array) -> Array:
-        """rho, (m, d + 1, k), of the rows of A X, ((d + 1) m, k).
+        """delta, (m, d + 1, k), of the rows of A X, ((d + 1) m, k).
 
-        The rotation rows are U^T rho_R and are multiplied by U.
+        The rotation rows are U^T delta_R and are multiplied by U.
         """
         m = len(self.tau)
         num_columns = rows.shape[1]
-        rho_t = rows[:m, None]
+        delta_t = rows[:m, None]
         in_eigenbasis = rows[m:].reshape(m, -1, num_columns)
-        rho_R = self.rotation.from_eigenbasis(in_eigenbasis)
-        return np.concatenate([rho_t, rho_R], axis=1)
+        delta_R = self.rotation.from_eigenbasis(in_eigenbasis)
+        return np.concatenate([delta_t, delta_R], axis=1)
 
-    def residual_rows(self, rho: Array) -> Array:
-        """The rows of A X, ((d + 1) m, k), of rho, (m, d + 1, k): rho_t, then U^T rho_R."""
-        num_columns = rho.shape[2]
-        in_eigenbasis = self.rotation.to_eigenbasis(rho[:, 1:])
+    def residual_rows(self, delta: Array) -> Array:
+        """The rows of A X, ((d + 1) m, k), of delta, (m, d + 1, k): delta_t, then U^T delta_R."""
+        num_columns = delta.shape[2]
+        in_eigenbasis = self.rotation.to_eigenbasis(delta[:, 1:])
         rotation_rows = in_eigenbasis.reshape(-1, num_columns)
-        return np.concatenate([rho[:, 0], rotation_rows])
+        return np.concatenate([delta[:, 0], rotation_rows])
 
     def matrix_blocks(self, R_ij: Array, t_ij: Array) -> tuple[Array, Array, Array, Array]:
         """What every edge (i, j) adds to the rotation rows and columns of M.
@@ -264,7 +264,7 @@ class EdgeCost:
 
             M[t_i, R_i] += c^T,    M[t_j, R_i] -= c^T,    c = tau t_ij,
             M[R_i, R_i] += D_i,    D_i = R_ij W R_ij^T + tau t_ij t_ij^T,
-            M[R_i, R_j] -= K,      K = R_ij W,
+            M[R_i, R_j] -= D_ij,   D_ij = R_ij W,
             M[R_j, R_j] += D_j,    D_j = W,
 
         and the transposes of the first, second and fourth. The entries of tau between t_i and t_j
@@ -277,7 +277,7 @@ class EdgeCost:
         diagonal_i : (m, d, d) array
             D_i.
         rotation_coupling : (m, d, d) array
-            K.
+            D_ij.
         diagonal_j : (m, d, d) array
             D_j.
         """
@@ -323,11 +323,11 @@ class EdgeCost:
         kappa_sizes = np.abs(self.kappa).ravel()
         return np.concatenate([kappa_sizes, self.tau, self.tau * longest])
 
-    def apply_weights(self, rho: Array) -> Array:
-        """(tau rho_t; W rho_R) of edges, (m, d + 1, d)."""
-        product = np.empty_like(rho)
-        product[:, 0] = self.tau[:, None] * rho[:, 0]
-        product[:, 1:] = self.rotation.apply(rho[:, 1:])
+    def apply_weights(self, delta: Array) -> Array:
+        """(tau delta_t; W delta_R) of edges, (m, d + 1, d)."""
+        product = np.empty_like(delta)
+        product[:, 0] = self.tau[:, None] * delta[:, 0]
+        product[:, 1:] = self.rotation.apply(delta[:, 1:])
         return product
 
     def apply_absolute_weights(self, sizes: Array) -> Array:
@@ -337,37 +337,37 @@ class EdgeCost:
         product[:, 1:] = self.rotation.apply_absolute(sizes[:, 1:])
         return product
 
-    def evaluate_edges(self, rho: Array, errors: Array, P_i: Array) -> EdgeTerms:
-        """Costs and half gradients at the computed residuals rho, (m, d + 1, d).
+    def evaluate_edges(self, delta: Array, errors: Array, P_i: Array) -> EdgeTerms:
+        """Costs and half gradients at the computed residuals delta, (m, d + 1, d).
 
-        The exact residuals are rho + e with |e| <= errors, (m, d + 1, d), entry by entry. P_i is
-        R_i^T. With D = diag(tau, W) and G = D rho the exact cost of an edge is
+        The exact residuals are delta + e with |e| <= errors, (m, d + 1, d), entry by entry. P_i is
+        R_i^T. With D = diag(tau, W) and G = D delta the exact cost of an edge is
 
-            <G, rho> + 2 <G, e> + <e, D e>,
+            <G, delta> + 2 <G, e> + <e, D e>,
 
-        which differs from <G, rho> by at most <2 |D| |rho| + |D| errors, errors>. The half gradient
-        D (rho + e) differs from G by at most |D| errors.
+        which differs from <G, delta> by at most <2 |D| |delta| + |D| errors, errors>. The half
+        gradient D (delta + e) differs from G by at most |D| errors.
 
-        <G, rho>, as computed, is off by at most gamma_k <|D| |rho|, |rho|> with k = d^2 + 2 d + 2.
-        The index k counts d roundings in an entry of G, (d + 1) d in the sum of products, one when
-        the terms of a tangent are added and one in the sum over the edges, by `exact_sum`.
+        <G, delta>, as computed, is off by at most gamma_k <|D| |delta|, |delta|> with k = d^2 + 2 d
+        + 2. The index k counts d roundings in an entry of G, (d + 1) d in the sum of products, one
+        when the terms of a tangent are added and one in the sum over the edges, by `exact_sum`.
 
         The error of W adds to the bound on the value and to the bound on G
         (`RotationWeights.effect_of_error`).
         """
-        d = rho.shape[2]
-        rho_size = np.abs(rho)
-        G = self.apply_weights(rho)
-        G_size = self.apply_absolute_weights(rho_size)
+        d = delta.shape[2]
+        delta_size = np.abs(delta)
+        G = self.apply_weights(delta)
+        G_size = self.apply_absolute_weights(delta_size)
         G_error = self.apply_absolute_weights(errors)
-        value = inner_products(G, rho)
-        # Errors of rho.
+        value = inner_products(G, delta)
+        # Errors of delta.
         value_error = float(np.sum((2.0 * G_size + G_error) * errors))
-        # Rounding of <G, rho>.
-        sum_of_sizes = float(np.sum(G_size * rho_size))
+        # Rounding of <G, delta>.
+        sum_of_sizes = float(np.sum(G_size * delta_size))
         value_error += gamma(d * d + 2 * d + 2) * sum_of_sizes
         # Error of W.
-        of_value, of_product = self.rotation.effect_of_error(rho_size[:, 1:], errors[:, 1:])
+        of_value, of_product = self.rotation.effect_of_error(delta_size[:, 1:], errors[:, 1:])
         value_error += of_value
         G_error[:, 1:] += of_product
         return EdgeTerms(value, value_error, G, G_error, G_size)
@@ -377,11 +377,12 @@ class EdgeCost:
 
         The vector u, (N,), is positive, and E bounds the errors entry by entry.
 
-        Here A has rho_R in its rotation rows, not U^T rho_R (`EdgeProblem.plain_residual_matrix`),
-        so that M = A^T D A with D = diag(tau, W), block by block. The absolute values of the terms
-        that an entry of M is a sum of add up to at most that entry of |A|^T |D| |A|. Every term is
-        off by at most `relative_error` of itself. The error of W, at most e in every entry of W,
-        adds |A|^T e 1 1^T |A|, 1 the vector of ones in the d rotation rows of an edge. So
+        Here A has delta_R in its rotation rows, not U^T delta_R
+        (`EdgeProblem.plain_residual_matrix`), so that M = A^T D A with D = diag(tau, W), block by
+        block. The absolute values of the terms that an entry of M is a sum of add up to at most
+        that entry of |A|^T |D| |A|. Every term is off by at most `relative_error` of itself. The
+        error of W, at most e in every entry of W, adds |A|^T e 1 1^T |A|, 1 the vector of ones in
+        the d rotation rows of an edge. So
 
             E = relative_error |A|^T |D| |A| + |A|^T e 1 1^T |A|.
         """
@@ -405,11 +406,11 @@ class EdgeCost:
         and e_R; subclasses need these.
         """
         m = len(self.tau)
-        _, residuals = problem.evaluated(poses)
+        residuals = problem.residuals(poses.stacked())
         return [self.rotation.error_of_rows(residuals[m:])]
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:
-        """Whether the cost depends on rho_t, and whether it depends on rho_R, of every edge.
+        """Whether the cost depends on delta_t, and whether it depends on delta_R, of every edge.
 
         Both have shape (m,).
         """
@@ -430,5 +431,5 @@ class EdgeCost:
 
 
 def isotropic_cost(tau: Array, kappa: Array) -> EdgeCost:
-    """Cost F: tau ||rho_t||^2 + kappa ||rho_R||_F^2 of every edge, for tau and kappa, (m,)."""
+    """Cost F: tau ||delta_t||^2 + kappa ||delta_R||_F^2 of every edge, for tau and kappa, (m,)."""
     return EdgeCost(tau, ScaledIdentities(kappa))

@@ -4,11 +4,9 @@ from typing import Protocol
 
 from scipy.sparse import csc_array, csr_array
 
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.cholesky import SymbolicCholesky
-from pgo_models.problem.excess import Tangent
 from pgo_models.problem.incidence import Incidence
 
 
@@ -50,11 +48,8 @@ class EdgeProblem(Protocol):
     def translation_matrix(self, of_edges: Array) -> csc_array:
         """Laplacian of d x d blocks, of which every edge has one, (m, d, d)."""
 
-    def evaluated(self, poses: Poses) -> tuple[Array, Array]:
-        """X, (N, d), of poses and its residuals A X, ((d+1) m, d)."""
-
-    def tangent_of_excess(self, poses: Poses) -> Tangent:
-        """Tangent of the excess of chi2 at poses."""
+    def residuals(self, X: Array) -> Array:
+        """A X, ((d+1) m, d), the residuals at X, (N, d)."""
 
     def recover_translations(self, R: Array) -> Array:
         """The translations of least quadratic part for given rotations, (n, d)."""

@@ -4,18 +4,18 @@ In the frame of pose i, r = R_i^T (t_j - t_i) - t_ij and E = R_i^T R_j R_ij^T, a
 about a. With s = a sin theta and H = (1 - cos theta) a a^T, chi2 of an edge is
 
     r^T I_tt r + 2 r^T I_tr s + tr(W (2 I - E - E^T))
-      = tau ||r||^2 + tr(W' (2 I - E - E^T)) + u^T J u + tr(H K H),
-    u = (r, s),   J = [I_tt - tau I, I_tr; ., K]
+      = tau ||r||^2 + tr(W' (2 I - E - E^T)) + u^T J u + tr(H J_ss H),
+    u = (r, s),   J = [I_tt - tau I, I_tr; ., J_ss]
 
-for W' that of I_rr - K, since 2 (1 - cos theta) a^T K a = s^T K s + (1 - cos theta)^2 a^T K a. The
-last two terms are the excess. r, s and H are linear in Z = rho R_i, as Z = (r^T; R_ij^T (E^T - I)).
-Where J and K are positive semidefinite, the excess is a convex quadratic function of Z, so that its
-tangents are lower bounds on it. They are quadratic in the poses and have the pattern of M. A
-relaxation with matrix weights needs many redundant constraints to obtain the same (Holmes, Duembgen
-& Barfoot 2024).
+for W' that of I_rr - J_ss, since 2 (1 - cos theta) a^T J_ss a = s^T J_ss s + (1 - cos theta)^2 a^T
+J_ss a. The last two terms are the excess. r, s and H are linear in Z = delta R_i, as Z = (r^T;
+R_ij^T (E^T - I)). Where J and J_ss are positive semidefinite, the excess is a convex quadratic
+function of Z, so that its tangents are lower bounds on it. They are quadratic in the poses and have
+the pattern of M. A relaxation with matrix weights needs many redundant constraints to obtain the
+same (Holmes, Duembgen & Barfoot 2024).
 
-For a tau below the smallest eigenvalue of I_tt, a K above I_tr^T (I_tt - tau I)^-1 I_tr makes J
-positive definite, whatever I is. The term of W' is convex only where I_rr - K >= 0, which bounds
+For a tau below the smallest eigenvalue of I_tt, a J_ss above I_tr^T (I_tt - tau I)^-1 I_tr makes J
+positive definite, whatever I is. The term of W' is convex only where I_rr - J_ss >= 0, which bounds
 tau by a share of I_tt that depends on the coupling I_tr. Where I is only semidefinite, no positive
 tau satisfies that: there tau is 2^-20 of the smallest eigenvalue of I_tt, and W' has a negative
 eigenvalue of about the same share of I_rr. The certificate needs a definite J only, and it can
@@ -42,10 +42,10 @@ class Excess:
     R_ij: Array  # (m, d, d)
     J: Array  # (m, q, q), q = d, or d + 1 or d + 3 with coupling blocks
     # (m, 2), for translations and rotations, each in its unit: the absolute values that a block
-    # (a, b) of J or K is computed from have norms of at most size_a size_b.
+    # (a, b) of J or J_ss is computed from have norms of at most size_a size_b.
     size: Array
     # (m, 2): lower bounds on the eigenvalues of the translation and the rotation blocks. J is at
-    # least the diagonal matrix of both, K at least the second.
+    # least the diagonal matrix of both, J_ss at least the second.
     least: Array
 
     def of_edges(self, chosen: IntArray | BoolArray) -> Self:
@@ -115,25 +115,25 @@ class Excess:
 
 @dataclass(frozen=True, eq=False)
 class CoupledExcess(Excess):
-    """Excess u^T J u + tr(H K H) with u = (r, s), where edges have coupling blocks."""
+    """Excess u^T J u + tr(H J_ss H) with u = (r, s), where edges have coupling blocks."""
 
-    K: Array  # (m, p, p), p = 1 in the plane, 3 in space
+    J_ss: Array  # (m, p, p), p = 1 in the plane, 3 in space
 
     def of_edges(self, chosen: IntArray | BoolArray) -> Self:
         """The excess of the chosen edges."""
         excess = super().of_edges(chosen)
-        return replace(excess, K=self.K[chosen])
+        return replace(excess, J_ss=self.J_ss[chosen])
 
     def with_silent_edges(self, R_ij: Array) -> Self:
         """The excess with further edges, on which it is zero; R_ij, (k, d, d), is theirs."""
         excess = super().with_silent_edges(R_ij)
-        no_K = np.zeros((len(R_ij), *self.K.shape[1:]))
-        return replace(excess, K=np.concatenate([self.K, no_K]))
+        no_J_ss = np.zeros((len(R_ij), *self.J_ss.shape[1:]))
+        return replace(excess, J_ss=np.concatenate([self.J_ss, no_J_ss]))
 
     def scaled(self, share: Array) -> Self:
         """The excess times shares, (m,)."""
         excess = super().scaled(share)
-        return replace(excess, K=share[:, None, None] * self.K)
+        return replace(excess, J_ss=share[:, None, None] * self.J_ss)
 
     def _rotation_defect(self, Z: Array) -> Array:
         """D = E - I, (m, d, d)."""
@@ -147,18 +147,18 @@ class CoupledExcess(Excess):
     def evaluate(self, Z: Array) -> tuple[Array, Array]:
         """The excess, (m,), and C, (m, d + 1, d).
 
-        C is the sum of the adjoints of Z -> u and Z -> H, applied to J u and K H.
+        C is the sum of the adjoints of Z -> u and Z -> H, applied to J u and J_ss H.
         """
         d = Z.shape[2]
         D = self._rotation_defect(Z)
         u = _argument(Z, D)
         J_u = _times_vectors(self.J, u)
         H = _defect_to_H(D)
-        K_H = self.K @ H
-        value = np.einsum("ma,ma->m", u, J_u) + np.einsum("mab,mab->m", H, K_H)
+        J_ss_H = self.J_ss @ H
+        value = np.einsum("ma,ma->m", u, J_u) + np.einsum("mab,mab->m", H, J_ss_H)
         # The gradient in D = (R_ij Z_R)^T.
         from_s = hat(J_u[:, d:])
-        from_H = _adjoint_of_defect_to_H(K_H + np.swapaxes(K_H, 1, 2), d)
+        from_H = _adjoint_of_defect_to_H(J_ss_H + np.swapaxes(J_ss_H, 1, 2), d)
         in_D = from_s + from_H
         C = np.empty_like(Z)
         C[:, 0] = J_u[:, :d]
@@ -176,7 +176,7 @@ class CoupledExcess(Excess):
         return np.stack([*in_w_i, *in_w_j], axis=1)
 
     def curvature(self, R_i: Array, R_j: Array, difference: Array) -> Array:
-        """The Gauss-Newton matrix in (v_i, v_j, w_i, w_j), with that of tr(H K H)."""
+        """The Gauss-Newton matrix in (v_i, v_j, w_i, w_j), with that of tr(H J_ss H)."""
         m, d = difference.shape
         p = tangent_dimension(d)
         dD = self._derivative_of_defect(R_i, R_j).reshape(-1, d, d)
@@ -186,8 +186,8 @@ class CoupledExcess(Excess):
         du[:, d:, of_w] = np.swapaxes(vee(dD).reshape(m, 2 * p, p), 1, 2)
         curvature = 2.0 * np.swapaxes(du, 1, 2) @ self.J @ du
         dH = _defect_to_H(dD).reshape(m, 2 * p, p * p)
-        K_dH = self.K[:, None] @ dH.reshape(m, 2 * p, p, p)
-        curvature[:, of_w, of_w] += 2.0 * dH @ np.swapaxes(K_dH.reshape(m, 2 * p, -1), 1, 2)
+        J_ss_dH = self.J_ss[:, None] @ dH.reshape(m, 2 * p, p, p)
+        curvature[:, of_w, of_w] += 2.0 * dH @ np.swapaxes(J_ss_dH.reshape(m, 2 * p, -1), 1, 2)
         return np.asarray(curvature)
 
     def relative_rounding(self, d: int) -> float:

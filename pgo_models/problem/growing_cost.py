@@ -32,7 +32,7 @@ from pgo_models.problem.matrices import residual_matrix
 
 @dataclass(frozen=True, eq=False)
 class GrowingCost:
-    """Sum over m edges of tau ||rho_t||^2 + tr(W rho_R rho_R^T), as in `EdgeCost`.
+    """Sum over m edges of tau ||delta_t||^2 + tr(W delta_R delta_R^T), as in `EdgeCost`.
 
     Parameters
     ----------

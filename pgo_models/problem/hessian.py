@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.incidence import Incidence
@@ -21,7 +20,7 @@ from pgo_models.problem.matrices import (
     short,
 )
 from pgo_models.problem.ordering import row_order
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,7 @@ def tangent_order(problem: PGOProblem) -> IntArray:
     return row_order(problem.pose_order, problem.d, p)
 
 
-def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) -> csc_array:
+def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
     """Hessian of F(R Exp(hat(w)), t + v) in (v, w), (side, side).
 
     `Lambda`, (n, d, d), is theta Lambda; without it the result is the Gauss-Newton matrix.
@@ -92,6 +91,8 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     The pattern depends on the graph alone. A rigid motion of all poses is in the null space at
     stationary points: ground a pose before factoring (`ground_pose`).
     """
+    problem = here.problem
+    poses = here.poses
     graph = problem.graph
     incidence = problem.incidence
     d = problem.d
@@ -99,7 +100,7 @@ def riemannian_hessian(problem: PGOProblem, poses: Poses, Lambda: Array | None) 
     R_j = poses.R.take(graph.j, axis=0)
     # Blocks of M. For the Hessian of chi2 they are those of its tangent; the Gauss-Newton matrix of
     # the excess is added below in either case.
-    weights = problem.weights if Lambda is None else problem.tangent_at(poses).weights
+    weights = problem.weights if Lambda is None else here.minorant
     coupling_t, diagonal_i, coupling_R, diagonal_j = weights.matrix_blocks(graph.R_ij, graph.t_ij)
     S_ii = incidence.at_both(diagonal_i, diagonal_j)
     if Lambda is not None:
@@ -193,7 +194,7 @@ def _curvature_blocks(
 
 
 def double_cross(A: Array, B: Array) -> Array:
-    """K with u^T K v = <hat(u) A hat(v)^T, B>: (n, 3, 3) in space, (n, 1, 1) in the plane.
+    """Phi with u^T Phi v = <hat(u) A hat(v)^T, B>: (n, 3, 3) in space, (n, 1, 1) in the plane.
 
     For B = A it is 2 cof(A).
 

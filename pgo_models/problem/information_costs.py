@@ -26,7 +26,7 @@ from pgo_models.problem.incidence import blocks_of_rows, rows_of_blocks
 
 @dataclass(frozen=True, eq=False)
 class ExcessCost(EdgeCost):
-    """chi2 of an edge: tau ||rho_t||^2 + tr(W rho_R rho_R^T) + excess(Z), Z = rho R_i.
+    """chi2 of an edge: tau ||delta_t||^2 + tr(W delta_R delta_R^T) + excess(Z), Z = delta R_i.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class ExcessCost(EdgeCost):
 
     @property
     def is_quadratic(self) -> bool:
-        """False: R_i is in Z and in rho."""
+        """False: R_i is in Z and in delta."""
         return False
 
     @property
@@ -64,9 +64,8 @@ class ExcessCost(EdgeCost):
         """True: only chi2 has an excess."""
         return True
 
-    def minorant(self, problem: EdgeProblem, poses: Poses) -> "TangentCost":
-        """The cost with the excess replaced by its tangent at the poses."""
-        X, residuals = problem.evaluated(poses)
+    def minorant(self, problem: EdgeProblem, X: Array, residuals: Array) -> "TangentCost":
+        """The cost with the excess replaced by its tangent at X."""
         Z = self.edge_products(problem.graph, X, residuals)
         tangent = self.excess.tangent(Z)
         return TangentCost(self.tau, self.rotation, tangent)
@@ -77,11 +76,6 @@ class ExcessCost(EdgeCost):
         quadratic_part = super().value(problem, X, residuals)
         excess, _ = self.excess.evaluate(Z)
         return quadratic_part + float(np.sum(excess))
-
-    def value_at(self, problem: EdgeProblem, poses: Poses) -> float:
-        """chi2 at poses, whose excess the tangent there has."""
-        quadratic_part = super().value(problem, *problem.evaluated(poses))
-        return quadratic_part + float(np.sum(problem.tangent_of_excess(poses).value))
 
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """chi2 of every edge, (m,)."""
@@ -110,8 +104,8 @@ class ExcessCost(EdgeCost):
         """Poses with the translations of least chi2 for their rotations; t_0 does not change.
 
         For given rotations chi2 is a quadratic function of the translations, whose half Hessian is
-        that of `translation_factor`. Edge (i, j) adds tau rho_t + R_i (J u)_t to the half gradient
-        at t_j and subtracts it at t_i. One step of Newton's method is exact.
+        that of `translation_factor`. Edge (i, j) adds tau delta_t + R_i (J u)_t to the half
+        gradient at t_j and subtracts it at t_i. One step of Newton's method is exact.
         """
         graph = problem.graph
         incidence = problem.incidence
@@ -119,7 +113,8 @@ class ExcessCost(EdgeCost):
         m = graph.num_edges
         if factor is None:
             factor = self.translation_factor(problem, poses)
-        X, residuals = problem.evaluated(poses)
+        X = poses.stacked()
+        residuals = problem.residuals(X)
         Z = self.edge_products(graph, X, residuals)
         u = self.excess.argument(Z)
         J_u_t = np.einsum("mab,mb->ma", self.excess.J[:, :d], u)
@@ -142,22 +137,23 @@ class ExcessCost(EdgeCost):
     ) -> list[float]:
         """Bounds on the errors of chi2 that `objective_rounding` does not count itself.
 
-        The residuals at the poses are off by at most e_t, (m,), and e_R in norm. With omega the
-        orthogonality error of the stored R_i, the first row of Z = rho R_i is off by at most e_t +
-        omega ||Z_t||, and the rotation rows likewise. An error e of Z changes the excess, a convex
-        quadratic function of Z with the half gradient C, by at most 2 <|C|, |e|> and its quadratic
-        form at e. The quadratic form is counted in `bound_of_norms`. The last bound is on the
-        rounding of the excess.
+        The residuals at the poses are off by at most e_t, (m,), and e_R in norm. With slant the
+        orthogonality error of the stored R_i, the first row of Z = delta R_i is off by at most e_t
+        + slant ||Z_t||, and the rotation rows likewise. An error e of Z changes the excess, a
+        convex quadratic function of Z with the half gradient C, by at most 2 <|C|, |e|> and its
+        quadratic form at e. The quadratic form is counted in `bound_of_norms`. The last bound is on
+        the rounding of the excess.
         """
         d = problem.d
-        tangent = problem.tangent_of_excess(poses)
+        X = poses.stacked()
+        tangent = self.minorant(problem, X, problem.residuals(X)).tangent
         C = tangent.C
         C_norm_t = block_norms(C[:, 0])
         C_norm_R = block_norms(C[:, 1:])
         row_norms = np.sqrt(np.einsum("mab,mab->ma", tangent.Z, tangent.Z))
-        omega = poses.orthogonality_error + d * gamma(d + 2)
-        error_t = e_t + omega * row_norms[:, 0]
-        error_R = e_R + omega * np.einsum("ma->m", row_norms[:, 1:])
+        slant = poses.orthogonality_error + d * gamma(d + 2)
+        error_t = e_t + slant * row_norms[:, 0]
+        error_R = e_R + slant * np.einsum("ma->m", row_norms[:, 1:])
         summation_error = PAIRWISE_SUM * UNIT_ROUNDOFF * np.abs(tangent.value)
         rounding = tangent.value_error + summation_error
         return [
@@ -168,7 +164,7 @@ class ExcessCost(EdgeCost):
         ]
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:
-        """Whether chi2 depends on rho_t, and whether it depends on rho_R, of every edge.
+        """Whether chi2 depends on delta_t, and whether it depends on delta_R, of every edge.
 
         Both have shape (m,).
         """
@@ -189,12 +185,12 @@ class ExcessCost(EdgeCost):
 
 @dataclass(frozen=True, eq=False)
 class TangentTerms(EdgeTerms):
-    """Terms of edges with a tangent, whose cost <C, rho P_i^T> depends on rho and on P_i = R_i^T.
+    """Terms of edges with a tangent, whose cost <C, delta P_i^T> depends on delta and on P_i.
 
-    The half gradient in P_i, for a fixed rho, is C^T rho.
+    P_i is R_i^T. The half gradient in P_i, for a fixed delta, is C^T delta.
     """
 
-    own: Array  # (m, d, d): C^T rho
+    own: Array  # (m, d, d): C^T delta
     own_error: Array  # bound on its error, entry by entry
 
     def complete_half_gradient(
@@ -204,7 +200,7 @@ class TangentTerms(EdgeTerms):
         half_gradient: Array,
         half_gradient_error: Array,
     ) -> tuple[Array, Array]:
-        """Half gradient in X and its error, (N, d): C^T rho is added in the rows of R_i^T.
+        """Half gradient in X and its error, (N, d): C^T delta is added in the rows of R_i^T.
 
         `relative_error` bounds that of the sum over the edges of a pose. The addition to A^T G
         rounds once more. Both arrays are changed.
@@ -222,7 +218,7 @@ class TangentTerms(EdgeTerms):
 class TangentCost(EdgeCost):
     """A quadratic minorant of chi2: its quadratic part and the tangent of its excess.
 
-    The cost is tau ||rho_t||^2 + tr(W rho_R rho_R^T) + value + 2 <C, Z - Z*> - loss.
+    The cost is tau ||delta_t||^2 + tr(W delta_R delta_R^T) + value + 2 <C, Z - Z*> - loss.
 
     Parameters
     ----------
@@ -268,6 +264,11 @@ class TangentCost(EdgeCost):
         tangent = float(np.sum(self.tangent.values(Z)))
         return quadratic_part + tangent
 
+    def value_at_contact(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
+        """chi2 at the X of the tangent, which has the excess there."""
+        quadratic_part = super().value(problem, X, residuals)
+        return quadratic_part + float(np.sum(self.tangent.value))
+
     def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
         """The minorant of every edge, (m,)."""
         Z = self.edge_products(problem.graph, X, residuals)
@@ -275,7 +276,7 @@ class TangentCost(EdgeCost):
         return quadratic_part + self.tangent.values(Z)
 
     def half_gradient(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
-        """M X, (N, d): A^T (diag(w) A X + C P_i), and C^T rho in the rows of P_i = R_i^T."""
+        """M X, (N, d): A^T (diag(w) A X + C P_i), and C^T delta in the rows of P_i = R_i^T."""
         n = problem.num_poses
         d = problem.d
         C = self.tangent.C
@@ -284,13 +285,13 @@ class TangentCost(EdgeCost):
         _, w = problem.residual_matrix
         in_residuals = w[:, None] * residuals + self.residual_rows(C @ P_i)
         half_gradient = problem.residual_adjoint @ in_residuals
-        rho = self.residual_blocks(residuals)
-        in_P_i = np.swapaxes(C, 1, 2) @ rho
+        delta = self.residual_blocks(residuals)
+        in_P_i = np.swapaxes(C, 1, 2) @ delta
         half_gradient[n:] += problem.incidence.at_beginning(in_P_i)
         return np.asarray(half_gradient)
 
     def matrix_blocks(self, R_ij: Array, t_ij: Array) -> tuple[Array, Array, Array, Array]:
-        """Blocks of M with those of 2 <C, rho R_i>, which is bilinear in the poses of the edge.
+        """Blocks of M with those of 2 <C, delta R_i>, which is bilinear in the poses of the edge.
 
         C_t is the first row of C, and C_R are the others. C_t is subtracted from the coupling of
         translations with R_i, C_R^T from that of R_i with R_j, and the symmetric part of 2 (t_ij
@@ -319,37 +320,39 @@ class TangentCost(EdgeCost):
         of_C = largest_of_C * longest
         return np.concatenate([super().weight_sizes(longest), of_C])
 
-    def evaluate_edges(self, rho: Array, errors: Array, P_i: Array) -> TangentTerms:
-        """Costs and half gradients, with value + 2 <C, rho P_i^T - Z*> - loss, C P_i and C^T rho.
+    def evaluate_edges(self, delta: Array, errors: Array, P_i: Array) -> TangentTerms:
+        """Costs and half gradients with those of the tangent: C P_i in delta, C^T delta in P_i.
 
-        The error of the difference Z - Z* = rho P_i^T - Z* has these parts: the errors of rho times
-        |P_i^T|; the rounding of the product, whose entries are sums of d; the rounding of the
+        The tangent costs value + 2 <C, delta P_i^T - Z*> - loss.
+
+        The error of the difference Z - Z* = delta P_i^T - Z* has these parts: the errors of delta
+        times |P_i^T|; the rounding of the product, whose entries are sums of d; the rounding of the
         difference. The rounding of the sum <C, Z - Z*>, of (d + 1) d products, is counted with it.
         """
-        terms = super().evaluate_edges(rho, errors, P_i)
+        terms = super().evaluate_edges(delta, errors, P_i)
         tangent = self.tangent
         C = tangent.C
-        d = rho.shape[2]
+        d = delta.shape[2]
         P_transposed = np.swapaxes(P_i, 1, 2)
         C_size = np.abs(C)
-        rho_size = np.abs(rho)
+        delta_size = np.abs(delta)
         P_size = np.abs(P_transposed)
         # The value, and its error.
-        difference = rho @ P_transposed - tangent.Z
+        difference = delta @ P_transposed - tangent.Z
         linear_part = 2.0 * inner_products(C, difference)
         constant = tangent.value - tangent.loss
-        product_errors = errors + gamma(d + 1) * rho_size
+        product_errors = errors + gamma(d + 1) * delta_size
         difference_error = product_errors @ P_size
         difference_error += gamma(d * d + d + 4) * np.abs(difference)
         linear_error = float(np.sum(2.0 * C_size * difference_error))
         constant_size = np.abs(constant) + np.abs(tangent.loss)
         constant_errors = tangent.value_error + 4.0 * UNIT_ROUNDOFF * constant_size
         value_error = linear_error + float(np.sum(constant_errors))
-        # The half gradient in rho, C P_i.
+        # The half gradient in delta, C P_i.
         G = C @ P_i
         G_error = gamma(d) * C_size @ np.swapaxes(P_size, 1, 2)
-        # The half gradient in P_i, C^T rho.
-        own = np.swapaxes(C, 1, 2) @ rho
+        # The half gradient in P_i, C^T delta.
+        own = np.swapaxes(C, 1, 2) @ delta
         own_error = np.swapaxes(C_size, 1, 2) @ product_errors
         return TangentTerms(
             value=terms.value + (linear_part + constant),

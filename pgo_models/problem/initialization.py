@@ -78,11 +78,6 @@ def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     root : int
         The pose at (I, 0).
 
-    Returns
-    -------
-    Poses
-        The start.
-
     Raises
     ------
     GraphError
@@ -150,11 +145,6 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
         near the constrained minimum of the same sum, and on large graphs Newton's method needs a
         factorisation less from there.
 
-    Returns
-    -------
-    Poses
-        The start.
-
     Examples
     --------
     >>> from pgo_models.graphs.scenes import grid
@@ -180,15 +170,15 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
 def _chordal_rotations(problem: PGOProblem) -> Array:
     """Rotations, (n, d, d), of the chordal relaxation with R_0 = I, projected."""
     n = problem.num_poses
-    K, b = relaxed_rotations(problem, 0)
+    matrix, b = relaxed_rotations(problem, 0)
     if n <= _SHARED:
-        factor = factorize_damped(problem.analysis, K)
+        factor = factorize_damped(problem.analysis, matrix)
         Y = factor.solve(b)[n:]
     else:
-        K_RR = K[n:, n:].tocsc()
+        of_rotations = matrix[n:, n:].tocsc()
         order = row_order(problem.pose_order, problem.d)
-        analysis = analyze(K_RR, problem.backend, order)
-        factor = factorize_damped(analysis, K_RR)
+        analysis = analyze(of_rotations, problem.backend, order)
+        factor = factorize_damped(analysis, of_rotations)
         Y = factor.solve(b[n:])
     return project_to_rotations(unstack_transposes(Y))
 
@@ -266,12 +256,12 @@ def averaging_pull(problem: PGOProblem, R: Array, stiffness: float) -> Array:
 
 
 def relaxed_rotations(problem: PGOProblem, held: int | None) -> tuple[csc_array, Array]:
-    """K, (N, N), and b, (N, d), with K X = b where tr(Y^T L Y) is least.
+    """Matrix, (N, N), and b, (N, d), with matrix X = b where tr(Y^T L Y) is least.
 
     The `held` pose, if there is one, has R = I.
 
-    Y are the rotations of X. K has the pattern of M: L where that has rotations, and the identity
-    for translations.
+    Y are the rotations of X. The matrix has the pattern of M: L where that has rotations, and the
+    identity for translations.
     """
     graph = problem.graph
     n = problem.num_poses

@@ -5,7 +5,6 @@ The cost is equation (16) of the paper, weighted, or chi2 of information matrice
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -25,9 +24,7 @@ from pgo_models.problem.cholesky import (
     factorize_damped,
 )
 from pgo_models.problem.edge_cost import EdgeCost
-from pgo_models.problem.excess import Tangent
 from pgo_models.problem.incidence import Incidence
-from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.ordering import counts_of_blocks, pose_order, row_order
 from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.problem.weighting import (
@@ -222,36 +219,12 @@ class PGOProblem(ReadOnly):
         Returns
         -------
         PGOProblem
-            It is computed once for these poses.
+            A new one, unless the cost is quadratic: its matrices are built when first asked for.
         """
-        if self.is_quadratic:
-            return self
-        tangent = self._tangents.get(poses)
-        if tangent is None:
-            cost = self.weights.minorant(self, poses)
-            tangent = _TangentProblem(self.graph, self.backend, cost, original=self)
-            self._tangents[poses] = tangent
-        return tangent
-
-    def tangent_of_excess(self, poses: Poses) -> Tangent:
-        """Return the tangent of the excess of chi2 that `tangent_at` has.
-
-        Parameters
-        ----------
-        poses : Poses
-            Where they touch.
-
-        Returns
-        -------
-        Tangent
-            With the value and the gradient of the excess at the poses.
-        """
-        cost = self.tangent_at(poses).weights
-        assert isinstance(cost, TangentCost)
-        return cost.tangent
+        return self.at(poses).tangent
 
     def with_rotation_terms(self, i: IntArray, j: IntArray, R_ij: Array, W: Array) -> "PGOProblem":
-        """Return the problem with terms tr(W rho_R rho_R^T), rho_R = R_j^T - R_ij^T R_i^T.
+        """Return the problem with terms tr(W delta_R delta_R^T), delta_R = R_j^T - R_ij^T R_i^T.
 
         Parameters
         ----------
@@ -283,26 +256,6 @@ class PGOProblem(ReadOnly):
         )
         cost = self.weights.with_rotation_terms(R_ij, W)
         return _ExtendedProblem(extended, self.backend, cost, original=self)
-
-    @cached_property
-    def _tangents(self) -> "WeakKeyDictionary[Poses, PGOProblem]":
-        """`tangent_at` of the poses that are still in use: it goes when they do."""
-        return WeakKeyDictionary()
-
-    @cached_property
-    def _evaluations(self) -> "WeakKeyDictionary[Poses, tuple[Array, Array]]":
-        """`evaluated` of the poses that are still in use: it goes when they do."""
-        return WeakKeyDictionary()
-
-    @cached_property
-    def _objectives(self) -> "WeakKeyDictionary[Poses, float]":
-        """`objective` of the poses that are still in use: it goes when they do."""
-        return WeakKeyDictionary()
-
-    @cached_property
-    def _half_gradients(self) -> "WeakKeyDictionary[Poses, Array]":
-        """`apply_M_at` of the poses that are still in use: it goes when they do."""
-        return WeakKeyDictionary()
 
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
 
@@ -463,12 +416,7 @@ class PGOProblem(ReadOnly):
         >>> bool(np.isclose(problem.objective(graph.truth), problem.edge_costs(graph.truth).sum()))
         True
         """
-        self._check_poses(poses)
-        objective = self._objectives.get(poses)
-        if objective is None:
-            objective = self.weights.value_at(self, poses)
-            self._objectives[poses] = objective
-        return objective
+        return self.at(poses).value
 
     def edge_costs(self, poses: Poses) -> Array:
         """Return the share of every edge in the cost.
@@ -483,26 +431,8 @@ class PGOProblem(ReadOnly):
         (m,) array
             Their sum is the objective.
         """
-        return self.weights.edge_values(self, *self.evaluated(poses))
-
-    def apply_M_at(self, poses: Poses) -> Array:
-        """Return M X at poses, half the gradient in X; for chi2 M is that of the tangent there.
-
-        Parameters
-        ----------
-        poses : Poses
-            One pose for every pose of the graph.
-
-        Returns
-        -------
-        (N, d) array
-            In the rows of X, read-only: it is computed once for these poses.
-        """
-        half_gradient = self._half_gradients.get(poses)
-        if half_gradient is None:
-            half_gradient = self.tangent_at(poses).apply_M(*self.evaluated(poses))
-            self._half_gradients[poses] = read_only(half_gradient)
-        return half_gradient
+        here = self.at(poses)
+        return self.weights.edge_values(self, here.X, here.residuals)
 
     def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
         """Return M X = A^T (w A X) by way of the residuals.
@@ -556,10 +486,7 @@ class PGOProblem(ReadOnly):
         (n, d) array
             Gradient in v, per metre.
         """
-        n = self.num_poses
-        d = self.d
-        G = 2.0 * self.apply_M_at(poses)
-        return -2.0 * vee(G[n:].reshape(n, d, d) @ poses.R), G[:n]
+        return self.at(poses).riemannian_gradient
 
     # Exact translations for given rotations.
 
@@ -678,19 +605,17 @@ class PGOProblem(ReadOnly):
         Poses
             With the same rotations, and t_0 where it is.
         """
-        objective = self.objective(poses)
+        here = self.at(poses)
         for _ in range(MOST_REFINEMENTS):
-            step = self.solve_translations(self.apply_M_at(poses)[: self.num_poses])
-            refined = poses.with_translations(poses.t - step)
-            refined_objective = self.objective(refined)
-            if not refined_objective < objective:
+            step = self.solve_translations(here.half_gradient[: self.num_poses])
+            refined = self.at(here.poses.with_translations(here.poses.t - step))
+            if not refined.value < here.value:
                 break
-            was_halved = 0.0 < refined_objective < 0.5 * objective
-            poses = refined
-            objective = refined_objective
+            was_halved = 0.0 < refined.value < 0.5 * here.value
+            here = refined
             if not was_halved:
                 break
-        return poses
+        return here.poses
 
     def seen_poses(self, poses: Poses) -> Poses:
         """Return the poses that the cost is evaluated at.
@@ -739,8 +664,8 @@ class PGOProblem(ReadOnly):
                 f"{poses} beside {self}; give one pose for every pose of the graph, in its order"
             )
 
-    def evaluated(self, poses: Poses) -> tuple[Array, Array]:
-        """Return X of poses and its residuals, read-only, computed once for these poses.
+    def at(self, poses: Poses) -> "EvaluatedPoses":
+        """Return the cost at poses with what belongs to it: residuals, gradient, minorant.
 
         Parameters
         ----------
@@ -749,18 +674,24 @@ class PGOProblem(ReadOnly):
 
         Returns
         -------
-        (N, d) array
-            X.
-        ((d+1) m, d) array
-            A X.
+        EvaluatedPoses
+            Each thing is computed when it is first asked for, and kept there.
+
+        Raises
+        ------
+        GraphError
+            When the poses do not fit the graph.
+
+        Examples
+        --------
+        >>> from pgo_models.graphs.scenes import grid
+        >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+        >>> here = problem.at(problem.graph.truth)
+        >>> bool(np.isclose(here.value, np.sum(here.X * here.half_gradient)))
+        True
         """
         self._check_poses(poses)
-        evaluation = self._evaluations.get(poses)
-        if evaluation is None:
-            X = self.stacked(poses)
-            evaluation = (read_only(X), read_only(self.residuals(X)))
-            self._evaluations[poses] = evaluation
-        return evaluation
+        return EvaluatedPoses(self, poses)
 
     @cached_property
     def residual_adjoint(self) -> csc_array:
@@ -840,6 +771,86 @@ class PGOProblem(ReadOnly):
     @cached_property
     def _M_rotation_rows(self) -> csr_array:
         return self.M[self.num_poses :].tocsr()
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedPoses(ReadOnly):
+    """Poses with their cost in a problem, residuals and gradient, each computed when asked for.
+
+    What was computed is kept here: who asks several things of the same poses holds on to this.
+    Arrays are read-only.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem.
+    poses : Poses
+        One pose for every pose of its graph (`PGOProblem.at` checks that).
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
+    >>> here = problem.at(problem.graph.truth)
+    >>> bool(here.value == problem.objective(problem.graph.truth))
+    True
+    """
+
+    problem: PGOProblem
+    poses: Poses
+
+    @cached_property
+    def X(self) -> Array:
+        """The poses as the cost sees them: the rows t_i, then the rows of every R_i^T, (N, d)."""
+        return read_only(self.problem.seen_poses(self.poses).stacked())
+
+    @cached_property
+    def residuals(self) -> Array:
+        """A X, ((d+1) m, d)."""
+        return read_only(self.problem.residuals(self.X))
+
+    @cached_property
+    def minorant(self) -> EdgeCost:
+        """The quadratic cost of the edges that touches theirs from below at the poses.
+
+        A quadratic cost is its own minorant.
+        """
+        problem = self.problem
+        if problem.is_quadratic:
+            return problem.weights
+        return problem.weights.minorant(problem, self.X, self.residuals)
+
+    @cached_property
+    def tangent(self) -> PGOProblem:
+        """The problem with the minorant for its cost; a quadratic one is its own tangent."""
+        problem = self.problem
+        if problem.is_quadratic:
+            return problem
+        return _TangentProblem(problem.graph, problem.backend, self.minorant, original=problem)
+
+    @cached_property
+    def value(self) -> float:
+        """F, or chi2, of which the minorant has computed most."""
+        problem = self.problem
+        if problem.is_quadratic:
+            return problem.weights.value(problem, self.X, self.residuals)
+        return self.minorant.value_at_contact(problem, self.X, self.residuals)
+
+    @cached_property
+    def half_gradient(self) -> Array:
+        """M X, (N, d), half the gradient in X; for chi2 M is that of the tangent."""
+        return read_only(self.minorant.half_gradient(self.problem, self.X, self.residuals))
+
+    @property
+    def riemannian_gradient(self) -> tuple[Array, Array]:
+        """Gradient of F(R_i Exp(hat(w_i)), t_i + v_i) in w, (n, 1 or 3), and in v, (n, d), at zero.
+
+        With G = 2 M X it is (-2 vee(G_i R_i), G_{t_i}).
+        """
+        n = self.problem.num_poses
+        d = self.problem.d
+        G = 2.0 * self.half_gradient
+        return -2.0 * vee(G[n:].reshape(n, d, d) @ self.poses.R), G[:n]
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from pgo_models.problem.rotation_weights import RotationWeights, ScaledIdentitie
 
 @dataclass(frozen=True, eq=False)
 class RotationAveraging(EdgeCost):
-    """Cost tr(W rho_R rho_R^T) of every edge, of rotations alone; kappa ||rho_R||_F^2 as in F.
+    """Cost of rotations alone, tr(W delta_R delta_R^T) of every edge: kappa ||delta_R||_F^2 in F.
 
     Measured translations, and those of poses, are ignored.
 
@@ -106,5 +106,5 @@ class RotationAveraging(EdgeCost):
         return self.seen_poses(poses)
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:
-        """That the cost depends on no rho_t, and on which rho_R; (m,) each."""
+        """That the cost depends on no delta_t, and on which delta_R; (m,) each."""
         return np.zeros(len(self.tau), dtype=bool), self.rotation.is_used

@@ -1,6 +1,6 @@
-"""Weights W of the rotation residuals: costs tr(W rho_R rho_R^T), edge by edge.
+"""Weights W of the rotation residuals: costs tr(W delta_R delta_R^T), edge by edge.
 
-The residual is rho_R = R_j^T - R_ij^T R_i^T.
+The residual is delta_R = R_j^T - R_ij^T R_i^T.
 
 They come in three forms, one class each with the same methods:
 
@@ -9,8 +9,8 @@ They come in three forms, one class each with the same methods:
 - `SymmetricMatrices`: W = U diag(kappa) U^T, computed from information matrices.
 
 The columns of U are the eigenvectors of W, "axes" in the names below. The residual matrix A of
-`pgo_models.problem.matrices.residual_matrix` has the rows U^T rho_R, in which W is diagonal: their
-weights are the eigenvalues kappa.
+`pgo_models.problem.matrices.residual_matrix` has the rows U^T delta_R, in which W is diagonal:
+their weights are the eigenvalues kappa.
 """
 
 from abc import ABC, abstractmethod
@@ -70,19 +70,19 @@ class RotationWeights(ABC):
     @property
     @abstractmethod
     def has_own_axes(self) -> bool:
-        """Whether U is not the identity, so that A has U^T rho_R in place of rho_R."""
+        """Whether U is not the identity, so that A has U^T delta_R in place of delta_R."""
 
     @abstractmethod
     def matrices(self, d: int) -> Array:
         """W, (m, d, d)."""
 
     @abstractmethod
-    def apply(self, rho_R: Array) -> Array:
-        """W rho_R for rho_R of shape (m, d, k)."""
+    def apply(self, delta_R: Array) -> Array:
+        """W delta_R for delta_R of shape (m, d, k)."""
 
     @abstractmethod
     def apply_absolute(self, sizes: Array) -> Array:
-        """|W| times sizes, (m, d, k): bound on W rho_R where |rho_R| <= sizes, entry by entry."""
+        """|W| times sizes, (m, d, k): bounds W delta_R where |delta_R| <= sizes, entry by entry."""
 
     @abstractmethod
     def measurement_products(self, R_ij: Array) -> tuple[Array, Array, Array]:
@@ -101,26 +101,26 @@ class RotationWeights(ABC):
         """
 
     @abstractmethod
-    def to_eigenbasis(self, rho_R: Array) -> Array:
-        """U^T rho_R for rho_R of shape (m, d, k): the rotation rows of A."""
+    def to_eigenbasis(self, delta_R: Array) -> Array:
+        """U^T delta_R for delta_R of shape (m, d, k): the rotation rows of A."""
 
     @abstractmethod
     def from_eigenbasis(self, rows: Array) -> Array:
-        """rho_R = U rows for rotation rows of A, (m, d, k)."""
+        """delta_R = U rows for rotation rows of A, (m, d, k)."""
 
     @abstractmethod
     def effect_of_error(self, sizes: Array, errors: Array) -> tuple[float, Array | float]:
-        """Bounds on what the error of W changes in the value and in W rho_R, both rounded up.
+        """Bounds on what the error of W changes in the value and in W delta_R, both rounded up.
 
-        The residuals have the sizes |rho_R| and are known up to errors, (m, d, d) each. With
-        ||W_exact - W||_F <= e and s = ||sizes + errors||_F, the sum over all edges of tr(W rho_R
-        rho_R^T) changes by at most sum_e e s^2, which is returned first. An entry of W rho_R
+        The residuals have the sizes |delta_R| and are known up to errors, (m, d, d) each. With
+        ||W_exact - W||_F <= e and s = ||sizes + errors||_F, the sum over all edges of tr(W delta_R
+        delta_R^T) changes by at most sum_e e s^2, which is returned first. An entry of W delta_R
         changes by at most e s, which is returned second, one number for every edge, (m, 1, 1).
         """
 
     @abstractmethod
     def error_of_rows(self, rows: Array) -> float:
-        """Bound on the difference of sum_rows kappa ||row||^2 and sum_e tr(W_exact rho_R rho_R^T).
+        """Bound on how far sum_rows kappa ||row||^2 is from sum_e tr(W_exact delta_R delta_R^T).
 
         The rows are those of A X, (d m, d). The bound counts the error of W and that of its stored
         eigenvectors, but not the rounding of the sum.
@@ -186,9 +186,9 @@ class ScaledIdentities(RotationWeights):
         """W = kappa I, (m, d, d)."""
         return np.asarray(self.kappa[:, None, None] * np.eye(d))
 
-    def apply(self, rho_R: Array) -> Array:
-        """Product kappa rho_R."""
-        return self.kappa[:, None, None] * rho_R
+    def apply(self, delta_R: Array) -> Array:
+        """Product kappa delta_R."""
+        return self.kappa[:, None, None] * delta_R
 
     def apply_absolute(self, sizes: Array) -> Array:
         """|kappa| times sizes."""
@@ -213,9 +213,9 @@ class ScaledIdentities(RotationWeights):
         at_j = np.ones((*columns_j.shape, 1))
         return at_i, at_j, columns_j[:, :, None]
 
-    def to_eigenbasis(self, rho_R: Array) -> Array:
-        """rho_R itself, as U = I."""
-        return rho_R
+    def to_eigenbasis(self, delta_R: Array) -> Array:
+        """delta_R itself, as U = I."""
+        return delta_R
 
     def from_eigenbasis(self, rows: Array) -> Array:
         """The rows themselves, as U = I."""
@@ -253,9 +253,9 @@ class _Rounded(RotationWeights):
         return OUTWARD * of_value, OUTWARD * of_product[:, None, None]
 
     def error_of_rows(self, rows: Array) -> float:
-        """Bound sum_e (e + error of the eigenvectors) ||rho_R||_F^2.
+        """Bound sum_e (e + error of the eigenvectors) ||delta_R||_F^2.
 
-        U^T rho_R has the norm of rho_R.
+        U^T delta_R has the norm of delta_R.
         """
         m = len(self.kappa)
         d = rows.shape[1]
@@ -357,16 +357,16 @@ class SymmetricMatrices(_Rounded):
 
     @property
     def has_own_axes(self) -> bool:
-        """True: the rotation rows of A are U^T rho_R."""
+        """True: the rotation rows of A are U^T delta_R."""
         return True
 
     def matrices(self, d: int) -> Array:
         """W, (m, d, d)."""
         return self.W
 
-    def apply(self, rho_R: Array) -> Array:
-        """W rho_R."""
-        return self.W @ rho_R
+    def apply(self, delta_R: Array) -> Array:
+        """W delta_R."""
+        return self.W @ delta_R
 
     def apply_absolute(self, sizes: Array) -> Array:
         """|W| sizes, with the absolute values of the entries."""
@@ -390,10 +390,10 @@ class SymmetricMatrices(_Rounded):
         columns = np.repeat(columns_j[:, None], d, axis=1)
         return at_i, at_j, columns
 
-    def to_eigenbasis(self, rho_R: Array) -> Array:
-        """U^T rho_R."""
+    def to_eigenbasis(self, delta_R: Array) -> Array:
+        """U^T delta_R."""
         transposed_axes = np.swapaxes(self.axes, 1, 2)
-        return transposed_axes @ rho_R
+        return transposed_axes @ delta_R
 
     def from_eigenbasis(self, rows: Array) -> Array:
         """U times rows, (m, d, k)."""

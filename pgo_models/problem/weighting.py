@@ -1,6 +1,6 @@
 """The costs of a graph's measurements: F, with two precisions an edge, or chi2; or rotations alone.
 
-**F**: tau ||rho_t||^2 + kappa ||rho_R||_F^2 (`pgo_models.problem.edge_cost`).
+**F**: tau ||delta_t||^2 + kappa ||delta_R||_F^2 (`pgo_models.problem.edge_cost`).
 
 **chi2** (`pgo_models.graphs.residuals.chi2`, CHORDAL): for a rotation E by theta about a, 2 (1 -
 cos theta) a^T I_rr a = tr(W (2 I - E - E^T)) with W = tr(I_rr) / 2 I - I_rr in space and I_theta /
@@ -195,20 +195,20 @@ def _uncoupled_cost(graph: PoseGraph, blocks: _Information) -> ExcessCost:
 
 
 def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) -> ExcessCost:
-    """chi2 with the excess u^T J u + tr(H K H), u = (r, s)."""
+    """chi2 with the excess u^T J u + tr(H J_ss H), u = (r, s)."""
     d = graph.d
     p = tangent_dimension(d)
     tau = _coupled_tau(information, blocks)
     J_tt = blocks.I_tt - tau[:, None, None] * np.eye(d)
     margin_t = np.repeat(blocks.margin[:, None], d, axis=1)
     margin_R = _rotation_margin(blocks)
-    # K is above the Schur complement I_tr^T J_tt^-1 I_tr, so that J is positive definite.
+    # J_ss is above the Schur complement I_tr^T J_tt^-1 I_tr, so that J is positive definite.
     schur = eliminated_products(J_tt, blocks.I_tr)
     share = 0.5 + 4.0 * margin_t[:, 0] / blocks.smallest + _MARGIN
-    K = share[:, None, None] * (schur + np.swapaxes(schur, 1, 2))
-    K = K + 2.0 * margin_R[:, None, None] * np.eye(p)
+    J_ss = share[:, None, None] * (schur + np.swapaxes(schur, 1, 2))
+    J_ss = J_ss + 2.0 * margin_R[:, None, None] * np.eye(p)
     upper = np.concatenate([J_tt, blocks.I_tr], axis=2)
-    lower = np.concatenate([np.swapaxes(blocks.I_tr, 1, 2), K], axis=2)
+    lower = np.concatenate([np.swapaxes(blocks.I_tr, 1, 2), J_ss], axis=2)
     in_frame_j = np.concatenate([upper, lower], axis=1)
     # From the measured frame of pose j to that of pose i. In the plane both have the same axis.
     to_frame_i = np.zeros_like(in_frame_j)
@@ -218,17 +218,17 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     margin = np.concatenate([margin_t, np.repeat(margin_R[:, None], p, axis=1)], axis=1)
     _check_excess(graph, tau, J, margin)
     trace_of_sizes = blocks.trace + d * tau
-    size = _block_sizes(d, trace_of_sizes, np.einsum("mkk->m", K))
+    size = _block_sizes(d, trace_of_sizes, np.einsum("mkk->m", J_ss))
     least = 0.5 * margin[:, [0, -1]]
     excess = CoupledExcess(graph.R_ij, J, size, least, J[:, d:, d:])
-    return ExcessCost(tau, _rotation_weights(blocks.I_rr, K), excess)
+    return ExcessCost(tau, _rotation_weights(blocks.I_rr, J_ss), excess)
 
 
 def _rotation_margin(blocks: _Information) -> Array:
-    """Half of what K exceeds the Schur complement by, (m,).
+    """Half of what J_ss exceeds the Schur complement by, (m,).
 
     It is a small share of the smallest eigenvalue of I_rr. Where I_rr is zero, the median over the
-    other edges takes the place of that eigenvalue, and W' is that of -K.
+    other edges takes the place of that eigenvalue, and W' is that of -J_ss.
     """
     is_zero = blocks.trace_R == 0.0
     median = np.median(blocks.smallest_R[~is_zero])
@@ -252,7 +252,7 @@ def _coupled_tau(information: Array, blocks: _Information) -> Array:
 
 
 def _block_sizes(d: int, trace: Array, trace_R: Array) -> Array:
-    """Sizes of the blocks of J and K, (m, 2), from the traces of their terms, rounded up.
+    """Sizes of the blocks of J and J_ss, (m, 2), from the traces of their terms, rounded up.
 
     Blocks of a definite J have ||J_ab||^2 <= tr(J_aa) tr(J_bb); and || |R_ij| ||^2 = d.
     """
@@ -303,11 +303,11 @@ def _uncoupled_rotation_weights(I_rr: Array) -> RotationWeights:
     return _rotation_weights(I_rr, np.zeros_like(I_rr))
 
 
-def _rotation_weights(I_rr: Array, K: Array) -> RotationWeights:
-    """The W that belongs to I_rr - K, (m, p, p), with a bound on its rounding error."""
+def _rotation_weights(I_rr: Array, J_ss: Array) -> RotationWeights:
+    """The W that belongs to I_rr - J_ss, (m, p, p), with a bound on its rounding error."""
     p = I_rr.shape[1]
-    difference = I_rr - K
-    sizes = np.linalg.norm(I_rr, axis=(1, 2)) + np.linalg.norm(K, axis=(1, 2))
+    difference = I_rr - J_ss
+    sizes = np.linalg.norm(I_rr, axis=(1, 2)) + np.linalg.norm(J_ss, axis=(1, 2))
     error = OUTWARD * gamma(4.0 * p) * p * sizes
     multiples_of_identity = difference[:, :1, :1] * np.eye(p)
     if p == 1 or (difference == multiples_of_identity).all():

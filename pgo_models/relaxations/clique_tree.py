@@ -24,7 +24,7 @@ class CliqueTree:
     ----------
     cliques : tuple of (c_k,) arrays
         Poses of every clique, ascending; parents come before children.
-    parent : (K,) array
+    parent : (k,) array
         Parent of every clique, -1 for the root.
     """
 
@@ -33,7 +33,7 @@ class CliqueTree:
 
     @property
     def sizes(self) -> IntArray:
-        """Number of poses of every clique, (K,)."""
+        """Number of poses of every clique, (k,)."""
         return np.array([len(clique) for clique in self.cliques])
 
     def separator(self, k: int) -> IntArray:

@@ -22,7 +22,7 @@ from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.geometry.stiefel import project_to_tangent, retract, row_products
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.matrices import assemble, block_entries, rotation_columns
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +85,12 @@ class LiftedPoses(Poses):
         w = np.einsum("nak,na->nk", last_rows, of_rotations)
         return np.asarray(w), v
 
-    def gradient(self, problem: PGOProblem) -> tuple[Array, Array]:
-        """Compute the gradient of F in (w, v), (n, k) and (n, r): 2 B^T M X and 2 (M X)_t."""
-        G = 2.0 * problem.apply_M_at(self)
+    def gradient(self, half_gradient: Array) -> tuple[Array, Array]:
+        """Compute the gradient of F in (w, v), (n, k) and (n, r): 2 B^T M X and 2 (M X)_t.
+
+        The half gradient is M X, (N, r).
+        """
+        G = 2.0 * half_gradient
         n, r, d = self.R.shape
         of_rotations = G[n:].reshape(n, d, r)
         gradient_w = np.einsum("nrak,nar->nk", self.basis, of_rotations)
@@ -163,18 +166,18 @@ def poses_from(R: Array, t: Array) -> Poses:
 # What Newton needs at poses of either kind.
 
 
-def gradient_at(problem: PGOProblem, poses: Poses) -> tuple[Array, Array]:
+def gradient_at(here: EvaluatedPoses) -> tuple[Array, Array]:
     """Compute the gradient of the cost in (w, v)."""
-    if isinstance(poses, LiftedPoses):
-        return poses.gradient(problem)
-    return problem.riemannian_gradient(poses)
+    if isinstance(here.poses, LiftedPoses):
+        return here.poses.gradient(here.half_gradient)
+    return here.riemannian_gradient
 
 
-def hessian_at(problem: PGOProblem, poses: Poses, Lambda: Array | None) -> csc_array:
+def hessian_at(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
     """Compute the Hessian of the cost in (v, w)."""
-    if isinstance(poses, LiftedPoses):
-        return poses.hessian(problem, Lambda)
-    return riemannian_hessian(problem, poses, Lambda)
+    if isinstance(here.poses, LiftedPoses):
+        return here.poses.hessian(here.problem, Lambda)
+    return riemannian_hessian(here, Lambda)
 
 
 # With the translations marginalised.
@@ -204,12 +207,11 @@ def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
     translations = problem.translations_for(stacked)
     poses = LiftedPoses(np.swapaxes(Y, 1, 2), translations)
     # The translations are the best ones for Y, so that the rotation rows of M X are Q Y.
-    MX = problem.apply_M_at(poses)
-    QY = MX[n:].reshape(n, d, r)
+    here = problem.at(poses)
+    QY = here.half_gradient[n:].reshape(n, d, r)
     Lambda = row_products(QY, Y)
     gradient = 2.0 * (QY - Lambda @ Y)
-    value = problem.objective(poses)
-    return LiftedPoint(Y, value, read_only(Lambda), read_only(gradient))
+    return LiftedPoint(Y, here.value, read_only(Lambda), read_only(gradient))
 
 
 def hessian_product(problem: PGOProblem, point: LiftedPoint, V: Array) -> Array:

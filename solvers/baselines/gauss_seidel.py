@@ -220,13 +220,6 @@ class GaussSeidel:
     def poses(self, problem: PGOProblem, state: GaussSeidelState) -> Poses:
         """Return the poses that a state stands for.
 
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : GaussSeidelState
-            A state of this solver.
-
         Returns
         -------
         Poses

@@ -136,20 +136,7 @@ class LevenbergMarquardt:
         return Measurement(state.objective, 0.0, state.decrement)
 
     def poses(self, problem: PGOProblem, state: LevenbergMarquardtState) -> Poses:
-        """Return the poses of a state.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : LevenbergMarquardtState
-            A state of this solver.
-
-        Returns
-        -------
-        Poses
-            Its poses.
-        """
+        """Return the poses of a state."""
         return state.poses
 
     def converged(self, state: LevenbergMarquardtState, measurement: Measurement) -> Status | None:
@@ -183,7 +170,7 @@ def _linearized(
     mu: float,
     analysis: SymbolicCholesky | None = None,
 ) -> LevenbergMarquardtState:
-    matrix = riemannian_hessian(problem, poses, None)
+    matrix = riemannian_hessian(problem.at(poses), None)
     ground_pose(matrix, problem)
     gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
     if analysis is None:

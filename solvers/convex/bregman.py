@@ -7,9 +7,9 @@ Each form is a class, to step through and to compare:
     MethodOfMultipliers lam <- lam + alpha (f - K x)      x minimises the augmented Lagrangian
     AlternatingBregman  lam <- lam + alpha (f - K x)      x by T passes over its blocks
 
-These are the paper's equations (2), (4), (8), and (9) with (10). The first three forms have the
-same x, with p = K^T lam and lam = -alpha b; the last one is ADMM for T = 1. Osher et al. 2005; Yin
-et al. 2008; Esser 2009.
+These are the paper's equations (2), (4), (8), and (9) with (10); alpha is the penalty, as there. The
+first three forms have the same x, with p = K^T lam and lam = -alpha b; the last one is ADMM for
+T = 1. Osher et al. 2005; Yin et al. 2008; Esser 2009.
 """
 
 import math
@@ -182,13 +182,6 @@ class Bregman(BregmanSettings):
     def point(self, problem: BregmanProblem, state: BregmanState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
 
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : BregmanState
-            A state of this solver.
-
         Returns
         -------
         BregmanPoint
@@ -231,13 +224,6 @@ class TwoLineBregman(BregmanSettings):
     def point(self, problem: BregmanProblem, state: TwoLineState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
 
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : TwoLineState
-            A state of this solver.
-
         Returns
         -------
         BregmanPoint
@@ -275,13 +261,6 @@ class MethodOfMultipliers(BregmanSettings):
 
     def point(self, problem: BregmanProblem, state: MultiplierState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
-
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : MultiplierState
-            A state of this solver.
 
         Returns
         -------
@@ -353,13 +332,6 @@ class AlternatingBregman(BregmanSettings):
 
     def point(self, problem: BregmanProblem, state: AlternatingState) -> BregmanPoint:
         """Return the point of a state, from which a run of any form can go on.
-
-        Parameters
-        ----------
-        problem : BregmanProblem
-            The problem that is solved.
-        state : AlternatingState
-            A state of this solver.
 
         Returns
         -------

@@ -156,13 +156,6 @@ class ExtendedSOC:
     def poses(self, problem: PGOProblem, state: SOCState) -> Poses:
         """Return the poses that a state stands for.
 
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : SOCState
-            A state of this solver.
-
         Returns
         -------
         Poses
@@ -206,8 +199,8 @@ def _model(state: SOCState) -> GraphQP:
 def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
     """Poses moved as a whole, where that lowers the added terms or meets the constraints.
 
-    At Q poses + s the terms are convex in (Q, s), without Q in SO(d): first Q and s are free and Q
-    is projected, then s is found for this Q. Directions of Q that no term or constraint determines
+    At V poses + s the terms are convex in (V, s), without V in SO(d): first V and s are free and V
+    is projected, then s is found for this V. Directions of V that no term or constraint determines
     are held near a small multiple of I, which the projection completes to a rotation.
     """
     change = model.change
@@ -215,11 +208,11 @@ def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
     X_0 = poses.stacked()
     n = len(poses.t)
     d = poses.d
-    Q = cp.Variable((d, d))
+    V = cp.Variable((d, d))
     s = cp.Variable((1, d))
     is_translation = np.repeat([1.0, 0.0], [n, d * n])[:, None]
-    is_moved = X_0 @ Q.T + is_translation @ s == X
-    near_identity = _FAINT * cp.sum_squares(Q - _FAINT * np.eye(d))
+    is_moved = X_0 @ V.T + is_translation @ s == X
+    near_identity = _FAINT * cp.sum_squares(V - _FAINT * np.eye(d))
     objective = cp.Minimize(sum(change.terms, near_identity))
     constraints = [*change.constraints, is_moved]
     for _ in range(2):
@@ -228,8 +221,8 @@ def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
             solve_compiled(problem, "motion of the start", solver=model.qp.solver)
         except PGOError:  # no motion meets the constraints: the poses will have to change
             return poses
-        turn = project_to_rotations(Q.value[None])[0]
-        constraints = [*change.constraints, is_moved, turn == Q]
+        turn = project_to_rotations(V.value[None])[0]
+        constraints = [*change.constraints, is_moved, turn == V]
     moved = poses.moved(turn, s.value[0])
     is_lower = model.cost(moved.stacked()) < (1.0 - _FAINT) * model.cost(X_0)
     return moved if is_lower or change.constraints else poses

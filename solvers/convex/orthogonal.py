@@ -190,13 +190,6 @@ class OrthogonalSOC:
     def point(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalPoint:
         """Return the point of a state, from which a run can go on.
 
-        Parameters
-        ----------
-        problem : OrthogonalProblem
-            The problem that is solved.
-        state : OrthogonalState
-            A state of this solver.
-
         Returns
         -------
         OrthogonalPoint

@@ -22,6 +22,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
     CholeskyFactor,
+    NonZeros,
     SymbolicCholesky,
     analyze,
 )
@@ -192,7 +193,7 @@ class SparseInterface(Interface):
         """
         num_terms = float(len(sizes) + len(own))
         of_sums = gamma(num_terms + 8.0)
-        of_factor = self.held.analysis.error_before()
+        of_factor = self.held.analysis.backward_error(NonZeros.MOST)
         sums = self._row_sums(sizes, own, diagonal)
         error: Array = of_sums * sums + of_factor / (1.0 - of_sums) * diagonal
         return OUTWARD * error

@@ -66,13 +66,7 @@ class EdgeFit:
         return self.residuals if self.lowered is None else self.lowered
 
     def sentence(self) -> str:
-        """Return the result of the chi-square tests of the edges at the poses.
-
-        Returns
-        -------
-        str
-            A sentence.
-        """
+        """Return the result of the chi-square tests of the edges at the poses."""
         return fit_sentence(self.residuals, self.cost)
 
     def advice_on_cost(self, solve: str) -> list[Advice]:

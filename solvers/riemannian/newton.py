@@ -99,13 +99,6 @@ class Newton:
     def poses(self, problem: PGOProblem, state: NewtonState) -> Poses:
         """Return the poses of a state.
 
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : NewtonState
-            A state of this method.
-
         Returns
         -------
         Poses

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.dual_variables import multipliers_at
 from pgo_models.certificates.rounding_errors import fits_to_rounding, rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
@@ -24,7 +24,7 @@ from pgo_models.problem.hessian import (
     tangent_order,
 )
 from pgo_models.problem.matrices import inner
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.riemannian.newton_step import (
     ModelOrder,
@@ -45,34 +45,46 @@ MOST_FITTING_STEPS = 3  # Newton steps at the rounding level of F
 class PolishState(NewtonFigures):
     """Poses on the way to a stationary point, and `NewtonFigures` of them."""
 
-    poses: Poses
+    here: EvaluatedPoses  # of the poses
     # whether the last factored matrix was the Hessian, not its damped Gauss-Newton part
     is_newton: bool = False
     # it and the last factor are for the next step to reuse
     analysis: SymbolicCholesky | None = None
     factor: CholeskyFactor | None = None
 
-
-@dataclass(frozen=True, eq=False)
-class CentralModel:
-    """`newton_step.NewtonModel` in one place."""
-
-    order: ModelOrder
-    factor: CholeskyFactor  # of H
-    poses: Poses
-    objective: float
-    rounding_level: float
-    gradient: Array  # g, (side,)
-    step: Array  # -H^-1 g, or what L-BFGS makes of it, (side,)
-    square: float  # minus the slope of F along the step
+    @property
+    def poses(self) -> Poses:
+        """The poses."""
+        return self.here.poses
 
 
 @dataclass(frozen=True, eq=False)
 class PolishTrial:
-    """Poses after a move, with F there."""
+    """Poses after a move."""
 
-    poses: Poses
-    objective: float
+    here: EvaluatedPoses
+
+    @property
+    def poses(self) -> Poses:
+        """The poses."""
+        return self.here.poses
+
+    @property
+    def objective(self) -> float:
+        """F there."""
+        return self.here.value
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CentralModel(PolishTrial):
+    """`newton_step.NewtonModel` in one place."""
+
+    order: ModelOrder
+    factor: CholeskyFactor  # of H
+    rounding_level: float
+    gradient: Array  # g, (side,)
+    step: Array  # -H^-1 g, or what L-BFGS makes of it, (side,)
+    square: float  # minus the slope of F along the step
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,14 +129,12 @@ class CentralAlgebra:
             factor = self.analysis.factorize(matrix, overwrite=overwritten)
         except NotPositiveDefiniteError:
             return None
-        poses = self.state.poses
-        gradient = self._gradient(poses)
+        gradient = self._gradient(self.state.here)
         step = -factor.solve(gradient)
         return CentralModel(
             order=order,
             factor=factor,
-            poses=poses,
-            objective=self.state.objective,
+            here=self.state.here,
             rounding_level=self.rounding_level,
             gradient=gradient,
             step=step,
@@ -143,12 +153,11 @@ class CentralAlgebra:
         w, v = self.layout.split(model.step)
         moved = model.poses.moved_along(length * w, length * v)
         poses = problem.at_best_translations(moved, self._factor_of_translations(model, moved))
-        objective = problem.objective(poses)
-        is_nearly_exact = objective <= NEARLY_EXACT * model.rounding_level
+        trial = PolishTrial(problem.at(poses))
+        is_nearly_exact = trial.objective <= NEARLY_EXACT * model.rounding_level
         if problem.is_quadratic and length == 1.0 and is_nearly_exact:
-            poses = problem.with_refined_translations(poses)
-            objective = problem.objective(poses)
-        return PolishTrial(poses, objective)
+            return PolishTrial(problem.at(problem.with_refined_translations(poses)))
+        return trial
 
     def _factor_of_translations(self, model: CentralModel, moved: Poses) -> CholeskyFactor | None:
         """Factor for the translations of moved poses, where chi2 needs one.
@@ -164,7 +173,7 @@ class CentralAlgebra:
 
     def model_at(self, model: CentralModel, trial: PolishTrial) -> CentralModel:
         """Return the model at the trial, its step by L-BFGS where the algebra learns from moves."""
-        gradient = self._gradient(trial.poses)
+        gradient = self._gradient(trial.here)
         if self.has_secants:
             w = vee(np.swapaxes(model.poses.R, 1, 2) @ trial.poses.R)
             move = self.layout.join(w, trial.poses.t - model.poses.t)
@@ -172,8 +181,7 @@ class CentralAlgebra:
         step = -_apply_inverse(model.factor, self._secants, gradient)
         return replace(
             model,
-            poses=trial.poses,
-            objective=trial.objective,
+            here=trial.here,
             gradient=gradient,
             step=step,
             square=-inner(gradient, step),
@@ -182,19 +190,19 @@ class CentralAlgebra:
     def accept(self, trial: PolishTrial) -> None:
         """Do nothing: the model has the poses."""
 
-    def _gradient(self, poses: Poses) -> Array:
-        return self.layout.join(*self.problem.riemannian_gradient(poses))
+    def _gradient(self, here: EvaluatedPoses) -> Array:
+        return self.layout.join(*here.riemannian_gradient)
 
     def _matrix(self, order: ModelOrder) -> csc_array:
         """Return H, with pose 0 grounded."""
         problem = self.problem
-        poses = self.state.poses
+        here = self.state.here
         Lambda = None
         if order.second_order:
-            Lambda = multipliers(problem, poses)
+            Lambda = multipliers_at(here)
             if order.eta:
                 Lambda = Lambda - order.eta * np.eye(problem.d)
-        matrix = riemannian_hessian(problem, poses, Lambda)
+        matrix = riemannian_hessian(here, Lambda)
         ground_pose(matrix, problem)
         if order.damping:
             matrix.setdiag(matrix.diagonal() * (1.0 + order.damping))
@@ -203,8 +211,13 @@ class CentralAlgebra:
 
 def start_polish(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishState:
     """Begin at poses; `share` is how many times looser than usual the tolerance is."""
-    tolerance = stationary_tolerance(problem.is_quadratic, share)
-    return PolishState(poses=poses, objective=problem.objective(poses), tolerance=tolerance)
+    return start_at(problem.at(poses), share)
+
+
+def start_at(here: EvaluatedPoses, share: float = 1.0) -> PolishState:
+    """Begin at poses that are evaluated, as `start_polish`."""
+    tolerance = stationary_tolerance(here.problem.is_quadratic, share)
+    return PolishState(here=here, objective=here.value, tolerance=tolerance)
 
 
 def start_run(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishState:
@@ -213,11 +226,12 @@ def start_run(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishSt
     The start of chi2 has the translations of another cost. With its own, the Hessian is the better
     model from the first step on, and one factorisation is saved.
     """
+    here = problem.at(poses)
     if not problem.is_quadratic:
-        settled = problem.at_best_translations(poses)
-        if problem.objective(settled) < problem.objective(poses):
-            poses = settled
-    return start_polish(problem, poses, share)
+        settled = problem.at(problem.at_best_translations(poses))
+        if settled.value < here.value:
+            here = settled
+    return start_at(here, share)
 
 
 def polish_step(
@@ -236,7 +250,7 @@ def polish_step(
         return replace(state, is_newton=False, moved=False)
     model = result.model
     now = PolishState(
-        poses=model.poses,
+        here=model.here,
         objective=model.objective,
         decrement=result.decrement,
         moved=result.moved,
@@ -247,8 +261,8 @@ def polish_step(
         factor=model.factor,
     )
     if now.is_stationary and now.objective <= algebra.rounding_level:
-        poses = _fit_every_edge(problem, now.poses, model.factor)
-        now = replace(now, poses=poses, objective=problem.objective(poses))
+        here = problem.at(_fit_every_edge(problem, now.poses, model.factor))
+        now = replace(now, here=here, objective=here.value)
     return now
 
 

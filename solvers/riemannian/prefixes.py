@@ -2,7 +2,7 @@
 
 The chordal relaxation, a spanning tree and odometry give poses of the whole graph at once. Where
 odometry is poor, or landmarks tie the poses together, Newton goes from them to a local minimum that
-may cost many times the least. A prefix has the poses 0 .. K - 1 alone. Its start is the solution of
+may cost many times the least. A prefix has the poses 0 .. k - 1 alone. Its start is the solution of
 a shorter prefix, continued by odometry over so few poses that it has no time to drift away.
 
 Whether it has is seen: where S_r, the certificate matrix grounded at a pose, is positive definite,
@@ -221,11 +221,6 @@ class GrowingStart:
     def has_prefixes(self, graph: PoseGraph) -> bool:
         """Return whether a graph has shorter prefixes to begin with, joined by odometry.
 
-        Parameters
-        ----------
-        graph : PoseGraph
-            The graph.
-
         Returns
         -------
         bool
@@ -281,13 +276,6 @@ class GrowingStart:
 
     def poses(self, problem: PGOProblem, state: PrefixState) -> Poses:
         """Return the poses of a state.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : PrefixState
-            A state of this method.
 
         Returns
         -------

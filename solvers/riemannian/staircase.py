@@ -148,13 +148,6 @@ class Staircase:
     def poses(self, problem: PGOProblem, state: StaircaseState) -> Poses:
         """Round Y to rotations, with the best translations for them.
 
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : StaircaseState
-            A state of this method.
-
         Returns
         -------
         Poses

@@ -160,13 +160,6 @@ class GNC(ValueEquality):
     def poses(self, problem: PGOProblem, state: GNCState) -> Poses:
         """Return the poses of a state.
 
-        Parameters
-        ----------
-        problem : PGOProblem
-            Problem that is solved.
-        state : GNCState
-            State of a run.
-
         Returns
         -------
         Poses

@@ -131,13 +131,6 @@ class IRLS:
     def poses(self, problem: PGOProblem, state: IRLSState) -> Poses:
         """Return the poses of a state.
 
-        Parameters
-        ----------
-        problem : PGOProblem
-            Problem that is solved.
-        state : IRLSState
-            State of a run.
-
         Returns
         -------
         Poses

@@ -104,7 +104,7 @@ class WeightedEdges:
             known=known,
             thresholds=chi2_thresholds(problem, quantile),
             costs=problem.edge_costs(poses),
-            newton=PolishState(poses=poses, objective=math.nan),
+            newton=PolishState(here=problem.at(poses), objective=math.nan),
         )
 
     @property

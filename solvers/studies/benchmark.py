@@ -68,11 +68,6 @@ class BenchmarkSettings:
     def robots(self, graph: PoseGraph) -> Partition:
         """Share a graph among the robots, by `suited_partition`.
 
-        Parameters
-        ----------
-        graph : PoseGraph
-            The graph.
-
         Returns
         -------
         Partition

@@ -214,11 +214,6 @@ def reproduce_tables(
     progress : bool, optional
         Whether to show a bar on stderr; if not given, it is shown on a terminal.
 
-    Returns
-    -------
-    Reproduction
-        The tables.
-
     Raises
     ------
     PGOError

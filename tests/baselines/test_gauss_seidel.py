@@ -80,7 +80,7 @@ def gauss_newton_move(problem: PGOProblem, R: np.ndarray) -> np.ndarray:
     gradient = layout.join(*problem.riemannian_gradient(origin))
     zero = np.zeros(1, dtype=np.int64)
     fixed = np.concatenate([layout.translations(zero)[0], layout.rotations(zero)[0]])
-    hessian = riemannian_hessian(problem, origin, None)
+    hessian = riemannian_hessian(problem.at(origin), None)
     step = fixed_by_hand(hessian, -gradient[:, None], fixed, np.zeros((len(fixed), 1)))
     return np.delete(step, fixed, axis=0)
 
@@ -154,7 +154,7 @@ def test_least_squares_are_F_without_orthogonality_and_F_linearized(
     free = np.concatenate(
         [np.arange(d, n * d), np.arange(n * d + (layout.side - n * d) // n, layout.side)]
     )
-    hessian = riemannian_hessian(problem, Poses(R, np.zeros((n, d))), None).toarray()[
+    hessian = riemannian_hessian(problem.at(Poses(R, np.zeros((n, d)))), None).toarray()[
         np.ix_(free, free)
     ]
     np.testing.assert_allclose(

@@ -100,7 +100,7 @@ def test_a_step_solves_the_damped_equations_of_the_poses(
     state = LevenbergMarquardt(damping=damping).init(problem, poses)
     layout = TangentLayout(n, d)
     gradient = layout.join(*problem.riemannian_gradient(poses))
-    A = riemannian_hessian(problem, poses, None).toarray()
+    A = riemannian_hessian(problem.at(poses), None).toarray()
     for column in np.concatenate([layout.translations(ZERO)[0], layout.rotations(ZERO)[0]]):
         A[column, column] *= 2
     residual = (A + damping * np.diag(np.diag(A))) @ state.step + gradient

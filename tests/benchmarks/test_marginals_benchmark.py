@@ -33,7 +33,7 @@ def seconds(call: Callable[[], object]) -> float:
 def test_all_marginals(benchmark: BenchmarkFixture, benchmark_data, name: str) -> None:
     problem = PGOProblem(read_g2o(benchmark_data / f"{name}.g2o"), weighting=Weighting.ISOTROPIC)
     poses = polish(problem, chordal_start(problem))
-    hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
+    hessian = riemannian_hessian(problem.at(poses), multipliers(problem, poses))
     layout = TangentLayout(problem.num_poses, problem.d)
     # timed apart: to permute is no part of either
     grounded = Marginals(hessian, layout)._information

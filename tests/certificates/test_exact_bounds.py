@@ -347,8 +347,7 @@ def proves(
     """Whether there is a proof; if so it must be true of the exact S."""
     proof = prove_definite(problem, Lambda, eta, fixed, first_shift)
     if proof is not None and proof.slack() is None:  # now its rounding is known
-        error = proof.factor_error()
-        proof = prove_definite(problem, Lambda, eta, fixed, first_shift, factor_error=error)
+        proof = prove_definite(problem, Lambda, eta, fixed, first_shift)
     if proof is None:
         return False
     S = ExactGraph.of_doubles(problem.graph).certificate_matrix(Lambda, eta)

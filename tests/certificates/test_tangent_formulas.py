@@ -82,7 +82,7 @@ def test_sizes_and_least_eigenvalues_of_an_excess(d: int, coupled: bool) -> None
         )
         if isinstance(excess, CoupledExcess):
             turned = turned if d == 3 else np.eye(1)
-            K = excess.R_ij[e].T @ excess.K[e] @ excess.R_ij[e] if d == 3 else excess.K[e]
+            K = excess.R_ij[e].T @ excess.J_ss[e] @ excess.R_ij[e] if d == 3 else excess.J_ss[e]
             assert (
                 size[1] ** 2
                 >= ENOUGH * d * np.trace(K)
@@ -93,7 +93,7 @@ def test_sizes_and_least_eigenvalues_of_an_excess(d: int, coupled: bool) -> None
             )
             bound = 2.0**-24 * np.linalg.eigvalsh(I_rr)[0] * (1 + 1e-9) + 2.0**-42 * np.trace(I_rr)
             assert 0.0 < 2.0 * least[1] <= bound
-            assert np.linalg.eigvalsh(excess.K[e])[0] >= least[1]
+            assert np.linalg.eigvalsh(excess.J_ss[e])[0] >= least[1]
         else:
             assert size[1] == 0.0
         diagonal = np.repeat(least, [d, excess.J.shape[1] - d])
@@ -108,7 +108,7 @@ def test_error_of_W(d: int, coupled: bool) -> None:
     assert isinstance(weights, ExcessCost)
     excess = weights.excess
     # in the frame of i, which turns no norm
-    K = excess.K if isinstance(excess, CoupledExcess) else np.zeros_like(I_rr)
+    K = excess.J_ss if isinstance(excess, CoupledExcess) else np.zeros_like(I_rr)
     sizes = np.linalg.norm(I_rr, axis=(1, 2)) + np.linalg.norm(K, axis=(1, 2))
     assert (weights.rotation.norm_of_error() >= (1.0 - 1e-9) * gamma(4.0 * p) * p * sizes).all()
 

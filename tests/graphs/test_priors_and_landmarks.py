@@ -230,7 +230,7 @@ def test_as_few_positions_as_fix_the_world_do(d):
         problem = PGOProblem(graph)
         poses = graph.completed(truth)
         assert problem.objective(poses) == pytest.approx(0.0, abs=1e-12)
-        curvatures = np.linalg.eigvalsh(riemannian_hessian(problem, poses, None).toarray())
+        curvatures = np.linalg.eigvalsh(riemannian_hessian(problem.at(poses), None).toarray())
         is_open = curvatures < 1e-9 * curvatures[-1]
         # Only a motion of the poses together with the world costs nothing.
         assert is_open.sum() == d + d * (d - 1) // 2

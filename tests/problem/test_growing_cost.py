@@ -69,7 +69,7 @@ def test_where_edges_fit_the_springs_are_the_hessian(d: int) -> None:
     t = graph.truth.t
     cost = GrowingCost.of(graph, isotropic_weights(graph))
     edges = np.arange(cost.num_edges)
-    hessian = riemannian_hessian(PGOProblem(graph), graph.truth, None)
+    hessian = riemannian_hessian(PGOProblem(graph).at(graph.truth), None)
     twist = rng.normal(size=(12, d * (d + 1) // 2))
     difference = twist[cost.i] - twist[cost.j]
     by_springs = np.einsum("ma,mab,mb->", difference, cost.stiffness(R, t, edges), difference)

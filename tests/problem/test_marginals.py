@@ -30,7 +30,7 @@ SIZES = st.integers(2, 30)
 def marginals_at(
     problem: PGOProblem, poses: Poses, anchor: int = 0, backend: CholeskyBackend | None = None
 ) -> Marginals:
-    hessian = riemannian_hessian(problem, poses, multipliers(problem, poses))
+    hessian = riemannian_hessian(problem.at(poses), multipliers(problem, poses))
     return Marginals(hessian, TangentLayout(problem.num_poses, problem.d), anchor, backend)
 
 

@@ -1,3 +1,5 @@
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +10,7 @@ from graphs import (
     SEEDS,
     SIZES,
     exact_graph,
+    informed,
     median_slope,
     random_poses,
     rounding_of_objective,
@@ -214,10 +217,43 @@ def test_a_graph_in_pieces_is_no_problem() -> None:
         PGOProblem(apart)
 
 
+@given(seed=SEEDS, d=DIMENSIONS, weighting=st.sampled_from(Weighting))
+def test_evaluated_poses_say_what_the_problem_says(seed: int, d: int, weighting: Weighting) -> None:
+    problem = PGOProblem(informed(seed, 6, d, coupled=True), weighting=weighting)
+    poses = random_poses(6, d, seed)
+    here = problem.at(poses)
+    assert here.poses is poses
+    np.testing.assert_array_equal(here.X, problem.stacked(poses))
+    np.testing.assert_array_equal(here.residuals, problem.residuals(here.X))
+    assert here.value == problem.objective(poses) == problem.objective_stacked(here.X)
+    tangent = problem.tangent_at(poses)
+    np.testing.assert_array_equal(here.half_gradient, tangent.apply_M(here.X))
+    # The cost of the tangent is that of its own problem everywhere, not where it touches alone.
+    elsewhere = random_poses(6, d, seed + 1)
+    assert tangent.objective(elsewhere) == tangent.objective_stacked(tangent.stacked(elsewhere))
+    assert here.tangent.tangent_at(elsewhere) is here.tangent
+
+
+def test_evaluated_poses_compute_once_and_are_kept_by_nobody_else() -> None:
+    problem = PGOProblem(informed(0, 6, 3, coupled=True), weighting=Weighting.INFORMATION)
+    poses = random_poses(6, 3, 0)
+    here = problem.at(poses)
+    assert here.half_gradient is here.half_gradient
+    assert here.tangent is here.tangent
+    assert problem.at(poses) is not here
+    for array in (here.X, here.residuals, here.half_gradient):
+        assert not array.flags.writeable
+    reference = weakref.ref(here)
+    del here
+    gc.collect()
+    assert reference() is None
+
+
 @pytest.mark.parametrize("poses", [Poses.identity(4, 3), Poses.identity(5, 2)])
 def test_poses_must_fit_the_graph(poses: Poses) -> None:
     problem = PGOProblem(random_geometric(5, np.random.default_rng(0)))
     for function in (
+        problem.at,
         problem.objective,
         problem.edge_costs,
         problem.riemannian_gradient,

@@ -79,7 +79,7 @@ def test_gradient_and_hessian_of_chi2(seed: int, n: int, d: int, coupled: bool) 
     F = problem.objective(poses)
     slope = float(layout.join(*problem.riemannian_gradient(poses)) @ step)
     curvature = float(
-        step @ (riemannian_hessian(problem, poses, multipliers(problem, poses)) @ step)
+        step @ (riemannian_hessian(problem.at(poses), multipliers(problem, poses)) @ step)
     )
     errors = []
     for h in (1e-2, 5e-3):

@@ -210,7 +210,7 @@ def test_a_move_is_learned_from(seed: int, n: int, d: int) -> None:
     """The secant equation: a change of the gradient gives back the move that made it."""
     problem = PGOProblem(varied_graph(seed, n, d))
     layout = TangentLayout(n, d)
-    matrix = riemannian_hessian(problem, random_poses(n, d, seed), None)
+    matrix = riemannian_hessian(problem.at(random_poses(n, d, seed)), None)
     matrix.setdiag(2.0 * matrix.diagonal())
     factor = factorize(matrix)
     rng = np.random.default_rng(seed)

@@ -64,7 +64,8 @@ def pulled(Lambda: Array, x: Array) -> float:
 def try_climb(robot: Interior, length: float) -> tuple[Interior, CostParts]:
     """Move a length along the direction: a trial, and the parts of F there."""
     trial = robot.moved(length)
-    return robot.with_changes(trial=trial), robot.evaluation(trial)
+    following = robot.with_changes(trial=trial)
+    return following, following.evaluation(trial)
 
 
 def gram(robot: Interior, _: None) -> tuple[Interior, Array]:

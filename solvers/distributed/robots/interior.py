@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
+from pgo_models.certificates.dual_variables import multiplier_norms, multipliers_at
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
@@ -29,7 +29,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.initialization import averaging_pull, relaxed_rotations
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 from pgo_models.relaxations.low_rank import gradient_at, hessian_at, tangent_widths
 from solvers.distributed.robots.factors import Eliminated, Factors
 from solvers.distributed.robots.proof import RobotProof
@@ -85,6 +85,7 @@ class Interior:
     factors: Factors
     state: InteriorState
     whole: Part  # with all edges in full
+    evaluated: tuple[EvaluatedPoses, ...] = ()  # the poses of the state, and its trial
 
     # The start: chordal relaxation, translations, multipliers.
 
@@ -99,8 +100,8 @@ class Interior:
         part = self.part
         p = len(part.poses)
         fixed = 0 if part.poses[0] == 0 else None
-        K, b = relaxed_rotations(part.problem, fixed)
-        of_rotations = K[p:, p:].tocsc()
+        matrix, b = relaxed_rotations(part.problem, fixed)
+        of_rotations = matrix[p:, p:].tocsc()
         return self._eliminate(of_rotations, (part.problem.d,), b[p:])
 
     def project(self, x: Array) -> tuple[Interior, None]:
@@ -219,7 +220,7 @@ class Interior:
             identity = np.eye(self.part.problem.d)
             Lambda = self.multipliers() - order.eta * identity
             Lambda[self.part.boundary] = 0.0  # the driver knows the whole force there
-        H = hessian_at(self.problem, self.state.poses, Lambda)
+        H = hessian_at(self.at(self.state.poses), Lambda)
         layout = self._layout
         diagonal = H.diagonal()
         grounded = diagonal.copy()
@@ -268,8 +269,8 @@ class Interior:
     def _tried(self, trial: Poses) -> tuple[Interior, TrialEvaluation]:
         """Evaluate a trial; its gradient is reduced by the last factor."""
         tried = self.with_changes(trial=trial)
-        following, gradient = tried.reduced(self._gradient(trial))
-        return following, TrialEvaluation(self.evaluation(trial), gradient)
+        following, gradient = tried.reduced(tried._gradient(trial))
+        return following, TrialEvaluation(following.evaluation(trial), gradient)
 
     def accept(self, _: None) -> tuple[Interior, None]:
         """Go to the trial."""
@@ -322,7 +323,14 @@ class Interior:
     @property
     def tangent_problem(self) -> PGOProblem:
         """A quadratic cost that touches the current one at the current poses, or is it."""
-        return self.problem.tangent_at(self.state.poses)
+        return self.at(self.state.poses).tangent
+
+    def at(self, poses: Poses) -> EvaluatedPoses:
+        """The current cost at poses, computed once for those of the state and its trial."""
+        for known in self.evaluated:
+            if known.poses is poses and known.problem is self.problem:
+                return known
+        return self.problem.at(poses)
 
     def moved(self, length: float) -> Poses:
         """Return the current poses, moved a length along the direction."""
@@ -338,7 +346,10 @@ class Interior:
 
     def with_changes(self, **changes: object) -> Interior:
         """The robot with some fields of its state replaced."""
-        return replace(self, state=replace(self.state, **changes))  # type: ignore[arg-type] # checked by the class
+        state = replace(self.state, **changes)  # type: ignore[arg-type] # checked by the class
+        following = replace(self, state=state)
+        evaluated = (following.at(state.poses), following.at(state.trial))
+        return replace(following, evaluated=evaluated)
 
     def _at(self, R: Array) -> Interior:
         return self.with_changes(poses=Poses(R, self.state.poses.t))
@@ -437,16 +448,16 @@ class Interior:
 
     def evaluation(self, poses: Poses) -> CostParts:
         """Evaluate the parts of F and of M X on the boundary, at poses."""
-        problem = self.problem
-        force = problem.apply_M_at(poses)[self.boundary_rows]
-        return CostParts(problem.objective(poses), rounding_level(problem, poses), force)
+        here = self.at(poses)
+        force = here.half_gradient[self.boundary_rows]
+        return CostParts(here.value, rounding_level(self.problem, poses), force)
 
     def multipliers(self) -> Array:
         """Compute Lambda_i, which hold in the interior alone, where the robot has every edge."""
-        return multipliers(self.problem, self.state.poses)
+        return multipliers_at(self.at(self.state.poses))
 
     def _gradient(self, poses: Poses) -> Array:
-        w, v = gradient_at(self.problem, poses)
+        w, v = gradient_at(self.at(poses))
         return self._layout.join(w, v)[:, None]
 
 

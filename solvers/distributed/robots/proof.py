@@ -22,7 +22,7 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.cholesky import CholeskyBackend, NonZeros
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
@@ -193,7 +193,7 @@ def _entry_errors(problem: PGOProblem, diagonal: Array, cut: Cut) -> tuple[Array
 
 def _expected_error(cut: Cut) -> Array:
     """Return the share of the diagonal that factoring may take, 0 where it is not known before."""
-    expected = None
-    if cut.analysis is not None:
-        expected = cut.analysis.expected_error(len(cut.boundary))
-    return np.zeros(len(cut.interior)) if expected is None else expected
+    if cut.analysis is None:
+        return np.zeros(len(cut.interior))
+    expected = cut.analysis.backward_error(NonZeros.COUNTED, len(cut.boundary))
+    return np.where(np.isfinite(expected), expected, 0.0)

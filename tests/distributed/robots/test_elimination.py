@@ -53,7 +53,7 @@ def matrix_of(problem: PGOProblem, poses: Poses, kind: str) -> csc_array:
     """One of the three matrices that driver and robots work with; positive semidefinite."""
     if kind == "translations":
         return problem.M[: problem.num_poses, : problem.num_poses].tocsc()
-    return problem.M.copy() if kind == "poses" else riemannian_hessian(problem, poses, None)
+    return problem.M.copy() if kind == "poses" else riemannian_hessian(problem.at(poses), None)
 
 
 @dataclass

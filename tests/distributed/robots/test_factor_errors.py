@@ -30,14 +30,16 @@ from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
     CholeskyFactor,
+    NonZeros,
     SymbolicCholesky,
     _Cholmod,
     _CholmodFactor,
     _SuperLUFactor,
     analyze,
 )
-from pgo_models.problem.floating_point import gamma
+from pgo_models.problem.floating_point import FactorCounts, gamma
 from pgo_models.problem.matrices import columns_of
+from pgo_models.problem.ordering import analyze_poses, most_counts, row_order
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import Interface
@@ -100,8 +102,8 @@ def test_a_factor_is_within_its_backward_error(
     stored = stored_matrix(A)
     analysis = analyze(stored, backend)
     factor = analysis.factorize(stored)
-    epsilon = factor.backward_error()
     difference = square_of(factor, analysis) - exact(A)
+    epsilon = factor.backward_error()
     assert (epsilon < 1e-8).all()
     assert max(largest_share(sign * difference, A.diagonal()) for sign in (1, -1)) > 0.0
     assert largest_share(difference - np.diag(exact(epsilon * A.diagonal())), A.diagonal()) < 0.0
@@ -124,9 +126,60 @@ def test_counts_of_a_pattern_do_not_depend_on_numbers() -> None:
         np.testing.assert_array_equal(counts.in_column, untouched.counts().in_column)
         np.testing.assert_array_equal(counts.in_row, untouched.counts().in_row)
         np.testing.assert_array_equal(counts.order, untouched.counts().order)
-    assert untouched.crude_error().min() >= untouched.counts().error(0).max() > 0
+    counted = untouched.backward_error(NonZeros.COUNTED)
+    np.testing.assert_array_equal(counted, untouched.counts().error(0))
+    of_full_factor = untouched.backward_error(NonZeros.ALL)
+    assert of_full_factor.min() >= counted.max() > 0
     side = float(M.shape[0])
-    assert untouched.crude_error().min() >= side * gamma(side)
+    assert of_full_factor.min() >= side * gamma(side)
+
+
+@BACKENDS
+def test_what_the_rounding_of_a_factor_is_not_known_from_says_inf(backend: CholeskyBackend) -> None:
+    M = stored_matrix(well_conditioned(0, 4, 2))
+    analysis = analyze(M, backend)
+    for non_zeros in (NonZeros.MOST, NonZeros.COUNTED):
+        assert np.isinf(analysis.backward_error(non_zeros)).all()
+    factor = analysis.factorize(M)
+    epsilon = factor.backward_error()
+    assert factor.is_counted
+    assert np.isfinite(epsilon).all()
+    counted = analysis.backward_error(NonZeros.COUNTED)
+    if backend is CholeskyBackend.CHOLMOD:
+        np.testing.assert_array_equal(counted, epsilon)
+    else:
+        assert np.isinf(counted).all()
+
+
+def test_the_most_non_zeros_are_found_once_and_bound_those_that_are_counted() -> None:
+    problem = PGOProblem(road(0, 40, 5.0, 3))
+    calls = []
+
+    def most() -> FactorCounts:
+        calls.append(1)
+        return most_counts(analyze_poses(problem.graph, problem.pose_order), 1, 3)
+
+    order = row_order(problem.pose_order, 1, 3)
+    analysis = analyze(problem.M, CholeskyBackend.CHOLMOD, order, most)
+    bound = analysis.backward_error(NonZeros.MOST)
+    np.testing.assert_array_equal(analysis.backward_error(NonZeros.MOST), bound)
+    assert len(calls) == 1
+    matrix = problem.M.copy()
+    matrix.setdiag(1.0 + 2.0 * matrix.diagonal())
+    assert (bound >= analysis.factorize(matrix).backward_error()).all()
+
+
+def test_a_factor_is_counted_in_place_and_solves_as_before() -> None:
+    M = stored_matrix(well_conditioned(1, 4, 2))
+    analysis = analyze(M, CholeskyBackend.CHOLMOD)
+    factor = analysis.factorize(M)
+    b = np.arange(float(M.shape[0]))
+    x = factor.solve(b)
+    assert not factor.is_counted
+    factor.backward_error()
+    assert isinstance(factor, _CholmodFactor)
+    assert factor.is_given_up
+    np.testing.assert_array_equal(factor.solve(b), x)
 
 
 def bordered(seed: int, coupling: float) -> tuple[Array, Cut]:
@@ -390,7 +443,6 @@ def test_a_long_column_takes_as_many_roundings_as_it_has_entries(backend: Choles
     A = csc_array((values, (rows, columns)), shape=(side, side))
     analysis = analyze(A, backend)
     factor = analysis.factorize(A)
-    allowed = factor.backward_error()[side - 1] * corner
     if isinstance(factor, _SuperLUFactor):
         row = int(np.flatnonzero(factor._rows == side - 1)[0])
         squares = exact(factor._lu.L.toarray()[row]) ** 2 * exact(factor._lu.U.diagonal())
@@ -400,4 +452,5 @@ def test_a_long_column_takes_as_many_roundings_as_it_has_entries(backend: Choles
         row = int(np.flatnonzero(analysis.counts().order == side - 1)[0])
         squares = exact(np.array(cvxopt.matrix(cholmod.getfactor(factor._numeric)))[row]) ** 2
     deviation = abs(total(squares) - exact(corner))
+    allowed = factor.backward_error()[side - 1] * corner
     assert 100 * 2.0**-53 * corner < deviation <= exact(allowed)
