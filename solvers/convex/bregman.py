@@ -7,7 +7,7 @@ Each form is a class, to step through and to compare:
     MethodOfMultipliers lam <- lam + alpha (f - K x)      x minimises the augmented Lagrangian
     AlternatingBregman  lam <- lam + alpha (f - K x)      x by T passes over its blocks
 
-These are the paper's equations (2), (4), (8), and (9) with (10); alpha is the penalty, as there. The
+These are the paper's equations (2), (4), (8), and (9) with (10), whose alpha is the penalty. The
 first three forms have the same x, with p = K^T lam and lam = -alpha b; the last one is ADMM for
 T = 1. Osher et al. 2005; Yin et al. 2008; Esser 2009.
 """

@@ -16,7 +16,6 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli.choices import chosen_pipeline
 from solvers.cli.inputs import chosen_partition
 from solvers.cli.options import BackEndName, FirstStage
