@@ -66,6 +66,28 @@ MUTANTS = (
         "        tau = tau * 1\n    kappas",
         ("tests/verification/test_verify.py",),
     ),
+    # The verifier.
+    Mutant(
+        "verify: rotations are at most sqrt(2) apart",
+        "pgo_models/verification/verify.py",
+        "FARTHEST = 8 ",
+        "FARTHEST = 2 ",
+        ("tests/verification/test_verify.py",),
+    ),
+    Mutant(
+        "verify: handedness terms are zero at the poses of the proof",
+        "pgo_models/verification/verify.py",
+        "value_at_X -= subtract_terms(",
+        "subtract_terms(",
+        ("tests/verification/test_verify.py",),
+    ),
+    Mutant(
+        "verify: a zero pivot with entries beside it counts as semidefinite",
+        "pgo_models/verification/balls.py",
+        "if pivot == 0 and any(beside_pivot):",
+        "if False:",
+        ("tests/verification/test_costs.py", "tests/verification/test_verify.py"),
+    ),
     # The lower bound, central and by robots.
     Mutant(
         "robots: the rounding of the separators' own entries is not counted",
@@ -255,6 +277,62 @@ MUTANTS = (
         ("tests/certificates/test_handedness.py",),
     ),
     Mutant(
+        "handedness: a third of the loss of T is all of it",
+        "pgo_models/certificates/handedness.py",
+        "of_T = 3.0 * omega",
+        "of_T = 1.0 * omega",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: T^T T - I is computed without rounding",
+        "pgo_models/certificates/handedness.py",
+        " + 3.0 * gamma(5.0)",
+        "",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: the eigenvalues of P are computed without rounding",
+        "pgo_models/certificates/handedness.py",
+        "[:, 0] - _EIGENVALUE_ERROR * UNIT_ROUNDOFF * P_size",
+        "[:, 0]",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: negative eigenvalues of P stay",
+        "pgo_models/certificates/handedness.py",
+        "np.maximum(values[chosen], 0.0)",
+        "values[chosen]",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: T is taken as it is given",
+        "pgo_models/certificates/handedness.py",
+        "project_to_rotations(T[chosen])",
+        "T[chosen]",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: closed forms make another direction negative",
+        "pgo_models/certificates/handedness.py",
+        "np.where(lacking < room, lacking + 0.25 * (room - lacking), room)",
+        "(lacking + 0.25 * (room - lacking))",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: the difference of bound and loss may be rounded up",
+        "pgo_models/certificates/lower_bound.py",
+        "math.nextafter(found.value - lost, -math.inf)",
+        "found.value - lost",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
+        "handedness: landmarks have pairs, too",
+        "pgo_models/certificates/handedness.py",
+        "    turns = ~np.isin(graph.j, graph.landmarks)\n    ends",
+        "    turns = np.ones(graph.num_edges, dtype=bool)\n    ends",
+        ("tests/certificates/test_handedness.py",),
+    ),
+    Mutant(
         "handedness: a P with an eigenvalue below zero counts as semidefinite",
         "pgo_models/certificates/handedness.py",
         "of_P = np.maximum(0.0, -least)",
@@ -283,11 +361,40 @@ MUTANTS = (
         ("tests/certificates/test_handedness.py",),
     ),
     Mutant(
+        "handedness by robots: the loss is not in the trace of the form with eta",
+        "solvers/distributed/robots/proof_orders.py",
+        "        lost = terms.loss()\n",
+        "",
+        ("tests/distributed/test_terms_by_robots.py",),
+    ),
+    Mutant(
         "handedness: the verifier takes any P",
         "pgo_models/verification/verify.py",
         "if not is_semidefinite(symmetric(triangle, 3)):",
         "if False:",
         ("tests/verification/test_verify.py",),
+    ),
+    # Robots with files of their own, and graphs that grow.
+    Mutant(
+        "own files: poses are moved to their frame without rounding",
+        "solvers/folder_solve.py",
+        "self.best = replace(best, objective=objective, rounding=rounding)",
+        "self.best = replace(best, objective=objective)",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
+        "own files: one robot's exact part makes the whole exact",
+        "solvers/folder_solve.py",
+        "all(part.is_exact for part in parts)",
+        "any(part.is_exact for part in parts)",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
+        "growing: measurements of old edges are not compared",
+        "solvers/growing.py",
+        "if own is not None and not np.array_equal(own, other[old]):",
+        "if False:",
+        ("tests/test_growing.py",),
     ),
     # Elsewhere.
     Mutant(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 import pytest
-from graphs import COSTS, exact_graph, informed
+from graphs import COSTS, exact_graph, informed, varied_graph
 
 import solvers
 from pgo_models.certificates.certificate import DEFAULT_GAP
@@ -17,7 +17,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel, grid, random_geometric
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -223,6 +223,40 @@ def test_edges_in_another_order_are_another_graph_and_solved_all_the_same() -> N
     # nothing new
     again = extend(growing, growing.graph, certify=False)
     assert again.objective == growing.objective
+
+
+@pytest.mark.parametrize(
+    ("name", "weighting"),
+    [
+        ("i", Weighting.ISOTROPIC),
+        ("R_ij", Weighting.ISOTROPIC),
+        ("t_ij", Weighting.ISOTROPIC),
+        ("kappa", Weighting.ISOTROPIC),
+        ("tau", Weighting.ISOTROPIC),
+        ("information", Weighting.INFORMATION),
+    ],
+)
+def test_a_graph_with_other_measurements_of_old_edges_is_solved_with_these(
+    name: str, weighting: Weighting
+) -> None:
+    graph = varied_graph(4, 24, 2)
+    graph = replace(graph, information=isotropic_information(graph.kappa, graph.tau, 2))
+    before = solvers.solve(PGOProblem(first_poses(graph, 20), weighting=weighting))
+    growing = GrowingSolution.of(before)
+    rows = getattr(graph, name).copy()
+    rows[0] = {
+        "i": (graph.i[0] + 2) % 20,
+        "R_ij": graph.R_ij[0] @ exp_map(np.array([[0.1]]))[0],
+    }.get(name, 4 * rows[0])
+    changed = replace(graph, **{name: rows})
+    grown = extend(growing, changed, certify=False)
+    problem = PGOProblem(changed, weighting=weighting)
+    best = solvers.solve(problem)
+    assert best.is_certified
+    unchanged = solvers.solve(PGOProblem(graph, weighting=weighting))
+    assert best.objective > (1.0 + 1e-5) * unchanged.objective
+    assert grown.objective == pytest.approx(problem.objective(grown.poses), rel=1e-9)
+    assert grown.objective == pytest.approx(best.objective, rel=1e-6)
 
 
 def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:

@@ -174,6 +174,20 @@ def test_semidefinite_matrices_are_told_to_the_last_digit(seed: int, side: int, 
     assert is_semidefinite([[fmpq(int(x)) for x in row] for row in rest.tolist()]) == (not needed)
 
 
+@given(SEEDS, st.integers(2, 6), st.data())
+@settings(max_examples=examples(20))
+def test_no_matrix_with_a_zero_on_its_diagonal_and_an_entry_beside_it_is_semidefinite(
+    seed: int, side: int, data: st.DataObject
+) -> None:
+    half = np.random.default_rng(seed).integers(-9, 10, (side, side))
+    whole = half @ half.T
+    at, beside = data.draw(st.permutations(range(side)))[:2]
+    whole[at] = whole[:, at] = 0
+    assert is_semidefinite([[fmpq(x) for x in row] for row in whole.tolist()])
+    whole[at, beside] = whole[beside, at] = 1
+    assert not is_semidefinite([[fmpq(x) for x in row] for row in whole.tolist()])
+
+
 @given(SEEDS, DIMENSIONS, st.floats(0.1, 3.0))
 @settings(max_examples=examples(20))
 def test_a_form_of_semidefinite_matrices_is_nowhere_above_their_cost(
