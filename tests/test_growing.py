@@ -259,6 +259,52 @@ def test_a_graph_with_other_measurements_of_old_edges_is_solved_with_these(
     assert grown.objective == pytest.approx(best.objective, rel=1e-6)
 
 
+def test_a_graph_with_fewer_poses_or_edges_is_solved_as_it_is() -> None:
+    graph = grid(np.random.default_rng(3))
+    growing = GrowingSolution.of(solvers.solve(graph))
+    is_last = np.arange(graph.num_edges) == graph.num_edges - 1
+    for smaller in (first_poses(graph, 20), graph.without_edges(is_last)):
+        found = extend(growing, smaller, certify=False)
+        assert found.graph is smaller
+        assert found.objective == pytest.approx(solvers.solve(smaller).objective, rel=1e-6)
+
+
+def test_poses_that_have_other_ids_now_are_told_by_these() -> None:
+    graph = grid(np.random.default_rng(3))
+    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 20)))
+    ids = graph.pose_ids.copy()
+    ids[[0, 19]] = ids[[19, 0]]
+    renamed = replace(graph, ids=ids)
+    found = extend(growing, renamed, certify=False)
+    assert found.graph is renamed
+    assert found.objective == pytest.approx(PGOProblem(renamed).objective(found.poses), rel=1e-9)
+    assert found.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-6)
+
+
+@pytest.mark.parametrize("is_first_with", [False, True])
+def test_information_matrices_may_come_or_go_with_a_whole_graph(is_first_with: bool) -> None:
+    graph = varied_graph(4, 24, 2)
+    with_matrices = replace(graph, information=isotropic_information(graph.kappa, graph.tau, 2))
+    without = replace(graph, information=None)
+    before, after = (with_matrices, without) if is_first_with else (without, with_matrices)
+    F = Weighting.ISOTROPIC
+    growing = GrowingSolution.of(solvers.solve(PGOProblem(first_poses(before, 20), weighting=F)))
+    found = extend(growing, after, certify=False)
+    best = solvers.solve(PGOProblem(after, weighting=F))
+    assert found.graph is after
+    assert found.objective == pytest.approx(best.objective, rel=1e-6)
+
+
+def test_what_a_whole_graph_knows_beside_its_edges_stays() -> None:
+    graph = replace(grid(np.random.default_rng(3)), fixed=np.array([2]))
+    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 20)))
+    assert extend(growing, graph, certify=False).graph is graph
+    pieced = growing
+    for pose in range(20, graph.num_poses):
+        pieced = pieced.with_edges(part_of(graph, edges_of(graph, pose)))
+    assert pieced.graph.fixed.tolist() == [2]
+
+
 def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
     graph = informed(4, 30, 3, coupled=True, noise=NoiseModel(0.002, 0.002))
     chi2 = solvers.solve(PGOProblem(graph, weighting=Weighting.INFORMATION))
@@ -268,6 +314,9 @@ def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
     seen = scene.with_landmark(np.array([0, 1, 2]), np.eye(3), tau=1.0)
     with pytest.raises(SettingError, match="landmarks or priors"):
         GrowingSolution.of(solvers.solve(seen))
+    held = scene.with_position_prior([0, 1, 9, 20], np.eye(4)[:, :3], tau=1.0)
+    with pytest.raises(SettingError, match="landmarks or priors"):
+        GrowingSolution.of(solvers.solve(held))
     rotations = solvers.solve(PGOProblem(scene, weighting=Weighting.ROTATIONS))
     with pytest.raises(SettingError, match="for F and chi2"):
         GrowingSolution.of(rotations)
