@@ -88,6 +88,34 @@ MUTANTS = (
         "if False:",
         ("tests/verification/test_costs.py", "tests/verification/test_verify.py"),
     ),
+    Mutant(
+        "verify: a landmark may have a rotation",
+        "pgo_models/verification/verify.py",
+        "if proof.R.keys() != graph.nodes - graph.landmarks:",
+        "if False:",
+        ("tests/verification/test_proof_files.py",),
+    ),
+    Mutant(
+        "verify: any node may be grounded",
+        "pgo_models/verification/verify.py",
+        "if proof.ground not in proof.R:",
+        "if False:",
+        ("tests/verification/test_proof_files.py",),
+    ),
+    Mutant(
+        "verify: what is a hundredth off a rotation is one",
+        "pgo_models/verification/verify.py",
+        "NO_ROTATION = 1e-6",
+        "NO_ROTATION = 1e-2",
+        ("tests/verification/test_costs.py",),
+    ),
+    Mutant(
+        "verify: a form that is not the cost goes unnoticed",
+        "pgo_models/verification/verify.py",
+        "if not value_at_X.overlaps(objective):",
+        "if False:",
+        ("tests/verification/test_verify.py",),
+    ),
     # The lower bound, central and by robots.
     Mutant(
         "robots: the rounding of the separators' own entries is not counted",
@@ -387,6 +415,27 @@ MUTANTS = (
         "solvers/folder_solve.py",
         "all(part.is_exact for part in parts)",
         "any(part.is_exact for part in parts)",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
+        "own files: the error of one robot's cost is that of all",
+        "solvers/folder_solve.py",
+        "error = math.fsum(part.error for part in parts)",
+        "error = parts[0].error",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
+        "own files: the frame is that of the first robot",
+        "solvers/folder_solve.py",
+        "key=lambda answer: (not answer.held[0], answer.held[1])",
+        "key=lambda answer: not answer.held[0]",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
+        "own files: landmarks are taken for poses",
+        "solvers/distributed/own_files.py",
+        "if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():",
+        "if (lines.edge_ids == WORLD_ID).any():",
         ("tests/distributed/test_own_files.py",),
     ),
     Mutant(

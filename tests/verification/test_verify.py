@@ -42,6 +42,10 @@ from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.verification import verify
+from pgo_models.verification.balls import arb, arb_mat
+from pgo_models.verification.costs import QuadraticForm, add_edge
+from pgo_models.verification.measurements import Edge
 from pgo_models.verification.verify import verify_proof
 from solvers.riemannian.certify import certify
 from solvers.riemannian.polish import polish
@@ -117,7 +121,10 @@ def test_a_bound_from_poses_that_are_no_optimum_is_a_bound(
     found = verify_proof(path, path.with_suffix(".json"))
     assert_verified(found, certificate)
     assert found.bound is not None
+    assert found.objective is not None
     assert found.bound <= best_known(problem, seed)
+    if found.gap is not None:
+        assert found.gap.overlaps((found.objective - found.bound) / found.objective)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -335,6 +342,21 @@ def test_landmarks_have_no_part_in_a_proof_of_rotations(tmp_path: Path) -> None:
     _, proof = proof_of(path)
     found = verify_proof(path, edited(proof, cost="rotations"))
     assert found.failure == "the poses: rotations alone are none of landmarks"
+
+
+def test_a_form_that_is_not_the_cost_is_said_to_be_a_defect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, varied_graph(1, 5, 2))
+    _, proof = proof_of(path)
+
+    def one_more(form: QuadraticForm, edge: Edge, cost: str, X: dict[int, arb_mat]) -> arb:
+        return add_edge(form, edge, cost, X) + 1
+
+    monkeypatch.setattr(verify, "add_edge", one_more)
+    found = verify_proof(path, proof)
+    assert found.bound is None
+    assert found.failure.endswith("a defect of pgo verify")
 
 
 def test_the_proof_of_another_graph_fails(tmp_path: Path) -> None:
