@@ -167,6 +167,30 @@ MUTANTS = (
         ("tests/distributed/robots/test_exact_robots.py",),
     ),
     Mutant(
+        "robots: no robot leaves out the translation of pose 0",
+        "solvers/distributed/robots/proof_orders.py",
+        "        fixed = np.append(fixed, 0)\n",
+        "        pass\n",
+        (
+            "tests/distributed/robots/test_exact_robots.py",
+            "tests/distributed/test_bound_by_robots.py",
+        ),
+    ),
+    Mutant(
+        "robots: multipliers of the driver of any size are in range",
+        "solvers/distributed/lower_bound.py",
+        "    if not is_in_range(added, diagonal):\n        return None\n",
+        "",
+        ("tests/distributed/robots/test_exact_robots.py",),
+    ),
+    Mutant(
+        "robots: a bound with terms and an eta does not name the terms",
+        "solvers/distributed/lower_bound.py",
+        "replace(found, terms=_collect_terms(driver)) if found.value > 0.0 else found",
+        "found",
+        ("tests/distributed/test_terms_by_robots.py",),
+    ),
+    Mutant(
         "rotations are taken to be no more than 1 apart",
         "pgo_models/certificates/lower_bound.py",
         "apart = math.sqrt(8.0) +",

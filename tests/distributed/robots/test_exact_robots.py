@@ -26,6 +26,7 @@ from robots import (
     driver_at,
     metis,
     sparse_elimination,
+    star,
 )
 
 from pgo_models.certificates.dual_variables import multipliers
@@ -177,6 +178,37 @@ def test_an_eta_costs_for_the_poses_of_driver_and_robots_alike() -> None:
     lost = eta * 8.0 * 16
     assert with_eta.value > 0.0
     assert without_eta.value - with_eta.value >= (1.0 - 1e-3) * lost
+
+
+@pytest.mark.parametrize("size", [-1e160, -1e200, np.nan])
+def test_multipliers_out_of_range_prove_nothing_to_a_driver(size: float) -> None:
+    problem = PGOProblem(varied_graph(3, 16, 3))
+    poses = polish(problem, chordal_start(problem))
+    with closing(driver_at(problem, contiguous(problem.graph, 3), poses)) as driver:
+        g = len(driver.cover)
+        far = np.zeros_like(driver.current.force)
+        far[g:] = size * np.swapaxes(driver.current.R, 1, 2).reshape(-1, 3)
+        driver.current = replace(driver.current, force=far)
+        assert prove_with_eta(driver, 1.0) is None
+        assert prove_grounded(driver, 1.0) is None
+
+
+@pytest.mark.parametrize("center", [0, 6])
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_form_with_eta_leaves_a_translation_out_whoever_has_its_pose(
+    center: int, d: int
+) -> None:
+    """Pose 0 is the driver's, or in the interior of a robot."""
+    graph, parts = star(center, d)
+    problem = PGOProblem(graph)
+    poses = polish(problem, chordal_start(problem))
+    central = prove_bound(problem, multipliers(problem, poses), 1e-3)
+    with closing(driver_at(problem, parts, poses)) as driver:
+        assert (0 in driver.cover) == (center == 0)
+        found = prove_with_eta(driver, 1e-3)
+    assert central is not None
+    assert found is not None
+    assert found.value == central
 
 
 def test_the_form_with_eta_has_the_constants_of_chi2_s_tangent_and_their_errors(
