@@ -511,6 +511,41 @@ MUTANTS = (
         "if False:",
         ("tests/test_growing.py",),
     ),
+    Mutant(
+        "growing: a cost that is not convex is taken",
+        "solvers/growing.py",
+        "cost.is_quadratic and cost.is_convex and cost.has_translations",
+        "cost.is_quadratic and cost.has_translations",
+        ("tests/test_growing.py",),
+    ),
+    Mutant(
+        "growing: information matrices that come or go are not compared",
+        "solvers/growing.py",
+        "        if (own is None) != (other is None):\n            return None\n",
+        "",
+        ("tests/test_growing.py",),
+    ),
+    Mutant(
+        "growing: ids of old poses are not compared",
+        "solvers/growing.py",
+        "    if not np.array_equal(graph.pose_ids[:n], before.pose_ids):\n        return None\n",
+        "",
+        ("tests/test_growing.py",),
+    ),
+    Mutant(
+        "growing: an update that was interrupted is followed by another solve",
+        "solvers/growing.py",
+        "update.status in OUT_OF_TIME or not",
+        "not",
+        ("tests/test_growing.py",),
+    ),
+    Mutant(
+        "growing: priors are taken for edges",
+        "solvers/growing.py",
+        "if len(graph.landmarks) or graph.world is not None:",
+        "if len(graph.landmarks):",
+        ("tests/test_growing.py",),
+    ),
     # Elsewhere.
     Mutant(
         "multipliers of sets other than X^T X = I have the wrong sign",

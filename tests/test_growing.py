@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from graphs import COSTS, exact_graph, informed, varied_graph
 
 import solvers
-from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex.graph_subproblem import ModelChange
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -21,7 +22,9 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_informat
 from pgo_models.graphs.scenes import NoiseModel, grid, random_geometric
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers import growing as growing_solves
 from solvers.growing import GrowingSolution, extend, extended_partition, extended_poses
+from solvers.result import Status
 
 
 def first_poses(graph: PoseGraph, count: int) -> PoseGraph:
@@ -73,6 +76,25 @@ def test_where_newton_ends_elsewhere_the_whole_pipeline_follows_and_its_stages_s
     assert grown.is_certified
     assert grown.stages[1].objective > (1.0 + DEFAULT_GAP) * grown.objective
     assert grown.seconds >= sum(stage.seconds for stage in grown.stages)
+
+
+def test_an_update_that_is_interrupted_is_not_followed_by_another_solve(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = grid(np.random.default_rng(0))
+    before = solvers.solve(first_poses(graph, 20))
+    updates: list[solvers.Solution] = []
+
+    def interrupted(*args: Any, **settings: Any) -> solvers.Solution:
+        found = solvers.solve(*args, **settings)
+        wide = replace(found.certificate, verdict=Verdict.NOT_CERTIFIED, gap=1.0)
+        updates.append(replace(found, status=Status.INTERRUPTED, certificate=wide))
+        return updates[-1]
+
+    monkeypatch.setattr(growing_solves, "solve", interrupted)
+    found = extend(before, graph)
+    assert len(updates) == 1
+    assert found.status is Status.INTERRUPTED
 
 
 def test_known_rotations_stay_and_new_poses_are_where_exact_measurements_put_them() -> None:
@@ -326,6 +348,30 @@ def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
         growing.with_edges(far)
     with pytest.raises(GraphError, match="one has information matrices"):
         growing.with_edges(part_of(graph, np.array([0])))
+
+
+def test_a_quadratic_chi2_that_is_not_convex_is_updated_with_a_certificate_alone() -> None:
+    """One axis of every turn is known far better than the others, so that W is indefinite."""
+    graph = varied_graph(4, 12, 3)
+    matrix = np.diag([25.0, 25.0, 25.0, 36.0, 1.0, 1.0])
+    stiff = replace(graph, information=np.tile(matrix, (graph.num_edges, 1, 1)))
+    problem = PGOProblem(stiff, weighting=Weighting.INFORMATION)
+    assert problem.weights.is_quadratic
+    assert not problem.weights.is_convex
+    with pytest.raises(SettingError, match="not quadratic and convex"):
+        GrowingSolution.of(solvers.solve(problem))
+
+
+def test_chi2_of_rotations_alone_is_updated_with_a_certificate_alone() -> None:
+    graph = varied_graph(4, 12, 3)
+    matrix = np.diag([0.0, 0.0, 0.0, 4.0, 4.0, 4.0])
+    silent = replace(
+        graph.with_weights(graph.kappa, np.zeros(graph.num_edges)),
+        information=np.tile(matrix, (graph.num_edges, 1, 1)),
+    )
+    before = solvers.solve(PGOProblem(silent, weighting=Weighting.INFORMATION))
+    with pytest.raises(SettingError, match="certify=True"):
+        GrowingSolution.of(before)
 
 
 # Robots
