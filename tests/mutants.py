@@ -498,6 +498,27 @@ MUTANTS = (
         ("tests/distributed/test_own_files.py",),
     ),
     Mutant(
+        "own files: a file fixes poses of other robots",
+        "solvers/distributed/own_files.py",
+        "fixed = np.flatnonzero(is_own & np.isin(ids, lines.fixed))",
+        "fixed = np.flatnonzero(np.isin(ids, lines.fixed))",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
+        "own files: rotations are tied by weights of translations",
+        "solvers/distributed/own_files.py",
+        "(graph.tau >= 0, graph.tau > 0, graph.kappa > 0)",
+        "(graph.tau >= 0, graph.tau > 0, graph.tau > 0)",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
+        "own files: positions are tied by edges without a weight",
+        "solvers/distributed/own_files.py",
+        "(graph.tau >= 0, graph.tau > 0, graph.kappa > 0)",
+        "(graph.tau >= 0, graph.tau >= 0, graph.kappa > 0)",
+        ("tests/distributed/test_own_files.py",),
+    ),
+    Mutant(
         "own files: landmarks are taken for poses",
         "solvers/distributed/own_files.py",
         "if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():",

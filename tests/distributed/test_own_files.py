@@ -241,6 +241,31 @@ def test_the_frame_is_that_of_the_first_pose_whoever_owns_it(tmp_path: Path) -> 
     np.testing.assert_allclose(written.initial.t[0], graph.truth.t[0], rtol=0, atol=1e-9)
 
 
+def test_a_line_that_fixes_a_pose_counts_in_the_file_of_its_owner_alone(tmp_path: Path) -> None:
+    graph = varied_graph(2, 8, 2).with_robots(np.arange(8) // 4)
+    write_g2o_folder(graph, tmp_path, graph.truth)
+    between = (graph.i < 4) & (graph.j >= 4)
+    of_other = int(graph.j[between][0])
+    with (tmp_path / "0.g2o").open("a") as file:
+        file.write(f"FIX {of_other}\n")
+    assert solve_folder(tmp_path).frame.startswith("pose 0 ")
+    with (tmp_path / "1.g2o").open("a") as file:
+        file.write(f"FIX {of_other}\n")
+    assert solve_folder(tmp_path).frame.startswith(f"pose {of_other} ")
+
+
+@pytest.mark.parametrize("what", ["positions", "rotations"])
+def test_what_no_edge_between_robots_ties_together_is_named(what: str, tmp_path: Path) -> None:
+    graph = varied_graph(2, 8, 2)
+    is_between = (graph.i < 4) != (graph.j < 4)
+    kappa = np.where(is_between & (what == "rotations"), 0.0, graph.kappa)
+    tau = np.where(is_between & (what == "positions"), 0.0, graph.tau)
+    loose = graph.with_weights(kappa, tau).with_robots(np.arange(8) // 4)
+    write_g2o_folder(loose, tmp_path)
+    with pytest.raises(GraphError, match=f"the {what} of all robots fall into 4 parts"):
+        solve_folder(tmp_path)
+
+
 # What crosses.
 
 
