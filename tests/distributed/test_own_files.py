@@ -18,6 +18,7 @@ from robots import PARTITIONERS, Partitioner, Recording, arrays_in
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import BoundSource, Verdict, certify_at
+from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, project_to_rotations
@@ -264,6 +265,14 @@ def test_what_no_edge_between_robots_ties_together_is_named(what: str, tmp_path:
     write_g2o_folder(loose, tmp_path)
     with pytest.raises(GraphError, match=f"the {what} of all robots fall into 4 parts"):
         solve_folder(tmp_path)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_the_cost_is_exact_where_the_part_of_every_robot_is(first: bool) -> None:
+    parts = [ObjectiveRounding(1.0, 0.25, first), ObjectiveRounding(2.0, 0.5, not first)]
+    assert folder_solve._sum_of_roundings(parts) == ObjectiveRounding(3.0, 0.75, False)
+    same = [replace(part, is_exact=True) for part in parts]
+    assert folder_solve._sum_of_roundings(same).is_exact
 
 
 # What crosses.
