@@ -497,12 +497,10 @@ def _new_edges(before: PoseGraph, graph: PoseGraph) -> IntArray | None:
     """
     n = before.num_poses
     m = before.num_edges
-    if graph.num_poses < n or not np.array_equal(graph.pose_ids[:n], before.pose_ids):
+    if not np.array_equal(graph.pose_ids[:n], before.pose_ids):
         return None
     between_known = np.flatnonzero((graph.i < n) & (graph.j < n))
     old = between_known[:m]
-    if len(old) < m:
-        return None
     for name in ("i", "j", *_MEASURED):
         own = getattr(before, name)
         other = getattr(graph, name)

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
 import pytest
-from graphs import COSTS, exact_graph, informed
+from graphs import COSTS, exact_graph, informed, varied_graph
 
 import solvers
-from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex.graph_subproblem import ModelChange
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel, grid, random_geometric
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers import growing as growing_solves
 from solvers.growing import GrowingSolution, extend, extended_partition, extended_poses
+from solvers.result import Status
 
 
 def first_poses(graph: PoseGraph, count: int) -> PoseGraph:
@@ -73,6 +76,25 @@ def test_where_newton_ends_elsewhere_the_whole_pipeline_follows_and_its_stages_s
     assert grown.is_certified
     assert grown.stages[1].objective > (1.0 + DEFAULT_GAP) * grown.objective
     assert grown.seconds >= sum(stage.seconds for stage in grown.stages)
+
+
+def test_an_update_that_is_interrupted_is_not_followed_by_another_solve(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = grid(np.random.default_rng(0))
+    before = solvers.solve(first_poses(graph, 20))
+    updates: list[solvers.Solution] = []
+
+    def interrupted(*args: Any, **settings: Any) -> solvers.Solution:
+        found = solvers.solve(*args, **settings)
+        wide = replace(found.certificate, verdict=Verdict.NOT_CERTIFIED, gap=1.0)
+        updates.append(replace(found, status=Status.INTERRUPTED, certificate=wide))
+        return updates[-1]
+
+    monkeypatch.setattr(growing_solves, "solve", interrupted)
+    found = extend(before, graph)
+    assert len(updates) == 1
+    assert found.status is Status.INTERRUPTED
 
 
 def test_known_rotations_stay_and_new_poses_are_where_exact_measurements_put_them() -> None:
@@ -225,6 +247,86 @@ def test_edges_in_another_order_are_another_graph_and_solved_all_the_same() -> N
     assert again.objective == growing.objective
 
 
+@pytest.mark.parametrize(
+    ("name", "weighting"),
+    [
+        ("i", Weighting.ISOTROPIC),
+        ("R_ij", Weighting.ISOTROPIC),
+        ("t_ij", Weighting.ISOTROPIC),
+        ("kappa", Weighting.ISOTROPIC),
+        ("tau", Weighting.ISOTROPIC),
+        ("information", Weighting.INFORMATION),
+    ],
+)
+def test_a_graph_with_other_measurements_of_old_edges_is_solved_with_these(
+    name: str, weighting: Weighting
+) -> None:
+    graph = varied_graph(4, 24, 2)
+    graph = replace(graph, information=isotropic_information(graph.kappa, graph.tau, 2))
+    before = solvers.solve(PGOProblem(first_poses(graph, 20), weighting=weighting))
+    growing = GrowingSolution.of(before)
+    rows = getattr(graph, name).copy()
+    rows[0] = {
+        "i": (graph.i[0] + 2) % 20,
+        "R_ij": graph.R_ij[0] @ exp_map(np.array([[0.1]]))[0],
+    }.get(name, 4 * rows[0])
+    changed = replace(graph, **{name: rows})
+    grown = extend(growing, changed, certify=False)
+    problem = PGOProblem(changed, weighting=weighting)
+    best = solvers.solve(problem)
+    assert best.is_certified
+    unchanged = solvers.solve(PGOProblem(graph, weighting=weighting))
+    assert best.objective > (1.0 + 1e-5) * unchanged.objective
+    assert grown.objective == pytest.approx(problem.objective(grown.poses), rel=1e-9)
+    assert grown.objective == pytest.approx(best.objective, rel=1e-6)
+
+
+def test_a_graph_with_fewer_poses_or_edges_is_solved_as_it_is() -> None:
+    graph = grid(np.random.default_rng(3))
+    growing = GrowingSolution.of(solvers.solve(graph))
+    is_last = np.arange(graph.num_edges) == graph.num_edges - 1
+    for smaller in (first_poses(graph, 20), graph.without_edges(is_last)):
+        found = extend(growing, smaller, certify=False)
+        assert found.graph is smaller
+        assert found.objective == pytest.approx(solvers.solve(smaller).objective, rel=1e-6)
+
+
+def test_poses_that_have_other_ids_now_are_told_by_these() -> None:
+    graph = grid(np.random.default_rng(3))
+    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 20)))
+    ids = graph.pose_ids.copy()
+    ids[[0, 19]] = ids[[19, 0]]
+    renamed = replace(graph, ids=ids)
+    found = extend(growing, renamed, certify=False)
+    assert found.graph is renamed
+    assert found.objective == pytest.approx(PGOProblem(renamed).objective(found.poses), rel=1e-9)
+    assert found.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-6)
+
+
+@pytest.mark.parametrize("is_first_with", [False, True])
+def test_information_matrices_may_come_or_go_with_a_whole_graph(is_first_with: bool) -> None:
+    graph = varied_graph(4, 24, 2)
+    with_matrices = replace(graph, information=isotropic_information(graph.kappa, graph.tau, 2))
+    without = replace(graph, information=None)
+    before, after = (with_matrices, without) if is_first_with else (without, with_matrices)
+    F = Weighting.ISOTROPIC
+    growing = GrowingSolution.of(solvers.solve(PGOProblem(first_poses(before, 20), weighting=F)))
+    found = extend(growing, after, certify=False)
+    best = solvers.solve(PGOProblem(after, weighting=F))
+    assert found.graph is after
+    assert found.objective == pytest.approx(best.objective, rel=1e-6)
+
+
+def test_what_a_whole_graph_knows_beside_its_edges_stays() -> None:
+    graph = replace(grid(np.random.default_rng(3)), fixed=np.array([2]))
+    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 20)))
+    assert extend(growing, graph, certify=False).graph is graph
+    pieced = growing
+    for pose in range(20, graph.num_poses):
+        pieced = pieced.with_edges(part_of(graph, edges_of(graph, pose)))
+    assert pieced.graph.fixed.tolist() == [2]
+
+
 def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
     graph = informed(4, 30, 3, coupled=True, noise=NoiseModel(0.002, 0.002))
     chi2 = solvers.solve(PGOProblem(graph, weighting=Weighting.INFORMATION))
@@ -234,6 +336,9 @@ def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
     seen = scene.with_landmark(np.array([0, 1, 2]), np.eye(3), tau=1.0)
     with pytest.raises(SettingError, match="landmarks or priors"):
         GrowingSolution.of(solvers.solve(seen))
+    held = scene.with_position_prior([0, 1, 9, 20], np.eye(4)[:, :3], tau=1.0)
+    with pytest.raises(SettingError, match="landmarks or priors"):
+        GrowingSolution.of(solvers.solve(held))
     rotations = solvers.solve(PGOProblem(scene, weighting=Weighting.ROTATIONS))
     with pytest.raises(SettingError, match="for F and chi2"):
         GrowingSolution.of(rotations)
@@ -243,6 +348,30 @@ def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
         growing.with_edges(far)
     with pytest.raises(GraphError, match="one has information matrices"):
         growing.with_edges(part_of(graph, np.array([0])))
+
+
+def test_a_quadratic_chi2_that_is_not_convex_is_updated_with_a_certificate_alone() -> None:
+    """One axis of every turn is known far better than the others, so that W is indefinite."""
+    graph = varied_graph(4, 12, 3)
+    matrix = np.diag([25.0, 25.0, 25.0, 36.0, 1.0, 1.0])
+    stiff = replace(graph, information=np.tile(matrix, (graph.num_edges, 1, 1)))
+    problem = PGOProblem(stiff, weighting=Weighting.INFORMATION)
+    assert problem.weights.is_quadratic
+    assert not problem.weights.is_convex
+    with pytest.raises(SettingError, match="not quadratic and convex"):
+        GrowingSolution.of(solvers.solve(problem))
+
+
+def test_chi2_of_rotations_alone_is_updated_with_a_certificate_alone() -> None:
+    graph = varied_graph(4, 12, 3)
+    matrix = np.diag([0.0, 0.0, 0.0, 4.0, 4.0, 4.0])
+    silent = replace(
+        graph.with_weights(graph.kappa, np.zeros(graph.num_edges)),
+        information=np.tile(matrix, (graph.num_edges, 1, 1)),
+    )
+    before = solvers.solve(PGOProblem(silent, weighting=Weighting.INFORMATION))
+    with pytest.raises(SettingError, match="certify=True"):
+        GrowingSolution.of(before)
 
 
 # Robots

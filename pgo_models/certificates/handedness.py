@@ -22,7 +22,6 @@ rotation averaging. In the plane it adds nothing: the hull of SO(2) is a disc, a
 reflections.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,13 +99,14 @@ class HandednessTerms(ReadOnly):
 
         Let T be off by D from the nearest rotation, ||D||_F <= slant and ||T^T T - I||_F <= slant.
         Then the term of T is off by tr(W (T^T T - I)) and 2 tr(W R_j^T R_i D) from that of the
-        rotation, 3 slant ||W||_* at most, ||W||_* <= sqrt(3) ||W||_F. The P that belongs to the
-        stored W is 4 (tr(W) I - W), off by a few roundings from the P that is stored, whose
-        smallest eigenvalue, where it is negative, is a bound on v^T P v, |v| <= 1.
+        rotation. As a rotation does not change ||D||_F, that is 3 slant ||W||_F at most
+        (Cauchy-Schwarz). The P that belongs to the stored W is 4 (tr(W) I - W), off by a few
+        roundings from the P that is stored, whose smallest eigenvalue, where it is negative, is a
+        bound on v^T P v, |v| <= 1.
         """
         slant = orthogonality_error(self.T) + 3.0 * gamma(5.0)
         W_size = np.linalg.norm(self.W, axis=(1, 2))
-        of_T = 3.0 * slant * math.sqrt(3.0) * W_size
+        of_T = 3.0 * slant * W_size
         P_size = np.linalg.norm(self.P, axis=(1, 2))
         least = np.linalg.eigvalsh(self.P)[:, 0] - _EIGENVALUE_ERROR * UNIT_ROUNDOFF * P_size
         of_P = np.maximum(0.0, -least)

@@ -352,9 +352,8 @@ def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     # large enough to be seen
     whole = replace(whole, product_error=whole.product_error + np.abs(whole.product))
     monkeypatch.setattr(robot_proof, "evaluate_certificate", lambda *_: whole)
-    found, product = robot_proof.RobotProof(
-        Lambda, start, X, low, slack, inside, np.zeros(0)
-    ).evaluated(problem, boundary)
+    proof = robot_proof.RobotProof(Lambda, start, X, low, slack, inside, np.zeros(0))
+    found, product = proof.evaluated(problem, boundary)
     np.testing.assert_array_equal(product, whole.product)
     np.testing.assert_array_equal(found.error, whole.product_error[boundary])
     assert (found.value, found.value_error) == (whole.value, whole.value_error)
@@ -362,6 +361,19 @@ def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.quadratic >= ENOUGH * np.sum(size**2 / slack[:, None]) > 3.0 * found.left
     away = np.linalg.norm((X - start)[n + 6 :].reshape(-1, 9), axis=1)
     assert found.squared_distances >= ENOUGH * np.sum((np.sqrt(8.0) + away) ** 2)
+
+
+def test_a_robot_moves_rotations_and_adds_to_translations() -> None:
+    rng = np.random.default_rng(3)
+    X, step = rng.standard_normal((2, 4 * 5, 3))
+    low = rng.standard_normal((5, 3))
+    rows = np.arange(0)
+    proof = robot_proof.RobotProof(np.zeros((5, 3, 3)), X, X, low, np.zeros(0), rows, np.zeros(0))
+    moved = proof.moved(step)
+    np.testing.assert_array_equal(moved.X[:5], X[:5])
+    np.testing.assert_array_equal(moved.X[5:], X[5:] - step[5:])
+    np.testing.assert_array_equal(moved.low, low - step[:5])
+    np.testing.assert_array_equal(moved.start, X)
 
 
 @pytest.mark.parametrize("d", [2, 3])

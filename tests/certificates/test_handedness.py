@@ -12,12 +12,24 @@ from hypothesis import given, settings, strategies as st
 import solvers
 from pgo_models.certificates.certificate import certify_at
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
-from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms, weights_of
+from pgo_models.certificates.handedness import (
+    HandednessTerms,
+    closed_form_terms,
+    distinct_pairs,
+    weights_of,
+)
 from pgo_models.certificates.lower_bound import best_bound, best_bound_with_terms
 from pgo_models.certificates.rounding_errors import evaluate_certificate, matrix_errors
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, exp_map, log_map, random_rotations
+from pgo_models.geometry.rotations import (
+    Array,
+    exp_map,
+    log_map,
+    orthogonality_error,
+    random_rotations,
+)
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.floating_point import UNIT_ROUNDOFF, gamma
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -92,6 +104,78 @@ def test_what_a_negative_P_can_cost_is_subtracted(seed: int, n: int, scale: floa
     assert negative.loss() > 0.1 * scale
 
 
+def test_the_worst_that_a_T_off_a_rotation_can_do_is_subtracted() -> None:
+    """P sees one axis, T is stretched along it, and the poses are half a turn about another."""
+    P = np.diag([1.0, 0.0, 0.0])
+    half_turn = np.diag([-1.0, 1.0, -1.0])
+    R = exact(np.stack([np.eye(3), half_turn]))
+    for stretch in ([1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, -1.0]):
+        T = np.eye(3) + 1e-9 * np.diag(stretch)
+        terms = HandednessTerms(np.array([0]), np.array([1]), T[None], P[None])
+        (term,) = exact_terms(terms, R)
+        assert term < -exact(1e-10)
+        assert term >= -exact(terms.loss())
+
+
+def test_the_roundings_of_T_and_of_P_are_in_the_loss_each() -> None:
+    """Of a T and a P that nothing is known to be wrong with."""
+    P = np.diag([1.0, 0.0, 0.0])
+    terms = HandednessTerms(np.array([0]), np.array([1]), np.eye(3)[None], P[None])
+    of_T = 3.0 * 3.0 * gamma(5.0) * np.linalg.norm(terms.W[0])
+    of_P = 64.0 * UNIT_ROUNDOFF * np.linalg.norm(P)
+    assert terms.loss() >= (1.0 - 1e-12) * (of_T + of_P)
+
+
+@given(seed=SEEDS, n=SIZES)
+def test_whatever_is_given_terms_are_made_of_rotations_and_definite_matrices(
+    seed: int, n: int
+) -> None:
+    graph = varied_graph(seed, n, 3)
+    rng = np.random.default_rng(seed)
+    shape = (graph.num_edges, 3, 3)
+    turns = random_rotations(graph.num_edges, 3, rng)
+    T = turns + 0.1 * rng.standard_normal(shape)
+    P = rng.standard_normal(shape)
+    terms = HandednessTerms.with_rotations(graph.i, graph.j, T, P)
+    assert (orthogonality_error(terms.T) < 1e-14).all()
+    np.testing.assert_array_equal(terms.P, np.swapaxes(terms.P, 1, 2))
+    values = np.linalg.eigvalsh(terms.P)
+    assert (values[:, 0] >= 2.0**-31 * values[:, 2]).all()
+
+
+def test_pairs_are_of_poses_with_rotations() -> None:
+    graph = ring_with_stiff_axes(0)
+    seen = graph.with_landmark(np.array([0, 1, 2]), np.eye(3), tau=1.0)
+    np.testing.assert_array_equal(distinct_pairs(seen), distinct_pairs(graph))
+
+
+@given(seed=SEEDS, n=SIZES, size=st.floats(0.5, 3.0))
+def test_terms_in_closed_form_make_no_other_direction_negative(
+    seed: int, n: int, size: float
+) -> None:
+    """At poses where edges fit badly, two of the three weights can be about as far from zero."""
+    problem = PGOProblem(informed(seed, n, 3, coupled=False), weighting=Weighting.INFORMATION)
+    graph = problem.graph
+    rng = np.random.default_rng(seed)
+    assert graph.truth is not None
+    poses = graph.truth.moved_along(size * rng.standard_normal((n, 3)), np.zeros((n, 3)))
+    tangent = problem.tangent_at(poses)
+    terms = closed_form_terms(tangent, poses)
+    if terms is None:
+        return
+    i, j = graph.i, graph.j
+    E = np.swapaxes(graph.R_ij, 1, 2) @ np.swapaxes(poses.R[i], 1, 2) @ poses.R[j]
+    weights = tangent.weights.W(3) @ E
+    weights = 0.5 * (weights + np.swapaxes(weights, 1, 2))
+    lowest = np.linalg.eigvalsh(weights)
+    of_terms = np.flatnonzero((lowest[:, 0] < 0.0) & (lowest[:, 1] > 0.0))
+    np.testing.assert_array_equal(graph.i[of_terms], terms.i)
+    left = np.linalg.eigvalsh(weights[of_terms] - terms.W)
+    rounding = 1e-8 * np.abs(lowest[of_terms]).max(axis=1)
+    assert (left[:, 0] > lowest[of_terms, 0]).all()
+    assert (left[:, 1] >= -rounding).all()
+
+
 def test_the_loss_is_taken_off_the_bound() -> None:
     problem = PGOProblem(varied_graph(1, 8, 3))
     poses = polish(problem, chordal_start(problem))
@@ -104,6 +188,22 @@ def test_the_loss_is_taken_off_the_bound() -> None:
     less = best_bound(rough.taken_off(problem), Lambda, poses, 1e-6, F)
     assert 0.0 < found.value <= less.value - rough.loss()
     assert found.rounding == less.rounding + rough.loss()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.7])
+def test_the_difference_of_bound_and_loss_is_rounded_down(
+    share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = PGOProblem(varied_graph(1, 8, 3))
+    poses = polish(problem, chordal_start(problem))
+    Lambda = multipliers(problem, poses)
+    F = problem.objective(poses)
+    terms = random_terms(problem.graph, poses, 0, 1e-3)
+    less = best_bound(terms.taken_off(problem), Lambda, poses, 1e-6, F)
+    for lost in share * less.value * 2.0 ** -np.arange(0.0, 20.0):
+        monkeypatch.setattr(HandednessTerms, "loss", lambda _, lost=lost: lost)
+        found = best_bound_with_terms(problem, Lambda, poses, 1e-6, F, terms)
+        assert exact(found.value) <= exact(less.value) - exact(lost)
 
 
 def test_robots_take_the_loss_off_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:

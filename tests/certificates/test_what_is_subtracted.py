@@ -14,6 +14,7 @@ from pgo_models.certificates import lower_bound
 from pgo_models.certificates.certificate import certify_at, judge
 from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.errors import ProofError
@@ -25,7 +26,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
 from solvers.distributed.robots import proof as robot_proof
-from solvers.distributed.robots.elimination import Cut
+from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
 from solvers.riemannian.polish import polish
 
 
@@ -223,6 +224,69 @@ def test_weights_near_the_ends_of_the_doubles_prove_nothing_to_a_robot(exponent:
         problem, np.zeros((8, 3, 3)), 0.0, cut, nothing_fixed, 1e-12, None
     )
     assert found is None
+
+
+def robot_of_eight_poses(d: int) -> tuple[PGOProblem, Cut]:
+    """A problem of which a robot has six poses in its interior."""
+    problem = PGOProblem(varied_graph(7, 8, d))
+    is_inside = np.concatenate([np.arange(8) >= 2, np.repeat(np.arange(8) >= 2, d)])
+    return problem, Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
+
+
+@pytest.mark.parametrize("size", [-1e160, -1e200, math.nan])
+def test_multipliers_out_of_range_prove_nothing_to_a_robot(size: float) -> None:
+    problem, cut = robot_of_eight_poses(3)
+    Lambda = np.zeros((8, 3, 3))
+    Lambda[4] = size * np.eye(3)
+    nothing_fixed = np.zeros(0, dtype=np.int64)
+    assert (
+        robot_proof.verify_interior(problem, Lambda, 0.0, cut, nothing_fixed, 1e-12, None) is None
+    )
+
+
+@pytest.mark.parametrize("growth", [0.0, 10.0])
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_robot_has_slack_only_where_its_margin_is_twice_the_rounding(
+    d: int, growth: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A factor's error is known when it is there; where it grows with the margin there is none."""
+    problem, cut = robot_of_eight_poses(d)
+    share = 1e-9
+    errors: list[Array] = []
+
+    def inexact(*args: object, **settings: bool) -> Elimination:
+        found = eliminate(*args, **settings)  # type: ignore[arg-type]
+        error = np.full(len(cut.interior), 1.5 * share * (1.0 + growth) ** len(errors))
+        errors.append(error)
+        return replace(found, interior_error=error)
+
+    monkeypatch.setattr(robot_proof, "eliminate", inexact)
+    S, diagonal = shifted_certificate(problem, np.zeros((8, d, d)), np.zeros(problem.side))
+    nothing_fixed = np.zeros(0, dtype=np.int64)
+    found = robot_proof.verify_interior(
+        problem, np.zeros((8, d, d)), 0.0, cut, nothing_fixed, share, None
+    )
+    if growth > 0.0:
+        assert found is None
+        return
+    assert found is not None
+    matrix, _, slack = found
+    taken_off = (S.diagonal() - matrix.diagonal())[cut.interior]
+    assert (slack > 0.0).all()
+    assert (slack <= taken_off - errors[-1] * diagonal[cut.interior]).all()
+
+
+def test_a_diagonal_that_terms_make_negative_is_rounded_all_the_same() -> None:
+    problem, cut = robot_of_eight_poses(3)
+    graph = problem.graph
+    P = np.tile(1e4 * np.eye(3), (graph.num_edges, 1, 1))
+    terms = HandednessTerms.at(optimum(problem), graph.i, graph.j, P)
+    less = terms.taken_off(problem)
+    _, diagonal = shifted_certificate(less, np.zeros((8, 3, 3)), np.zeros(less.side))
+    of_M = less.M.data[less.diagonal_positions]
+    assert (of_M[cut.boundary] < 0.0).any()
+    _, errors = robot_proof._entry_errors(less, diagonal, cut)
+    assert (errors >= 4 * 3 * 2.0**-53 * np.abs(of_M[cut.boundary])).all()
 
 
 def test_a_bound_above_F_is_said_to_be_a_defect() -> None:

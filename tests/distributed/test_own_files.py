@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graphs import DIMENSIONS, SEEDS, informed, varied_graph
+from budget import examples
+from graphs import DIMENSIONS, SEEDS, exact_graph, informed, varied_graph
 from hypothesis import given, settings, strategies as st
 from processes import LimitedProcesses, under_limit
 from robots import PARTITIONERS, Partitioner, Recording, arrays_in
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import BoundSource
+from pgo_models.certificates.certificate import BoundSource, Verdict, certify_at
+from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, project_to_rotations
@@ -38,8 +40,6 @@ from solvers.place import Attempt
 from solvers.result import Status
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import WARM_START
-
-pytestmark = pytest.mark.slow  # solves by robots from end to end
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 LIMIT = 27.0  # MB beside the program itself
@@ -83,7 +83,7 @@ def check_same(solution: FolderSolution, graph: PoseGraph, out: Path) -> None:
     assert pytest.approx(F, rel=1e-9, abs=level) == solution.F
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(12))
 @given(seed=SEEDS, n=st.integers(4, 30), d=DIMENSIONS, partitioner=PARTITIONERS, drop=st.booleans())
 def test_folders_are_solved_as_the_whole_graph(
     tmp_path_factory: pytest.TempPathFactory,
@@ -175,6 +175,23 @@ def test_what_is_certified_is_what_is_written_however_far_its_frame(
     assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
 
 
+@pytest.mark.parametrize("away", [0.0, 1e12])
+def test_poses_that_their_frame_rounds_are_no_longer_exact(away: float, tmp_path: Path) -> None:
+    """Far away the last bits of coordinates are 1e-4, and the verdict is of what is written."""
+    graph = exact_graph(1, 12, 2).with_robots(np.arange(12) // 4)
+    assert graph.truth is not None
+    write_g2o_folder(graph, tmp_path / "in", graph.truth.moved(np.eye(2), np.array([away, -away])))
+    certificate = solve_folder(tmp_path / "in", out=tmp_path / "out").certificate
+    written = read_g2o(tmp_path / "out")
+    assert written.initial is not None
+    expected = certify_at(pgo.PGOProblem(written), written.initial)
+    assert certificate.verdict is expected.verdict
+    assert (certificate.verdict is Verdict.EXACT) == (away == 0.0)
+    # The errors of all robots' edges add up, and no robot sees less error than there is.
+    error = expected.objective_error
+    assert 0.5 * error <= certificate.objective_error <= 2.0 * error
+
+
 def test_an_edge_that_no_end_has_counts_all_the_same(tmp_path: Path) -> None:
     """Edges between robots 0 and 1 stand in the file of robot 2, twice in that of robot 3."""
     shutil.copytree(ROBOTS, tmp_path / "in")
@@ -219,6 +236,50 @@ def test_the_frame_is_that_of_a_fixed_pose(tmp_path: Path) -> None:
     np.testing.assert_allclose(written.initial.R[100], graph.initial.R[100], rtol=0, atol=1e-9)
 
 
+def test_the_frame_is_that_of_the_first_pose_whoever_owns_it(tmp_path: Path) -> None:
+    graph = varied_graph(2, 8, 2).with_robots(np.arange(8)[::-1] // 4)
+    assert graph.truth is not None
+    write_g2o_folder(graph, tmp_path / "in", graph.truth)
+    solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
+    assert solution.frame == "pose 0 where its file has it"
+    written = read_g2o(tmp_path / "out")
+    assert written.initial is not None
+    np.testing.assert_allclose(written.initial.t[0], graph.truth.t[0], rtol=0, atol=1e-9)
+
+
+def test_a_line_that_fixes_a_pose_counts_in_the_file_of_its_owner_alone(tmp_path: Path) -> None:
+    graph = varied_graph(2, 8, 2).with_robots(np.arange(8) // 4)
+    write_g2o_folder(graph, tmp_path, graph.truth)
+    between = (graph.i < 4) & (graph.j >= 4)
+    of_other = int(graph.j[between][0])
+    with (tmp_path / "0.g2o").open("a") as file:
+        file.write(f"FIX {of_other}\n")
+    assert solve_folder(tmp_path).frame.startswith("pose 0 ")
+    with (tmp_path / "1.g2o").open("a") as file:
+        file.write(f"FIX {of_other}\n")
+    assert solve_folder(tmp_path).frame.startswith(f"pose {of_other} ")
+
+
+@pytest.mark.parametrize("what", ["positions", "rotations"])
+def test_what_no_edge_between_robots_ties_together_is_named(what: str, tmp_path: Path) -> None:
+    graph = varied_graph(2, 8, 2)
+    is_between = (graph.i < 4) != (graph.j < 4)
+    kappa = np.where(is_between & (what == "rotations"), 0.0, graph.kappa)
+    tau = np.where(is_between & (what == "positions"), 0.0, graph.tau)
+    loose = graph.with_weights(kappa, tau).with_robots(np.arange(8) // 4)
+    write_g2o_folder(loose, tmp_path)
+    with pytest.raises(GraphError, match=f"the {what} of all robots fall into 4 parts"):
+        solve_folder(tmp_path)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_the_cost_is_exact_where_the_part_of_every_robot_is(first: bool) -> None:
+    parts = [ObjectiveRounding(1.0, 0.25, first), ObjectiveRounding(2.0, 0.5, not first)]
+    assert robots_with_files._sum_of_roundings(parts) == ObjectiveRounding(3.0, 0.75, False)
+    same = [replace(part, is_exact=True) for part in parts]
+    assert robots_with_files._sum_of_roundings(same).is_exact
+
+
 # What crosses.
 
 
@@ -243,6 +304,7 @@ def test_robots_leave_poses_where_their_areas_interleave(
     assert all(agent.subgraph.is_sparse == is_interleaved for agent in engine.agents)
 
 
+@pytest.mark.slow  # graphs of thousands of poses
 @pytest.mark.parametrize("climbs", [False, True])
 def test_messages_do_not_grow_with_the_interiors(
     climbs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -282,6 +344,7 @@ def test_messages_do_not_grow_with_the_interiors(
     assert largest[1][1] <= 12 * width * (12 * width + 1) // 2
 
 
+@pytest.mark.slow  # 16 processes, each under a limit
 @pytest.mark.skipif(
     sys.platform != "linux", reason="RLIMIT_DATA counts private memory on Linux alone"
 )
@@ -325,6 +388,10 @@ def test_what_takes_the_whole_graph_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(GraphError, match=r"0\.g2o has priors or landmarks, .* --split given"):
         solve_folder(tmp_path / "in")
+    seen = varied_graph(0, 6, 2).with_landmark(np.arange(6), np.ones((6, 2)), tau=1.0)
+    write_g2o_folder(seen.with_robots(np.arange(7) // 4), tmp_path / "seen")
+    with pytest.raises(GraphError, match=r"[01]\.g2o has priors or landmarks"):
+        solve_folder(tmp_path / "seen")
 
 
 def test_files_that_are_no_robots_are_named(tmp_path: Path) -> None:
@@ -345,6 +412,7 @@ def test_files_that_are_no_robots_are_named(tmp_path: Path) -> None:
         solve_folder(ROBOTS, out=tmp_path / "in")
 
 
+@pytest.mark.slow  # staircases by robots
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
     graph = varied_graph(1, 20, d, NoiseModel(translation_std=1.0, rotation_std=1.5))
@@ -382,6 +450,7 @@ def test_the_staircase_follows_where_newton_has_had_no_step() -> None:
     assert solution.certificate.gap < without.certificate.gap
 
 
+@pytest.mark.slow  # a staircase by robots
 def test_the_staircase_climbs_from_the_best(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -425,6 +494,7 @@ def test_the_staircase_climbs_from_the_best(
     assert began == pytest.approx([best, best], rel=1e-9)
 
 
+@pytest.mark.slow  # a second try by robots
 def test_ctrl_c_between_the_loops_keeps_what_was_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,9 +19,12 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.rotation_hull import matrices_at
-from solvers.distributed import handedness
+from solvers.distributed import handedness, lower_bound as robots_bound
 from solvers.distributed.driver import Driver
-from solvers.distributed.lower_bound import best_bound_with_terms as best_bound_by_robots
+from solvers.distributed.lower_bound import (
+    best_bound_with_terms as best_bound_by_robots,
+    prove_with_eta,
+)
 from solvers.distributed.robots import handedness as robot_orders
 from solvers.handedness.ascent import AscentState, HandednessAscent
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
@@ -121,6 +124,40 @@ def test_the_bound_with_terms_is_the_central_one(
         # what an eta costs, grounded at another pose, is another figure
         return
     assert found.value == pytest.approx(central.value, rel=1e-9, abs=allowed)
+
+
+def test_a_bound_with_terms_and_an_eta_names_the_terms(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, poses = loose(0, 12)
+    Pi = 1e-3 * random_multipliers(0, len(distinct_pairs(problem.graph)))
+    driver = driver_with_terms(problem, partition(problem.graph, 3), poses, Pi)
+    less_terms = handedness.return_to_best(driver)
+    # as where S_r less the terms is not definite without an eta
+    monkeypatch.setattr(robots_bound, "_bound_with_terms", lambda *_: None)
+    found = best_bound_by_robots(driver, 1e-6, less_terms)
+    assert found.value > 0.0
+    assert found.eta > 0.0
+    assert found.terms is not None
+    assert found.terms.num_pairs == collected_terms(driver).num_pairs
+
+
+def test_the_loss_of_every_robot_is_taken_off_the_form_with_eta(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, poses = loose(0, 12)
+    Pi = 1e-3 * random_multipliers(0, len(distinct_pairs(problem.graph)))
+    driver = driver_with_terms(problem, partition(problem.graph, 3), poses, Pi)
+    less_terms = handedness.return_to_best(driver)
+    eta = 0.1 * problem.objective(poses) / (12 * problem.d)
+    known = prove_with_eta(driver, eta, less_terms)
+    assert known is not None
+    lost = 0.1 * known.value
+    assert lost > 0.0
+    monkeypatch.setattr(HandednessTerms, "loss", lambda terms: lost)
+    found = prove_with_eta(driver, eta, less_terms)
+    assert found is not None
+    num_robots = len(driver.robots_with_edges)
+    assert num_robots > 1
+    assert found.value == pytest.approx(known.value - num_robots * lost, rel=1e-9)
 
 
 def ascents(

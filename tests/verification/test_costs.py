@@ -26,6 +26,8 @@ from pgo_models.verification.costs import (
     StepFailedError,
     UndecidedError,
     add_edge,
+    definite_tau,
+    less_tau,
     precisions,
 )
 from pgo_models.verification.measurements import exact_number, read_graph
@@ -150,6 +152,34 @@ def test_a_pivot_that_may_be_zero_is_not_decided() -> None:
         eliminate({0: {0: arb_mat([[wide]])}}, {0: arb_mat([[arb(1)]])})
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_matrix_that_makes_no_rotation_is_none(d: int) -> None:
+    """Of zeros, and of equal columns, the balls are not numbers, which no comparison decides."""
+    reflection = np.diag([-1.0, *np.ones(d - 1)])
+    skewed = np.eye(d)
+    skewed[0, 1] = 1e-5
+    for rows in (np.zeros((d, d)), np.ones((d, d)), reflection, skewed):
+        with pytest.raises(StepFailedError, match="R is no rotation"):
+            exact_rotation(rows.tolist(), "R")
+
+
+@given(SEEDS, DIMENSIONS, st.sampled_from([0.5, 1.0 - 2.0**-24, 1.0, 1.5]), st.booleans())
+@settings(max_examples=examples(40))
+def test_a_tau_that_is_found_leaves_the_matrix_definite(
+    seed: int, d: int, share: float, is_singular: bool
+) -> None:
+    """Whatever share of the largest is asked for: what is found in doubles is checked exactly."""
+    rng = np.random.default_rng(seed)
+    half = rng.integers(-9, 10, (3 * d - 3, 3 * d - 3 - is_singular))
+    rows = [[fmpq(x) for x in row] for row in (half @ half.T).tolist()]
+    tau = definite_tau(rows, d, share)
+    if tau is not None:
+        assert tau > 0
+        assert first_bad_pivot(less_tau(rows, tau, d)) is None
+    if share > 1.0 or is_singular:
+        assert tau is None
+
+
 @pytest.mark.parametrize("word", ["1", "-1.5e-3", "+.5", "5.", "1E+2", "0.1", "-0"])
 def test_numbers_are_what_their_digits_say(word: str) -> None:
     from fractions import Fraction
@@ -172,6 +202,20 @@ def test_semidefinite_matrices_are_told_to_the_last_digit(seed: int, side: int, 
         np.column_stack([half, axis])
     ) > np.linalg.matrix_rank(half)
     assert is_semidefinite([[fmpq(int(x)) for x in row] for row in rest.tolist()]) == (not needed)
+
+
+@given(SEEDS, st.integers(2, 6), st.data())
+@settings(max_examples=examples(20))
+def test_no_matrix_with_a_zero_on_its_diagonal_and_an_entry_beside_it_is_semidefinite(
+    seed: int, side: int, data: st.DataObject
+) -> None:
+    half = np.random.default_rng(seed).integers(-9, 10, (side, side))
+    whole = half @ half.T
+    at, beside = data.draw(st.permutations(range(side)))[:2]
+    whole[at] = whole[:, at] = 0
+    assert is_semidefinite([[fmpq(x) for x in row] for row in whole.tolist()])
+    whole[at, beside] = whole[beside, at] = 1
+    assert not is_semidefinite([[fmpq(x) for x in row] for row in whole.tolist()])
 
 
 @given(SEEDS, DIMENSIONS, st.floats(0.1, 3.0))

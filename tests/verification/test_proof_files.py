@@ -48,6 +48,9 @@ ROOT = Path(__file__).parents[2]
         ("objective", "12", "finite"),
         ("ground", "moon", "id of a pose"),
         ("ground", 2**70, "id of a pose"),
+        ("ground", True, "id of a pose"),
+        ("handedness", {"i": 0}, "no list of terms"),
+        ("handedness", [{"i": 0, "j": 1, "T": [1, 0], "P": 6 * [0.0]}], "T of a handedness term"),
         ("poses", 5, "no entry 'id'"),
         ("poses", [5], "no entry 'id'"),
         ("poses", [{"id": 0}], "no entry 't'"),
@@ -94,6 +97,10 @@ def test_a_file_that_is_no_proof_is_one_line(text: str, tmp_path: Path, pgo_comm
             f"{SPACE}PARAMS_SE3OFFSET 0 1 0 0 0 0 0 1\nEDGE_SE3_XYZ_PRIOR 0 0 3 4 5 1 0 0 1 0 1",
             ":3: a sensor that is not at its pose",
         ),
+        (
+            f"{SPACE}PARAMS_SE3OFFSET 0 0 0 0 0 0 1 0\nEDGE_SE3_XYZ_PRIOR 0 0 3 4 5 1 0 0 1 0 1",
+            ":3: a sensor that is not at its pose",
+        ),
     ],
 )
 def test_a_graph_that_is_none_is_one_line(
@@ -107,6 +114,33 @@ def test_a_graph_that_is_none_is_one_line(
     code, out, err = pgo_command("verify", path, path)
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert words in err
+
+
+def test_handedness_terms_in_the_plane_are_one_line(tmp_path: Path, pgo_command: Call) -> None:
+    path = written(tmp_path, varied_graph(0, 4, 2))
+    _, proof = proof_of(path)
+    term = {"i": 0, "j": 1, "T": np.eye(3).tolist(), "P": [1.0, 0.0, 0.0, 1.0, 0.0, 1.0]}
+    code, out, err = pgo_command("verify", path, edited(proof, handedness=[term]))
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "no list of terms in 3D" in err
+
+
+def test_who_has_a_rotation_and_who_is_grounded_is_checked(tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_text(f"{PLANE}EDGE_SE2_XY 0 7 3 4 10 1 20\nEDGE_SE2_XY 2 7 1 4 10 1 20\n")
+    _, proof = proof_of(path)
+    record = json.loads(proof.read_text())
+    of_pose = next(pose for pose in record["poses"] if pose["id"] == 1)
+    of_landmark = next(pose for pose in record["poses"] if pose["id"] == 7)
+    for ground in (7, 99):
+        found = verify_proof(path, edited(proof, ground=ground))
+        assert found.failure == f"the poses: pose {ground}, to be grounded, is none"
+    of_landmark["R"] = of_pose["R"]
+    found = verify_proof(path, edited(proof, poses=record["poses"]))
+    assert found.failure == "the poses: a pose has no R, or a landmark has one"
+    del of_landmark["R"], of_pose["R"]
+    found = verify_proof(path, edited(proof, poses=record["poses"]))
+    assert found.failure == "the poses: a pose has no R, or a landmark has one"
 
 
 def test_files_that_cannot_be_read_are_one_line(tmp_path: Path, pgo_command: Call) -> None:

@@ -28,17 +28,27 @@ from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
 
 import solvers
 from pgo_models.certificates.certificate import BoundSource, certify_at
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.handedness import HandednessTerms
+from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import FileFormatError
-from pgo_models.geometry.rotations import random_rotations
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import exp_map, random_rotations
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.verification import verify
+from pgo_models.verification.balls import arb, arb_mat
+from pgo_models.verification.costs import QuadraticForm, add_edge
+from pgo_models.verification.measurements import Edge
 from pgo_models.verification.verify import verify_proof
 from solvers.riemannian.certify import certify
+from solvers.riemannian.polish import polish
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 WEIGHTINGS = st.sampled_from(COSTS)
@@ -110,7 +120,10 @@ def test_a_bound_from_poses_that_are_no_optimum_is_a_bound(
     found = verify_proof(path, path.with_suffix(".json"))
     assert_verified(found, certificate)
     assert found.bound is not None
+    assert found.objective is not None
     assert found.bound <= best_known(problem, seed)
+    if found.gap is not None:
+        assert found.gap.overlaps((found.objective - found.bound) / found.objective)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -330,6 +343,21 @@ def test_landmarks_have_no_part_in_a_proof_of_rotations(tmp_path: Path) -> None:
     assert found.failure == "the poses: rotations alone are none of landmarks"
 
 
+def test_a_form_that_is_not_the_cost_is_said_to_be_a_defect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, varied_graph(1, 5, 2))
+    _, proof = proof_of(path)
+
+    def one_more(form: QuadraticForm, edge: Edge, cost: str, X: dict[int, arb_mat]) -> arb:
+        return add_edge(form, edge, cost, X) + 1
+
+    monkeypatch.setattr(verify, "add_edge", one_more)
+    found = verify_proof(path, proof)
+    assert found.bound is None
+    assert found.failure.endswith("a defect of pgo verify")
+
+
 def test_the_proof_of_another_graph_fails(tmp_path: Path) -> None:
     path = written(tmp_path, varied_graph(0, 6, 3))
     _, proof = proof_of(path)
@@ -355,6 +383,28 @@ def test_a_multiplier_beyond_all_bounds_is_no_proof(tmp_path: Path) -> None:
         assert not found.is_verified
         assert found.bound is None or found.bound <= 1e-9
         assert pose == 0 or found.failure.startswith("the elimination: H is not positive definite")
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("share", [1.001, 1.5])
+def test_a_shift_costs_what_rotations_half_a_turn_apart_cost(
+    d: int, share: float, tmp_path: Path
+) -> None:
+    """At poses half a turn apart F is 8 kappa, which is a maximum; the least F is 0."""
+    kappa = 3.0
+    edge = np.array([0]), np.array([1]), np.eye(d)[None], np.zeros((1, d))
+    path = written(tmp_path, PoseGraph(2, *edge, np.array([kappa]), np.ones(1)))
+    _, proof = proof_of(path)
+    poses = json.loads(proof.read_text())["poses"]
+    half_turn = np.eye(d)
+    half_turn[0, 0] = half_turn[1, 1] = -1.0
+    poses[1]["R"] = half_turn.tolist()
+    for pose in poses:
+        del pose["Lambda"]  # the verifier takes those of the poses
+    claims = dict(objective=8.0 * kappa, lower_bound=0.0, eta=share * kappa, ground=0)
+    found = verify_proof(path, edited(proof, poses=poses, **claims))
+    assert found.is_verified
+    assert found.bound == 0
 
 
 def test_a_local_minimum_proves_no_more_than_it_can(tmp_path: Path) -> None:
@@ -420,9 +470,48 @@ def test_handedness_terms_are_verified_and_nothing_less(tmp_path: Path) -> None:
     fails(lambda terms: terms.clear(), "the elimination")
     fails(lambda terms: terms[0].update(P=[-1.0, 0.0, 0.0, 1.0, 0.0, 1.0]), "not positive semid")
     fails(lambda terms: terms[0].update(P=[1.0, 1.01, 0.0, 1.0, 0.0, 1.0]), "not positive semid")
+    fails(lambda terms: terms[0].update(P=[0.0, 1e-9, 0.0, 1.0, 0.0, 1.0]), "not positive semid")
     fails(lambda terms: terms[0].update(T=np.diag([1.0, 1.0, -1.0]).tolist()), "is no rotation")
     fails(lambda terms: terms[0].update(j=terms[0]["i"]), "two poses")
     fails(lambda terms: terms[0].update(j=10**9), "two poses")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_handedness_terms_are_at_the_poses_of_a_proof_is_taken_off(
+    seed: int, tmp_path: Path
+) -> None:
+    """At a minimum of the cost less terms that are not zero there, which is none of the cost."""
+    path = written(tmp_path, varied_graph(seed, 8, 3, LOUD_NOISE))
+    problem = PGOProblem(read_g2o(path), weighting=Weighting.ISOTROPIC)
+    graph = problem.graph
+    solution = solvers.solve(problem)
+    terms = turned_terms(graph, solution.poses, 0.2 * float(graph.kappa.min()), seed)
+    less = terms.taken_off(problem)
+    poses = polish(less, solution.poses)
+    certificate = replace(
+        certify_at(problem, poses),
+        Lambda=multipliers(less, poses),
+        bound=LowerBound(1e-6, 0.0, is_grounded=True, rounding=0.0, terms=terms),
+    )
+    save_proof(problem, certificate, path.with_suffix(".json"))
+    found = verify_proof(path, path.with_suffix(".json"))
+    least = best_known(problem, seed)
+    of_terms = problem.objective(poses) - less.objective(poses)
+    assert problem.objective(poses) > (1.0 + 1e-6) * least
+    assert found.is_verified
+    assert found.bound is not None
+    assert found.bound <= least
+    assert float(found.bound) == pytest.approx(problem.objective(poses) - of_terms, rel=1e-9)
+
+
+def turned_terms(graph: PoseGraph, poses: Poses, size: float, seed: int) -> HandednessTerms:
+    """Terms on all edges whose T are turned away from those of the poses."""
+    rng = np.random.default_rng(seed)
+    roots = rng.standard_normal((graph.num_edges, 3, 3))
+    P = size * roots @ np.swapaxes(roots, 1, 2)
+    turns = exp_map(0.3 * rng.standard_normal((graph.num_edges, 3)))
+    T = np.swapaxes(poses.R[graph.i], 1, 2) @ poses.R[graph.j] @ turns
+    return HandednessTerms.with_rotations(graph.i, graph.j, T, P)
 
 
 @given(seed=SEEDS, size=st.sampled_from([1e-3, 1.0, 1e3]))

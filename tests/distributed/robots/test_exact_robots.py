@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from budget import examples
 from exact_arithmetic import ExactGraph, exact, is_positive_definite, less_diagonal, without
-from graphs import DIMENSIONS, SEEDS, random_poses, turned_away, varied_graph, wound_ring
+from graphs import (
+    DIMENSIONS,
+    SEEDS,
+    informed,
+    random_poses,
+    turned_away,
+    varied_graph,
+    wound_ring,
+)
 from hypothesis import given, settings, strategies as st
 from roads import Shape, road
 from robots import (
@@ -18,6 +26,7 @@ from robots import (
     driver_at,
     metis,
     sparse_elimination,
+    star,
 )
 
 from pgo_models.certificates.dual_variables import multipliers
@@ -27,9 +36,11 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import gamma
+from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed import lower_bound as distributed_bound
 from solvers.distributed.driver import collect
 from solvers.distributed.interface import Interface
@@ -167,6 +178,64 @@ def test_an_eta_costs_for_the_poses_of_driver_and_robots_alike() -> None:
     lost = eta * 8.0 * 16
     assert with_eta.value > 0.0
     assert without_eta.value - with_eta.value >= (1.0 - 1e-3) * lost
+
+
+@pytest.mark.parametrize("size", [-1e160, -1e200, np.nan])
+def test_multipliers_out_of_range_prove_nothing_to_a_driver(size: float) -> None:
+    problem = PGOProblem(varied_graph(3, 16, 3))
+    poses = polish(problem, chordal_start(problem))
+    with closing(driver_at(problem, contiguous(problem.graph, 3), poses)) as driver:
+        g = len(driver.cover)
+        far = np.zeros_like(driver.current.force)
+        far[g:] = size * np.swapaxes(driver.current.R, 1, 2).reshape(-1, 3)
+        driver.current = replace(driver.current, force=far)
+        assert prove_with_eta(driver, 1.0) is None
+        assert prove_grounded(driver, 1.0) is None
+
+
+@pytest.mark.parametrize("center", [0, 6])
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_form_with_eta_leaves_a_translation_out_whoever_has_its_pose(
+    center: int, d: int
+) -> None:
+    """Pose 0 is the driver's, or in the interior of a robot."""
+    graph, parts = star(center, d)
+    problem = PGOProblem(graph)
+    poses = polish(problem, chordal_start(problem))
+    central = prove_bound(problem, multipliers(problem, poses), 1e-3)
+    with closing(driver_at(problem, parts, poses)) as driver:
+        assert (0 in driver.cover) == (center == 0)
+        found = prove_with_eta(driver, 1e-3)
+    assert central is not None
+    assert found is not None
+    assert found.value == central
+
+
+def test_the_form_with_eta_has_the_constants_of_chi2_s_tangent_and_their_errors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = informed(3, 16, 3, coupled=True, spread=0.3)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    poses = problem.at_best_translations(polish(problem, chordal_start(problem.convex_part)))
+    eta = 1e-4
+    tangent = problem.tangent_at(poses)
+    constant, _ = tangent.weights.constant
+    central = prove_bound(tangent, multipliers(problem, poses), eta)
+    assert central is not None
+    assert abs(constant) > 1e-3 * central > 0.0
+    with closing(driver_at(problem, contiguous(graph, 3), None)) as driver:
+        driver.choose_cost(final=True)
+        driver.set_poses(poses)
+        found = prove_with_eta(driver, eta)
+        assert found is not None
+        assert found.value == pytest.approx(central, rel=1e-9)
+        lost = 0.1 * central
+        monkeypatch.setattr(TangentCost, "constant", property(lambda cost: (0.0, lost)))
+        without = prove_with_eta(driver, eta)
+        num_robots = len(driver.robots_with_edges)
+    assert without is not None
+    assert num_robots > 1
+    assert without.value == pytest.approx(found.value - constant - num_robots * lost, rel=1e-9)
 
 
 def test_weights_that_could_underflow_prove_nothing_by_robots_either() -> None:
