@@ -51,6 +51,7 @@ ORDER = {
         "robust_solves",
         "extended_solve",
         "request",
+        "local_solution",
         "shared_solve",
         "pipeline",
         "folder_solve",

@@ -30,6 +30,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.html_tables import facts_table
+from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting, name_of_cost
@@ -333,6 +334,10 @@ def certify_at(
     True
     """
     check_poses(problem.graph, poses)
+    local = LocalWorld.of(problem)
+    if local is not None:
+        local_certificate = certify_at(local.problem, local.local_poses(poses), gap, stationarity)
+        return certificate_of_whole(local, poses, local_certificate)
     best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
     certificate = certify_with(
         problem,
@@ -347,6 +352,21 @@ def certify_at(
         return certificate
     terms = closed_form_terms(problem.tangent_at(best), best)
     return certificate if terms is None else with_terms(problem, certificate, terms, best)
+
+
+def certificate_of_whole(local: LocalWorld, poses: Poses, certificate: Certificate) -> Certificate:
+    """Certificate of poses of the file, from that of the same poses in the local problem.
+
+    The bound is the same, as the cost is. So is all that is said of the poses, where they are local
+    poses without any rounding. Others are judged in the whole problem, with the rounding of its
+    coordinates; and so are poses that fit to this rounding, which the local problem does not know.
+    """
+    certificate = replace(certificate, poses=local.unrounded_poses(certificate.poses))
+    is_same = local.keeps_exactly(poses)
+    if is_same and certificate.is_certified:
+        return certificate
+    in_whole = judge(local.whole, poses, certificate)
+    return certificate if is_same and in_whole.verdict is not Verdict.EXACT else in_whole
 
 
 def with_terms(
