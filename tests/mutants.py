@@ -60,6 +60,13 @@ MUTANTS = (
         ("tests/test_far_priors.py",),
     ),
     Mutant(
+        "far priors: what far coordinates do not explain counts as their rounding",
+        "pgo_models/certificates/certificate.py",
+        "not certificate.objective_at_most <= level:",
+        "not certificate.objective_at_most <= 1e4 * level:",
+        ("tests/test_far_priors.py",),
+    ),
+    Mutant(
         "far priors: the verifier moves the world pose and its measurements apart",
         "pgo_models/verification/verify.py",
         "moved = [p + t for p, t in",

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exact_arithmetic import MP, ExactGraph
-from graphs import informed, varied_graph
+from graphs import exact_graph, informed, varied_graph
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import Certificate, certify_at
+from pgo_models.certificates.certificate import Certificate, Verdict, certify_at
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
@@ -274,6 +274,37 @@ def test_marginals_are_those_near_zero(d):
     np.testing.assert_allclose(
         other.marginals(3, anchor=5), one.marginals(3, anchor=5), rtol=1e-6, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_poses_that_fit_but_for_the_last_digits_of_far_coordinates_are_exact(d):
+    graph = exact_graph(0, 8, d)
+    truth = graph.truth
+    for digits in (9, 16):
+        positions = np.round(truth.t + UTM[:d], digits)
+        far = graph.with_position_prior(np.arange(8), positions, 4.0)
+        solution = solve(far)
+        again = certify(solution.problem, solution.poses)
+        for certificate in (solution.certificate, again):
+            assert certificate.verdict is Verdict.EXACT
+            # The cost is what half a unit in the last place makes.
+            assert 0.0 < certificate.objective <= certificate.rounding_level
+            assert certificate.rounding_level < 1e-17 * (graph.tau.sum() + 32.0)
+    # A hundred units are no rounding.
+    off = np.random.default_rng(0).choice([-1e-7, 1e-7], positions.shape)
+    solution = solve(graph.with_position_prior(np.arange(8), positions + off, 4.0))
+    assert solution.certificate.verdict is not Verdict.EXACT
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_exact_poses_stay_exact_where_a_far_estimate_has_them(d):
+    graph = exact_graph(1, 8, d)
+    truth = graph.truth
+    far = replace(graph, initial=Poses(truth.R, truth.t + UTM[:d]), truth=None)
+    solution = solve(far)
+    assert solution.certificate.verdict is Verdict.EXACT
+    assert 0.0 < solution.objective <= solution.certificate.rounding_level
+    assert solve(with_estimate(d, UTM)).certificate.verdict is Verdict.CERTIFIED
 
 
 def test_chi2_of_the_printed_poses_is_that_of_the_solution():

@@ -21,6 +21,7 @@ from pgo_models.certificates.lower_bound import (
 )
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
+    coordinate_level,
     objective_rounding,
 )
 from pgo_models.errors import ProofError, SettingError
@@ -358,15 +359,27 @@ def certificate_of_whole(local: LocalWorld, poses: Poses, certificate: Certifica
     """Certificate of poses of the file, from that of the same poses in the local problem.
 
     The bound is the same, as the cost is. So is all that is said of the poses, where they are local
-    poses without any rounding. Others are judged in the whole problem, with the rounding of its
-    coordinates; and so are poses that fit to this rounding, which the local problem does not know.
+    poses without any rounding; others are judged with the rounding of their coordinates.
     """
     certificate = replace(certificate, poses=local.unrounded_poses(certificate.poses))
-    is_same = local.keeps_exactly(poses)
-    if is_same and certificate.is_certified:
+    if not local.keeps_exactly(poses):
+        return judge(local.whole, poses, certificate)
+    return exact_to_coordinates(local.whole, poses, certificate)
+
+
+def exact_to_coordinates(
+    problem: PGOProblem, poses: Poses, certificate: Certificate
+) -> Certificate:
+    """The certificate, EXACT where its poses cost no more than the `coordinate_level`.
+
+    Poses far from zero that fit but for the last digits of their coordinates cannot be better in
+    doubles.
+    """
+    level = coordinate_level(problem, poses)
+    if certificate.is_certified or not certificate.objective_at_most <= level:
         return certificate
-    in_whole = judge(local.whole, poses, certificate)
-    return certificate if is_same and in_whole.verdict is not Verdict.EXACT else in_whole
+    rounding_level = max(level, certificate.rounding_level)
+    return replace(certificate, gap=0.0, rounding_level=rounding_level, verdict=Verdict.EXACT)
 
 
 def with_terms(

@@ -26,9 +26,9 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
 # The world pose is moved where positions are so many times as far from zero as they are from each
-# other. Rounding grows with the square of that: at 64 it is 4e3 times that of a map around zero,
-# 1e-12, which no gap that is asked for notices.
-_FAR = 64.0
+# other. The rounding of M grows with the square of that: up to 256 it is at most 7e4 units, which
+# leaves gaps of 1e-11 or so. A map within a few hundred of its own sizes of zero stays as it is.
+_FAR = 256.0
 
 
 @dataclass(frozen=True, eq=False)

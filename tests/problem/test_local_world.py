@@ -54,6 +54,9 @@ def test_every_measurement_is_moved_without_rounding(seed, d, size):
         for p, q, o in zip(before, after, local.point, strict=True):
             assert Fraction(p) - Fraction(o) == Fraction(q)
     np.testing.assert_array_equal(moved[~priors], graph.t_ij[~priors])
+    for name in ("i", "j", "R_ij", "kappa", "tau", "information"):
+        before, after = (getattr(problem.graph, name) for problem in (problem, local.problem))
+        np.testing.assert_array_equal(after, before)
 
 
 @given(seed=SEEDS, d=DIMENSIONS)
