@@ -16,12 +16,13 @@ import numpy as np
 
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
+from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, factorize
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.growing_cost import GrowingCost
+from pgo_models.problem.local_world import LocalWorld, far_middle, seen_from_point
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -62,6 +63,9 @@ class GrowingSolution:
         Poses, cost and factor.
     weighting : Weighting
         Which cost it is.
+    origin : Array, shape (d,)
+        Point that the positions in the map are relative to. It is not zero where the first solution
+        is far from zero: rounding of large coordinates would keep updates from converging.
     backend : CholeskyBackend, optional
         The sparse Cholesky of a certificate.
 
@@ -84,6 +88,7 @@ class GrowingSolution:
     numbers: dict[int, int]
     map: GrowingMap
     weighting: Weighting
+    origin: Array
     backend: CholeskyBackend | None = None
 
     @classmethod
@@ -118,13 +123,14 @@ class GrowingSolution:
         assert isinstance(weighting, Weighting)
         cost = GrowingCost.of(graph, _quadratic_cost(graph, weighting))
         numbers = dict(zip(graph.pose_ids.tolist(), range(graph.num_poses), strict=True))
-        started = GrowingMap.of(cost, poses.R, poses.t)
-        return cls((graph,), numbers, started, weighting, problem.backend)
+        origin = far_middle(poses.t, graph)
+        started = GrowingMap.of(cost, poses.R, poses.t - origin)
+        return cls((graph,), numbers, started, weighting, origin, problem.backend)
 
     @property
     def poses(self) -> Poses:
         """All poses, in the frame of the first solution."""
-        return Poses(self.map.R, self.map.t)
+        return Poses(self.map.R, self.map.t + self.origin)
 
     @property
     def objective(self) -> float:
@@ -251,7 +257,8 @@ class GrowingSolution:
 
     def _solved_afresh(self) -> GrowingSolution:
         """The solution by Newton on the whole graph, from the present poses."""
-        solved = run(Newton(tolerance=_AFRESH), self.problem, self.poses)
+        start = Poses(self.map.R, self.map.t)
+        solved = run(Newton(tolerance=_AFRESH), self.problem, start)
         poses = solved.poses
         return replace(self, map=GrowingMap.of(self.map.cost, poses.R, poses.t))
 
@@ -418,6 +425,10 @@ def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
     rotations are projected. Then all translations are the best for the rotations. A GraphError when
     no pose of the problem has one of the ids.
     """
+    local = LocalWorld.of(problem)
+    if local is not None:
+        start = extended_poses(local.problem, ids, _seen_locally(local, ids, poses))
+        return local.unrounded_poses(start)
     n = problem.num_poses
     d = problem.d
     M = problem.convex_part.M
@@ -443,6 +454,14 @@ def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
         R[new] = project_to_rotations(unstack_transposes(X[n:])[new])
         t[new] = X[new]
     return problem.at_best_translations(Poses(R, t))
+
+
+def _seen_locally(local: LocalWorld, ids: IntArray, poses: Poses) -> Poses:
+    """Poses with these ids as the local problem has them; as they are if they are of no world."""
+    world = np.flatnonzero(ids == WORLD_ID)
+    if not len(world):
+        return poses
+    return seen_from_point(poses, int(world[0]), local.point)
 
 
 def extended_partition(robots: Partition, ids: IntArray, graph: PoseGraph) -> Partition:

@@ -18,8 +18,10 @@ from pgo_models.errors import GraphWarning
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.here import Here
+from solvers.local_solution import local_request, solution_of_whole
 from solvers.loop import RunMonitor
 from solvers.network.engine import Engine, InProcess
 from solvers.plan import solve_at
@@ -71,6 +73,10 @@ def solve(
     not quadratic and convex, where SOC would run on its `convex_part`. For such a chi2 the second
     attempt starts at the optimum of F, and smaller information matrices take the place of the
     staircase. Robots leave SOC out in the plane, where every edge has a tau > 0.
+
+    Priors may be far from zero, as positions in UTM or ECEF coordinates are. The stages, and a
+    callback, then see all poses from a point among them. The solution has the coordinates of the
+    priors, and its certificate is of these as they are rounded to doubles.
 
     Parameters
     ----------
@@ -181,10 +187,19 @@ def solve(
     _warn_of_landmarks_seen_once(request.problem.graph)
     if request.pipeline.has_added_terms:
         return _solve_with_added_terms(request)
-    if robust is not None:
-        return _solve_without_wrong_edges(request, robust)
-    if robots is not None:
-        return _solve_by_robots(request, robots)
+    local = LocalWorld.of(request.problem)
+    if local is None:
+        return _solve_where_it_runs(request)
+    solution = _solve_where_it_runs(local_request(local, request))
+    return solution_of_whole(local, solution)
+
+
+def _solve_where_it_runs(request: SolveRequest) -> Solution:
+    """Solution by a robust solve, by robots, or in one place, as was asked for."""
+    if request.robust is not None:
+        return _solve_without_wrong_edges(request, request.robust)
+    if request.robots is not None:
+        return _solve_by_robots(request, request.robots)
     return _solve_in_one_place(request)
 
 

@@ -6,7 +6,12 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, judge
+from pgo_models.certificates.certificate import (
+    DEFAULT_GAP,
+    Verdict,
+    exact_to_coordinates,
+    judge,
+)
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
@@ -270,7 +275,10 @@ def solution_of(
     poses, frame, held = choose_gauge(current, problem.graph, request.anchor)
     poses = problem.seen_poses(poses)  # a frame has an origin, too
     # A frame far away rounds the poses: the certificate is of those that are returned.
-    certificate = judge(problem, poses, best.proof)
+    found = best.proof
+    certificate = judge(problem, poses, found)
+    if found.verdict is Verdict.EXACT:
+        certificate = exact_to_coordinates(problem, poses, certificate)
     return Solution(
         problem=problem,
         poses=poses,

@@ -28,6 +28,7 @@ from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.hessian import riemannian_hessian, unknowns_of
 from pgo_models.problem.initialization import spanning_tree_start
+from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
@@ -178,12 +179,16 @@ class Solution:
             Shape (k p, k p) for k poses, or (n, p, p) for every pose, with p = d(d+1)/2, and
             p = d(d-1)/2 for rotations.
         """
-        hessian = riemannian_hessian(
-            self.problem.at(self.poses), multipliers(self.problem, self.poses)
-        )
-        hessian, layout = unknowns_of(self.problem, hessian)
+        problem = self.problem
+        at = self.poses
+        local = LocalWorld.of(problem)
+        if local is not None:
+            problem = local.problem
+            at = local.local_poses(at)
+        hessian = riemannian_hessian(problem.at(at), multipliers(problem, at))
+        hessian, layout = unknowns_of(problem, hessian)
         anchor = self.anchor if anchor is None else anchor
-        marginals = Marginals(hessian, layout, anchor, self.problem.backend)
+        marginals = Marginals(hessian, layout, anchor, problem.backend)
         return marginals.joint(*poses) if poses else marginals.diagonal
 
     def save(self, path: Path | str) -> None:

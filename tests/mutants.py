@@ -44,6 +44,35 @@ BOUNDS = (
     "tests/certificates/test_prove_bound.py",
 )
 MUTANTS = (
+    # Priors far from zero.
+    Mutant(
+        "far priors: positions are moved though that rounds them",
+        "pgo_models/problem/local_world.py",
+        "return np.where(is_exact, point, 0.0)",
+        "return point",
+        ("tests/problem/test_local_world.py",),
+    ),
+    Mutant(
+        "far priors: poses in another frame count as moved without rounding",
+        "pgo_models/certificates/certificate.py",
+        "if not local.keeps_exactly(poses):",
+        "if local is None:",
+        ("tests/test_far_priors.py",),
+    ),
+    Mutant(
+        "far priors: what far coordinates do not explain counts as their rounding",
+        "pgo_models/certificates/certificate.py",
+        "not certificate.objective_at_most <= level:",
+        "not certificate.objective_at_most <= 1e4 * level:",
+        ("tests/test_far_priors.py",),
+    ),
+    Mutant(
+        "far priors: the verifier moves the world pose and its measurements apart",
+        "pgo_models/verification/verify.py",
+        "moved = [p + t for p, t in",
+        "moved = [p - t for p, t in",
+        ("tests/verification/test_world_at_zero.py",),
+    ),
     # Rotations alone.
     Mutant(
         "rotations alone: translations of given poses cost something",

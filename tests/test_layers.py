@@ -53,6 +53,7 @@ ORDER = {
         "extended_solve",
         "request",
         "plan",
+        "local_solution",
         "shared_solve",
         "pipeline",
         "folder_solve",

@@ -21,6 +21,7 @@ from pgo_models.certificates.lower_bound import (
 )
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
+    coordinate_level,
     objective_rounding,
 )
 from pgo_models.errors import ProofError, SettingError
@@ -30,6 +31,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.html_tables import facts_table
+from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting, name_of_cost
@@ -333,6 +335,10 @@ def certify_at(
     True
     """
     check_poses(problem.graph, poses)
+    local = LocalWorld.of(problem)
+    if local is not None:
+        local_certificate = certify_at(local.problem, local.local_poses(poses), gap, stationarity)
+        return certificate_of_whole(local, poses, local_certificate)
     best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
     certificate = certify_with(
         problem,
@@ -347,6 +353,33 @@ def certify_at(
         return certificate
     terms = closed_form_terms(problem.tangent_at(best), best)
     return certificate if terms is None else with_terms(problem, certificate, terms, best)
+
+
+def certificate_of_whole(local: LocalWorld, poses: Poses, certificate: Certificate) -> Certificate:
+    """Certificate of poses of the file, from that of the same poses in the local problem.
+
+    The bound is the same, as the cost is. So is all that is said of the poses, where they are local
+    poses without any rounding; others are judged with the rounding of their coordinates.
+    """
+    certificate = replace(certificate, poses=local.unrounded_poses(certificate.poses))
+    if not local.keeps_exactly(poses):
+        return judge(local.whole, poses, certificate)
+    return exact_to_coordinates(local.whole, poses, certificate)
+
+
+def exact_to_coordinates(
+    problem: PGOProblem, poses: Poses, certificate: Certificate
+) -> Certificate:
+    """The certificate, EXACT where its poses cost no more than the `coordinate_level`.
+
+    Poses far from zero that fit but for the last digits of their coordinates cannot be better in
+    doubles.
+    """
+    level = coordinate_level(problem, poses)
+    if certificate.is_certified or not certificate.objective_at_most <= level:
+        return certificate
+    rounding_level = max(level, certificate.rounding_level)
+    return replace(certificate, gap=0.0, rounding_level=rounding_level, verdict=Verdict.EXACT)
 
 
 def with_terms(

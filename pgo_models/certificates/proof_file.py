@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
+from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
@@ -72,7 +74,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         what = "the bound is that of smaller information matrices, not the file's"
         way_out = "leave out --proof, or add --cost isotropic to prove F"
         raise SettingError(f"no proof to write: {what}; {way_out}")
-    poses = _poses_of_bound(problem, certificate)
+    poses, objective = _point_of_bound(problem, certificate)
     transposed = np.swapaxes(certificate.Lambda, 1, 2)
     Lambda = 0.5 * (certificate.Lambda + transposed)
     upper_triangle = np.triu_indices(d)
@@ -91,7 +93,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         "format": FORMAT,
         "cost": cost,
         "d": d,
-        "objective": problem.objective(poses),
+        "objective": objective,
         "lower_bound": certificate.lower_bound,
         "rounding_level": certificate.rounding_level,
         "eta": eta,
@@ -116,6 +118,21 @@ def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, o
         }
         for i, j, T, P in zip(terms.i, terms.j, terms.T, terms.P, strict=True)
     ]
+
+
+def _point_of_bound(problem: PGOProblem, certificate: Certificate) -> tuple[Poses, float]:
+    """Poses that the bound was found at, and their cost.
+
+    Where priors are far away, the poses stay with their small coordinates, unrounded, and the world
+    pose is far from them.
+    """
+    local = LocalWorld.of(problem)
+    if local is None:
+        poses = _poses_of_bound(problem, certificate)
+        return poses, problem.objective(poses)
+    at_bound = local.local_poses(certificate.poses)
+    poses, objective = _point_of_bound(local.problem, replace(certificate, poses=at_bound))
+    return local.unrounded_poses(poses), objective
 
 
 def _poses_of_bound(problem: PGOProblem, certificate: Certificate) -> Poses:

@@ -273,6 +273,18 @@ def rounding_level(problem: PGOProblem, poses: Poses) -> float:
     return problem.weights.bound_of_norms(e_t, e_R)
 
 
+def coordinate_level(problem: PGOProblem, poses: Poses) -> float:
+    """Cost that half a unit in the last place of all coordinates can make.
+
+    Doubles have a coordinate t to u |t|. So r_t = t_j - t_i - R_i t_ij of coordinates that fit
+    exactly may be as large as u (||t_i|| + ||t_j|| + ||t_ij||), once these are rounded.
+    """
+    graph = problem.graph
+    size = block_norms(poses.t)
+    e_t = UNIT_ROUNDOFF * (size[graph.i] + size[graph.j] + block_norms(graph.t_ij))
+    return problem.weights.bound_of_norms(e_t, 0.0)
+
+
 def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
     """Whether rounding alone can make every residual as large as it is: F cannot be told from zero.
 

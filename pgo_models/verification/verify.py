@@ -55,6 +55,12 @@ with n rotations, the bound of weak duality in Rosen et al. 2019.)
 rows R_i^T alone. Then the rows t_i^T are left out of S, G and Z as those of pose r are, and the
 proof is the same without the shift of X.
 
+**The world pose.** Priors measure from it, and where it stands is a matter of names: with another
+point o of its frame in its place, t_w + R_w o is the unknown, and positions p in its frame become
+p - o, which leaves every residual t_j - t_w - R_w p as it is. Where a proof has the world pose
+unturned, it is moved to zero (`with_world_at_zero`). If priors are far away, as in UTM coordinates,
+the multiplier of a stationary point then has no lever of their length.
+
 **Handedness terms.** In three dimensions a proof may take terms off q that are never negative on
 rotations, so that the smaller form bounds the cost as well. For poses i and j, a rotation T and a
 positive semidefinite P, let rho = R_j^T - T^T R_i^T and W = (tr(P) / 2 I - P) / 4. Where the
@@ -74,7 +80,7 @@ Nothing in a proof is believed: other poses or multipliers give another bound, w
 Nothing outside `pgo_models.verification` is imported but `pgo_models.errors`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from pathlib import Path
 from typing import Any
@@ -283,6 +289,7 @@ def verify_proof(
     """
     measured = read_graph(Path(graph), skip_unknown)
     given = read_proof(Path(proof), measured.d)
+    measured, given = with_world_at_zero(measured, given)
     name = f"{graph}: {len(measured.nodes)} nodes, {len(measured.edges)} edges, {measured.d}D"
     failure = ""
     before = ctx.prec
@@ -439,6 +446,27 @@ def grounded_poses(graph: Graph, proof: Proof) -> dict[int, arb_mat]:
             X[node] = above(translation, rotation)
     X[r] = above(arb_mat(1, graph.d), identity(graph.d))
     return X
+
+
+def with_world_at_zero(graph: Graph, proof: Proof) -> tuple[Graph, Proof]:
+    """Graph and proof with an unturned world pose moved to zero, exactly; others as they are.
+
+    The proof has it at t_w with R_w = I. At its point o = -t_w it stands at t_w + R_w o = 0, and
+    its measurements p become p - o = p + t_w.
+    """
+    d = graph.d
+    unturned = [[float(a == b) for b in range(d)] for a in range(d)]
+    if proof.R.get(WORLD) != unturned or WORLD not in proof.t:
+        return graph, proof
+    shift = [fmpq(*number.as_integer_ratio()) for number in proof.t[WORLD]]
+    edges = []
+    for edge in graph.edges:
+        if edge.i == WORLD:
+            moved = [p + t for p, t in zip(edge.measured[:d], shift, strict=True)]
+            edge = replace(edge, measured=(*moved, *edge.measured[d:]))
+        edges.append(edge)
+    t = {**proof.t, WORLD: [0.0] * d}
+    return replace(graph, edges=edges), replace(proof, t=t)
 
 
 def check_names(graph: Graph, proof: Proof) -> None:

@@ -12,6 +12,7 @@ from pgo_models.certificates.certificate import (
     BoundSource,
     Certificate,
     Verdict,
+    certificate_of_whole,
     certify_at,
     judge,
     judge_cost,
@@ -20,7 +21,9 @@ from pgo_models.certificates.certificate import (
 from pgo_models.certificates.rounding_errors import ObjectiveRounding, fits_to_rounding
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.residuals import check_poses
 from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting
@@ -71,6 +74,11 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     ('POLISHED', True)
     """
     problem = as_problem(problem)
+    local = LocalWorld.of(problem)
+    if local is not None:
+        check_poses(problem.graph, poses)
+        local_certificate = certify(local.problem, local.local_poses(poses), gap)
+        return certificate_of_whole(local, poses, local_certificate)
     stationarity = relative_decrement(problem, poses)
     if stationarity <= STATIONARY_DECREMENT and problem.is_quadratic:
         certificate = certify_at(problem, poses, gap, stationarity)
