@@ -26,6 +26,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
+from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Journal
@@ -60,6 +61,7 @@ from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
+from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 from solvers.stages import Answer, PlannedStage, finer, run_stages
 
 
@@ -88,8 +90,10 @@ class FolderSolution:
     seconds : float
         Wall time.
     note : str
-        Why the cost is F and not chi2 where the files have matrices, or what a proof of chi2 needs;
-        or "".
+        For whom it holds where robots are absent, why the cost is F and not chi2 where the files
+        have matrices, and what may prove more.
+    num_absent : int
+        Number of poses of robots without a file, which edges of others name.
     """
 
     name: str
@@ -101,6 +105,7 @@ class FolderSolution:
     F: float
     seconds: float
     note: str = ""
+    num_absent: int = 0
 
     @property
     def status(self) -> Status:
@@ -120,7 +125,7 @@ class FolderSolution:
         facts = [
             ("graph", graph),
             ("status", f"{self.status.name}: {self.status.value}"),
-            *self.certificate.facts(),
+            *self._facts_of_certificate(),
             *self._other_cost(),
             ("note", self.note),
             ("frame", self.frame),
@@ -129,6 +134,12 @@ class FolderSolution:
             *self.ledger.facts(),
         ]
         return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
+
+    def _facts_of_certificate(self) -> list[tuple[str, str]]:
+        """Cost, bound, gap and verdict, which says for whom it holds."""
+        facts = dict(self.certificate.facts())
+        facts["verdict"] += verdict_suffix(self.num_absent)
+        return list(facts.items())
 
     def _other_cost(self) -> list[tuple[str, str]]:
         """F of the poses, where the cost is chi2."""
@@ -149,6 +160,7 @@ def solve_folder(
     time_limit: float = math.inf,
     verbose: bool = False,
     progress: bool | None = None,
+    trust_folder: bool = False,
 ) -> FolderSolution:
     """Solve and certify a folder with one g2o file a robot, each read by its robot alone.
 
@@ -177,6 +189,8 @@ def solve_folder(
         file whole or not at all.
     callback, time_limit, verbose, progress : optional
         As of `solve`.
+    trust_folder : bool
+        As of `read_g2o`.
 
     Returns
     -------
@@ -207,11 +221,12 @@ def solve_folder(
         check_g2o_folder(out, len(files))
     place = _place_of_robots(engine, len(files))
     stages: list[Stage] = []
-    opened = open_files(files, place, pipeline.driver_memory, weighting)
+    opened = open_files(files, place, pipeline.driver_memory, weighting, trust_folder)
     driver = opened.driver
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
         shared = RobotJob(driver, journal, monitor)
-        job = _FolderJob(folder.name, pipeline.gap, opened.weighting, shared)
+        name = f"{folder.name}, {FILES_HERE}" if opened.num_absent else folder.name
+        job = _FolderJob(name, pipeline.gap, opened.weighting, shared)
         try:
             job.run(pipeline)
         except NotPositiveDefiniteError as error:
@@ -228,7 +243,7 @@ def solve_folder(
             write = partial(write_answer, Path(out).absolute())
             driver.network.ask(write, [None] * len(files), Count.PIGGYBACKED)
     return FolderSolution(
-        name=folder.name,
+        name=name,
         certificate=certificate,
         sizes=opened.sizes,
         stages=tuple(stages),
@@ -236,17 +251,29 @@ def solve_folder(
         frame=frame,
         F=F,
         note=_note(weighting, opened, certificate),
+        num_absent=opened.num_absent,
         seconds=time.perf_counter() - monitor.began,
     )
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, certificate: Certificate) -> str:
-    """Why the cost is F where that was not asked for, or what a proof of chi2 needs; or ""."""
+    """For whom the solution holds, why its cost is F if not asked for, and what may find more."""
+    reason = ""
     if weighting is Weighting.OWN and opened.has_indefinite:
-        return "the cost is F, as some information matrices are indefinite: chi2 can be negative"
-    if certificate.is_certified or not opened.driver.has_two_costs:
+        reason = "the cost is F, as some information matrices are indefinite: chi2 can be negative"
+    return joined_notes(note_of_absence(opened.num_absent), reason, _way_on(opened, certificate))
+
+
+def _way_on(opened: OpenedFiles, certificate: Certificate) -> str:
+    """What a solve in one process has beside this one, where the gap is wider than asked for."""
+    if certificate.is_certified:
         return ""
-    return f"smaller information matrices may prove more; for these {READ_HERE}"
+    ways = ["a start that grows may find better poses"]
+    if opened.driver.d == 3:
+        ways.append("handedness terms may prove more")
+    if opened.driver.has_two_costs:
+        ways.append("smaller information matrices may prove more")
+    return f"{', '.join(ways)}; for these {READ_HERE}"
 
 
 def _check_first_stage(soc: SOC | PaperSOC | None) -> None:

@@ -57,6 +57,7 @@ from solvers.cli.options import (
     Split,
     SplitOption,
     Start,
+    TrustFolderOption,
     UnitWeightsOption,
 )
 from solvers.cli.shell import (
@@ -164,6 +165,7 @@ def solve_command(
     information: InformationOption = False,
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
+    trust_folder: TrustFolderOption = False,
     anchor: Annotated[
         int | None,
         typer.Option(
@@ -219,6 +221,7 @@ def solve_command(
         skip_unknown,
         drop_edge,
         rotations,
+        trust_folder,
     )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
@@ -254,7 +257,8 @@ def solve_command(
     solution = with_places(solution, graph, drop_edge)
     _save_and_show(solution, source, stages, outputs, display)
     warn_of_weights(graph, problem, solution.certificate, drop_edge)
-    raise typer.Exit(_exit_code(solution.status, solution.is_certified))
+    num_absent = len(problem.graph.absent)
+    raise typer.Exit(_exit_code(solution.status, solution.is_certified, num_absent))
 
 
 @dataclass(frozen=True)
@@ -489,10 +493,12 @@ def _solve_own_files(
         time_limit=stages.time_limit,
         verbose=display.verbose,
         progress=display.has_bar,
+        trust_folder=source.trust_folder,
     )
     if not display.quiet:
         typer.echo(f"{solution}")
-    return _exit_code(solution.status, solution.certificate.is_certified)
+    is_certified = solution.certificate.is_certified
+    return _exit_code(solution.status, is_certified, solution.num_absent)
 
 
 def _save_and_show(
@@ -568,8 +574,11 @@ def _text_with_error(solution: Solution) -> str:
     return f"{solution}\n\nerror to the truth (ATE): {error:.4g} m"
 
 
-def _exit_code(status: Status, is_certified: bool) -> int:
-    """Exit code of a solve that has ended."""
+def _exit_code(status: Status, is_certified: bool, num_absent: int) -> int:
+    """Exit code of a solve that has ended.
+
+    What is certified without absent robots is no certificate of the graph that was asked for.
+    """
     if not status.is_success:
         return NOT_CONVERGED
-    return DONE if is_certified else NOT_CERTIFIED
+    return DONE if is_certified and num_absent == 0 else NOT_CERTIFIED
