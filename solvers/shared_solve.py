@@ -19,6 +19,7 @@ from solvers.distributed.stages import (
     CertifyByRobots,
     ClimbByRobots,
     ConsensusAlone,
+    HearSilentRobot,
     NewtonByRobots,
     RecallAttempt,
     RobotJob,
@@ -28,6 +29,7 @@ from solvers.distributed.stages import (
     stages_before_newton,
 )
 from solvers.network.engine import InProcess
+from solvers.network.faults import RobotSilentError
 from solvers.request import Pipeline, SolveRequest, plan_improvements, solution_of
 from solvers.result import Stage
 from solvers.soc.paper import PaperSOC
@@ -56,6 +58,7 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
         pipeline.faults,
         pipeline.has_driver,
     )
+    missing = "" if pipeline.has_driver else note_without_driver(problem)
     mark = run_fingerprint(problem, partition, settings, request.start)
     engine = request.engine if request.engine is not None else InProcess()
     job = Job(problem, pipeline.gap, monitor)
@@ -79,11 +82,14 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
             if pipeline.has_driver:
                 monitor.poses_found.append(collect(driver)[0])
             answer = job.broken_off(Stage.interruption)
+        except RobotSilentError as error:
+            monitor.poses_found.append(collect(driver)[0])
+            answer = job.broken_off(Stage.silence)
+            missing = str(error)
         except NotPositiveDefiniteError:
             answer = job.broken_off(Stage.without_factor)
         if job.stages[-1].status.is_success:
             journal.end()
-    missing = "" if pipeline.has_driver else note_without_driver(problem)
     return solution_of(request, job, answer, driver.network.ledger, partition, missing)
 
 
@@ -109,7 +115,12 @@ def _plan_attempt_by_robots(
         first = StartByRobots(shared, "chordal start, in one place", find)
     planned = stages_before_newton(shared, soc, first, pipeline.faults)
     newton = NewtonByRobots(shared, pipeline.newton)
-    return [*planned, newton, CertifyByRobots(shared, problem, job.gap)]
+    certify = CertifyByRobots(shared, problem, job.gap)
+    if pipeline.faults is None or soc is None:
+        return [*planned, newton, certify]
+    # A robot may fall silent before SOC has ended, and after it.
+    hear = HearSilentRobot(shared, soc, pipeline.faults)
+    return [*planned, hear, newton, certify, hear]
 
 
 def _plan_climb_by_robots(job: Job, shared: RobotJob, pipeline: Pipeline) -> list[PlannedStage]:

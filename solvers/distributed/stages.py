@@ -224,6 +224,32 @@ class SOCByRobots:
 
 
 @dataclass(frozen=True, eq=False)
+class HearSilentRobot:
+    """The driver waits for a robot that `faults` silence in SOC, and gives it up at last.
+
+    Rounds are numbered on from those of SOC.
+    """
+
+    job: RobotJob
+    soc: SOC
+    faults: Faults
+
+    @property
+    def name(self) -> str:
+        """Name of the stage."""
+        return "silent robot"
+
+    def run(self, answer: Answer) -> Answer:
+        """Return the answer as it is, or raise a RobotSilentError."""
+        # By its name, since the stage of a checkpoint has no settings.
+        soc = next(stage for stage in reversed(self.job.stages) if stage.name.startswith("SOC"))
+        rounds_then = soc.history.records[-1].measurement.rounds or 0
+        rounds_since = self.job.driver.network.ledger.rounds - rounds_then
+        self.faults.check_heard(soc.iterations + rounds_since, self.soc.max_iterations)
+        return answer
+
+
+@dataclass(frozen=True, eq=False)
 class NewtonByRobots:
     """Newton on the cost that is asked for, unless time is up."""
 
