@@ -118,8 +118,9 @@ class Pipeline:
             )
         if not self.has_driver and not is_consensus:
             raise SettingError(
-                "without a driver robots run CONSENSUS alone; "
-                "take it (--method consensus), or give driver_memory"
+                "without a driver robots run CONSENSUS alone; give the pipeline "
+                "SOC(robots=.., coupling=Coupling.CONSENSUS) and solve() the robots, "
+                "or leave out driver_memory=0"
             )
 
     @property

@@ -227,13 +227,14 @@ def solve_command(
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
     display = Display(verbose, quiet, as_json)
     outputs = Outputs(out or [], report, covariances, proof, resume)
+    network.check_without_driver(stages, outputs.proof, graph)
     if network.reads_own_files(graph):
-        _refuse_what_needs_the_graph(given, outputs, source.chosen_cost)
+        _refuse_what_needs_the_graph(given, outputs, source.chosen_cost, method)
         raise typer.Exit(_solve_own_files(source, stages, network, display, outputs))
     outputs.check_pages()
     with JobBar(1, None if takes_long_to_read(graph) else False, f"reading {graph}"):
         loaded = with_times(source.loaded(), times)
-    if network.has_no_driver and source.chosen_cost is None:
+    if network.has_no_driver and source.chosen_cost is None and not rotations:
         source = replace(source, cost=Cost.ISOTROPIC)
     problem = source.problem(loaded)
     outputs.check_drawable(problem)
@@ -351,6 +352,29 @@ class RobotOptions:
         is_shared_anew = bool(self.robots or self.split)
         return is_on_ray and not is_shared_anew and locate(graph).is_dir()
 
+    def check_without_driver(self, stages: StageOptions, proof: Path | None, graph: str) -> None:
+        """Raise a SettingError where robots without a driver are asked for what needs one."""
+        if not self.has_no_driver:
+            return
+        no_driver = "--driver-memory 0 is no driver"
+        if proof is not None:
+            raise SettingError(
+                f"{no_driver}, and then nothing is proven: no proof to write; leave out --proof, "
+                "or --driver-memory 0"
+            )
+        if stages.robust is not None:
+            raise SettingError(f"{no_driver}, and --robust needs one; leave out one of the two")
+        if self.reads_own_files(graph):
+            raise SettingError(
+                f"{no_driver}, and robots with files of their own need one; leave it out, or have "
+                "the graph read in one process: --split given --method consensus"
+            )
+        if stages.method is not FirstStage.CONSENSUS:
+            raise SettingError(
+                "without a driver robots run CONSENSUS alone: add --method consensus, "
+                "or leave out --driver-memory 0"
+            )
+
     def chosen_for(self, graph: PoseGraph, stages: StageOptions) -> Place:
         """Where the solve is run; a SettingError when the options do not go together."""
         method = choices.chosen_method(stages.method, self.robots, self.is_given)
@@ -449,11 +473,18 @@ def _given_options(arguments: dict[str, object]) -> set[str]:
     return {name for name, value in arguments.items() if value is not None and value is not False}
 
 
-def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs, cost: Cost | None) -> None:
+def _refuse_what_needs_the_graph(
+    given: set[str], outputs: Outputs, cost: Cost | None, method: FirstStage | None
+) -> None:
     """Raise a SettingError for an option that robots with own files cannot serve.
 
     Nobody has the whole graph then.
     """
+    if method is FirstStage.CONSENSUS:
+        raise SettingError(
+            "--method consensus is not run by robots with files of their own; leave it out, "
+            "or have the graph read in one process: --split given --method consensus"
+        )
     others = sorted(given - choices.FOR_OWN_FILES)
     out = outputs.out
     if not others and (len(out) > 1 or (out and out[0].suffix)):

@@ -28,6 +28,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import spanning_tree, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
@@ -53,7 +54,7 @@ NO_CERTIFICATE = (
 
 def note_without_driver(problem: PGOProblem) -> str:
     """What a solution of robots without a driver lacks, and why its cost is F."""
-    if problem.graph.information is None:
+    if problem.graph.information is None or problem.weighting is not Weighting.ISOTROPIC:
         return NO_CERTIFICATE
     return f"{NO_CERTIFICATE}; the cost is F, as SOC alone needs one that is convex and quadratic"
 
