@@ -64,8 +64,9 @@ class Pipeline:
     gap : float
         Relative gap to certify, (objective - lower_bound) / objective; positive.
     growing : GrowingStart or None
-        The start of another attempt where the certificate of the first is wider than `gap`, of
-        solves in one place; None leaves it out.
+        The start of another attempt where the certificate of the first is wider than `gap`; None
+        leaves it out. It is found in one place, also for robots that share a graph, and not beside
+        a checkpoint.
     second_try : bool
         Whether a second attempt is made where the certificate is still wider.
     staircase : Staircase or None
@@ -247,6 +248,7 @@ def plan_improvements(
     plan: Plan,
     climb: Sequence[PlannedStage],
     ascent: AscentOfTerms,
+    grown_by_robots: Sequence[PlannedStage] | None = None,
 ) -> list[PlannedStage]:
     """Stages that follow the first attempt.
 
@@ -254,7 +256,7 @@ def plan_improvements(
     """
     planned: list[PlannedStage] = []
     if pipeline.growing is not None:
-        planned.append(GrowingAttempt(job, pipeline.growing, pipeline.newton))
+        planned.append(GrowingAttempt(job, pipeline.growing, pipeline.newton, grown_by_robots))
     if pipeline.second_try:
         planned.append(SecondAttempt(job, plan, pipeline.soc))
     if pipeline.staircase is not None:

@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 
+from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
@@ -34,7 +35,7 @@ from solvers.request import Pipeline, SolveRequest, plan_improvements, solution_
 from solvers.result import Stage
 from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC
-from solvers.solution import Solution
+from solvers.solution import Solution, joined_notes
 from solvers.stages import Answer, Job, Plan, PlannedStage, run_stages
 
 
@@ -43,12 +44,9 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
 
     Without a driver these are the start and CONSENSUS alone.
     """
-    pipeline = request.pipeline
+    pipeline = _pipeline_by_robots(request)
     problem = request.problem
     monitor = request.monitor
-    pipeline = replace(pipeline, growing=None)
-    if not pipeline.has_driver:
-        pipeline = replace(pipeline, second_try=False, staircase=None, handedness=None)
     partition = robots_of_solve(pipeline.soc, robots, problem.graph)
     settings = (
         pipeline.soc,
@@ -74,7 +72,8 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
         ascent = AscentByRobots(shared.without_checkpoints(), problem, job.gap)
         try:
             first = plan(pipeline.soc, request.start)
-            further = plan_improvements(pipeline, job, plan, climb, ascent)
+            grown = _plan_grown_by_robots(job, shared.without_checkpoints(), pipeline)
+            further = plan_improvements(pipeline, job, plan, climb, ascent, grown)
             answer = run_stages([*first, *further], Answer())
         except KeyboardInterrupt:
             if not job.stages:
@@ -90,7 +89,29 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
             answer = job.broken_off(Stage.without_factor)
         if job.stages[-1].status.is_success:
             journal.end()
-    return solution_of(request, job, answer, driver.network.ledger, partition, missing)
+    solution = solution_of(request, job, answer, driver.network.ledger, partition, missing)
+    left_out = _note_of_growing(request, solution.certificate)
+    return replace(solution, note=joined_notes(solution.note, left_out))
+
+
+def _pipeline_by_robots(request: SolveRequest) -> Pipeline:
+    """The pipeline without the stages that these robots cannot run."""
+    pipeline = request.pipeline
+    if request.checkpoint is not None:  # a checkpoint does not hold prefixes
+        pipeline = replace(pipeline, growing=None)
+    if pipeline.has_driver:
+        return pipeline
+    return replace(pipeline, growing=None, second_try=False, staircase=None, handedness=None)
+
+
+def _note_of_growing(request: SolveRequest, certificate: Certificate) -> str:
+    """Sentence on the start that a checkpoint leaves out, where it may find better poses, or ""."""
+    growing = request.pipeline.growing
+    if request.checkpoint is None or growing is None or not certificate.can_improve:
+        return ""
+    if not growing.has_prefixes(request.problem.graph):
+        return ""
+    return "a start that grows may find better poses; it takes a solve without a checkpoint"
 
 
 def _plan_attempt_by_robots(
@@ -121,6 +142,15 @@ def _plan_attempt_by_robots(
     # A robot may fall silent before SOC has ended, and after it.
     hear = HearSilentRobot(shared, soc, pipeline.faults)
     return [*planned, hear, newton, certify, hear]
+
+
+def _plan_grown_by_robots(job: Job, shared: RobotJob, pipeline: Pipeline) -> list[PlannedStage]:
+    """Stages by robots from poses that prefixes of the graph have led to."""
+    return [
+        SetPoses(shared),
+        NewtonByRobots(shared, pipeline.newton),
+        CertifyByRobots(shared, job.problem, job.gap),
+    ]
 
 
 def _plan_climb_by_robots(job: Job, shared: RobotJob, pipeline: Pipeline) -> list[PlannedStage]:

@@ -136,10 +136,10 @@ class Job:
         last = self.stages[-1].status
         if last.is_success or last in BROKEN_OFF:
             return last.is_success
-        names = [stage.name for stage in self.stages]
-        if GROWING_START not in names:
+        is_growing = [stage.name.startswith(GROWING_START) for stage in self.stages]
+        if not any(is_growing):
             return False
-        end_of_first = self.stages[names.index(GROWING_START) - 1]
+        end_of_first = self.stages[is_growing.index(True) - 1]
         return end_of_first.status.is_success
 
     def better(self, answer: Answer, other: Certificate) -> Answer:
@@ -315,11 +315,12 @@ class GrowPrefixes:
 
     job: Job
     growing: GrowingStart
+    suffix: str = ""  # of the name, where robots do the rest
 
     @property
     def name(self) -> str:
         """Name of the stage."""
-        return GROWING_START
+        return GROWING_START + self.suffix
 
     def run(self, answer: Answer) -> Answer:
         """Return the poses of the last prefix, whatever the answer so far is."""
@@ -336,11 +337,14 @@ class GrowingAttempt:
     On graphs with landmarks the first attempt takes few steps of Newton's method, as it mostly
     fails where these are not enough. `newton` takes them to the end where this attempt does not
     give the gap either, so that no answer is worse for it.
+
+    Robots go on from the start as `by_robots` plans it; the start itself is found in one place.
     """
 
     job: Job
     growing: GrowingStart
     newton: Newton
+    by_robots: Sequence[PlannedStage] | None = None
 
     @property
     def name(self) -> str:
@@ -371,16 +375,20 @@ class GrowingAttempt:
         off, and where a matrix has no Cholesky factor.
         """
         job = self.job
-        may_go_on = was_cut_short or job.stages[-1].status.is_success
+        last = job.stages[-1].status
+        # Robots take all steps of Newton's method at once.
+        is_at_limit = self.by_robots is not None and last is Status.MAX_ITERATIONS
+        may_go_on = was_cut_short or last.is_success or is_at_limit
         if not (answer.current_certificate.can_improve and may_go_on):
             return None
         if not self.growing.has_prefixes(job.problem.graph):
             return None
-        planned: list[PlannedStage] = [
-            GrowPrefixes(job, self.growing),
-            RunNewton(job, self.newton),
-            FindCertificate(job),
-        ]
+        planned: list[PlannedStage]
+        if self.by_robots is None:
+            start = GrowPrefixes(job, self.growing)
+            planned = [start, RunNewton(job, self.newton), FindCertificate(job)]
+        else:
+            planned = [GrowPrefixes(job, self.growing, ", in one place"), *self.by_robots]
         try:
             return run_stages(planned, Answer()).certificate
         except NotPositiveDefiniteError:
