@@ -1,8 +1,9 @@
 """solve_folder(folder): robots load their own files, solve together, and write their own poses.
 
-No process has the whole graph. The process that calls `solve_folder` is the driver: it learns the
+No party has the whole graph. The process that calls `solve_folder` is the driver: it learns the
 interface between the robots (`solvers.distributed.own_files`), and of the answer the cost, its
-bound and sums.
+bound and sums. It also delivers the messages between robots, which nothing of it reads. Without an
+engine the robots run in this process, too, each with its own data.
 """
 
 import math

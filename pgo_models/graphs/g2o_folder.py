@@ -76,7 +76,13 @@ class _Joined(NamedTuple):
         )
 
     def some(self, chosen: IntArray | BoolArray) -> _Joined:
-        return _Joined(*(column[chosen] for column in self))
+        return _Joined(
+            self.file[chosen],
+            self.row[chosen],
+            self.ids[chosen],
+            self.numbers[chosen],
+            self.scale[chosen],
+        )
 
 
 def check_one_graph(files: Sequence[G2OLines]) -> None:

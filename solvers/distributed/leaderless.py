@@ -5,6 +5,9 @@ and solve for rotations and translations jointly, project the rotations, and sol
 translations that belong to these. Both are runs of CONSENSUS to a loose tolerance. Then SOC
 follows. Best translations of given rotations, Newton and the certificate need a driver.
 
+"Without a driver" is said of the method. One process still has the whole graph: it makes the tree,
+delivers all messages, and collects the poses of the result, so that it sees every pose.
+
 The sums that robots need, and so their tests of convergence, go along a tree of robots. CONVERGED
 means of SOC that the relative gradient of F over rotations and translations is within its tolerance
 at the poses that the robots hold and that are returned. How far F is from an optimum does not

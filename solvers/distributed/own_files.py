@@ -2,9 +2,10 @@
 
 The driver learns the ids of poses as runs of consecutive ids, so that it can number the poses, and
 of the edges between robots their ends, of which it computes a vertex cover. Measurements between
-two robots are exchanged by these robots alone. A pose belongs to the first file with a VERTEX line
-of it, or else to the first file that names it. An edge that stands in several files counts once, as
-in `read_g2o`.
+two robots are messages between these robots, which the process of the driver delivers: they pass
+through its memory, and nothing of the driver reads them. A pose belongs to the first file with a
+VERTEX line of it, or else to the first file that names it. An edge that stands in several files
+counts once, as in `read_g2o`.
 
 The orders to a robot stand below in the sequence in which they are given: `read_file`,
 `number_poses`, `join_neighbours`, `take_cost`, `place_cover`; where areas of robots interleave
@@ -530,8 +531,8 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> NumberedI
     number = np.cumsum(known_size) - known_size
     owned = [OwnedRuns(first[named], number[named], owner[named]) for named in is_named]
     # As `absent_ids`: a file without VERTEX lines places all that it names.
-    has_no_vertex = ~has_vertex.any(axis=1)
-    is_placed = (has_vertex | is_named & has_no_vertex[:, None]).any(axis=0)
+    is_file_placed = np.array([len(vertices) > 0 for _, vertices, _ in claims])
+    is_placed = (has_vertex | (is_named & ~is_file_placed[:, None])).any(axis=0)
     num_absent = int(known_size[~is_placed].sum())
     return NumberedIds(owned, int(known_size.sum()), num_absent)
 
