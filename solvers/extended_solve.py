@@ -23,7 +23,7 @@ from solvers.place import Attempt
 from solvers.result import Stage
 from solvers.riemannian.newton import Newton
 from solvers.robust_solves.attempts import SolveOnce
-from solvers.solution import Solution, note_of_coupling
+from solvers.solution import Solution, joined_notes, note_of_absence, note_of_coupling
 
 
 def solve_extended(
@@ -82,7 +82,11 @@ def solve_extended(
     certificate = _certificate_with_terms(
         solution.certificate, model, answer, with_known_priors, is_F=not other_terms
     )
-    notes = [note_of_coupling(problem), f"the bound leaves out {', '.join(left_out)}"]
+    note = joined_notes(
+        note_of_absence(len(problem.graph.absent)),
+        note_of_coupling(problem),
+        f"the bound leaves out {', '.join(left_out)}",
+    )
     return replace(
         solution,
         problem=problem,
@@ -92,7 +96,7 @@ def solve_extended(
         status=answer.status,
         stages=tuple(stages),
         seconds=time.perf_counter() - monitor.began,
-        note="; ".join(note for note in notes if note),
+        note=note,
         frame="that of the added terms",
     )
 

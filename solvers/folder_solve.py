@@ -1,8 +1,9 @@
 """solve_folder(folder): robots load their own files, solve together, and write their own poses.
 
-No process has the whole graph. The process that calls `solve_folder` is the driver: it learns the
+No party has the whole graph. The process that calls `solve_folder` is the driver: it learns the
 interface between the robots (`solvers.distributed.own_files`), and of the answer the cost, its
-bound and sums.
+bound and sums. It also delivers the messages between robots, which nothing of it reads. Without an
+engine the robots run in this process, too, each with its own data.
 """
 
 import math
@@ -20,6 +21,7 @@ from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
+from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Journal
@@ -37,6 +39,7 @@ from solvers.result import Record, Stage, Status
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
+from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +69,10 @@ class FolderSolution:
     seconds : float
         Wall time.
     note : str
-        Why the cost is F and not chi2 where the files have matrices, or what a proof of chi2 needs;
-        or "".
+        For whom it holds where robots are absent, why the cost is F and not chi2 where the files
+        have matrices, what failed, and what may find more.
+    num_absent : int
+        Number of poses of robots without a file, which edges of others name.
     """
 
     name: str
@@ -80,6 +85,7 @@ class FolderSolution:
     F: float
     seconds: float
     note: str = ""
+    num_absent: int = 0
 
     def __str__(self) -> str:
         num_poses, num_edges = self.sizes
@@ -94,7 +100,7 @@ class FolderSolution:
         facts = [
             ("graph", graph),
             ("status", f"{self.status.name}: {self.status.value}"),
-            *self.certificate.facts(),
+            *self._facts_of_certificate(),
             *self._other_cost(),
             ("note", self.note),
             ("frame", self.frame),
@@ -103,6 +109,12 @@ class FolderSolution:
             *self.ledger.facts(),
         ]
         return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
+
+    def _facts_of_certificate(self) -> list[tuple[str, str]]:
+        """Cost, bound, gap and verdict, which says for whom it holds."""
+        facts = dict(self.certificate.facts())
+        facts["verdict"] += verdict_suffix(self.num_absent)
+        return list(facts.items())
 
     def _other_cost(self) -> list[tuple[str, str]]:
         """F of the poses, where the cost is chi2."""
@@ -123,6 +135,7 @@ def solve_folder(
     time_limit: float = math.inf,
     verbose: bool = False,
     progress: bool | None = None,
+    trust_folder: bool = False,
 ) -> FolderSolution:
     """Solve and certify a folder with one g2o file a robot, each read by its robot alone.
 
@@ -151,6 +164,8 @@ def solve_folder(
         file whole or not at all.
     callback, time_limit, verbose, progress : optional
         As of `solve`.
+    trust_folder : bool
+        As of `read_g2o`.
 
     Returns
     -------
@@ -180,13 +195,13 @@ def solve_folder(
     if out is not None:
         check_g2o_folder(out, len(files))
     stages: list[Stage] = []
-    opened = open_files(
-        files, _engine_of_robots(engine, len(files)), pipeline.driver_memory, weighting
-    )
+    engine = _engine_of_robots(engine, len(files))
+    opened = open_files(files, engine, pipeline.driver_memory, weighting, trust_folder)
+    name = f"{folder.name}, {FILES_HERE}" if opened.num_absent else folder.name
     driver = opened.driver
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
         place = RobotsWithFiles(
-            monitor, stages, driver, journal, None, folder.name, pipeline.gap, opened.weighting
+            monitor, stages, driver, journal, None, name, pipeline.gap, opened.weighting
         )
         best = solve_at(place, pipeline, None)
         best, frame, F = place.move_to_frame(best)
@@ -194,7 +209,7 @@ def solve_folder(
             write = partial(write_answer, Path(out).absolute())
             driver.network.ask(write, [None] * len(files), Count.PIGGYBACKED)
     return FolderSolution(
-        name=folder.name,
+        name=name,
         certificate=best.proof,
         sizes=opened.sizes,
         status=best.status,
@@ -203,16 +218,17 @@ def solve_folder(
         frame=frame,
         F=F,
         note=_note(weighting, opened, place.note(best)),
+        num_absent=opened.num_absent,
         seconds=time.perf_counter() - monitor.began,
     )
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:
-    """Why the cost is F where that was not asked for, and the note of the place; or ""."""
-    if not (weighting is Weighting.OWN and opened.has_indefinite):
-        return note
-    why = "the cost is F, as some information matrices are indefinite: chi2 can be negative"
-    return f"{why}; {note}" if note else why
+    """For whom it holds, why the cost is F where that was not asked for, and the place's note."""
+    reason = ""
+    if weighting is Weighting.OWN and opened.has_indefinite:
+        reason = "the cost is F, as some information matrices are indefinite: chi2 can be negative"
+    return joined_notes(note_of_absence(opened.num_absent), reason, note)
 
 
 def _check_first_stage(soc: FirstStage) -> None:

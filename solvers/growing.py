@@ -327,8 +327,9 @@ def extend(
         change, if the poses and edges of the solution come first in the graph, in their order; the
         first update after a Solution factors the whole graph.
     robots : Partition, optional
-        Robots that own the poses of the grown graph. Unless given, they are those of the solution,
-        and a new pose goes to the robot of the pose that its first edge joins it with.
+        Robots that own the poses of the grown graph. Unless given, they are those of the solution.
+        A new pose goes to the robot that the graph names, or where these are not the robots of the
+        solution, to that of the pose that its first edge joins it with.
     engine : Engine, optional
         Where the robots run; in this process unless given.
 
@@ -467,12 +468,14 @@ def _seen_locally(local: LocalWorld, ids: IntArray, poses: Poses) -> Poses:
 def extended_partition(robots: Partition, ids: IntArray, graph: PoseGraph) -> Partition:
     """Owners of the poses of a graph that has grown, from the `robots` of the poses with these ids.
 
-    A new pose goes to the robot of the pose that its first edge joins it with. A GraphError where
-    no edge joins some poses with known ones.
+    A new pose goes to the robot that the graph names, where the robots are those that it names, and
+    else to the robot of the pose that its first edge joins it with. A GraphError where no edge
+    joins some of the latter poses with known ones.
     """
     owner = np.full(graph.num_poses, -1)
     _, known, place = np.intersect1d(graph.pose_ids, ids, return_indices=True)
     owner[known] = robots.robot[place]
+    owner = _owners_by_name(owner, robots.num_robots, graph)
     while (owner < 0).any():
         is_open = (owner[graph.i] < 0) != (owner[graph.j] < 0)
         if not is_open.any():
@@ -487,6 +490,28 @@ def extended_partition(robots: Partition, ids: IntArray, graph: PoseGraph) -> Pa
         poses, first = np.unique(new, return_index=True)
         owner[poses] = owner[known_ends[first]]
     return Partition(owner, robots.method)
+
+
+def _owners_by_name(owner: IntArray, num_robots: int, graph: PoseGraph) -> IntArray:
+    """Owners, (n,), with those of new poses (-1) whose robot the graph names.
+
+    The robots are those of the graph if one robot owns all known poses of each that it names. A
+    robot that it names for new poses alone gets a number of its own, unless known robots share
+    names, as then nothing says whether it is one of them.
+    """
+    if graph.robot is None:
+        return owner
+    # Nobody names the owner of the world pose.
+    is_known = (owner >= 0) & (np.arange(graph.num_poses) != graph.world)
+    names, owners = np.unique(np.stack([graph.robot[is_known], owner[is_known]]), axis=1)
+    if len(np.unique(names)) < len(names):
+        return owner
+    owner_of_name = np.full(graph.num_robots, -1)
+    owner_of_name[names] = owners
+    if len(np.unique(owners)) == len(owners):
+        new_names = np.flatnonzero(owner_of_name < 0)
+        owner_of_name[new_names] = num_robots + np.arange(len(new_names))
+    return np.where(owner < 0, owner_of_name[graph.robot], owner)
 
 
 def _quadratic_cost(graph: PoseGraph, weighting: Weighting) -> EdgeCost:

@@ -18,6 +18,7 @@ from pgo_models.errors import NotPositiveDefiniteError, PGOError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.handedness.hull_lagrangian import HullState
+from solvers.network.faults import RobotSilentError
 from solvers.place import Attempt, FirstStage, Place, Step
 from solvers.request import Pipeline
 from solvers.result import Stage, Status
@@ -46,6 +47,8 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
         return place.salvage(Stage.interruption)
     except NotPositiveDefiniteError:
         return place.salvage(Stage.without_factor)
+    except RobotSilentError as error:
+        return replace(place.salvage(Stage.silence), failures=(str(error),))
     best = improved(Step.GROWING, from_growing_start, place, settings, first)  # step 5
     if _was_cut_short(place, settings, first) and (best is first or best.is_open):
         best = unless_it_fails(Step.LAST_STEPS, _LastSteps(first), place, settings, best)

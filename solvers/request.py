@@ -58,8 +58,8 @@ class Pipeline:
     gap : float
         Relative gap to certify, (objective - lower_bound) / objective; positive.
     growing : GrowingStart or None
-        The start of another attempt where the certificate of the first is wider than `gap`, of
-        solves in one place; None leaves it out.
+        The start of another attempt where the certificate of the first is wider than `gap`; None
+        leaves it out. It is found in one place, also for robots that share a graph.
     second_try : bool
         Whether a second attempt is made where the certificate is still wider.
     staircase : Staircase or None
@@ -112,8 +112,9 @@ class Pipeline:
             )
         if not self.has_driver and not is_consensus:
             raise SettingError(
-                "without a driver robots run CONSENSUS alone; "
-                "take it (--method consensus), or give driver_memory"
+                "without a driver robots run CONSENSUS alone; give the pipeline "
+                "SOC(robots=.., coupling=Coupling.CONSENSUS) and solve() the robots, "
+                "or leave out driver_memory=0"
             )
 
     @property

@@ -29,6 +29,7 @@ class Status(enum.Enum):
     )
     NOT_FINITE = "the iterate contains nan or inf; raise the penalty"
     FAILED = "a numerical failure ended this step; the answer before it stands"
+    SILENT = "a robot that is needed stays silent, see the note; bring it back"
     NOT_FACTORED = "a matrix has no Cholesky factor in doubles; its weights are too far apart"
 
     @property
@@ -306,3 +307,19 @@ class Stage:
             With `Status.INTERRUPTED`.
         """
         return cls("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())
+
+    @classmethod
+    def silence(cls, objective: float) -> "Stage":
+        """Return a stage that says that a robot was silent for too long.
+
+        Parameters
+        ----------
+        objective : float
+            Cost of the poses that are returned.
+
+        Returns
+        -------
+        Stage
+            With `Status.SILENT`.
+        """
+        return cls("wait for a robot", Status.SILENT, 0, objective, 0.0, History())

@@ -27,6 +27,7 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
         pipeline.soc,
         pipeline.newton,
         pipeline.gap,
+        pipeline.growing,
         pipeline.second_try,
         pipeline.faults,
         pipeline.has_driver,

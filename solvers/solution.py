@@ -328,6 +328,7 @@ class Solution:
                 "d": graph.d,
                 "poses": len(named),
                 "edges": graph.num_edges,
+                "absent": graph.pose_ids[graph.absent].tolist(),
             },
             "objective": self.objective,
             **both_costs(self.problem, self.poses),
@@ -351,6 +352,7 @@ class Solution:
         verdict = self.verdict.name if self.robust is None else self.robust.headline
         cost = f"{self.certificate.cost}={self.certificate.cost_text}"
         gap = rounded_up(self.certificate.proven_gap, 3)
+        verdict += verdict_suffix(len(self.problem.graph.absent))
         return f"Solution({name!r}, {cost}, gap={gap}, {verdict})"
 
     def __str__(self) -> str:
@@ -401,9 +403,8 @@ class Solution:
         return facts + self._network_facts()
 
     def _verdict_text(self) -> str:
-        if self.robust is not None:
-            return self.robust.headline
-        return self.certificate.verdict_text
+        text = self.certificate.verdict_text if self.robust is None else self.robust.headline
+        return text + verdict_suffix(len(self.problem.graph.absent))
 
     def _network_facts(self) -> Facts:
         """What is printed of robots and of what they sent."""
@@ -463,7 +464,7 @@ def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | Non
         "F": isotropic.objective(poses) if is_complete else None,
         "chi2": chi2(graph, poses) if is_complete and has_chi2 else None,
         "edges_without_coupling": num_uncoupled,
-        "note": note_of_coupling(problem),
+        "note": joined_notes(note_of_absence(len(graph.absent)), note_of_coupling(problem)),
     }
 
 
@@ -551,13 +552,33 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
 
 
 def note_of(problem: PGOProblem, certificate: Certificate, lacks: str = "") -> str:
-    """Note of a solution: coupling that chi2 leaves out, and what the certificate lacks.
+    """Note of a solution: absent robots, coupling left out, and what the certificate lacks.
 
-    The latter is `lacks`, or unless given what `note_of_weights` and `note_of_tangent` say.
+    The last is `lacks`, or unless given what `note_of_weights` and `note_of_tangent` say.
     """
     found = note_of_weights(problem.graph, certificate) or note_of_tangent(problem, certificate)
-    notes = (note_of_coupling(problem), lacks or found)
+    absence = note_of_absence(len(problem.graph.absent))
+    return joined_notes(absence, note_of_coupling(problem), lacks or found)
+
+
+def joined_notes(*notes: str) -> str:
+    """Notes that say something, as one."""
     return "; ".join(note for note in notes if note)
+
+
+def note_of_absence(num_absent: int) -> str:
+    """Sentence on what a solution holds for where edges name poses of absent robots, or ""."""
+    if num_absent == 0:
+        return ""
+    return (
+        f"edges name {num_absent} poses of robots without a file here: cost, bound and verdict "
+        "are of the files here alone, not of the graph of all robots"
+    )
+
+
+def verdict_suffix(num_absent: int) -> str:
+    """What a verdict says where edges name poses of absent robots, or ""."""
+    return "; this is of the files here alone, without absent robots" if num_absent else ""
 
 
 def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:

@@ -16,6 +16,7 @@ from pgo_models.convex.graph_subproblem import ModelChange
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error
+from pgo_models.graphs.datasets import load
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information
@@ -410,6 +411,38 @@ def test_a_new_pose_goes_to_the_robot_that_its_first_edge_joins_it_with() -> Non
     assert grown.method is PartitionMethod.CONTIGUOUS
     with pytest.raises(GraphError, match="no edge joins"):
         extended_partition(robots, np.arange(3), chain.without_edges(i > 1))
+
+
+def test_new_poses_go_to_the_robots_that_the_files_name() -> None:
+    """Also those of a robot that comes later, whose letter is before those of others."""
+    graph = load("robots")
+    for kept in (np.arange(160) % 40 < 30, (np.arange(160) % 40 < 30) & (graph.robots != 1)):
+        first = graph.subgraph(np.flatnonzero(kept))
+        before = solvers.solve(first, robots=first.num_robots)
+        assert before.robots is not None
+        assert before.robots.method is PartitionMethod.GIVEN
+        grown = extended_partition(before.robots, first.pose_ids, graph)
+        pairs = np.unique(np.stack([grown.robot, graph.robots]), axis=1)
+        assert pairs.shape == (2, 4)
+        np.testing.assert_array_equal(grown.robot[kept], before.robots.robot)
+    assert extend(before, graph).is_certified
+
+
+def test_robots_that_the_files_do_not_name_take_their_neighbours() -> None:
+    graph = load("robots")
+    kept = np.flatnonzero(graph.robots < 3)
+    first = graph.subgraph(kept)
+    halves = Partition((np.arange(120) >= 60).astype(int), PartitionMethod.CONTIGUOUS)
+    unnamed = replace(graph, robot=None)
+    np.testing.assert_array_equal(
+        extended_partition(halves, first.pose_ids, graph).robot,
+        extended_partition(halves, first.pose_ids, unnamed).robot,
+    )
+    # Of two robots that one name stands for, neither is known to be the new one.
+    shared = Partition(np.array([0, 0, 1])[first.robots], PartitionMethod.GIVEN)
+    grown = extended_partition(shared, first.pose_ids, graph)
+    np.testing.assert_array_equal(grown.robot[:120], shared.robot)
+    assert grown.num_robots == 2
 
 
 def test_robots_can_be_given_and_a_further_one_joins() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.certificates.certificate import BoundSource, Certificate
+from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_at
@@ -44,7 +44,8 @@ def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) 
     ------
     SettingError
         When the weights of the problem are not those of a g2o file, or the bound is that of smaller
-        information matrices.
+        information matrices; and when no bound was sought, without a driver or in a solve that was
+        broken off: that a cost is never negative needs no proof.
     PGOError
         When the file cannot be written.
 
@@ -70,6 +71,11 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     graph = problem.graph
     d = problem.d
     cost = _cost_name(problem)
+    if certificate.verdict is Verdict.TRIVIAL and not certificate.Lambda.any():
+        # A search for a bound has multipliers, which are zero at a perfect fit alone.
+        what = f"no bound was sought, and that {certificate.cost} is never negative needs none"
+        way_out = "leave out --proof, or solve with a driver and to the end"
+        raise SettingError(f"no proof to write: {what}; {way_out}")
     if certificate.source is BoundSource.SOFTENED:
         what = "the bound is that of smaller information matrices, not the file's"
         way_out = "leave out --proof, or add --cost isotropic to prove F"

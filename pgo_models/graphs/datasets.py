@@ -72,6 +72,7 @@ def load(
     weights: RotationWeight = RotationWeight.SE_SYNC,
     skip_unknown: bool = False,
     square_roots: bool = False,
+    trust_folder: bool = False,
 ) -> PoseGraph:
     """Load a pose graph by the name of a data set, or from a file or folder.
 
@@ -95,6 +96,8 @@ def load(
         As for `read_g2o`.
     square_roots : bool
         As for `read_g2o`; a JSON robot log has none.
+    trust_folder : bool
+        As for `read_g2o`.
 
     Returns
     -------
@@ -122,7 +125,13 @@ def load(
     """
     path = locate(name_or_path, registry, download=download)
     if path.suffix != SUFFIX:
-        graph = read_g2o(path, weights, skip_unknown=skip_unknown, square_roots=square_roots)
+        graph = read_g2o(
+            path,
+            weights,
+            skip_unknown=skip_unknown,
+            square_roots=square_roots,
+            trust_folder=trust_folder,
+        )
     elif square_roots:
         raise SettingError(f"{path} has covariances, and no square roots; leave square_roots out")
     else:

@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +16,22 @@ from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOErro
 from pgo_models.files import check_lines, check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.g2o_folder import (
+    FILES_HERE,
+    LETTER_CODES,
+    LETTER_SHIFT,
+    LETTERS,
+    absent_ids,
+    check_one_graph,
+)
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
 from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
 from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 
-_LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
-_LETTER_CODES = [ord(letter) for letter in _LETTERS]
-MOST_SYMBOLS = len(_LETTERS)  # robots whose poses can be named by GTSAM symbols
+MOST_SYMBOLS = len(LETTERS)  # robots whose poses can be named by GTSAM symbols
 _ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
-_LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
 # Entries of two rotations that may differ by normalisation of their quaternions.
 _SAME_ROTATION = 1e-9
 
@@ -36,6 +42,7 @@ def read_g2o(
     *,
     skip_unknown: bool = False,
     square_roots: bool = False,
+    trust_folder: bool = False,
 ) -> PoseGraph:
     """Read a g2o file, or a folder with one g2o file for each robot.
 
@@ -72,7 +79,14 @@ def read_g2o(
     (c) Some id is no symbol, and there is one file. One robot owns all poses.
 
     An edge that two files of a folder contain is one measurement. If several files have a VERTEX
-    line of a pose, the file of the robot that owns the pose decides where the pose is.
+    line of a pose, the file of the robot that owns the pose decides where the pose is. Files that
+    speak against being of one graph are refused, unless the folder is trusted: ids that name no
+    robot and stand on VERTEX lines far from each other, odometry that two files measure
+    differently, and edges of two files with nearly equal numbers, which would count twice.
+
+    If the files have VERTEX lines of their own poses, and no file has one of a pose that edges
+    name, the file of its robot is absent: `PoseGraph.absent` has these poses, and the name of the
+    graph says so.
 
     Some folders also contain the whole graph, such as `fullGraph.g2o` in those of
     distributed-mapper. This file is not that of a robot: it is left out, and a `GraphWarning` names
@@ -91,6 +105,9 @@ def read_g2o(
     square_roots : bool
         Whether matrices, of all tags, are upper triangular square roots U of the information U^T U,
         by rows, as iSAM writes them.
+    trust_folder : bool
+        Whether the files of a folder are of one graph whatever speaks against it: the same id is
+        the same pose, and edges count unless all their numbers are the same.
 
     Returns
     -------
@@ -102,7 +119,7 @@ def read_g2o(
     FileFormatError
         With file:line of the first 20 lines that cannot be read or measure nothing, and for FIX of
         unknown poses. Also for a folder with a 2D file and a 3D file, and if there are no edges or
-        no files.
+        no files; and with file:line of both lines for files that speak against being of one graph.
 
     References
     ----------
@@ -118,14 +135,22 @@ def read_g2o(
     files = [read_lines(file, skip_unknown, square_roots) for file in g2o_files(path)]
     files = _files_of_robots(files)
     _check_ids_of_landmarks(files)
-    return graph_of_files(path, files, weights)
+    _common_dimension(files)
+    if not trust_folder:
+        check_one_graph(files)
+    graph = graph_of_files(path, files, weights)
+    absent = absent_ids(files)
+    if not path.is_dir() or not len(absent):
+        return graph
+    name = f"{graph.name}, {FILES_HERE}"
+    return replace(graph, absent=np.searchsorted(graph.pose_ids, absent), name=name)
 
 
 def graph_of_files(
     path: Path,
     files: list[G2OLines],
     weights: RotationWeight,
-    letters: Sequence[int] = _LETTER_CODES,
+    letters: Sequence[int] = LETTER_CODES,
 ) -> PoseGraph:
     """Graph of the lines of a file for each robot, or of one file.
 
@@ -387,11 +412,11 @@ def symbol_ids(robots: IntArray) -> IntArray:
         raise GraphError(
             f"{count} robots, but symbols have {MOST_SYMBOLS} letters; number the poses instead"
         )
-    letters = _LETTERS[26:] if count <= 26 else _LETTERS
+    letters = LETTERS[26:] if count <= 26 else LETTERS
     ids = np.zeros(len(robots), dtype=np.int64)
     for robot in range(count):
         mine = robots == robot
-        first_symbol = ord(letters[robot]) << _LETTER_SHIFT
+        first_symbol = ord(letters[robot]) << LETTER_SHIFT
         ids[mine] = first_symbol + np.arange(mine.sum())
     return ids
 
@@ -405,12 +430,12 @@ def pose_names(graph: PoseGraph) -> list[str]:
     names = [graph.pose_name(pose) for pose in range(graph.num_poses)]
     poses = graph.in_files.tolist()
     ids = {pose: int(names[pose]) for pose in poses}
-    codes = {symbol >> _LETTER_SHIFT for symbol in ids.values()}
-    if not codes <= set(_LETTER_CODES):
+    codes = {symbol >> LETTER_SHIFT for symbol in ids.values()}
+    if not codes <= set(LETTER_CODES):
         return names
-    index_bits = (1 << _LETTER_SHIFT) - 1
+    index_bits = (1 << LETTER_SHIFT) - 1
     for pose, symbol in ids.items():
-        letter = chr(symbol >> _LETTER_SHIFT)
+        letter = chr(symbol >> LETTER_SHIFT)
         index = symbol & index_bits
         names[pose] = f"{letter}{index}"
     return names
@@ -589,7 +614,7 @@ def _robots(
     ids: IntArray, files: list[G2OLines], letters_of_robots: Sequence[int]
 ) -> IntArray | None:
     """Robot of every pose by the cases (a) and (b) of `read_g2o`; None in case (c)."""
-    letters = ids >> _LETTER_SHIFT
+    letters = ids >> LETTER_SHIFT
     if np.isin(letters, letters_of_robots).all():
         return _ranks(letters)
     if len(files) == 1:

@@ -35,7 +35,7 @@ _ROUNDING = 1e-14
 _NAMED_COMPONENTS = 5  # components that an error names
 
 _WHOLE_NUMBERS = ("num_poses", "world")
-_WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks")
+_WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks", "absent")
 _REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times")
 _EDGE_FIELDS = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information", "uncoupled")
 
@@ -104,6 +104,9 @@ class PoseGraph(ReadOnly):
     uncoupled : BoolArray, (m,), optional
         Which information matrices have lost their coupling block because they were indefinite with
         it, see `pgo_models.without_indefinite_coupling`.
+    absent : IntArray, (a,)
+        Poses of robots without a file in the folder that was read: edges of others name them. What
+        is found holds for these edges, and not for the graph of all robots.
 
     Raises
     ------
@@ -141,6 +144,7 @@ class PoseGraph(ReadOnly):
     world: int | None = None
     landmarks: IntArray = field(default_factory=_no_poses)
     uncoupled: BoolArray | None = None
+    absent: IntArray = field(default_factory=_no_poses)
 
     def __post_init__(self) -> None:
         self._convert(_WHOLE_NUMBERS, whole_number)
@@ -252,13 +256,15 @@ class PoseGraph(ReadOnly):
 
     @property
     def extras(self) -> str:
-        """Text with the number of landmarks and of priors, empty if there are none."""
+        """Text with the number of landmarks, priors and absent robots' poses, "" for none."""
         text = ""
         if len(self.landmarks):
             text += f", landmarks={len(self.landmarks)}"
         num_priors = int(self.is_prior.sum())
         if num_priors:
             text += f", priors={num_priors}"
+        if len(self.absent):
+            text += f", poses of absent robots={len(self.absent)}"
         return text
 
     def __repr__(self) -> str:
@@ -393,11 +399,13 @@ class PoseGraph(ReadOnly):
             raise GraphError(
                 f"{self.name} has no edges; a pose graph needs at least one measurement"
             )
-        if not self._has_poses(self.landmarks):
-            raise GraphError(
-                f"landmarks are poses {self.landmarks}, "
-                f"not all of them of 0 .. {self.num_poses - 1}"
-            )
+        for name in ("landmarks", "absent"):
+            poses_of_kind = getattr(self, name)
+            if not self._has_poses(poses_of_kind):
+                raise GraphError(
+                    f"{name} are poses {poses_of_kind}, "
+                    f"not all of them of 0 .. {self.num_poses - 1}"
+                )
         matrix_shape = self.R_ij.shape[1:]
         if self.R_ij.ndim != 3 or matrix_shape not in ((2, 2), (3, 3)):
             raise GraphError(f"R_ij has shape {self.R_ij.shape}; give (m, 2, 2) or (m, 3, 3)")
@@ -702,6 +710,7 @@ class PoseGraph(ReadOnly):
             times = self.times[is_kept[self.bodies]]
         fixed = new_number[self.fixed]
         landmarks = new_number[self.landmarks]
+        absent = new_number[self.absent]
         return replace(
             self,
             num_poses=len(chosen),
@@ -714,6 +723,7 @@ class PoseGraph(ReadOnly):
             times=times,
             world=world,
             landmarks=landmarks[landmarks >= 0],
+            absent=absent[absent >= 0],
         )
 
     def edge_subgraph(self, edges: IntArray) -> PoseGraph:

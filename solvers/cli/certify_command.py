@@ -24,6 +24,7 @@ from solvers.cli.options import (
     ProofOption,
     RotationsOption,
     SkipUnknownOption,
+    TrustFolderOption,
     UnitWeightsOption,
 )
 from solvers.cli.shell import (
@@ -41,6 +42,7 @@ from solvers.solution import (
     certificate_json,
     facts_of_unknowns,
     other_cost,
+    verdict_suffix,
     write_json,
 )
 
@@ -69,6 +71,7 @@ def certify_command(
     information: InformationOption = False,
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
+    trust_folder: TrustFolderOption = False,
     drop_edge: DropEdgeOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -88,6 +91,7 @@ def certify_command(
         skip_unknown,
         drop_edge,
         rotations,
+        trust_folder,
     )
     problem = source.problem(source.loaded())
     poses = estimated_poses(problem.graph, estimate)
@@ -98,13 +102,15 @@ def certify_command(
 
     def show() -> None:
         typer.echo(_text(problem, poses, certificate, str(record["note"])))
-        name = graph_in_commands(graph, {"--skip-unknown": skip_unknown}, drop_edge)
+        options = {"--skip-unknown": skip_unknown, "--trust-folder": trust_folder}
+        name = graph_in_commands(graph, options, drop_edge)
         fit = edge_fit(problem, poses, graph, drop_edge)
         show_advice(fit.advice_on_cost(f"pgo solve {name}"))
 
     save_then_show(targets, show, (lambda: record) if as_json else None, quiet)
     warn_of_weights(graph, problem, certificate, drop_edge)
-    raise typer.Exit(DONE if certificate.is_certified else NOT_CERTIFIED)
+    holds = certificate.is_certified and not len(problem.graph.absent)
+    raise typer.Exit(DONE if holds else NOT_CERTIFIED)
 
 
 def _record(problem: PGOProblem, poses: Poses, certificate: Certificate) -> dict[str, object]:
@@ -125,5 +131,8 @@ def _text(problem: PGOProblem, poses: Poses, certificate: Certificate, note: str
     rows += other_cost(problem, poses)
     rows += facts_of_unknowns(problem, of_poses="ignored")
     lines = [str(certificate)]
+    num_absent = len(problem.graph.absent)
+    if num_absent:
+        lines.insert(0, f"{'graph':<12} {problem.graph.name}{verdict_suffix(num_absent)}")
     lines += [f"{label:<12} {text}" for label, text in rows]
     return wrapped("\n".join(lines), _INDENT)

@@ -38,6 +38,7 @@ FOR_OWN_FILES = {
     "max_iterations",
     "tolerance",
     "time_limit",
+    "trust_folder",
     "verbose",
     "quiet",
 }

@@ -149,7 +149,7 @@ def place_of_weight(graph: str, dropped: Dropped = None) -> str:
     if not _can_be_read_again(graph):
         return f"{graph}: weights too far apart for doubles; give it as a file to see which"
     with warnings.catch_warnings(action="ignore"):
-        loaded = load_graph(graph, False, True, dropped)
+        loaded = load_graph(graph, False, True, dropped, trust_folder=True)
     _, edge, problem = extreme_weight(loaded)
     _, places = kept_edges(graph, dropped)
     weights = np.concatenate([loaded.kappa, loaded.tau])

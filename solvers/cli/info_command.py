@@ -16,7 +16,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.separators import report_partition
 from solvers.cli.explanations import explained_by_its_graph
 from solvers.cli.inputs import chosen_partition, indefinite_matrices, load_graph
-from solvers.cli.options import SkipUnknownOption, Split, SplitOption
+from solvers.cli.options import SkipUnknownOption, Split, SplitOption, TrustFolderOption
 from solvers.cli.shell import JsonOption, figures_of_facts, save_then_show, wrapped
 from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.versions import installation
@@ -37,6 +37,7 @@ def info_command(
     ] = None,
     split: SplitOption = None,
     skip_unknown: SkipUnknownOption = False,
+    trust_folder: TrustFolderOption = False,
     square_roots: Annotated[
         bool,
         typer.Option(
@@ -64,7 +65,13 @@ def info_command(
     else:
         if out is not None:
             _check_out(out)
-        loaded = load_graph(graph, False, skip_unknown, square_roots=square_roots)
+        loaded = load_graph(
+            graph,
+            False,
+            skip_unknown,
+            square_roots=square_roots,
+            trust_folder=trust_folder,
+        )
         facts, record = _describe_graph(graph, loaded, robots, split)
         if out is not None:
             targets = [(out, partial(write_g2o, loaded))]

@@ -48,6 +48,7 @@ class GraphOptions:
     skip_unknown: bool = False
     drop_edge: Dropped = None
     rotations: bool = False
+    trust_folder: bool = False
 
     def __post_init__(self) -> None:
         asked = self._asked
@@ -77,7 +78,13 @@ class GraphOptions:
     def loaded(self) -> PoseGraph:
         """The graph, without the edges to leave out."""
         has_unit_weights = self.chosen_cost is Cost.UNIT
-        return load_graph(self.graph, has_unit_weights, self.skip_unknown, self.drop_edge)
+        return load_graph(
+            self.graph,
+            has_unit_weights,
+            self.skip_unknown,
+            self.drop_edge,
+            trust_folder=self.trust_folder,
+        )
 
     def problem(self, loaded: PoseGraph) -> PGOProblem:
         """Problem of the loaded graph, with the cost that was asked for, or its own.
@@ -115,6 +122,7 @@ class GraphOptions:
             "--rotations": self.rotations,
             "--drop-coupling": self.drop_coupling,
             "--skip-unknown": self.skip_unknown,
+            "--trust-folder": self.trust_folder,
         }
         cost = self.chosen_cost
         if cost in (Cost.ISOTROPIC, Cost.UNIT):
@@ -163,17 +171,23 @@ def load_graph(
     skip_unknown: bool = False,
     dropped: Dropped = None,
     square_roots: bool = False,
+    trust_folder: bool = False,
 ) -> PoseGraph:
     """Graph of a file, folder or data set, without the edges to leave out.
 
     Its weights are its own, or with `unit_weights` those of the paper. With `square_roots`, its
-    file has square roots of information matrices.
+    file has square roots of information matrices. The rest is as for `read_g2o`.
     """
     # Both need memory, which the graph might leave none of.
     take_buffers()
     if default_backend() is CholeskyBackend.CHOLMOD:
         import_cvxopt()
-    loaded = load(graph, skip_unknown=skip_unknown, square_roots=square_roots)
+    loaded = load(
+        graph,
+        skip_unknown=skip_unknown,
+        square_roots=square_roots,
+        trust_folder=trust_folder,
+    )
     if dropped:
         kept, _ = kept_edges(graph, dropped)
         loaded = loaded.without_edges(~kept)

@@ -92,6 +92,14 @@ SkipUnknownOption = Annotated[
         "--skip-unknown", help="Skip lines of a g2o file with unknown tags, and say which."
     ),
 ]
+TrustFolderOption = Annotated[
+    bool,
+    typer.Option(
+        "--trust-folder",
+        help="Take the files of a folder to be of one graph whatever speaks against it: the same "
+        "ids are the same poses, and nearly equal edges all count.",
+    ),
+]
 ProofOption = Annotated[
     Path | None,
     typer.Option(

@@ -57,6 +57,7 @@ from solvers.cli.options import (
     Split,
     SplitOption,
     Start,
+    TrustFolderOption,
     UnitWeightsOption,
 )
 from solvers.cli.shell import (
@@ -164,6 +165,7 @@ def solve_command(
     information: InformationOption = False,
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
+    trust_folder: TrustFolderOption = False,
     anchor: Annotated[
         int | None,
         typer.Option(
@@ -219,18 +221,20 @@ def solve_command(
         skip_unknown,
         drop_edge,
         rotations,
+        trust_folder,
     )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
     display = Display(verbose, quiet, as_json)
     outputs = Outputs(out or [], report, covariances, proof, resume)
+    network.check_without_driver(stages, outputs.proof, graph)
     if network.reads_own_files(graph):
-        _refuse_what_needs_the_graph(given, outputs, source.chosen_cost)
+        _refuse_what_needs_the_graph(given, outputs, source.chosen_cost, method)
         raise typer.Exit(_solve_own_files(source, stages, network, display, outputs))
     outputs.check_pages()
     with JobBar(1, None if takes_long_to_read(graph) else False, f"reading {graph}"):
         loaded = with_times(source.loaded(), times)
-    if network.has_no_driver and source.chosen_cost is None:
+    if network.has_no_driver and source.chosen_cost is None and not rotations:
         source = replace(source, cost=Cost.ISOTROPIC)
     problem = source.problem(loaded)
     outputs.check_drawable(problem)
@@ -254,7 +258,8 @@ def solve_command(
     solution = with_places(solution, graph, drop_edge)
     _save_and_show(solution, source, stages, outputs, display)
     warn_of_weights(graph, problem, solution.certificate, drop_edge)
-    raise typer.Exit(_exit_code(solution.status, solution.is_certified))
+    num_absent = len(problem.graph.absent)
+    raise typer.Exit(_exit_code(solution.status, solution.is_certified, num_absent))
 
 
 @dataclass(frozen=True)
@@ -347,6 +352,29 @@ class RobotOptions:
         is_on_ray = self.engine is Runner.RAY or bool(self.address)
         is_shared_anew = bool(self.robots or self.split)
         return is_on_ray and not is_shared_anew and locate(graph).is_dir()
+
+    def check_without_driver(self, stages: StageOptions, proof: Path | None, graph: str) -> None:
+        """Raise a SettingError where robots without a driver are asked for what needs one."""
+        if not self.has_no_driver:
+            return
+        no_driver = "--driver-memory 0 is no driver"
+        if proof is not None:
+            raise SettingError(
+                f"{no_driver}, and then nothing is proven: no proof to write; leave out --proof, "
+                "or --driver-memory 0"
+            )
+        if stages.robust is not None:
+            raise SettingError(f"{no_driver}, and --robust needs one; leave out one of the two")
+        if self.reads_own_files(graph):
+            raise SettingError(
+                f"{no_driver}, and robots with files of their own need one; leave it out, or have "
+                "the graph read in one process: --split given --method consensus"
+            )
+        if stages.method is not FirstStage.CONSENSUS:
+            raise SettingError(
+                "without a driver robots run CONSENSUS alone: add --method consensus, "
+                "or leave out --driver-memory 0"
+            )
 
     def chosen_for(self, graph: PoseGraph, stages: StageOptions) -> Place:
         """Where the solve is run; a SettingError when the options do not go together."""
@@ -446,11 +474,18 @@ def _given_options(arguments: dict[str, object]) -> set[str]:
     return {name for name, value in arguments.items() if value is not None and value is not False}
 
 
-def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs, cost: Cost | None) -> None:
+def _refuse_what_needs_the_graph(
+    given: set[str], outputs: Outputs, cost: Cost | None, method: FirstStage | None
+) -> None:
     """Raise a SettingError for an option that robots with own files cannot serve.
 
     Nobody has the whole graph then.
     """
+    if method is FirstStage.CONSENSUS:
+        raise SettingError(
+            "--method consensus is not run by robots with files of their own; leave it out, "
+            "or have the graph read in one process: --split given --method consensus"
+        )
     others = sorted(given - choices.FOR_OWN_FILES)
     out = outputs.out
     if not others and (len(out) > 1 or (out and out[0].suffix)):
@@ -490,10 +525,12 @@ def _solve_own_files(
         time_limit=stages.time_limit,
         verbose=display.verbose,
         progress=display.has_bar,
+        trust_folder=source.trust_folder,
     )
     if not display.quiet:
         typer.echo(f"{solution}")
-    return _exit_code(solution.status, solution.certificate.is_certified)
+    is_certified = solution.certificate.is_certified
+    return _exit_code(solution.status, is_certified, solution.num_absent)
 
 
 def _save_and_show(
@@ -569,8 +606,11 @@ def _text_with_error(solution: Solution) -> str:
     return f"{solution}\n\nerror to the truth (ATE): {error:.4g} m"
 
 
-def _exit_code(status: Status, is_certified: bool) -> int:
-    """Exit code of a solve that has ended."""
+def _exit_code(status: Status, is_certified: bool, num_absent: int) -> int:
+    """Exit code of a solve that has ended.
+
+    What is certified without absent robots is no certificate of the graph that was asked for.
+    """
     if not status.is_success:
         return NOT_CONVERGED
-    return DONE if is_certified else NOT_CERTIFIED
+    return DONE if is_certified and num_absent == 0 else NOT_CERTIFIED

@@ -12,7 +12,7 @@ from pgo_models.errors import PGOError, SettingError
 from pgo_models.files import check_writable
 from solvers.cli.explanations import explained_by_its_graph
 from solvers.cli.inputs import check_outputs_differ, load_graph
-from solvers.cli.options import DropEdgeOption, UnitWeightsOption
+from solvers.cli.options import DropEdgeOption, TrustFolderOption, UnitWeightsOption
 from solvers.cli.shell import BROKEN_OFF, JsonOption, QuietOption, save_then_show, wrapped
 from solvers.reporting.result_table import check_table_format
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
@@ -122,6 +122,7 @@ def compare_command(
     time_limit: Annotated[float, typer.Option(help="Seconds for every method.")] = math.inf,
     unit_weights: UnitWeightsOption = False,
     drop_edge: DropEdgeOption = None,
+    trust_folder: TrustFolderOption = False,
     jobs: JobsOption = ComparisonSettings.num_jobs,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -135,7 +136,7 @@ def compare_command(
         BenchmarkSettings(robots, time_limit=time_limit),
         jobs,
     )
-    loaded = load_graph(graph, unit_weights, dropped=drop_edge)
+    loaded = load_graph(graph, unit_weights, dropped=drop_edge, trust_folder=trust_folder)
     comparison = compare_methods(loaded, settings, progress=False if quiet else None)
     table = comparison.table()
     tables = [(path, table.save) for path in out or []]

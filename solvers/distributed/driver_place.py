@@ -29,6 +29,22 @@ from solvers.soc.soc import SOC, WARM_START
 
 
 @dataclass(frozen=True, eq=False)
+class AttemptWithFaults(Attempt):
+    """An attempt whose SOC had faults. Rounds are numbered on from those of SOC.
+
+    `offset` is the number of the current round less the rounds on the ledger. For `patience` rounds
+    the driver waits for a robot that is silent, and then gives it up.
+    """
+
+    offset: int = 0
+    patience: int = 0
+
+    def check_heard(self, faults: Faults, rounds: int) -> None:
+        """Raise a RobotSilentError where a robot is silent now, and stays silent for too long."""
+        faults.check_heard(rounds + self.offset, self.patience)
+
+
+@dataclass(frozen=True, eq=False)
 class DriverPlace(Place):
     """Start, SOC, Newton and staircase by a driver and its robots.
 
@@ -99,7 +115,15 @@ class DriverPlace(Place):
             soc,
         )
         self.stages.append(stage)
-        return replace(attempt, status=finished.status)
+        if self.faults is None:
+            return replace(attempt, status=finished.status)
+        rounds = driver.network.ledger.rounds
+        offset = finished.iterations - rounds
+        heard = AttemptWithFaults(
+            status=finished.status, offset=offset, patience=soc.max_iterations
+        )
+        heard.check_heard(self.faults, rounds)
+        return heard
 
     def _run_coupling(
         self, soc: SOC

@@ -2,9 +2,10 @@
 
 The driver learns the ids of poses as runs of consecutive ids, so that it can number the poses, and
 of the edges between robots their ends, of which it computes a vertex cover. Measurements between
-two robots are exchanged by these robots alone. A pose belongs to the first file with a VERTEX line
-of it, or else to the first file that names it. An edge that stands in several files counts once, as
-in `read_g2o`.
+two robots are messages between these robots, which the process of the driver delivers: they pass
+through its memory, and nothing of the driver reads them. A pose belongs to the first file with a
+VERTEX line of it, or else to the first file that names it. An edge that stands in several files
+counts once, as in `read_g2o`.
 
 The orders to a robot stand below in the sequence in which they are given: `read_file`,
 `number_poses`, `join_neighbours`, `take_cost`, `place_cover`; where areas of robots interleave
@@ -17,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -26,6 +28,13 @@ from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o import edge_rows_to_keep, make_folder, write_g2o
+from pgo_models.graphs.g2o_folder import (
+    Rows,
+    check_measurements,
+    check_places,
+    measured_edges,
+    placed_poses,
+)
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
 from pgo_models.graphs.g2o_rows import information_of, poses_of
 from pgo_models.graphs.pose_graph import (
@@ -73,29 +82,39 @@ class OwnedRuns:
     number: IntArray
     owner: IntArray
 
+    def of(self, ids: IntArray) -> IntArray:
+        """The run that each id is in."""
+        return np.searchsorted(self.first, ids, side="right") - 1
+
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Edges as in `G2OLines`, and the numbers and owners of their ends, (m, 2)."""
+    """Edges of a file, and the numbers and owners of their ends, (m, 2)."""
+
+    rows: Rows
+    numbers: IntArray
+    owners: IntArray
+
+    def some(self, chosen: IntArray | BoolArray | slice) -> Edges:
+        """Some of the edges."""
+        return Edges(self.rows.some(chosen), self.numbers[chosen], self.owners[chosen])
+
+
+class _JoinedEdges(NamedTuple):
+    """Edges of several files: ids, rows of numbers as in `G2OLines`, and as in `Edges`."""
 
     ids: IntArray
     rows: Array
     numbers: IntArray
     owners: IntArray
 
-    def some(self, chosen: IntArray | BoolArray | slice) -> Edges:
-        """Some of the edges."""
-        return Edges(self.ids[chosen], self.rows[chosen], self.numbers[chosen], self.owners[chosen])
 
-    @staticmethod
-    def joined(parts: Sequence[Edges]) -> Edges:
-        """Edges of several parts, one after the other."""
-        return Edges(
-            np.concatenate([part.ids for part in parts]),
-            np.concatenate([part.rows for part in parts]),
-            np.concatenate([part.numbers for part in parts]),
-            np.concatenate([part.owners for part in parts]),
-        )
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a robot tells another: edges that touch its poses, and VERTEX lines of these."""
+
+    edges: Edges
+    places: Rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +163,7 @@ class FileAgent(Agent):
     """A robot that loads its own file; its attributes are set by the orders below."""
 
     lines: G2OLines
-    edges: Edges
+    own: Told  # what its own file says of its poses
     graph: PoseGraph  # of its own poses, and those at the far end of its edges
     numbers: IntArray  # (n_a,): numbers of these poses in the whole graph, ascending
     owners: IntArray  # (n_a,)
@@ -177,31 +196,41 @@ def read_file(agent: FileAgent, _: None) -> Claim:
     return lines.d, _runs(np.unique(lines.vertex_ids)), _runs(ids_of_edges_alone)
 
 
-def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
-    """Take numbers and owners for the ids; return the edges with an end at another robot.
+def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Told]:
+    """Take numbers and owners for the ids; return what others are to be told of their poses.
 
-    They are messages, by the number of that robot.
+    They are messages, by the number of the other robot.
     """
-    ids = agent.lines.edge_ids
-    run = np.searchsorted(runs.first, ids, side="right") - 1
-    numbers = runs.number[run] + ids - runs.first[run]
+    rows = measured_edges(agent.lines)
+    run = runs.of(rows.ids)
+    numbers = runs.number[run] + rows.ids - runs.first[run]
     owners = runs.owner[run]
-    edges = Edges(ids, agent.lines.edges, numbers, owners)
-    agent.edges = edges.some((owners == agent.robot).any(axis=1))
-    messages = {}
-    for robot in np.unique(owners).tolist():
-        if robot != agent.robot:
-            messages[robot] = edges.some((owners == robot).any(axis=1))
-    return messages
+    edges = Edges(rows, numbers, owners)
+    places = placed_poses(agent.lines)
+    owners_of_places = runs.owner[runs.of(places.ids)]
+    told = {}
+    for robot in np.unique(np.append(owners, owners_of_places)).tolist():
+        touches = (owners == robot).any(axis=1)
+        told[robot] = Told(edges.some(touches), places.some(owners_of_places == robot))
+    no_lines = slice(0)
+    agent.own = told.pop(agent.robot, Told(edges.some(no_lines), places.some(no_lines)))
+    return told
 
 
-def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
+def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) -> Border:
     """Make the graph of the robot: its own edges, and those that others have of its poses.
 
-    FIX lines of its own poses count.
+    FIX lines of its own poses count. The request is what others told the robot, and whether the
+    folder is trusted, so that nothing is asked that `read_g2o` would ask.
     """
-    edges = _joined_edges({**received, agent.robot: agent.edges})
-    if not len(edges.rows):
+    received, is_trusted = request
+    lines = agent.lines
+    told = [part for _, part in sorted({**received, agent.robot: agent.own}.items())]
+    if not is_trusted:
+        check_places(lines.d, [part.places for part in told])
+        check_measurements(lines.d, [part.edges.rows for part in told])
+    edges = _joined_edges([part.edges for part in told])
+    if not len(edges.numbers):
         raise GraphError(
             f"{agent.path}: no edge touches a pose of this robot; add one, or remove the file"
         )
@@ -210,7 +239,6 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
     ids = edges.ids.ravel()[first]
     i, j = ends.reshape(-1, 2).T
     is_own = agent.owners == agent.robot
-    lines = agent.lines
     R_ij, t_ij = poses_of(lines.d, edges.rows)
     information = information_of(lines.d, edges.rows)
     kappa, tau = edge_precisions(information)
@@ -230,16 +258,20 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
     )
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
     agent.given = _given_pose(lines, ids[holding])
-    del agent.lines, agent.edges
+    del agent.lines, agent.own
     return _border(agent)
 
 
-def _joined_edges(edges_of: Mapping[int, Edges]) -> Edges:
+def _joined_edges(files: Sequence[Edges]) -> _JoinedEdges:
     """Edges of several files as one, in which an edge of several files counts once."""
-    files = [edges for _, edges in sorted(edges_of.items())]
-    kept_of_files = edge_rows_to_keep([(file.ids, file.rows) for file in files])
+    kept_of_files = edge_rows_to_keep([(file.rows.ids, file.rows.numbers) for file in files])
     parts = [file.some(kept) for file, kept in zip(files, kept_of_files, strict=True)]
-    return Edges.joined(parts)
+    return _JoinedEdges(
+        np.concatenate([part.rows.ids for part in parts]),
+        np.concatenate([part.rows.numbers for part in parts]),
+        np.concatenate([part.numbers for part in parts]),
+        np.concatenate([part.owners for part in parts]),
+    )
 
 
 def _given_pose(lines: G2OLines, pose_id: int) -> Array:
@@ -390,29 +422,39 @@ class OpenedFiles:
         The cost that is solved: ISOTROPIC or INFORMATION.
     has_indefinite : bool
         Whether the share of any edge in chi2 can be negative.
+    num_absent : int
+        Number of poses of robots without a file, as `PoseGraph.absent`.
     """
 
     driver: Driver
     sizes: IntArray
     weighting: Weighting
     has_indefinite: bool
+    num_absent: int
 
 
 def open_files(
-    files: Sequence[RobotFile], engine: Engine, memory: float, weighting: Weighting
+    files: Sequence[RobotFile],
+    engine: Engine,
+    memory: float,
+    weighting: Weighting,
+    trust_folder: bool = False,
 ) -> OpenedFiles:
     """Have robots read these files, and agree on the cost that `weighting` stands for.
 
-    Raises a FileFormatError for a file that cannot be read or has no pose of its own, and a
-    GraphError if the graph is not connected, or has a matrix that chi2 cannot have. All messages
-    but the start of the robots are counted.
+    Raises a FileFormatError for a file that cannot be read or has no pose of its own, and, unless
+    the folder is trusted, for files that speak against being of one graph. Raises a GraphError if
+    the graph is not connected, or has a matrix that chi2 cannot have. All messages but the start of
+    the robots are counted.
     """
     network = CountedPool(engine.open(FileAgent, files), len(files))
     try:
         claims = network.ask(read_file, [None] * len(files), Count.ROUND)
-        runs, num_poses = number_ids(claims, files)
-        sent = network.ask(number_poses, runs, Count.PIGGYBACKED)
-        borders = network.ask(join_neighbours, network.exchange(sent), Count.PIGGYBACKED)
+        numbered = number_ids(claims, files)
+        num_poses = numbered.num_poses
+        sent = network.ask(number_poses, numbered.runs, Count.PIGGYBACKED)
+        received = [(told, trust_folder) for told in network.exchange(sent)]
+        borders = network.ask(join_neighbours, received, Count.PIGGYBACKED)
         sizes = np.array([border.counts for border in borders]).T
         num_without_edge = num_poses - int(sizes[0].sum())
         _check_connected(borders, num_without_edge, files[0][1].parent)
@@ -429,7 +471,7 @@ def open_files(
         if memory != 0:
             summaries = _chosen_elimination(network, summaries)
         driver = Driver(summaries, num_poses, lambda: network, memory)
-        return OpenedFiles(driver, sizes, weighting, has_indefinite)
+        return OpenedFiles(driver, sizes, weighting, has_indefinite, numbered.num_absent)
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()
         raise
@@ -456,8 +498,19 @@ def _own_weighting(borders: Sequence[Border]) -> Weighting:
     return Weighting.INFORMATION
 
 
-def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[list[OwnedRuns], int]:
-    """Numbers and owners of the ids that every file names, and the number of different ids.
+class NumberedIds(NamedTuple):
+    """Numbers and owners of the ids that every file names.
+
+    Of the `num_poses` different ids `num_absent` are poses of robots without a file.
+    """
+
+    runs: list[OwnedRuns]
+    num_poses: int
+    num_absent: int
+
+
+def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> NumberedIds:
+    """Numbers and owners of the ids that every file names.
 
     The ends of all runs cut the ids into intervals. All ids of an interval are named by the same
     files, or by none.
@@ -477,7 +530,11 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[lis
     known_size = np.where(known, size, 0)
     number = np.cumsum(known_size) - known_size
     owned = [OwnedRuns(first[named], number[named], owner[named]) for named in is_named]
-    return owned, int(known_size.sum())
+    # As `absent_ids`: a file without VERTEX lines places all that it names.
+    is_file_placed = np.array([len(vertices) > 0 for _, vertices, _ in claims])
+    is_placed = (has_vertex | (is_named & ~is_file_placed[:, None])).any(axis=0)
+    num_absent = int(known_size[~is_placed].sum())
+    return NumberedIds(owned, int(known_size.sum()), num_absent)
 
 
 def _covers(runs: IntArray, bounds: IntArray) -> BoolArray:
@@ -493,13 +550,11 @@ def _check_claims(claims: Sequence[Claim], files: Sequence[RobotFile], owners: I
     """Refuse a file of another dimension than the first, and one without a pose of its own."""
     d_of_first = claims[0][0]
     for (robot, path), (d, *_) in zip(files, claims, strict=True):
-        problem = ""
         if d != d_of_first:
-            problem = "2D beside 3D"
-        elif robot not in owners:
-            problem = "no pose in it is of this robot"
-        if problem:
-            raise FileFormatError(path, None, f"{problem}; remove it, or {READ_HERE}")
+            raise FileFormatError(path, None, "2D beside 3D; put it into a folder of its own")
+        if robot not in owners:
+            problem = f"no pose in it is of this robot; remove it, or {READ_HERE}"
+            raise FileFormatError(path, None, problem)
 
 
 def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: Path) -> None:

@@ -5,6 +5,9 @@ and solve for rotations and translations jointly, project the rotations, and sol
 translations that belong to these. Both are runs of CONSENSUS to a loose tolerance. Then SOC
 follows. Best translations of given rotations, Newton and the certificate need a driver.
 
+"Without a driver" is said of the method. One process still has the whole graph: it makes the tree,
+delivers all messages, and collects the poses of the result, so that it sees every pose.
+
 The sums that robots need, and so their tests of convergence, go along a tree of robots. CONVERGED
 means of SOC that the relative gradient of F over rotations and translations is within its tolerance
 at the poses that the robots hold and that are returned. How far F is from an optimum does not
@@ -25,6 +28,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import spanning_tree, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
@@ -52,7 +56,7 @@ NO_CERTIFICATE = (
 
 def note_without_driver(problem: PGOProblem) -> str:
     """What a solution of robots without a driver lacks, and why its cost is F."""
-    if problem.graph.information is None:
+    if problem.graph.information is None or problem.weighting is not Weighting.ISOTROPIC:
         return NO_CERTIFICATE
     return f"{NO_CERTIFICATE}; the cost is F, as SOC alone needs one that is convex and quadratic"
 

@@ -17,7 +17,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
-from solvers.distributed.driver_place import DriverPlace, chosen_soc
+from solvers.distributed.driver_place import AttemptWithFaults, DriverPlace, chosen_soc
 from solvers.distributed.elimination_choice import choose_elimination
 from solvers.distributed.handedness import (
     RobotsPoint,
@@ -113,6 +113,9 @@ class RobotsOfGraph(DriverPlace):
             certificate = certify_with(
                 here.problem, poses, Lambda, here.gap, attempt.decrement, BoundSource.GIVEN, bound
             )
+        if self.faults is not None and isinstance(attempt, AttemptWithFaults):
+            # A robot may have fallen silent since SOC ended.
+            attempt.check_heard(self.faults, self.driver.network.ledger.rounds)
         self.journal.end_attempt((poses, certificate))
         return replace(attempt, poses=poses, certificate=certificate)
 
@@ -198,6 +201,6 @@ class RobotsOfGraph(DriverPlace):
 
     def salvage(self, ending: Ending) -> Attempt:
         """The best poses known, those of the robots among them, with the bound F >= 0."""
-        if ending == Stage.interruption:
+        if ending in (Stage.interruption, Stage.silence):
             self.monitor.poses_found.append(collect(self.driver)[0])
         return self.here.salvage(ending)

@@ -6,10 +6,14 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import EngineError, SettingError, check_settings
 
 T = TypeVar("T")
 Link = tuple[int, int]  # sender and receiver
+
+
+class RobotSilentError(EngineError):
+    """A robot is silent for longer than the driver waits for what only this robot can answer."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +21,9 @@ class Faults:
     """Faults between robots, for study; the same seed gives the same faults.
 
     `Pipeline(faults=..)` runs its CONSENSUS stage with them: robots then do not wait for each
-    other.
+    other. Of a later stage a driver waits for a robot that is silent, for as many rounds as the
+    CONSENSUS stage may take. A robot that is silent for longer has no part in Newton's method or a
+    certificate, and then there are none.
 
     Parameters
     ----------
@@ -72,6 +78,29 @@ class Faults:
         """
         since = number - self.silent_from
         return robot == self.silent_robot and 0 <= since < self.silent_rounds
+
+    def check_heard(self, number: int, patience: int) -> None:
+        """Raise a RobotSilentError where a robot is silent in a round and long after it.
+
+        Parameters
+        ----------
+        number : int
+            Number of the round.
+        patience : int
+            Number of rounds after it in which the robot may stay silent.
+
+        Raises
+        ------
+        RobotSilentError
+            When the robot stays silent for longer.
+        """
+        end = self.silent_from + self.silent_rounds
+        if self.is_silent(self.silent_robot or 0, number) and end > number + patience:
+            raise RobotSilentError(
+                f"robot {self.silent_robot} is silent from round {self.silent_from} on, and Newton "
+                "and the certificate need its answers: they were left out, and F >= 0 is all that "
+                "is known of the optimum"
+            )
 
 
 class _Letter(NamedTuple, Generic[T]):

@@ -13,6 +13,7 @@ from pgo_models.figures import in_percent, rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import known_datasets
+from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
@@ -167,6 +168,12 @@ def advice(
     name = source if source is not None else _name_in_commands(graph, certificate)
     solve = f"pgo solve {name}"
     suggestions = []
+    if len(graph.absent):
+        text = (
+            "Put the files of all robots into the folder, and solve it again: this map is of the "
+            "files that were here alone."
+        )
+        suggestions.append(Advice(text, solve))
     if not status.is_success:
         suggestions.append(_advice_on_status(status, solve))
     suggestions += fit.advice_on_cost(solve)
@@ -191,7 +198,8 @@ def advice(
 
 def _name_in_commands(graph: PoseGraph, certificate: Certificate) -> str:
     """Name of a known data set or of a g2o file, with the option for its cost."""
-    file = graph.name if graph.name in known_datasets() else f"{graph.name}.g2o"
+    stem = graph.name.removesuffix(f", {FILES_HERE}")
+    file = stem if stem in known_datasets() or len(graph.absent) else f"{stem}.g2o"
     name = shlex.quote(file)
     if certificate.weighting is Weighting.ISOTROPIC and graph.information is not None:
         name += " --cost isotropic"

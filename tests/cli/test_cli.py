@@ -44,6 +44,41 @@ def test_consensus_goes_without_a_driver_and_says_so(pgo_command):
     assert pgo_command("solve", "robots", "--driver-memory", "0")[0] == 1
 
 
+@pytest.mark.parametrize(
+    ("arguments", "refusal", "way_out"),
+    [
+        ("grid", "robots run CONSENSUS alone", "--method consensus"),
+        ("grid --robots 3", "robots run CONSENSUS alone", "--method consensus"),
+        ("grid --method newton", "robots run CONSENSUS alone", None),
+        ("grid --robust gnc", "--robust needs one", None),
+        ("grid --method consensus --proof {folder}/p.json", "no proof to write", None),
+        (
+            "robots --engine ray",
+            "robots with files of their own need one",
+            "--engine threads --split given --method consensus",
+        ),
+    ],
+)
+def test_what_to_do_without_a_driver_is_said_at_once(
+    arguments, refusal, way_out, pgo_command, tmp_path
+):
+    words = arguments.format(folder=tmp_path).split()
+    code, out, err = pgo_command("solve", *words, "--driver-memory", "0")
+    assert (code, out) == (1, "")
+    assert refusal in err
+    assert not (tmp_path / "p.json").exists()
+    if way_out is not None:
+        assert way_out.removeprefix("--engine threads ") in err
+        words = [word for word in words if word not in ("--engine", "ray")]
+        assert pgo_command("solve", *words, *way_out.split(), "--driver-memory", "0")[0] == 3
+
+
+def test_consensus_by_robots_with_files_of_their_own_needs_a_split(pgo_command):
+    code, out, err = pgo_command("solve", "robots", "--engine", "ray", "--method", "consensus")
+    assert (code, out) == (1, "")
+    assert "--split given --method consensus" in err
+
+
 def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
     folder = tmp_path / "robots"
     shutil.copytree(ROOT / "data" / "robots", folder)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
+import solvers
 from pgo_models.graphs.g2o import edge_places
 
 ROOT = Path(__file__).parents[2]
@@ -182,3 +183,45 @@ def test_all_wrong_lines_of_a_file_are_printed(pgo_command, tmp_path):
     assert lines[0].startswith(f"pgo: {path}:1: 'x' is no number")
     assert [line.split(": ")[0] for line in lines[1:20]] == [f"{path}:{k}" for k in range(2, 21)]
     assert lines[20:] == ["25 lines are wrong; the first 20 are named"]
+
+
+def test_nothing_is_certified_for_robots_that_are_absent(pgo_command, tmp_path):
+    """The first line, the verdict, the note, JSON and the exit code say for whom it holds."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for robot in (0, 2):
+        (folder / f"{robot}.g2o").write_text((ROOT / f"data/robots/{robot}.g2o").read_text())
+    num_absent = len(pgo.read_g2o(folder).absent)
+    code, out, err = pgo_command("solve", folder, "--out", tmp_path / "solved.g2o")
+    assert (code, err) == (3, "")
+    assert "in, only robots with a file here: " in out.splitlines()[0]
+    text = " ".join(out.split())
+    assert f"edges name {num_absent} poses of robots without a file here" in text
+    assert "asked for; this is of the files here alone, without absent robots note" in text
+    record = printed_json(pgo_command("solve", folder, "--json")[1])
+    assert len(record["graph"]["absent"]) == num_absent
+    assert "only robots with a file here" in record["graph"]["name"]
+    assert record["note"].startswith(f"edges name {num_absent} poses of robots without a file")
+    judged = pgo_command("certify", folder, "--estimate", tmp_path / "solved.g2o")
+    assert judged[0] == 3
+    assert "only robots with a file here" in judged[1].splitlines()[0]
+    assert (
+        "edges name"
+        in printed_json(
+            pgo_command("certify", folder, "--estimate", tmp_path / "solved.g2o", "--json")[1]
+        )["note"]
+    )
+    assert "only robots with a file here" in pgo_command("info", folder)[1].splitlines()[0]
+    solution = solvers.solve(pgo.read_g2o(folder))
+    assert repr(solution).endswith("this is of the files here alone, without absent robots)")
+
+
+def test_a_folder_of_several_graphs_is_a_question_that_an_option_answers(pgo_command):
+    for command in ("solve", "info", "certify", "compare"):
+        code, out, err = pgo_command(command, ROOT / "data")
+        assert (code, out, err.count("\n")) == (1, "", 1)
+        assert "circle.g2o:1: pose 0 is elsewhere than at " in err
+        assert "--trust-folder" in err
+    code, out, _ = pgo_command("solve", ROOT / "data", "--trust-folder")
+    assert code == 0
+    assert out.startswith("graph        data: 50 poses, 952 edges, 3D")

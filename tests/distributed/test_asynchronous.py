@@ -194,6 +194,29 @@ def test_a_solve_with_faults_is_certified_with_the_central_gap(d: int, fault: st
     np.testing.assert_array_equal(again.poses.R, solution.poses.R)  # the same seed, the same faults
 
 
+@pytest.mark.parametrize("silent_from", [0, 3, "after SOC"])
+def test_nothing_is_certified_for_a_robot_that_is_silent_for_ever(silent_from: int | str) -> None:
+    """Also where it falls silent between SOC and the certificate; the driver waits for others."""
+    graph = varied_graph(3, 20, 2)
+    parts = metis(graph, 3)
+    soc = SOC(robots=parts, tolerance=2e-3, max_iterations=60)
+    heard = solve(graph, Pipeline(soc=soc, faults=Faults()), robots=parts)
+    assert heard.is_certified
+    if silent_from == "after SOC":
+        silent_from = heard.stages[1].iterations + 2
+    assert isinstance(silent_from, int)
+    for rounds in (10**9, 1000):
+        silence = Faults(silent_robot=1, silent_from=silent_from, silent_rounds=rounds)
+        solution = solve(graph, Pipeline(soc=soc, faults=silence), robots=parts)
+        assert not solution.is_certified
+        assert solution.lower_bound == 0.0
+        assert solution.status is Status.SILENT
+        assert f"robot 1 is silent from round {silent_from} on" in solution.note
+        assert solution.objective == pytest.approx(solution.problem.objective(solution.poses))
+    waits = Faults(silent_robot=1, silent_from=silent_from, silent_rounds=60)
+    assert solve(graph, Pipeline(soc=soc, faults=waits), robots=parts).is_certified
+
+
 def test_a_round_is_one_message_a_link_and_no_all_reduce() -> None:
     problem = scene("grid")
     engine = Recording()

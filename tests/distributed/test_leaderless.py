@@ -26,6 +26,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_alone import (
@@ -261,3 +263,20 @@ def test_the_memory_of_the_driver_is_a_setting_and_the_refusal_says_the_way_out(
             Pipeline(soc=soc, driver_memory=value)
     with pytest.raises(SettingError, match="driver_memory is for solves by robots"):
         solve(graph, Pipeline(soc=soc, driver_memory=0))
+
+
+def test_without_a_driver_there_is_no_proof_to_write(tmp_path: Path) -> None:
+    graph = grid(np.random.default_rng(0))
+    parts = metis(graph, 3)
+    solution = solve(graph, Pipeline(soc=SOC(robots=parts), driver_memory=0), robots=parts)
+    with pytest.raises(SettingError, match="no proof to write: no bound was sought, and that F is"):
+        solution.save_proof(tmp_path / "proof.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_rotations_alone_are_solved_without_a_driver() -> None:
+    problem = PGOProblem(grid(np.random.default_rng(0)), weighting=Weighting.ROTATIONS)
+    parts = metis(problem.graph, 3)
+    solution = solve(problem, Pipeline(soc=SOC(robots=parts), driver_memory=0), robots=parts)
+    assert solution.objective == pytest.approx(solve(problem).objective, rel=1e-6)
+    assert solution.note == NO_CERTIFICATE

@@ -15,7 +15,7 @@ from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from solvers.cli import app as cli
 from solvers.network.ledger import Ledger, Traffic
-from solvers.reporting.edge_fit import EdgeFit, fit_sentence
+from solvers.reporting.edge_fit import EdgeFit, fit_sentence, judge_edges
 from solvers.reporting.fit_plots import explore_fit
 from solvers.reporting.report import report_page
 from solvers.reporting.report_text import advice, headline, meaning, percent
@@ -334,3 +334,20 @@ def test_the_histogram_counts_every_edge(solution):
         assert (bars.get("misfits", 0), sum(bars.values())) == (misfits, 212)
     (curve,) = [trace for trace in explore_fit(residuals, 3).data if trace.type == "scatter"]
     assert sum(value or 0.0 for value in curve.y) == pytest.approx(212, rel=0.01)
+
+
+def test_a_map_without_absent_robots_is_first_advised_to_have_them():
+    graph = pgo.load("robots")
+    part = replace(
+        graph.subgraph(np.arange(60)),
+        absent=np.arange(40, 60),
+        name="robots, only robots with a file here",
+    )
+    certificate = solvers.certify(part, part.initial)
+    first, *_ = advice(part, certificate, solvers.Status.CONVERGED, judge_edges_of(part))
+    assert first.text.startswith("Put the files of all robots into the folder")
+    assert first.command == "pgo solve robots --cost isotropic"
+
+
+def judge_edges_of(graph):
+    return judge_edges(pgo.PGOProblem(graph), graph.initial)
