@@ -847,13 +847,14 @@ class PoseGraph(ReadOnly):
         GraphError
             When there is not one measurement for every edge, or as for `PoseGraph`.
         """
-        if measured.d != self.d or not len(i) == len(j) == measured.num_poses:
+        i = whole_array(i, "i")
+        j = whole_array(j, "j")
+        if measured.d != self.d or not i.shape == j.shape == (measured.num_poses,):
             raise GraphError(
                 f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge"
             )
-        shape = np.shape(i)
-        kappa_rows = np.array(np.broadcast_to(kappa, shape), dtype=float)
-        tau_rows = np.array(np.broadcast_to(tau, shape), dtype=float)
+        kappa_rows = _rows_of_weights(kappa, len(i), "kappa")
+        tau_rows = _rows_of_weights(tau, len(i), "tau")
         new_rows = {
             "i": i,
             "j": j,
@@ -932,6 +933,7 @@ class PoseGraph(ReadOnly):
         >>> load("grid").with_position_prior(np.array([0, 5, 9]), np.eye(3), tau=1.0)
         PoseGraph('grid', d=3, poses=27, edges=111, priors=3, robots=1)
         """
+        poses = self._checked_poses(poses)
         measured = Poses.of_points(positions)
         return self.with_prior(poses, measured, kappa=0.0, tau=tau)
 
@@ -990,9 +992,9 @@ class PoseGraph(ReadOnly):
     def _checked_poses(self, poses: IntArray) -> IntArray:
         """Poses (k,), k > 0, as whole numbers; a GraphError unless the graph has them."""
         poses = whole_array(poses, "poses")
-        if not poses.size or not self._has_poses(poses):
+        if poses.ndim != 1 or not poses.size or not self._has_poses(poses):
             raise GraphError(
-                f"measured poses are {poses}; give one or more, 0 to {self.num_poses - 1}"
+                f"measured poses are {poses}; give one or more, 0 to {self.num_poses - 1}, in a row"
             )
         return poses
 
@@ -1012,6 +1014,16 @@ class PoseGraph(ReadOnly):
             robot = np.append(self.robot, self.robot[beside])
         ids = np.append(self.pose_ids, name)
         return replace(self, num_poses=self.num_poses + 1, ids=ids, robot=robot, **others)
+
+
+def _rows_of_weights(weights: Weights, count: int, name: str) -> Array:
+    """Weights of so many edges, of which one may be given for all; else a GraphError."""
+    rows = real_array(weights, name)
+    if rows.shape not in ((), (1,), (count,)):
+        raise GraphError(
+            f"{name} has shape {rows.shape} for {count} edges; give one number for all, or each"
+        )
+    return np.array(np.broadcast_to(rows, count))
 
 
 def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
