@@ -16,10 +16,11 @@ from pgo_models.files import check_lines, check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
-from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
+from pgo_models.graphs.g2o_rows import information_of, measurements_of, numbers_of, poses_of
 from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
+from pgo_models.graphs.written_digits import most_digits, written_errors
 
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
 _LETTER_CODES = [ord(letter) for letter in _LETTERS]
@@ -156,6 +157,7 @@ def graph_of_files(
     information = information_of(d, rows)
     kappa, tau = edge_precisions(information, weights)
     R_ij, t_ij = poses_of(d, rows)
+    digits = most_digits(file.digits for file in files)
     landmark_ids = np.concatenate([file.landmarks for file in files])
     is_landmark = np.isin(ids, landmark_ids)
     return PoseGraph(
@@ -174,6 +176,7 @@ def graph_of_files(
         name=printable(name_of(path)),
         world=world,
         landmarks=np.flatnonzero(is_landmark),
+        written_error=written_errors(measurements_of(d, rows), digits),
     )
 
 

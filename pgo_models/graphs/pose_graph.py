@@ -36,8 +36,18 @@ _NAMED_COMPONENTS = 5  # components that an error names
 
 _WHOLE_NUMBERS = ("num_poses", "world")
 _WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks")
-_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times")
-_EDGE_FIELDS = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information", "uncoupled")
+_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times", "written_error")
+_EDGE_FIELDS = (
+    "i",
+    "j",
+    "R_ij",
+    "t_ij",
+    "kappa",
+    "tau",
+    "information",
+    "uncoupled",
+    "written_error",
+)
 
 
 def _no_poses() -> IntArray:
@@ -104,6 +114,10 @@ class PoseGraph(ReadOnly):
     uncoupled : BoolArray, (m,), optional
         Which information matrices have lost their coupling block because they were indefinite with
         it, see `pgo_models.without_indefinite_coupling`.
+    written_error : Array, (m, 2), optional
+        What ||t_ij|| and ||R_ij||_F may be off by because a file writes measurements with so many
+        digits: half a unit of the last one (`pgo_models.graphs.written_digits`). 0 where nothing is
+        known of that, as of measurements that no file has.
 
     Raises
     ------
@@ -141,6 +155,7 @@ class PoseGraph(ReadOnly):
     world: int | None = None
     landmarks: IntArray = field(default_factory=_no_poses)
     uncoupled: BoolArray | None = None
+    written_error: Array | None = None
 
     def __post_init__(self) -> None:
         self._convert(_WHOLE_NUMBERS, whole_number)
@@ -432,6 +447,7 @@ class PoseGraph(ReadOnly):
             "tau": (m,),
             "information": (m, k, k),
             "uncoupled": (m,),
+            "written_error": (m, 2),
             "ids": (n,),
             "robot": (n,),
             "fixed": (len(self.fixed),),
@@ -487,7 +503,7 @@ class PoseGraph(ReadOnly):
 
     def _check_precisions(self) -> None:
         """Check that the numbers of all edges are finite, and their precisions not negative."""
-        for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
+        for name in ("R_ij", "t_ij", "kappa", "tau", "information", "written_error"):
             values = getattr(self, name)
             if values is not None:
                 numbers_of_edges = values.reshape(self.num_edges, -1)
@@ -864,6 +880,7 @@ class PoseGraph(ReadOnly):
             "tau": tau_rows,
             "information": isotropic_information(kappa_rows, tau_rows, self.d),
             "uncoupled": np.zeros(len(kappa_rows), dtype=bool),
+            "written_error": np.zeros((len(kappa_rows), 2)),
         }
         all_edges = np.ones(self.num_edges, dtype=bool)
         own_rows = self._edge_rows(all_edges)
@@ -1024,6 +1041,11 @@ def _rows_of_weights(weights: Weights, count: int, name: str) -> Array:
             f"{name} has shape {rows.shape} for {count} edges; give one number for all, or each"
         )
     return np.array(np.broadcast_to(rows, count))
+
+
+def written_error_of(graph: PoseGraph, edges: BoolArray | IntArray) -> Array | None:
+    """`PoseGraph.written_error` of the given edges."""
+    return None if graph.written_error is None else graph.written_error[edges]
 
 
 def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
