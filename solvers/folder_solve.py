@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, judge_cost
+from pgo_models.certificates.certificate import BoundSource, Certificate, judge_cost
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import NotPositiveDefiniteError, PGOError, SettingError
@@ -329,10 +330,11 @@ class _FolderJob:
         assert best is not None
         d = self.shared.driver.d
         no_poses = Poses(np.zeros((0, d, d)), np.zeros((0, d)))
-        unjudged = Certificate(
-            objective=best.objective,
-            bound=best.bound,
-            gap=math.nan,
+        judgement = judge_cost(self.name, best.objective, best.rounding, best.bound, self.gap)
+        return Certificate(
+            objective=judgement.objective,
+            bound=judgement.bound,
+            gap=judgement.gap,
             rounding_level=best.rounding.level,
             stationarity=best.decrement,
             source=best.source,
@@ -340,10 +342,11 @@ class _FolderJob:
             poses_objective=best.objective,
             Lambda=no_poses.R,
             wanted_gap=self.gap,
-            verdict=Verdict.TRIVIAL,
+            verdict=judgement.verdict,
             weighting=self.weighting,
+            objective_error=best.rounding.error,
+            fit=best.rounding.fit,
         )
-        return judge_cost(self.name, unjudged, best.objective, best.rounding)
 
     def move_to_frame(self) -> tuple[str, float]:
         """Move the poses of the best answer to their frame; return which that is, and F there.
@@ -405,7 +408,7 @@ def _sum_of_roundings(parts: Sequence[ObjectiveRounding]) -> ObjectiveRounding:
     """How accurately a sum is known of whose parts that is known."""
     level = math.fsum(part.level for part in parts)
     error = math.fsum(part.error for part in parts)
-    return ObjectiveRounding(level, error, all(part.is_exact for part in parts))
+    return ObjectiveRounding(level, error, Fit.of_all(part.fit for part in parts))
 
 
 def _frame(answers: Sequence[RobotAnswer]) -> tuple[Array, Array, str]:

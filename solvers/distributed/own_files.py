@@ -21,13 +21,14 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o import edge_rows_to_keep, make_folder, write_g2o
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
-from pgo_models.graphs.g2o_rows import information_of, poses_of
+from pgo_models.graphs.g2o_rows import information_of, measurements_of, poses_of
 from pgo_models.graphs.pose_graph import (
     WORLD_ID,
     IntArray,
@@ -36,6 +37,7 @@ from pgo_models.graphs.pose_graph import (
     middle_pose,
 )
 from pgo_models.graphs.precisions import edge_precisions, indefinite_edges
+from pgo_models.graphs.written_digits import WrittenDigits, most_digits, written_errors
 from pgo_models.problem.weighting import (
     Weighting,
     convex_cost,
@@ -61,17 +63,21 @@ READ_HERE = (
 
 RobotFile = tuple[int, Path]  # a robot and its file, on the machine where the robot runs
 # What a file names: d, the ids of its VERTEX lines, and the ids that only its edges name; see
-# `_runs`.
-Claim = tuple[int, IntArray, IntArray]
+# `_runs`. And the digits that it is written with.
+Claim = tuple[int, IntArray, IntArray, WrittenDigits]
 
 
 @dataclass(frozen=True, eq=False)
 class OwnedRuns:
-    """Runs of consecutive ids, (k,): first id, number of that pose in the whole graph, owner."""
+    """Runs of consecutive ids, (k,): first id, number of that pose in the whole graph, owner.
+
+    With the digits of all files together, as they are all written in one way.
+    """
 
     first: IntArray
     number: IntArray
     owner: IntArray
+    digits: WrittenDigits
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +121,7 @@ class Border:
     has_indefinite: bool  # whether the share of an edge in chi2 can be negative
 
 
-NO_ROUNDING = ObjectiveRounding(0.0, 0.0, True)  # of no edges
+NO_ROUNDING = ObjectiveRounding(0.0, 0.0, Fit.ROUNDING)  # of no edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +151,7 @@ class FileAgent(Agent):
 
     lines: G2OLines
     edges: Edges
+    digits: WrittenDigits  # of all files
     graph: PoseGraph  # of its own poses, and those at the far end of its edges
     numbers: IntArray  # (n_a,): numbers of these poses in the whole graph, ascending
     owners: IntArray  # (n_a,)
@@ -174,7 +181,8 @@ def read_file(agent: FileAgent, _: None) -> Claim:
         )
     agent.lines = lines
     ids_of_edges_alone = np.setdiff1d(lines.edge_ids, lines.vertex_ids)
-    return lines.d, _runs(np.unique(lines.vertex_ids)), _runs(ids_of_edges_alone)
+    runs_of_vertices = _runs(np.unique(lines.vertex_ids))
+    return lines.d, runs_of_vertices, _runs(ids_of_edges_alone), lines.digits
 
 
 def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
@@ -188,6 +196,7 @@ def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Edges]:
     owners = runs.owner[run]
     edges = Edges(ids, agent.lines.edges, numbers, owners)
     agent.edges = edges.some((owners == agent.robot).any(axis=1))
+    agent.digits = runs.digits
     messages = {}
     for robot in np.unique(owners).tolist():
         if robot != agent.robot:
@@ -227,6 +236,7 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
         ids=ids,
         fixed=fixed,
         name=agent.path.stem,
+        written_error=written_errors(measurements_of(lines.d, edges.rows), agent.digits),
     )
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
     agent.given = _given_pose(lines, ids[holding])
@@ -462,13 +472,13 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[lis
     The ends of all runs cut the ids into intervals. All ids of an interval are named by the same
     files, or by none.
     """
-    runs = np.concatenate([np.concatenate(claim[1:]) for claim in claims])
+    runs = np.concatenate([np.concatenate(claim[1:3]) for claim in claims])
     bounds = np.unique(np.concatenate([runs[:, 0], runs[:, 1] + 1]))
     first = bounds[:-1]
     size = np.diff(bounds)
     # Whether a file has VERTEX lines of an interval, and names it at all: (files, intervals).
-    has_vertex = np.stack([_covers(vertices, bounds) for _, vertices, _ in claims])
-    has_edge_alone = np.stack([_covers(others, bounds) for _, _, others in claims])
+    has_vertex = np.stack([_covers(vertices, bounds) for _, vertices, _, _ in claims])
+    has_edge_alone = np.stack([_covers(others, bounds) for _, _, others, _ in claims])
     is_named = has_vertex | has_edge_alone
     claimants = np.where(has_vertex.any(axis=0), has_vertex, is_named)
     owner = claimants.argmax(axis=0)  # the first of them
@@ -476,7 +486,8 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> tuple[lis
     _check_claims(claims, files, owner[known])
     known_size = np.where(known, size, 0)
     number = np.cumsum(known_size) - known_size
-    owned = [OwnedRuns(first[named], number[named], owner[named]) for named in is_named]
+    digits = most_digits(digits for *_, digits in claims)
+    owned = [OwnedRuns(first[named], number[named], owner[named], digits) for named in is_named]
     return owned, int(known_size.sum())
 
 

@@ -170,6 +170,20 @@ def test_what_is_certified_is_what_is_written_however_far_its_frame(
     assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
 
 
+def test_a_gap_that_rounding_hides_is_not_certified(tmp_path: Path) -> None:
+    graph = pgo.grid(np.random.default_rng(0))
+    write_g2o_folder(graph.with_robots(pgo.partition(graph, 3).robot), tmp_path)
+    first = solve_folder(tmp_path).certificate
+    assert 0.0 < first.gap < first.proven_gap < 1e-12
+    between = 0.5 * (first.gap + first.proven_gap)
+    solution = solve_folder(tmp_path, solvers.Pipeline(gap=between))
+    certificate = solution.certificate
+    assert certificate.verdict.name == "NOT_CERTIFIED"
+    assert not certificate.can_improve
+    assert [stage.name for stage in solution.stages] == ["chordal start", "SOC", "Newton"]
+    assert solve_folder(tmp_path, solvers.Pipeline(gap=first.proven_gap)).certificate.is_certified
+
+
 def test_an_edge_that_no_end_has_counts_all_the_same(tmp_path: Path) -> None:
     """Edges between robots 0 and 1 stand in the file of robot 2, twice in that of robot 3."""
     shutil.copytree(ROBOTS, tmp_path / "in")
