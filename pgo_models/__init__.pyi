@@ -8,6 +8,7 @@ from pgo_models.certificates.dual_variables import (
     certificate_matrix as certificate_matrix,
     multipliers as multipliers,
 )
+from pgo_models.certificates.fit import Fit as Fit
 from pgo_models.certificates.handedness import HandednessTerms as HandednessTerms
 from pgo_models.certificates.lower_bound import LowerBound as LowerBound, prove_bound as prove_bound
 from pgo_models.certificates.proof_file import save_proof as save_proof
@@ -123,6 +124,6 @@ __all__ += ["graph_qp", "rotation_qp", "solve_relaxation"]
 __all__ += ["compare_poses", "explore_graph", "plot_graph"]
 # Types in the signatures of the names above.
 __all__ += ["EdgeResiduals", "NoiseModel", "Registry"]
-__all__ += ["BoundSource", "HandednessTerms", "LowerBound"]
+__all__ += ["BoundSource", "Fit", "HandednessTerms", "LowerBound"]
 __all__ += ["GraphQP", "PoseVariables", "RotationQP", "Term", "Unknowns"]
 __all__ += ["RelaxationForm", "RelaxationSolution", "RelaxationStatus"]

@@ -10,8 +10,8 @@ from dataclasses import replace
 import cvxpy as cp
 
 from pgo_models.certificates.certificate import Certificate, relative_gap, verdict_of
+from pgo_models.certificates.fit import Fit, fit_of
 from pgo_models.certificates.lower_bound import NO_BOUND
-from pgo_models.certificates.rounding_errors import fits_to_rounding
 from pgo_models.convex.graph_subproblem import GraphQP, ModelChange
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
@@ -157,16 +157,16 @@ def _certificate_with_terms(
     objective = model.cost(poses.stacked())
     has_replaced_edges = bool(model.change.replaced_edges)
     bound = NO_BOUND if has_replaced_edges else certificate.bound
-    is_exact = False
+    fit = Fit.NONE
     if is_F and not has_replaced_edges:
-        is_exact = fits_to_rounding(priors, priors.graph.completed(poses))
-    gap = relative_gap(objective, bound.value, is_exact)
+        fit = fit_of(priors, priors.graph.completed(poses))
     return replace(
         certificate,
         objective=objective,
         objective_error=math.nan,
         bound=bound,
-        gap=gap,
-        verdict=verdict_of(is_exact, gap, bound, certificate.wanted_gap),
+        gap=relative_gap(objective, bound.value, fit is Fit.ROUNDING),
+        verdict=verdict_of(fit, objective, bound, certificate.wanted_gap),
+        fit=fit,
         stationarity=answer.decrement,
     )

@@ -8,6 +8,7 @@ at any later one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, overload
@@ -155,7 +156,16 @@ class GrowingSolution:
         ends_j = [self._numbers_of(graph)[graph.j] for graph in self.graphs]
         i = np.concatenate(ends_i)
         j = np.concatenate(ends_j)
-        return PoseGraph(len(ids), i, j, **arrays, ids=ids, fixed=first.fixed, name=first.name)
+        return PoseGraph(
+            len(ids),
+            i,
+            j,
+            **arrays,
+            ids=ids,
+            fixed=first.fixed,
+            name=first.name,
+            written_error=_written_error(self.graphs),
+        )
 
     def with_edges(self, graph: PoseGraph) -> GrowingSolution:
         """Return the solution after new edges.
@@ -532,6 +542,17 @@ def _quadratic_cost(graph: PoseGraph, weighting: Weighting) -> EdgeCost:
 def _numbers_of(graph: PoseGraph, numbers: dict[int, int]) -> IntArray:
     """Numbers, (n,), of the poses of a graph by their ids."""
     return np.array([numbers[name] for name in graph.pose_ids.tolist()])
+
+
+def _written_error(graphs: Sequence[PoseGraph]) -> Array | None:
+    """`PoseGraph.written_error` of the edges of several graphs; None where none of them has one."""
+    if all(graph.written_error is None for graph in graphs):
+        return None
+    rows = []
+    for graph in graphs:
+        written = graph.written_error
+        rows.append(np.zeros((graph.num_edges, 2)) if written is None else written)
+    return np.concatenate(rows)
 
 
 def _new_edges(before: PoseGraph, graph: PoseGraph) -> IntArray | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
@@ -301,7 +302,7 @@ class Solution:
         given = f"{name}: {cost} = {rounded_up(self.problem.objective(before), 4)}"
         verdict = self.verdict.name.lower().replace("_", " ")
         objective = rounded_up(certificate.objective_at_most, 6)
-        figures = f"{cost} = {objective}, gap {rounded_up(certificate.proven_gap, 2)}"
+        figures = f"{cost} = {objective}, gap {rounded_up(certificate.printed_gap, 2)}"
         if self.robust is None:
             solved = f"{verdict}: {figures}"
         else:
@@ -351,7 +352,7 @@ class Solution:
         name = self.problem.graph.name
         verdict = self.verdict.name if self.robust is None else self.robust.headline
         cost = f"{self.certificate.cost}={self.certificate.cost_text}"
-        gap = rounded_up(self.certificate.proven_gap, 3)
+        gap = rounded_up(self.certificate.printed_gap, 3)
         verdict += verdict_suffix(len(self.problem.graph.absent))
         return f"Solution({name!r}, {cost}, gap={gap}, {verdict})"
 
@@ -534,7 +535,8 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
     """What `.json` files hold of a certificate; None stands for what is not known.
 
     That is eta where none was proved, the error of the objective where no bound on it is known, and
-    the stationarity where it was not measured.
+    the stationarity where it was not measured. `exact_to` is ROUNDING, COORDINATES or DIGITS where
+    the verdict is EXACT.
     """
     return {
         "lower_bound": certificate.lower_bound,
@@ -548,6 +550,7 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
         "digits": certificate.digits,
         "stationarity": finite_or_none(certificate.stationarity),
         "verdict": certificate.verdict.name,
+        "exact_to": None if certificate.fit is Fit.NONE else certificate.fit.name,
     }
 
 

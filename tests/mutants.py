@@ -61,9 +61,9 @@ MUTANTS = (
     ),
     Mutant(
         "far priors: what far coordinates do not explain counts as their rounding",
-        "pgo_models/certificates/certificate.py",
-        "not certificate.objective_at_most <= level:",
-        "not certificate.objective_at_most <= 1e4 * level:",
+        "pgo_models/certificates/fit.py",
+        "coordinates = UNIT_ROUNDOFF * (size[graph.i] + size[graph.j] + lengths)",
+        "coordinates = 1e2 * UNIT_ROUNDOFF * (size[graph.i] + size[graph.j] + lengths)",
         ("tests/test_far_priors.py",),
     ),
     Mutant(
@@ -508,8 +508,8 @@ MUTANTS = (
     Mutant(
         "own files: one robot's exact part makes the whole exact",
         "solvers/distributed/robots_with_files.py",
-        "all(part.is_exact for part in parts)",
-        "any(part.is_exact for part in parts)",
+        "Fit.of_all(part.fit for part in parts)",
+        "Fit.of_all(part.fit for part in parts[:1])",
         ("tests/distributed/test_own_files.py",),
     ),
     Mutant(

@@ -16,6 +16,7 @@ from graphs import exact_graph, informed, varied_graph
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import Certificate, Verdict, certify_at
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
@@ -286,10 +287,9 @@ def test_poses_that_fit_but_for_the_last_digits_of_far_coordinates_are_exact(d):
         solution = solve(far)
         again = certify(solution.problem, solution.poses)
         for certificate in (solution.certificate, again):
-            assert certificate.verdict is Verdict.EXACT
             # The cost is what half a unit in the last place makes.
-            assert 0.0 < certificate.objective <= certificate.rounding_level
-            assert certificate.rounding_level < 1e-17 * (graph.tau.sum() + 32.0)
+            assert (certificate.verdict, certificate.fit) == (Verdict.EXACT, Fit.COORDINATES)
+            assert 0.0 < certificate.objective < 1e-17 * (graph.tau.sum() + 32.0)
     # A hundred units are no rounding.
     off = np.random.default_rng(0).choice([-1e-7, 1e-7], positions.shape)
     solution = solve(graph.with_position_prior(np.arange(8), positions + off, 4.0))
@@ -303,7 +303,8 @@ def test_exact_poses_stay_exact_where_a_far_estimate_has_them(d):
     far = replace(graph, initial=Poses(truth.R, truth.t + UTM[:d]), truth=None)
     solution = solve(far)
     assert solution.certificate.verdict is Verdict.EXACT
-    assert 0.0 < solution.objective <= solution.certificate.rounding_level
+    assert solution.certificate.fit is Fit.COORDINATES
+    assert "last bits of the coordinates" in str(solution)
     assert solve(with_estimate(d, UTM)).certificate.verdict is Verdict.CERTIFIED
 
 

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass, replace
 
 from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.fit import Fit, fits_to_coordinates
 from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
 from pgo_models.certificates.lower_bound import (
     NO_BOUND,
@@ -21,7 +22,6 @@ from pgo_models.certificates.lower_bound import (
 )
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
-    coordinate_level,
     objective_rounding,
 )
 from pgo_models.errors import ProofError, SettingError
@@ -43,7 +43,7 @@ class Verdict(enum.Enum):
     """What the certificate says of the poses."""
 
     CERTIFIED = "globally optimal within the gap asked for"
-    EXACT = "globally optimal, exact to rounding: every edge fits to its last bits"
+    EXACT = "globally optimal: every edge fits as closely as its numbers can tell"
     NOT_CERTIFIED = "not shown to be optimal: the bound holds, but the gap is wider than asked for"
     TRIVIAL = "not shown to be optimal: no bound better than zero was found"
 
@@ -52,6 +52,7 @@ class BoundSource(enum.Enum):
     """Where the multipliers of the bound were taken."""
 
     GIVEN = "at the poses given"
+    REFINED = "after polishing the poses given, which were stationary, to rounding"
     POLISHED = "after polishing the poses given, which were not stationary"
     CHORDAL = (
         "at the point that the chordal start polishes to, "
@@ -91,10 +92,10 @@ class Certificate(ReadOnly):
     bound : LowerBound
         The proven bound.
     gap : float
-        (objective - lower_bound) / objective; 0 where the verdict is EXACT.
+        (objective - lower_bound) / objective, as computed; 0 where the poses fit to rounding.
     rounding_level : float
-        F of poses whose residuals are as large as rounding can make each. Where the verdict is
-        EXACT, F of the poses is at most four times that, in exact arithmetic (`fits_to_rounding`).
+        F of poses whose residuals are as large as rounding can make each. Where the poses fit to
+        rounding, F of them is at most four times that, in exact arithmetic (`fit_of`).
     stationarity : float
         Half the squared Newton decrement of the given poses, over F: about the relative decrease of
         F down to the stationary point beside them.
@@ -118,6 +119,8 @@ class Certificate(ReadOnly):
         nearest to theirs); nan where none is known.
     has_translations : bool
         Whether this is said of poses; otherwise of rotations alone.
+    fit : Fit
+        How closely the poses fit every edge; the verdict is EXACT unless that is NONE.
     """
 
     objective: float
@@ -134,6 +137,7 @@ class Certificate(ReadOnly):
     weighting: Weighting = Weighting.ISOTROPIC
     objective_error: float = math.nan
     has_translations: bool = True
+    fit: Fit = Fit.NONE
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
@@ -153,30 +157,35 @@ class Certificate(ReadOnly):
 
     @property
     def is_best_in_doubles(self) -> bool:
-        """Whether S_r is definite and the gap below 1e-6.
+        """Whether S_r is definite and the gap below 1e-6, or below the one asked for.
 
         A smaller gap takes more precision, not other poses.
         """
-        return self.bound.is_grounded and self.eta == 0.0 and self.gap <= DEFAULT_GAP
+        small = max(DEFAULT_GAP, self.wanted_gap)
+        return self.bound.is_grounded and self.eta == 0.0 and self.gap <= small
+
+    @property
+    def is_hidden_by_rounding(self) -> bool:
+        """Whether nothing but rounding keeps the gap that was asked for from being proven.
+
+        That of the bound, or that of the cost: then the gap as computed is the one asked for.
+        """
+        has_bound = not math.isnan(self.eta)
+        is_close = has_bound and self.gap <= self.wanted_gap
+        return not self.is_certified and (self.is_best_in_doubles or is_close)
 
     @property
     def can_improve(self) -> bool:
         """Whether other poses, or multipliers of another rank, could give what was asked for."""
-        return not (self.is_certified or self.is_best_in_doubles or self.bound.is_definite)
+        return not (self.is_certified or self.is_hidden_by_rounding or self.bound.is_definite)
 
     @property
     def digits(self) -> int:
         """Number of digits that are proven.
 
         It is the largest k with lower_bound >= (1 - 10^-k) objective_at_most, exactly.
-
-        None where the verdict is EXACT.
         """
-        return (
-            0
-            if self.verdict is Verdict.EXACT
-            else proven_digits(self.objective_at_most, self.lower_bound)
-        )
+        return proven_digits(self.objective_at_most, self.lower_bound)
 
     @property
     def objective_at_most(self) -> float:
@@ -184,11 +193,7 @@ class Certificate(ReadOnly):
 
         It is the objective as computed where no such bound is known.
         """
-        return (
-            self.objective
-            if math.isnan(self.objective_error)
-            else sum_above(self.objective, self.objective_error)
-        )
+        return _cost_at_most(self.objective, self.objective_error)
 
     @property
     def proven_gap(self) -> float:
@@ -196,13 +201,15 @@ class Certificate(ReadOnly):
 
         No poses cost less than (1 - proven_gap) of what these do.
 
-        (C - lower_bound) / C of C = objective_at_most, rounded up; 0 where the verdict is EXACT.
+        (C - lower_bound) / C of C = objective_at_most, rounded up. It is 1 where nothing better
+        than zero is known of the least cost, also of poses that fit every edge.
         """
-        return (
-            0.0
-            if self.verdict is Verdict.EXACT
-            else gap_above(self.objective_at_most, self.lower_bound)
-        )
+        return gap_above(self.objective_at_most, self.lower_bound)
+
+    @property
+    def printed_gap(self) -> float:
+        """The proven gap as tables show it: 0 of poses that fit to rounding, whose cost is none."""
+        return 0.0 if self.fit is Fit.ROUNDING else self.proven_gap
 
     @property
     def cost_text(self) -> str:
@@ -220,18 +227,22 @@ class Certificate(ReadOnly):
 
         From four digits on, it says how many are proven.
         """
-        if self.verdict is Verdict.EXACT:
+        if self.fit is Fit.ROUNDING:
             return "0: every edge fits to its rounding"
         text = rounded_up(self.proven_gap, 3)
+        if self.fit is Fit.DIGITS:
+            return f"{text}, of a cost below the digits of the file"
+        if self.fit is Fit.COORDINATES:
+            return f"{text}, of a cost below the last bits of the coordinates"
         return f"{text}, proven to {self.digits} digits" if self.digits > 3 else text
 
     @property
     def is_certified(self) -> bool:
-        """Whether the gap is within the one asked for, or F exact to rounding."""
+        """Whether the gap is proven to be within the one asked for, or the poses are exact."""
         return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
 
     def __repr__(self) -> str:
-        gap = rounded_up(self.proven_gap, 3)
+        gap = rounded_up(self.printed_gap, 3)
         return f"Certificate({self.cost}={self.cost_text}, gap={gap}, {self.verdict.name})"
 
     def __str__(self) -> str:
@@ -269,7 +280,16 @@ class Certificate(ReadOnly):
     def verdict_text(self) -> str:
         """The verdict as it is printed, which says where it is of rotations alone."""
         subject = "" if self.has_translations else "rotations "
-        return f"{self.verdict.name}: {subject}{self.verdict.value}"
+        return f"{self.verdict.name}: {subject}{self._verdict_sentence}"
+
+    @property
+    def _verdict_sentence(self) -> str:
+        """What the verdict says, with how closely exact poses fit and what hides a gap."""
+        if self.verdict is Verdict.EXACT and self.fit is not Fit.NONE:
+            return f"globally optimal, {self.fit.value}"
+        if self.verdict is Verdict.NOT_CERTIFIED and self.is_hidden_by_rounding:
+            return f"{self.verdict.value}, and rounding in doubles leaves no smaller one"
+        return self.verdict.value
 
     @property
     def proof(self) -> str:
@@ -370,16 +390,10 @@ def certificate_of_whole(local: LocalWorld, poses: Poses, certificate: Certifica
 def exact_to_coordinates(
     problem: PGOProblem, poses: Poses, certificate: Certificate
 ) -> Certificate:
-    """The certificate, EXACT where its poses cost no more than the `coordinate_level`.
-
-    Poses far from zero that fit but for the last digits of their coordinates cannot be better in
-    doubles.
-    """
-    level = coordinate_level(problem, poses)
-    if certificate.is_certified or not certificate.objective_at_most <= level:
+    """The certificate, EXACT where its poses fit as the last bits of far coordinates allow."""
+    if certificate.is_certified or not fits_to_coordinates(problem, poses):
         return certificate
-    rounding_level = max(level, certificate.rounding_level)
-    return replace(certificate, gap=0.0, rounding_level=rounding_level, verdict=Verdict.EXACT)
+    return replace(certificate, fit=Fit.COORDINATES, verdict=Verdict.EXACT)
 
 
 def with_terms(
@@ -426,7 +440,7 @@ def certify_with(
     if bound is None:
         ground = ground if ground is not None else problem.at_best_translations(poses)
         tangent = problem.tangent_at(ground)
-        if rounding.is_exact:
+        if rounding.fit is Fit.ROUNDING:
             bound = NO_BOUND
         elif terms is None:
             bound = best_bound(tangent, Lambda, ground, gap, objective)
@@ -435,20 +449,24 @@ def certify_with(
     weighting = (
         problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC
     )
-    # the gap comes with the verdict
-    figures = objective, bound, math.nan, rounding.level, stationarity
-    unjudged = Certificate(
-        *figures,
-        source,
-        poses,
-        objective,
-        Lambda,
-        gap,
-        Verdict.TRIVIAL,
-        weighting,
+    judgement = judge_cost(repr(problem), objective, rounding, bound, gap)
+    return Certificate(
+        objective=judgement.objective,
+        bound=judgement.bound,
+        gap=judgement.gap,
+        rounding_level=rounding.level,
+        stationarity=stationarity,
+        source=source,
+        poses=poses,
+        poses_objective=objective,
+        Lambda=Lambda,
+        wanted_gap=gap,
+        verdict=judgement.verdict,
+        weighting=weighting,
+        objective_error=rounding.error,
         has_translations=problem.has_translations,
+        fit=rounding.fit,
     )
-    return judge_cost(problem, unjudged, objective, rounding)
 
 
 def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
@@ -457,48 +475,74 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
     A ProofError when F of the poses is below it by more than the rounding of F: then one of the two
     is wrong.
     """
-    return judge_cost(
-        problem, certificate, problem.objective(poses), objective_rounding(problem, poses)
+    objective = problem.objective(poses)
+    rounding = objective_rounding(problem, poses)
+    judgement = judge_cost(
+        repr(problem), objective, rounding, certificate.bound, certificate.wanted_gap
     )
+    return judgement.of(certificate)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a bound says of poses with a given cost."""
+
+    objective: float
+    rounding: ObjectiveRounding
+    bound: LowerBound
+    gap: float
+    verdict: Verdict
+
+    def of(self, certificate: Certificate) -> Certificate:
+        """The certificate with this judgement of its poses in place of its own."""
+        return replace(
+            certificate,
+            objective=self.objective,
+            objective_error=self.rounding.error,
+            rounding_level=self.rounding.level,
+            fit=self.rounding.fit,
+            bound=self.bound,
+            gap=self.gap,
+            verdict=self.verdict,
+        )
 
 
 def judge_cost(
-    problem: PGOProblem | str, given: Certificate, F: float, rounding: ObjectiveRounding
-) -> Certificate:
-    """The given certificate of poses that cost F instead, held against its bound.
+    subject: str, F: float, rounding: ObjectiveRounding, bound: LowerBound, wanted_gap: float
+) -> Judgement:
+    """Hold the cost F of poses, which is known to its rounding, against a bound.
 
-    Errors are those of `judge`.
+    Errors are those of `judge`, and name the subject: a problem.
     """
-    bound = given.bound
     if bound.value > F + rounding.error:
         raise ProofError(
-            f"lower bound {bound.value!r} is above F = {F!r} of {problem!r}, "
+            f"lower bound {bound.value!r} is above F = {F!r} of {subject}, "
             f"which is known to {rounding.error:.2g}: "
             "a defect of pgo_models; please report it with the graph"
         )
     # F may come out below a true bound by its own rounding, which is then what the gap is known to.
-    gap = relative_gap(F, bound.value if bound.value < F else F - rounding.error, rounding.is_exact)
+    gap = relative_gap(
+        F,
+        bound.value if bound.value < F else F - rounding.error,
+        rounding.fit is Fit.ROUNDING,
+    )
     # chi2, which is never negative, may come out below zero.
     bound = replace(bound, value=min(bound.value, max(F, 0.0)))
-    verdict = verdict_of(rounding.is_exact, gap, bound, given.wanted_gap)
-    return replace(
-        given,
-        objective=F,
-        objective_error=rounding.error,
-        rounding_level=rounding.level,
-        bound=bound,
-        gap=gap,
-        verdict=verdict,
-    )
+    verdict = verdict_of(rounding.fit, _cost_at_most(F, rounding.error), bound, wanted_gap)
+    return Judgement(F, rounding, bound, gap, verdict)
 
 
-def verdict_of(is_exact: bool, gap: float, bound: LowerBound, wanted_gap: float) -> Verdict:
-    """Verdict on poses that are exact or not (`fits_to_rounding`), with their gap and the bound."""
-    if is_exact:
+def verdict_of(fit: Fit, cost_at_most: float, bound: LowerBound, wanted_gap: float) -> Verdict:
+    """Verdict on poses that fit the edges so closely and cost no more than that.
+
+    The gap is that of `Certificate.proven_gap`: what was asked for has to be proven.
+    """
+    if fit is not Fit.NONE:
         return Verdict.EXACT
     if math.isnan(bound.eta):
         return Verdict.TRIVIAL
-    return Verdict.CERTIFIED if gap <= wanted_gap else Verdict.NOT_CERTIFIED
+    proven_gap = gap_above(cost_at_most, bound.value)
+    return Verdict.CERTIFIED if proven_gap <= wanted_gap else Verdict.NOT_CERTIFIED
 
 
 def relative_gap(objective: float, lower_bound: float, is_exact: bool = False) -> float:
@@ -509,3 +553,8 @@ def relative_gap(objective: float, lower_bound: float, is_exact: bool = False) -
     if is_exact:
         return 0.0
     return (objective - lower_bound) / objective if 0.0 < objective < math.inf else 1.0
+
+
+def _cost_at_most(objective: float, error: float) -> float:
+    """A cost and the bound on its error; the cost as computed where no such bound is known."""
+    return objective if math.isnan(error) else sum_above(objective, error)

@@ -8,11 +8,11 @@ by at most gamma_k times the sum of their absolute values, gamma_k = k u / (1 - 
 `OUTWARD` rounds up, `has_safe_scale` bars underflow.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from pgo_models.certificates.fit import Fit, fit_of, residual_errors, rounding_cost
 from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
@@ -27,8 +27,6 @@ from pgo_models.problem.floating_point import (
 from pgo_models.problem.incidence import rows_of_blocks
 from pgo_models.problem.problem import PGOProblem
 
-_SHARE_OF_ONE = 8.0  # times sqrt(m) its own error: what an edge may be off by beside m - 1 that fit
-_NEARLY = 2.0  # times its rounding level: above that there is no need to look at every edge
 # of weights: products of four stay far from underflow and overflow
 _SMALLEST = 1e-100
 _LARGEST = 1e100
@@ -216,12 +214,12 @@ class ObjectiveRounding:
     level: float
     # bound on the distance of F as computed from F at the exact rotations nearest to the poses
     error: float
-    # whether every edge fits (`fits_to_rounding`): then F is at most 4 level, exactly
-    is_exact: bool
+    # how closely every edge fits: where it is to rounding, F is at most 4 level, exactly
+    fit: Fit
 
 
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
-    """Rounding level of F at poses, and a bound on its error there.
+    """Rounding level of F at poses, a bound on its error there, and how closely they fit.
 
     As computed, a residual is off by its evaluation and by the `orthogonality_error` of the stored
     R, at most
@@ -229,23 +227,21 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
         e_t = (2 d + 3) u (||t_j - t_i|| + ||t_ij||) + slant ||t_ij||,
         e_R = 2 sqrt(d) (2 d + 3) u + 2 slant
 
-    in the Euclidean norm of its d, or d^2, numbers; the error is sum tau (2 ||r_t|| e_t + e_t^2) +
-    kappa (2 ||r_R|| e_R + e_R^2) and the rounding of the sum. The level is sum tau e_t^2 + kappa
-    e_R^2 with twice the largest ||t_i||, seen from the first pose, for ||t_j - t_i||: a solve for
-    all translations leaves every one with an error in proportion to the last bits of the largest.
-    In chi2, kappa r_R is W r_R, and its excess, whose half gradient is C, adds 2 <|C|, errors> +
-    (size_t e_t + size_R e_R)^2.
+    in the Euclidean norm of its d, or d^2, numbers (`residual_errors`); the error is sum tau (2
+    ||r_t|| e_t + e_t^2) + kappa (2 ||r_R|| e_R + e_R^2) and the rounding of the sum. In chi2, kappa
+    r_R is W r_R, and its excess, whose half gradient is C, adds 2 <|C|, errors> + (size_t e_t +
+    size_R e_R)^2. The level is `rounding_cost`.
 
-    Whether the poses are exact is not asked of the level, a sum, but of every edge:
-    `fits_to_rounding`.
+    Whether the poses are exact is not asked of the level, a sum, but of every edge: `fit_of`.
     """
     poses = problem.seen_poses(poses)
     graph = problem.graph
     d = problem.d
     m = problem.graph.num_edges
     offsets = poses.t.take(graph.j, axis=0) - poses.t.take(graph.i, axis=0)
-    distances = block_norms(offsets)
-    e_t, e_R = _residual_errors(problem, poses, distances)
+    errors = residual_errors(problem, block_norms(offsets), poses.orthogonality_error)
+    e_t = errors.translation
+    e_R = float(errors.rotation[0])  # the same of every edge
     residuals = problem.at(poses).residuals
     _, w = problem.residual_matrix
     # sum ||D r|| e, the terms that are linear in the errors. Along the axes of W, which turn no
@@ -257,115 +253,25 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     cross = float(np.sum(norms_t * e_t))
     cross += e_R * float(np.sum(norms_R))
     # The terms that are quadratic in the errors, and the rounding of the sum F.
-    quadratic = problem.weights.bound_of_norms(e_t, e_R)
+    quadratic = errors.cost(problem)
     F = float(np.sum(np.abs(w) * inner_products(residuals, residuals)))
     error = quadratic + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * F
     for of_cost in problem.weights.value_errors(problem, poses, e_t, e_R):
         error += of_cost
-    level = rounding_level(problem, poses)
-    is_exact = _is_exact(problem, poses, level)
-    return ObjectiveRounding(level, OUTWARD * error, is_exact)
+    level = rounding_cost(problem, poses)
+    return ObjectiveRounding(level, OUTWARD * error, fit_of(problem, poses))
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:
-    """Level of `objective_rounding`."""
-    e_t, e_R = _last_bits(problem, problem.seen_poses(poses))
-    return problem.weights.bound_of_norms(e_t, e_R)
+    """F of poses that a solve leaves, where nothing but rounding is left: what it stops at.
 
-
-def coordinate_level(problem: PGOProblem, poses: Poses) -> float:
-    """Cost that half a unit in the last place of all coordinates can make.
-
-    Doubles have a coordinate t to u |t|. So r_t = t_j - t_i - R_i t_ij of coordinates that fit
-    exactly may be as large as u (||t_i|| + ||t_j|| + ||t_ij||), once these are rounded.
-    """
-    graph = problem.graph
-    size = block_norms(poses.t)
-    e_t = UNIT_ROUNDOFF * (size[graph.i] + size[graph.j] + block_norms(graph.t_ij))
-    return problem.weights.bound_of_norms(e_t, 0.0)
-
-
-def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
-    """Whether rounding alone can make every residual as large as it is: F cannot be told from zero.
-
-    Residuals are computed as r_t = t_j - t_i - R_i t_ij and r_R = R_j - R_i R_ij, in this order.
-    With the e_t and e_R of the level (`objective_rounding`) and m edges, two things are wanted:
-
-        sum tau ||r_t||^2 + kappa ||r_R||_F^2 <= level = sum tau e_t^2 + kappa e_R^2,
-        ||r_t|| <= 8 sqrt(m) e_t  and  ||r_R||_F <= 8 sqrt(m) e_R  of every edge,
-
-    the latter whatever its weight is.
-
-    The first alone says nothing of light edges where there is a heavy one, whose rounding outweighs
-    all that they cost; by the second no edge takes much more than the errors of m edges like
-    itself, 8 being for what a solve adds to the rounding of one residual. A residual without weight
-    does not count. In chi2 kappa is the largest |eigenvalue| of W, and (size_t ||r_t|| + size_R
-    ||r_R||)^2 is added on either side for the excess. Where robots share the edges, each asks this
-    of its own.
-
-    What follows is exact. The rounding of a residual together with the distance of the stored R
-    from rotations is at most e_t and e_R: that of r_t is (2 + d^1.5) u, and (2 d + 3) u is in e_t;
-    that of r_R is (d + 1) (d + d^0.5) u, and 2 d^0.5 (2 d + 3) u is in e_R. So at the exact
-    rotations nearest to the poses every residual is at most (8 sqrt(m) + 1) e_t and (8 sqrt(m) + 1)
-    e_R. And F, or chi2, is at most 4 `rounding_level` there, by the triangle inequality in the norm
-    whose square the sum is. As neither is ever negative, no poses cost less by more than that.
-
-    Parameters
-    ----------
-    problem : PGOProblem
-        F or chi2.
-    poses : Poses
-        Poses of its graph.
-
-    Returns
-    -------
-    bool
-        False says nothing of how good the poses are.
+    It is sum tau e_t^2 + kappa e_R^2 with twice the largest ||t_i||, seen from the first pose, for
+    ||t_j - t_i||: a solve for all translations leaves every one with an error in proportion to the
+    last bits of the largest. No claim is made of it: whether poses are exact is asked of every edge
+    (`fit_of`).
     """
     poses = problem.seen_poses(poses)
-    return _is_exact(problem, poses, rounding_level(problem, poses))
-
-
-def _is_exact(problem: PGOProblem, poses: Poses, level: float) -> bool:
-    """Both conditions of `fits_to_rounding`, for poses with this rounding level."""
-    # The cost as a whole is cheap to compute, and mostly settles it.
-    if not problem.objective(poses) <= _NEARLY * level:
-        return False
-    graph = problem.graph
-    t = poses.t
-    R = poses.R
-    R_i = R[graph.i]
-    offsets = problem.weights.seen_offsets(graph.t_ij)
-    turned_offsets = (R_i @ offsets[:, :, None])[:, :, 0]
-    residuals_t = t[graph.j] - t[graph.i] - turned_offsets
-    residuals_R = R[graph.j] - R_i @ graph.R_ij
-    r_t = block_norms(residuals_t)
-    r_R = block_norms(residuals_R)
-    is_seen_t, is_seen_R = problem.weights.is_seen()
-    e_t, e_R = _last_bits(problem, poses)
-    share = _SHARE_OF_ONE * math.sqrt(graph.num_edges)
-    fits_t = (r_t <= share * e_t) | ~is_seen_t
-    fits_R = (r_R <= share * e_R) | ~is_seen_R
-    if not (fits_t.all() and fits_R.all()):
-        return False
-    return problem.weights.bound_of_norms(r_t, r_R) <= level
-
-
-def _last_bits(problem: PGOProblem, poses: Poses) -> tuple[Array, float]:
-    """Errors e_t, (m,), and e_R of residuals, with the last bits of the farthest coordinates."""
     from_first = poses.t - poses.t[:1]
     extent = 2.0 * block_norms(from_first).max()
     distances = np.full(problem.graph.num_edges, extent)
-    return _residual_errors(problem, poses, distances)
-
-
-def _residual_errors(problem: PGOProblem, poses: Poses, distance: Array) -> tuple[Array, float]:
-    """Errors e_t, (m,), and e_R of `objective_rounding`, with distances for ||t_j - t_i||, (m,)."""
-    d = problem.d
-    share = (2 * d + 3) * UNIT_ROUNDOFF
-    slant = poses.orthogonality_error + d * gamma(d + 2)
-    offsets = problem.weights.seen_offsets(problem.graph.t_ij)
-    length = block_norms(offsets)
-    e_t = share * (distance + length) + slant * length
-    e_R = 2.0 * math.sqrt(d) * share + 2.0 * slant
-    return e_t, e_R
+    return residual_errors(problem, distances, poses.orthogonality_error).cost(problem)

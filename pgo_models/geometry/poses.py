@@ -107,9 +107,17 @@ class Poses(ReadOnly):
         -------
         Poses
             A pose with R_i = I at every point.
+
+        Raises
+        ------
+        GraphError
+            When the points are no (n, d) array of real numbers.
         """
-        d = np.shape(t)[1]
-        return cls(np.broadcast_to(np.eye(d), (len(t), d, d)), t)
+        points = real_array(t, "points")
+        if points.ndim != 2:
+            raise GraphError(f"points have shape {points.shape}; give (n, d), a row for each point")
+        n, d = points.shape
+        return cls(np.broadcast_to(np.eye(d), (n, d, d)), points)
 
     @property
     def num_poses(self) -> int:

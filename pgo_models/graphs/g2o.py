@@ -25,10 +25,11 @@ from pgo_models.graphs.g2o_folder import (
     check_one_graph,
 )
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
-from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
+from pgo_models.graphs.g2o_rows import information_of, measurements_of, numbers_of, poses_of
 from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
+from pgo_models.graphs.written_digits import most_digits, written_errors
 
 MOST_SYMBOLS = len(LETTERS)  # robots whose poses can be named by GTSAM symbols
 _ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
@@ -181,6 +182,7 @@ def graph_of_files(
     information = information_of(d, rows)
     kappa, tau = edge_precisions(information, weights)
     R_ij, t_ij = poses_of(d, rows)
+    digits = most_digits(file.digits for file in files)
     landmark_ids = np.concatenate([file.landmarks for file in files])
     is_landmark = np.isin(ids, landmark_ids)
     return PoseGraph(
@@ -199,6 +201,7 @@ def graph_of_files(
         name=printable(name_of(path)),
         world=world,
         landmarks=np.flatnonzero(is_landmark),
+        written_error=written_errors(measurements_of(d, rows), digits),
     )
 
 

@@ -44,6 +44,7 @@ from pgo_models.graphs.g2o_tags import (
 )
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.precisions import are_definite
+from pgo_models.graphs.written_digits import WrittenDigits, digits_of
 
 _NAMED_TAGS = 10  # unknown tags that a warning names
 _KNOWN_TAGS = ", ".join(TAGS_IN_FILES)
@@ -68,6 +69,7 @@ class G2OLines:
     fixed: IntArray  # (f,): ids of the FIX lines
     fixed_lines: IntArray  # (f,)
     landmarks: IntArray  # (l,): ids of points
+    digits: WrittenDigits  # of the measurements as they are written
     landmark_shift: int = 0  # what was added to the ids of landmarks, which the file has for poses
 
 
@@ -195,6 +197,7 @@ class _Assembly:
         """What the file holds. Lines with problems are left out, and noted in the source."""
         self._settle_edge2()
         self._note_noise()
+        digits = self._digits()
         vertices = self._joined(is_edge=False)
         edges = self._joined(is_edge=True)
         fixed_rows = np.array(self._source.fixed, dtype=np.int64).reshape(-1, 2)
@@ -211,6 +214,7 @@ class _Assembly:
             fixed=fixed,
             fixed_lines=fixed_lines,
             landmarks=np.zeros(0, dtype=np.int64),
+            digits=digits,
         )
         if vertices.is_point.any() or edges.is_point.any():
             return self._with_landmarks(file, vertices.is_point, edges.is_point)
@@ -275,6 +279,15 @@ class _Assembly:
         # TORO, whose matrices are information, writes vertices; iSAM does not.
         if parsed["EDGE3"] and not parsed["VERTEX3"]:
             self.notes.append(f"EDGE3 {_TAKEN_AS_INFORMATION}")
+
+    def _digits(self) -> WrittenDigits:
+        """Digits with which the measurements are written."""
+        measured = [np.zeros(0)]
+        for tag, kind in TAGS.items():
+            if kind.is_edge:
+                parts = self._source.parsed[tag]
+                measured += [part.numbers[:, : kind.num_measured].ravel() for part in parts]
+        return digits_of(np.concatenate(measured))
 
     def _joined(self, is_edge: bool) -> _Rows:
         """All VERTEX or all EDGE lines in the order of the file.

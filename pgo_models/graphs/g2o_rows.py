@@ -25,11 +25,15 @@ def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
     return rotations_from_quaternions(quaternions), t
 
 
+def measurements_of(d: int, edges: Array) -> Array:
+    """The measured numbers of EDGE rows, which are like rows of vertices."""
+    return edges[:, : _num_measured(d)]
+
+
 def information_of(d: int, edges: Array) -> Array:
     """Information matrices (m, k, k) of EDGE rows, k = 3 in the plane and 6 in space."""
     k = 3 if d == 2 else 6
-    num_measured = 3 if d == 2 else 7
-    columns = num_measured + triangle_places(k)
+    columns = _num_measured(d) + triangle_places(k)
     return np.asarray(edges[:, columns])
 
 
@@ -37,3 +41,8 @@ def numbers_of(R: Array, t: Array) -> Array:
     """Rows x y theta, or x y z qx qy qz qw, of rotations and translations: `poses_of` backwards."""
     rotations = log_map(R) if t.shape[1] == 2 else quaternions_from_rotations(R)
     return np.concatenate([t, rotations], axis=1)
+
+
+def _num_measured(d: int) -> int:
+    """How many numbers stand for a pose."""
+    return 3 if d == 2 else 7

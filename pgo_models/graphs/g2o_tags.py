@@ -63,7 +63,7 @@ class Tag:
             return 4
         has_triangle = self.is_edge and self.noise is not Noise.MISSING
         num_in_triangle = self._side * (self._side + 1) // 2 if has_triangle else 0
-        return self._num_measured + num_in_triangle
+        return self.num_measured + num_in_triangle
 
     @property
     def has_matrix(self) -> bool:
@@ -82,7 +82,7 @@ class Tag:
             problem = "range and standard deviations are not all positive; correct or remove it"
             return is_wrong, problem
         if self.noise is Noise.COVARIANCE:
-            covariances = numbers[:, self._num_measured + triangle_places(self._side)]
+            covariances = numbers[:, self.num_measured + triangle_places(self._side)]
             is_covariance = are_definite(covariances, SINGULAR)
             problem = "the covariance matrix is not positive definite; correct or remove it"
             return ~is_covariance, problem
@@ -107,7 +107,7 @@ class Tag:
         return self.d if self.is_point else 3 * self.d - 3
 
     @property
-    def _num_measured(self) -> int:
+    def num_measured(self) -> int:
         """How many numbers the measurement has."""
         has_quaternion = self._side == 6 and not self.is_toro
         return 7 if has_quaternion else self._side
@@ -118,14 +118,14 @@ class Tag:
             return numbers
         if self.noise is Noise.DEVIATIONS:
             return _cartesian(numbers)
-        measured = numbers[:, : self._num_measured]
+        measured = numbers[:, : self.num_measured]
         if self.noise is Noise.SQUARE_ROOT:
-            U = np.triu(numbers[:, self._num_measured + triangle_places(self._side)])
+            U = np.triu(numbers[:, self.num_measured + triangle_places(self._side)])
             information = U.mT @ U
         elif self.noise is Noise.MISSING:
             information = np.tile(np.eye(self._side), (len(numbers), 1, 1))
         else:
-            covariances = numbers[:, self._num_measured + triangle_places(self._side)]
+            covariances = numbers[:, self.num_measured + triangle_places(self._side)]
             information = np.asarray(np.linalg.inv(covariances), dtype=float)
         triangles = information[:, *np.triu_indices(self._side)]
         return np.concatenate([measured, triangles], axis=1)

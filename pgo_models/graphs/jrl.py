@@ -21,6 +21,7 @@ from pgo_models.graphs.g2o_parser import G2OLines, far_information, problems_of
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
+from pgo_models.graphs.written_digits import digits_of
 
 SUFFIX = ".jrl"
 _SHOWN = 60  # characters of a wrong value that a message shows
@@ -259,6 +260,7 @@ def _file(
     rows = [np.zeros((0, width))]
     places = [np.zeros(0, dtype=np.int64)]
     landmarks = [np.zeros(0, dtype=np.int64)]
+    measured = [np.zeros(0)]
     for of_type in by_type.values():
         kind = of_type.kind
         if kind.d != d:  # none of its measurements could be read
@@ -273,6 +275,7 @@ def _file(
         places_of_kind = of_kind[~is_wrong]
         problems += far_information(places_of_kind[~is_right])
         rows.append(rows_of_kind[is_right])
+        measured.append(numbers[:, : kind.num_measured].ravel())
         ids.append(ids_of_kind[is_right])
         places.append(places_of_kind[is_right])
         if kind.to_landmark:
@@ -292,6 +295,7 @@ def _file(
         fixed=no_ids,
         fixed_lines=no_ids,
         landmarks=np.unique(np.concatenate(landmarks)),
+        digits=digits_of(np.concatenate(measured)),
     )
 
 

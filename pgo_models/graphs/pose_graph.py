@@ -36,8 +36,18 @@ _NAMED_COMPONENTS = 5  # components that an error names
 
 _WHOLE_NUMBERS = ("num_poses", "world")
 _WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks", "absent")
-_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times")
-_EDGE_FIELDS = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information", "uncoupled")
+_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times", "written_error")
+_EDGE_FIELDS = (
+    "i",
+    "j",
+    "R_ij",
+    "t_ij",
+    "kappa",
+    "tau",
+    "information",
+    "uncoupled",
+    "written_error",
+)
 
 
 def _no_poses() -> IntArray:
@@ -107,6 +117,10 @@ class PoseGraph(ReadOnly):
     absent : IntArray, (a,)
         Poses of robots without a file in the folder that was read: edges of others name them. What
         is found holds for these edges, and not for the graph of all robots.
+    written_error : Array, (m, 2), optional
+        What ||t_ij|| and ||R_ij||_F may be off by because a file writes measurements with so many
+        digits: half a unit of the last one (`pgo_models.graphs.written_digits`). 0 where nothing is
+        known of that, as of measurements that no file has.
 
     Raises
     ------
@@ -145,6 +159,7 @@ class PoseGraph(ReadOnly):
     landmarks: IntArray = field(default_factory=_no_poses)
     uncoupled: BoolArray | None = None
     absent: IntArray = field(default_factory=_no_poses)
+    written_error: Array | None = None
 
     def __post_init__(self) -> None:
         self._convert(_WHOLE_NUMBERS, whole_number)
@@ -440,6 +455,7 @@ class PoseGraph(ReadOnly):
             "tau": (m,),
             "information": (m, k, k),
             "uncoupled": (m,),
+            "written_error": (m, 2),
             "ids": (n,),
             "robot": (n,),
             "fixed": (len(self.fixed),),
@@ -495,7 +511,7 @@ class PoseGraph(ReadOnly):
 
     def _check_precisions(self) -> None:
         """Check that the numbers of all edges are finite, and their precisions not negative."""
-        for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
+        for name in ("R_ij", "t_ij", "kappa", "tau", "information", "written_error"):
             values = getattr(self, name)
             if values is not None:
                 numbers_of_edges = values.reshape(self.num_edges, -1)
@@ -857,13 +873,14 @@ class PoseGraph(ReadOnly):
         GraphError
             When there is not one measurement for every edge, or as for `PoseGraph`.
         """
-        if measured.d != self.d or not len(i) == len(j) == measured.num_poses:
+        i = whole_array(i, "i")
+        j = whole_array(j, "j")
+        if measured.d != self.d or not i.shape == j.shape == (measured.num_poses,):
             raise GraphError(
                 f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge"
             )
-        shape = np.shape(i)
-        kappa_rows = np.array(np.broadcast_to(kappa, shape), dtype=float)
-        tau_rows = np.array(np.broadcast_to(tau, shape), dtype=float)
+        kappa_rows = _rows_of_weights(kappa, len(i), "kappa")
+        tau_rows = _rows_of_weights(tau, len(i), "tau")
         new_rows = {
             "i": i,
             "j": j,
@@ -873,6 +890,7 @@ class PoseGraph(ReadOnly):
             "tau": tau_rows,
             "information": isotropic_information(kappa_rows, tau_rows, self.d),
             "uncoupled": np.zeros(len(kappa_rows), dtype=bool),
+            "written_error": np.zeros((len(kappa_rows), 2)),
         }
         all_edges = np.ones(self.num_edges, dtype=bool)
         own_rows = self._edge_rows(all_edges)
@@ -942,6 +960,7 @@ class PoseGraph(ReadOnly):
         >>> load("grid").with_position_prior(np.array([0, 5, 9]), np.eye(3), tau=1.0)
         PoseGraph('grid', d=3, poses=27, edges=111, priors=3, robots=1)
         """
+        poses = self._checked_poses(poses)
         measured = Poses.of_points(positions)
         return self.with_prior(poses, measured, kappa=0.0, tau=tau)
 
@@ -1000,9 +1019,9 @@ class PoseGraph(ReadOnly):
     def _checked_poses(self, poses: IntArray) -> IntArray:
         """Poses (k,), k > 0, as whole numbers; a GraphError unless the graph has them."""
         poses = whole_array(poses, "poses")
-        if not poses.size or not self._has_poses(poses):
+        if poses.ndim != 1 or not poses.size or not self._has_poses(poses):
             raise GraphError(
-                f"measured poses are {poses}; give one or more, 0 to {self.num_poses - 1}"
+                f"measured poses are {poses}; give one or more, 0 to {self.num_poses - 1}, in a row"
             )
         return poses
 
@@ -1022,6 +1041,21 @@ class PoseGraph(ReadOnly):
             robot = np.append(self.robot, self.robot[beside])
         ids = np.append(self.pose_ids, name)
         return replace(self, num_poses=self.num_poses + 1, ids=ids, robot=robot, **others)
+
+
+def _rows_of_weights(weights: Weights, count: int, name: str) -> Array:
+    """Weights of so many edges, of which one may be given for all; else a GraphError."""
+    rows = real_array(weights, name)
+    if rows.shape not in ((), (1,), (count,)):
+        raise GraphError(
+            f"{name} has shape {rows.shape} for {count} edges; give one number for all, or each"
+        )
+    return np.array(np.broadcast_to(rows, count))
+
+
+def written_error_of(graph: PoseGraph, edges: BoolArray | IntArray) -> Array | None:
+    """`PoseGraph.written_error` of the given edges."""
+    return None if graph.written_error is None else graph.written_error[edges]
 
 
 def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:

@@ -94,7 +94,7 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
         axes.set_ylim(bottom=lowest)
         axes.set_xlabel("k-th smallest eigenvalue of S")
         axes.set_ylabel("|eigenvalue| (per rad$^2$)")
-        gap = rounded_up(certificate.proven_gap, 2)
+        gap = rounded_up(certificate.printed_gap, 2)
         axes.set_title(f"{problem.graph.name}: gap {gap}, {certificate.verdict.name}")
         count_along_x(axes)
         figure.legend(loc="outside lower center", ncols=3, columnspacing=1.0, handletextpad=0.4)

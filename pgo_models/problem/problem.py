@@ -253,6 +253,7 @@ class PGOProblem(ReadOnly):
             information=None,
             initial=None,
             truth=None,
+            written_error=None,
         )
         cost = self.weights.with_rotation_terms(R_ij, W)
         return _ExtendedProblem(extended, self.backend, cost, original=self)

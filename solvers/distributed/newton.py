@@ -30,6 +30,7 @@ from solvers.riemannian.newton_step import (
     newton_step,
     stationary_tolerance,
 )
+from solvers.riemannian.polish import MOST_FITTING_STEPS, NEARLY_EXACT
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,9 +96,11 @@ class EliminatedAlgebra:
         """Return the poses after a move.
 
         Their translations are the best ones for the rotations, but not of chi2: there the matrix of
-        the translations differs from rotations to rotations.
+        the translations differs from rotations to rotations. Nor where F is near its rounding level
+        (`refine`).
         """
-        if self.driver.is_final:
+        is_nearly_exact = model.objective <= NEARLY_EXACT * model.rounding_level
+        if self.driver.is_final or is_nearly_exact:
             return self._straight_trial(model, length)
         return self._trial_with_best_translations(model, length)
 
@@ -108,6 +111,22 @@ class EliminatedAlgebra:
     def accept(self, trial: CoverTrial) -> None:
         """Go to the trial, here and on the robots."""
         self.driver.accept(trial.at)
+
+    def refine(self, order: ModelOrder) -> None:
+        """Take Newton steps at the rounding level of F, as long as they halve it.
+
+        The translations move straight on there: a solve for all of them leaves errors in proportion
+        to the last bits of the farthest, which every edge has to fit without (`fit_of`).
+        """
+        model = self.factorize(order)
+        for _ in range(MOST_FITTING_STEPS):
+            if model is None:
+                return
+            trial = self._straight_trial(model, 1.0)
+            if trial.objective > 0.5 * model.objective:
+                return
+            model = self.model_at(model, trial)
+            self.accept(trial)
 
     def _straight_trial(self, model: Model, length: float) -> CoverTrial:
         """Return the trial whose translations move straight on."""
@@ -179,7 +198,11 @@ class SubstructuredNewton:
             num_rows = driver.num_poses * driver.d
             shift = first_shift(state.eta, driver.current.objective, num_rows)
         rules = StepRules(tolerance, self.newton.second_order, shift)
-        result = newton_step(EliminatedAlgebra(driver), rules)
+        algebra = EliminatedAlgebra(driver)
+        result = newton_step(algebra, rules)
+        is_stationary = result.decrement <= tolerance or result.is_at_rounding
+        if is_stationary and driver.current.objective <= driver.current.rounding_level:
+            algebra.refine(result.model.order)
         eta = result.model.order.eta
         return SubstructuredNewtonState(
             k=state.k + 1,

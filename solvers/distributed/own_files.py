@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.poses import Poses
@@ -36,7 +37,7 @@ from pgo_models.graphs.g2o_folder import (
     placed_poses,
 )
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
-from pgo_models.graphs.g2o_rows import information_of, poses_of
+from pgo_models.graphs.g2o_rows import information_of, measurements_of, poses_of
 from pgo_models.graphs.pose_graph import (
     WORLD_ID,
     IntArray,
@@ -45,6 +46,7 @@ from pgo_models.graphs.pose_graph import (
     middle_pose,
 )
 from pgo_models.graphs.precisions import edge_precisions, indefinite_edges
+from pgo_models.graphs.written_digits import WrittenDigits, most_digits, written_errors
 from pgo_models.problem.weighting import (
     Weighting,
     convex_cost,
@@ -70,17 +72,21 @@ READ_HERE = (
 
 RobotFile = tuple[int, Path]  # a robot and its file, on the machine where the robot runs
 # What a file names: d, the ids of its VERTEX lines, and the ids that only its edges name; see
-# `_runs`.
-Claim = tuple[int, IntArray, IntArray]
+# `_runs`. And the digits that it is written with.
+Claim = tuple[int, IntArray, IntArray, WrittenDigits]
 
 
 @dataclass(frozen=True, eq=False)
 class OwnedRuns:
-    """Runs of consecutive ids, (k,): first id, number of that pose in the whole graph, owner."""
+    """Runs of consecutive ids, (k,): first id, number of that pose in the whole graph, owner.
+
+    With the digits of all files together, as they are all written in one way.
+    """
 
     first: IntArray
     number: IntArray
     owner: IntArray
+    digits: WrittenDigits
 
     def of(self, ids: IntArray) -> IntArray:
         """The run that each id is in."""
@@ -134,7 +140,7 @@ class Border:
     has_indefinite: bool  # whether the share of an edge in chi2 can be negative
 
 
-NO_ROUNDING = ObjectiveRounding(0.0, 0.0, True)  # of no edges
+NO_ROUNDING = ObjectiveRounding(0.0, 0.0, Fit.ROUNDING)  # of no edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +170,7 @@ class FileAgent(Agent):
 
     lines: G2OLines
     own: Told  # what its own file says of its poses
+    digits: WrittenDigits  # of all files
     graph: PoseGraph  # of its own poses, and those at the far end of its edges
     numbers: IntArray  # (n_a,): numbers of these poses in the whole graph, ascending
     owners: IntArray  # (n_a,)
@@ -193,7 +200,8 @@ def read_file(agent: FileAgent, _: None) -> Claim:
         )
     agent.lines = lines
     ids_of_edges_alone = np.setdiff1d(lines.edge_ids, lines.vertex_ids)
-    return lines.d, _runs(np.unique(lines.vertex_ids)), _runs(ids_of_edges_alone)
+    runs_of_vertices = _runs(np.unique(lines.vertex_ids))
+    return lines.d, runs_of_vertices, _runs(ids_of_edges_alone), lines.digits
 
 
 def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Told]:
@@ -212,6 +220,7 @@ def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Told]:
     for robot in np.unique(np.append(owners, owners_of_places)).tolist():
         touches = (owners == robot).any(axis=1)
         told[robot] = Told(edges.some(touches), places.some(owners_of_places == robot))
+    agent.digits = runs.digits
     no_lines = slice(0)
     agent.own = told.pop(agent.robot, Told(edges.some(no_lines), places.some(no_lines)))
     return told
@@ -255,6 +264,7 @@ def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) 
         ids=ids,
         fixed=fixed,
         name=agent.path.stem,
+        written_error=written_errors(measurements_of(lines.d, edges.rows), agent.digits),
     )
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
     agent.given = _given_pose(lines, ids[holding])
@@ -515,13 +525,13 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> NumberedI
     The ends of all runs cut the ids into intervals. All ids of an interval are named by the same
     files, or by none.
     """
-    runs = np.concatenate([np.concatenate(claim[1:]) for claim in claims])
+    runs = np.concatenate([np.concatenate(claim[1:3]) for claim in claims])
     bounds = np.unique(np.concatenate([runs[:, 0], runs[:, 1] + 1]))
     first = bounds[:-1]
     size = np.diff(bounds)
     # Whether a file has VERTEX lines of an interval, and names it at all: (files, intervals).
-    has_vertex = np.stack([_covers(vertices, bounds) for _, vertices, _ in claims])
-    has_edge_alone = np.stack([_covers(others, bounds) for _, _, others in claims])
+    has_vertex = np.stack([_covers(vertices, bounds) for _, vertices, _, _ in claims])
+    has_edge_alone = np.stack([_covers(others, bounds) for _, _, others, _ in claims])
     is_named = has_vertex | has_edge_alone
     claimants = np.where(has_vertex.any(axis=0), has_vertex, is_named)
     owner = claimants.argmax(axis=0)  # the first of them
@@ -529,9 +539,10 @@ def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> NumberedI
     _check_claims(claims, files, owner[known])
     known_size = np.where(known, size, 0)
     number = np.cumsum(known_size) - known_size
-    owned = [OwnedRuns(first[named], number[named], owner[named]) for named in is_named]
+    digits = most_digits(digits for *_, digits in claims)
+    owned = [OwnedRuns(first[named], number[named], owner[named], digits) for named in is_named]
     # As `absent_ids`: a file without VERTEX lines places all that it names.
-    is_file_placed = np.array([len(vertices) > 0 for _, vertices, _ in claims])
+    is_file_placed = np.array([len(vertices) > 0 for _, vertices, _, _ in claims])
     is_placed = (has_vertex | (is_named & ~is_file_placed[:, None])).any(axis=0)
     num_absent = int(known_size[~is_placed].sum())
     return NumberedIds(owned, int(known_size.sum()), num_absent)

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, judge_cost
+from pgo_models.certificates.certificate import BoundSource, Certificate, judge_cost
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import PGOError
@@ -112,10 +113,11 @@ class RobotsWithFiles(DriverPlace):
         """Certificate of the poses that the robots keep."""
         kept = self.kept[-1]
         no_poses = Poses(np.zeros((0, self.d, self.d)), np.zeros((0, self.d)))
-        unjudged = Certificate(
-            objective=kept.objective,
-            bound=bound,
-            gap=math.nan,
+        judgement = judge_cost(self.name, kept.objective, kept.rounding, bound, self.gap)
+        return Certificate(
+            objective=judgement.objective,
+            bound=judgement.bound,
+            gap=judgement.gap,
             rounding_level=kept.rounding.level,
             stationarity=kept.decrement,
             source=source,
@@ -123,10 +125,11 @@ class RobotsWithFiles(DriverPlace):
             poses_objective=kept.objective,
             Lambda=no_poses.R,
             wanted_gap=self.gap,
-            verdict=Verdict.TRIVIAL,
+            verdict=judgement.verdict,
             weighting=self.weighting,
+            objective_error=kept.rounding.error,
+            fit=kept.rounding.fit,
         )
-        return judge_cost(self.name, unjudged, kept.objective, kept.rounding)
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the poses that the robots keep, with the best bound that either has."""
@@ -189,7 +192,7 @@ def _sum_of_roundings(parts: Sequence[ObjectiveRounding]) -> ObjectiveRounding:
     """How accurately a sum is known of whose parts that is known."""
     level = math.fsum(part.level for part in parts)
     error = math.fsum(part.error for part in parts)
-    return ObjectiveRounding(level, error, all(part.is_exact for part in parts))
+    return ObjectiveRounding(level, error, Fit.of_all(part.fit for part in parts))
 
 
 def _frame(answers: Sequence[Answer]) -> tuple[Array, Array, str]:

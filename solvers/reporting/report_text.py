@@ -9,6 +9,7 @@ from decimal import Decimal
 from typing import Protocol
 
 from pgo_models.certificates.certificate import Certificate, Verdict
+from pgo_models.certificates.fit import Fit
 from pgo_models.figures import in_percent, rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -92,9 +93,12 @@ def headline(certificate: Certificate) -> str:
     """Return the verdict in one sentence."""
     verdict = certificate.verdict
     if verdict is Verdict.EXACT:
+        digits = "double precision"
+        if certificate.fit is Fit.DIGITS:
+            digits = "their file"
         return (
-            "Certified: the measurements agree to the last digits of double precision, and the "
-            "poses fit them all."
+            f"Certified: the measurements agree to the last digits of {digits}, and the poses fit "
+            "them all."
         )
     if verdict is Verdict.TRIVIAL:
         nothing = f"nothing better than {certificate.cost} >= 0 is proven"
@@ -119,6 +123,19 @@ def meaning(certificate: Certificate) -> list[str]:
         f"The poses cost {certificate.cost} = {certificate.cost_text}: the sum, over all "
         "measurements, of squared errors times precisions."
     )
+    if certificate.fit is Fit.DIGITS:
+        return [
+            cost,
+            "That is no more than what rounding the measurements to the last digits of their file "
+            f"makes of it, and {certificate.cost} is never below zero: no other poses fit better, "
+            "as far as the file can tell.",
+        ]
+    if certificate.fit is Fit.COORDINATES:
+        return [
+            cost,
+            "That is no more than what the last bits of the coordinates make of it, as doubles "
+            f"have them so far from zero, and {certificate.cost} is never below zero.",
+        ]
     if certificate.verdict is Verdict.EXACT:
         rounding = rounded_up(certificate.rounding_level, 2)
         return [
@@ -145,7 +162,7 @@ def _conclusion(certificate: Certificate) -> str:
     """What follows for the poses from a bound that is better than zero."""
     if certificate.verdict is Verdict.CERTIFIED:
         return _OPTIMAL
-    if certificate.gap <= _NEARLY_CLOSED:
+    if certificate.proven_gap <= _NEARLY_CLOSED:
         return _NEARLY_OPTIMAL
     if certificate.source.is_of_relaxation:
         return _NOT_TIGHT
@@ -252,7 +269,7 @@ def _advice_if_certified(
         Advice("Keep the poses, for example as g2o.", f"{solve} --out solved.g2o"),
         Advice("Check them independently of this solve.", f"pgo certify {certified_graph}"),
     ]
-    if certificate.gap > _SMALL_GAP:
+    if certificate.proven_gap > _SMALL_GAP and certificate.verdict is not Verdict.EXACT:
         suggestions.append(Advice("Ask for a tighter proof.", f"{solve} --gap {_FINER_GAP:g}"))
     return suggestions
 
@@ -260,9 +277,9 @@ def _advice_if_certified(
 def _advice_if_not_certified(
     graph: PoseGraph, certificate: Certificate, solve: str
 ) -> list[Advice]:
-    if certificate.gap <= _NEARLY_CLOSED and certificate.verdict is not Verdict.TRIVIAL:
+    if certificate.proven_gap <= _NEARLY_CLOSED and certificate.verdict is not Verdict.TRIVIAL:
         # The next power of ten above the gap.
-        reached = 10.0 ** math.ceil(math.log10(max(certificate.gap, 1e-16)))
+        reached = 10.0 ** math.ceil(math.log10(certificate.proven_gap))
         text = (
             "The gap asked for is finer than what was proven here; ask for the one that was "
             "reached."

@@ -11,14 +11,12 @@ from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
     BoundSource,
     Certificate,
-    Verdict,
     certificate_of_whole,
     certify_at,
     judge,
     judge_cost,
-    relative_gap,
 )
-from pgo_models.certificates.rounding_errors import ObjectiveRounding, fits_to_rounding
+from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
@@ -80,11 +78,13 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
         local_certificate = certify(local.problem, local.local_poses(poses), gap)
         return certificate_of_whole(local, poses, local_certificate)
     stationarity = relative_decrement(problem, poses)
-    if stationarity <= STATIONARY_DECREMENT and problem.is_quadratic:
+    is_stationary = stationarity <= STATIONARY_DECREMENT
+    if is_stationary and problem.is_quadratic:
         certificate = certify_at(problem, poses, gap, stationarity)
     else:
         polished = certify_at(problem, polish(problem, poses), gap, stationarity)
-        certificate = judge(problem, poses, replace(polished, source=BoundSource.POLISHED))
+        source = BoundSource.REFINED if is_stationary else BoundSource.POLISHED
+        certificate = judge(problem, poses, replace(polished, source=source))
     if not _bound_is_tight(problem, certificate):
         start = polish(problem.convex_part, chordal_start(problem.convex_part))
         other = certify_at(problem, polish(problem, start), gap, stationarity)
@@ -105,16 +105,18 @@ def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Ce
     shrunk = bound_by_shrinking(problem, certificate.poses)
     if shrunk.bound.value <= certificate.lower_bound:
         return certificate
-    by_smaller_cost = replace(
-        certificate, bound=shrunk.bound, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED
-    )
-    is_exact = certificate.verdict is Verdict.EXACT
+    by_smaller_cost = replace(certificate, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED)
     # Of the poses given, which need not be those that the bound was found at.
-    rounding = ObjectiveRounding(certificate.rounding_level, certificate.objective_error, is_exact)
-    return judge_cost(problem, by_smaller_cost, certificate.objective, rounding)
+    rounding = ObjectiveRounding(
+        certificate.rounding_level, certificate.objective_error, certificate.fit
+    )
+    judgement = judge_cost(
+        repr(problem), certificate.objective, rounding, shrunk.bound, certificate.wanted_gap
+    )
+    return judgement.of(by_smaller_cost)
 
 
 def _bound_is_tight(problem: PGOProblem, certificate: Certificate) -> bool:
-    """Whether the poses that the bound was found at have the gap asked for, or are exact."""
-    gap = relative_gap(certificate.poses_objective, certificate.lower_bound)
-    return gap <= certificate.wanted_gap or fits_to_rounding(problem, certificate.poses)
+    """Whether the poses that the bound was found at have the gap asked for, but for rounding."""
+    judged = judge(problem, certificate.poses, certificate)
+    return judged.is_certified or judged.is_hidden_by_rounding

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers_at
-from pgo_models.certificates.rounding_errors import fits_to_rounding, rounding_level
+from pgo_models.certificates.fit import Fit, fit_of
+from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, vee
@@ -267,7 +268,7 @@ def polish_step(
 
 
 def _fit_every_edge(problem: PGOProblem, poses: Poses, factor: CholeskyFactor) -> Poses:
-    """Move poses with F at its rounding level until every edge fits to its own.
+    """Move poses with F at its rounding level until every edge fits to its own numbers.
 
     Where that fails they are returned as they are. F is a sum, in which the rounding of heavy edges
     hides what light ones could still gain. A Newton step sees it all the same; one is enough, as a
@@ -276,11 +277,11 @@ def _fit_every_edge(problem: PGOProblem, poses: Poses, factor: CholeskyFactor) -
     layout = TangentLayout(problem.num_poses, problem.d)
     moved = poses
     for _ in range(MOST_FITTING_STEPS):
-        if fits_to_rounding(problem, moved):
+        if fit_of(problem, moved) is not Fit.NONE:
             return moved
         gradient = layout.join(*problem.riemannian_gradient(moved))
         moved = moved.moved_along(*layout.split(-factor.solve(gradient)))
-    return moved if fits_to_rounding(problem, moved) else poses
+    return poses if fit_of(problem, moved) is Fit.NONE else moved
 
 
 def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgo_models.certificates.certificate import Verdict
+from pgo_models.certificates.fit import Fit
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.problem import PGOProblem
@@ -83,6 +84,8 @@ class Rejection:
         Whether the kept edges cost more together than right ones may.
     places : tuple of str
         `file:line` of every edge, where they are known.
+    fit : Fit
+        How closely the poses fit the kept edges, where the verdict on these is EXACT.
     """
 
     problem: PGOProblem
@@ -97,6 +100,7 @@ class Rejection:
     verdict: Verdict
     is_misfit: bool
     places: tuple[str, ...] = ()
+    fit: Fit = Fit.NONE
 
     @property
     def rejected(self) -> BoolArray:
@@ -178,7 +182,8 @@ class Rejection:
         edges = f"for all {len(self.kept)} edges"
         if self.rejected.any():
             edges = f"for the {int(self.kept.sum())} edges kept"
-        proven = f"{self.verdict.name} {edges}; {self.held}"
+        digits = " to the digits of the file" if self.fit is Fit.DIGITS else ""
+        proven = f"{self.verdict.name}{digits} {edges}; {self.held}"
         if not self.doubts:
             return proven
         doubts = "; ".join(self.doubts)

@@ -202,7 +202,7 @@ class Estimate:
             name=stage.name,
             cost=doubted.truncated_cost(poses),
             rejected=int((~kept).sum()),
-            gap=certificate.proven_gap,
+            gap=certificate.printed_gap,
             is_certified=certificate.is_certified,
             seconds=time.perf_counter() - began,
         )

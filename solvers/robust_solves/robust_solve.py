@@ -324,6 +324,7 @@ class _RobustSolve:
             threshold_scale=choice.threshold_scale,
             verdict=solution.certificate.verdict,
             is_misfit=solution.edge_residuals.is_overall_misfit,
+            fit=solution.certificate.fit,
         )
         ledgers = self.place.ledgers
         ledger = reduce(Ledger.joined, ledgers) if ledgers else None

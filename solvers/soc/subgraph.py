@@ -11,7 +11,13 @@ from scipy.sparse import csc_array, csr_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, poses_by_distance
+from pgo_models.graphs.pose_graph import (
+    IntArray,
+    PoseGraph,
+    middle_pose,
+    poses_by_distance,
+    written_error_of,
+)
 from pgo_models.graphs.separators import cover_of_edges
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.initialization import largest_stiffness
@@ -110,6 +116,7 @@ class Subgraph:
             graph.kappa[kept],
             graph.tau[kept],
             name=graph.name,
+            written_error=written_error_of(graph, kept),
         )
         final = None
         if self.final is not None:
@@ -364,6 +371,7 @@ def _subgraph(
         graph.tau[edges],
         ids=graph.pose_ids[poses],
         name=f"{graph.name}, robot {robot}",
+        written_error=written_error_of(graph, edges),
     )
     convex_part = problem.convex_part
     in_cover, is_counted, copies, common = placement.of(robot, local, poses, owner)

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.certificates.rounding_errors import fits_to_rounding, objective_rounding
+from pgo_models.certificates.fit import fits_to_rounding
+from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.poses import Poses

@@ -13,6 +13,7 @@ from graphs import (
     SIZES,
     best_known,
     exact_graph,
+    informed,
     optimum_tolerance,
     random_poses,
     rounded_up,
@@ -29,8 +30,9 @@ from pgo_models.certificates.certificate import (
     certify_at,
     judge,
 )
+from pgo_models.certificates.fit import Fit, fits_to_rounding
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.certificates.rounding_errors import fits_to_rounding, objective_rounding
+from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, random_rotations
@@ -40,6 +42,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.certify import certify
 from solvers.riemannian.polish import polish, relative_decrement
 
@@ -79,7 +82,8 @@ def assert_holds_together(
         assert (fits_to_rounding(problem, poses), certificate.gap) == (True, 0.0)
     else:
         assert certificate.gap == (objective - certificate.lower_bound) / objective
-        assert certificate.is_certified == (certificate.gap <= certificate.wanted_gap)
+        is_within = certificate.proven_gap <= certificate.wanted_gap
+        assert certificate.is_certified == (is_within and not math.isnan(certificate.eta))
     assert certificate.poses_objective == problem.objective(certificate.poses)
     assert certificate.stationarity == relative_decrement(problem, poses)
     if math.isnan(certificate.eta):
@@ -390,12 +394,57 @@ def test_a_gap_is_written_with_the_digits_that_it_proves() -> None:
     assert near.gap_text == "9.1e-13, proven to 12 digits"
     far = replace(whole, bound=replace(found.bound, value=0.75 * 2.0**60))
     assert (far.gap_text, far.digits) == ("0.25", 0)
-    exact = replace(found, verdict=Verdict.EXACT)
-    assert (exact.gap_text, exact.digits, exact.proven_gap) == (
-        "0: every edge fits to its rounding",
-        0,
-        0.0,
+    to_rounding = replace(near, verdict=Verdict.EXACT, fit=Fit.ROUNDING)
+    assert to_rounding.gap_text == "0: every edge fits to its rounding"
+    assert to_rounding.verdict_text.endswith("exact to rounding: every edge fits to its last bits")
+    to_digits = replace(near, verdict=Verdict.EXACT, fit=Fit.DIGITS)
+    assert to_digits.gap_text == "9.1e-13, of a cost below the digits of the file"
+    # Of exact poses, too, no more is said to be proven than is.
+    for exact in (to_rounding, to_digits):
+        assert (exact.digits, exact.proven_gap) == (near.digits, near.proven_gap)
+    assert (to_rounding.printed_gap, to_digits.printed_gap) == (0.0, near.proven_gap)
+
+
+def test_the_verdict_compares_what_is_proven() -> None:
+    """The gap as computed leaves out the rounding of the cost."""
+    problem = PGOProblem(grid(np.random.default_rng(0)))
+    poses = polish(problem, chordal_start(problem))
+    first = certify(problem, poses)
+    assert 0.0 < first.gap < first.proven_gap < 1e-12
+    enough = certify(problem, poses, first.proven_gap)
+    assert enough.verdict is Verdict.CERTIFIED
+    for gap in (first.gap, 0.5 * (first.gap + first.proven_gap), 0.1 * first.gap):
+        certificate = certify(problem, poses, gap)
+        assert certificate.verdict is Verdict.NOT_CERTIFIED
+        assert certificate.verdict_text.endswith("and rounding in doubles leaves no smaller one")
+        # No time is spent on other poses, whose rounding is the same.
+        assert (certificate.is_hidden_by_rounding, certificate.can_improve) == (True, False)
+        assert certificate.source is BoundSource.GIVEN
+
+
+def test_a_gap_that_other_poses_may_close_is_no_matter_of_rounding() -> None:
+    problem = varied_problem(0, 8, 3)
+    certificate = certify(problem, random_poses(8, 3, 0))
+    assert (certificate.verdict, certificate.is_hidden_by_rounding) == (
+        Verdict.NOT_CERTIFIED,
+        False,
     )
+    assert certificate.can_improve
+    assert certificate.verdict_text == f"NOT_CERTIFIED: {Verdict.NOT_CERTIFIED.value}"
+
+
+@settings(max_examples=examples(30))
+@given(seed=SEEDS, d=DIMENSIONS, noise=st.floats(-9.0, -5.0), gap=st.sampled_from([1e-6, 1e-9]))
+def test_no_printed_gap_of_a_certified_solution_is_above_the_one_asked_for(
+    seed: int, d: int, noise: float, gap: float
+) -> None:
+    """Where noise is small the rounding of the cost is as large as the gap."""
+    graph = varied_graph(seed, 10, d, NoiseModel(10.0**noise, 10.0**noise))
+    problem = PGOProblem(graph)
+    certificate = certify(problem, polish(problem, chordal_start(problem)), gap)
+    if certificate.verdict is Verdict.CERTIFIED:
+        assert certificate.proven_gap <= gap
+        assert float(certificate.gap_text.split(",")[0]) <= gap * (1.0 + 1e-2)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -411,3 +460,20 @@ def test_the_error_of_the_cost_is_that_of_the_poses_judged(seed: int) -> None:
         <= certificate.objective + 2.0 * rounding.error
     )
     assert certificate.proven_gap >= certificate.gap
+
+
+@settings(max_examples=examples(10))
+@given(seed=SEEDS, d=DIMENSIONS)
+def test_stationary_poses_are_not_called_others(seed: int, d: int) -> None:
+    """The bound on chi2 is found at the stationary point to the last digit, all the same."""
+    graph = informed(seed, 8, d, coupled=True, spread=0.5)
+    problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
+    start = chordal_start(problem.convex_part)
+    stationary = polish(problem, start)
+    for poses in (start, stationary):
+        certificate = certify(problem, poses)
+        text = str(certificate)
+        is_stationary = certificate.stationarity <= STATIONARY_DECREMENT
+        assert "which were not stationary" not in text or not is_stationary
+        assert "which were stationary" not in text or is_stationary
+    assert certificate.source in (BoundSource.REFINED, BoundSource.CHORDAL, BoundSource.SOFTENED)

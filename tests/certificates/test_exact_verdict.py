@@ -14,21 +14,19 @@ from budget import examples
 from exact_arithmetic import MP, Exact, ExactGraph, exact, nearest_rotations
 from graphs import DIMENSIONS, SEEDS, exact_graph, informed, random_poses, turned_away, varied_graph
 from hypothesis import given, settings, strategies as st
+from roads import road
 
 import solvers
-from pgo_models.certificates import rounding_errors
+from pgo_models.certificates import fit
 from pgo_models.certificates.certificate import (
     BoundSource,
     Certificate,
     Verdict,
     certify_with,
 )
+from pgo_models.certificates.fit import Fit, fits_to_rounding
 from pgo_models.certificates.lower_bound import NO_BOUND
-from pgo_models.certificates.rounding_errors import (
-    fits_to_rounding,
-    objective_rounding,
-    rounding_level,
-)
+from pgo_models.certificates.rounding_errors import objective_rounding, rounding_level
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
@@ -58,6 +56,11 @@ def exact_residuals(graph: PoseGraph, poses: Poses) -> tuple[Exact, Exact]:
     return (shift**2).sum(axis=1), (turn**2).sum(axis=(1, 2))
 
 
+def norms(rows: Exact) -> Exact:
+    """Euclidean norms of rows."""
+    return np.array([MP.sqrt(square) for square in (rows**2).sum(axis=1)])
+
+
 def allowed_residuals(problem: PGOProblem, poses: Poses) -> tuple[Exact, Exact]:
     """What residuals are at most where the verdict is EXACT.
 
@@ -68,10 +71,12 @@ def allowed_residuals(problem: PGOProblem, poses: Poses) -> tuple[Exact, Exact]:
     u = MP.mpf(2) ** -53
     t = exact(poses.t)
     count = 8 * MP.sqrt(graph.num_edges) + 1
-    extent = 2 * MP.sqrt(max(((t - t[:1]) ** 2).sum(axis=1)))
     omega = exact(poses.orthogonality_error) + (d * (d + 2) + 1) * u
-    length = np.array([MP.sqrt(square) for square in (exact(graph.t_ij) ** 2).sum(axis=1)])
-    e_t = (2 * d + 3) * u * (extent + length) + omega * length
+    length = norms(exact(graph.t_ij))
+    distance = norms(t[graph.j] - t[graph.i])
+    from_centre = norms(t - exact(np.sort(poses.t, axis=0)[(len(t) - 1) // 2]))
+    coordinates = from_centre[graph.i] + from_centre[graph.j]
+    e_t = (2 * d + 3) * u * (distance + length) + omega * length + u * coordinates
     e_R = 2 * MP.sqrt(d) * (2 * d + 3) * u + 2 * omega
     rounding_up = 1 + MP.mpf(2) ** -20
     return count * e_t * rounding_up, count * e_R * rounding_up
@@ -244,10 +249,92 @@ def test_the_sum_of_all_edges_is_held_against_the_level(monkeypatch: pytest.Monk
     sizes = 2.0 ** np.arange(-56.0, -40.0)
     moves = rng.standard_normal(graph.truth.t.shape)
     found = [Poses(graph.truth.R, graph.truth.t + size * moves) for size in sizes]
-    said = [objective_rounding(problem, poses).is_exact for poses in found]
+    said = [objective_rounding(problem, poses).fit is Fit.ROUNDING for poses in found]
     assert said == sorted(said, reverse=True)
     assert 0 < sum(said) < len(said)
     for poses in found:
         assert_exact_is_true(problem, poses)
-    monkeypatch.setattr(rounding_errors, "_NEARLY", math.inf)
-    assert [objective_rounding(problem, poses).is_exact for poses in found] == said
+    monkeypatch.setattr(fit, "_NEARLY", math.inf)
+    assert [objective_rounding(problem, poses).fit is Fit.ROUNDING for poses in found] == said
+
+
+@settings(max_examples=examples(40))
+@given(
+    seed=SEEDS,
+    n=st.integers(4, 10),
+    d=DIMENSIONS,
+    distance=st.floats(6.0, 12.0),
+    size=st.floats(-7.0, -1.0),
+    weight=st.floats(-12.0, 12.0),
+)
+def test_a_pose_far_away_excuses_no_other(
+    seed: int, n: int, d: int, distance: float, size: float, weight: float
+) -> None:
+    """The error of an edge is that of its own numbers, whichever pose is the first."""
+    rng = np.random.default_rng(seed)
+    graph = exact_graph(seed, n, d)
+    assert graph.truth is not None
+    far = int(rng.integers(n))
+    t = graph.truth.t.copy()
+    t[far] = 10.0**distance
+    back = np.swapaxes(graph.truth.R[graph.i], 1, 2)
+    t_ij = np.einsum("mab,mb->ma", back, t[graph.j] - t[graph.i])
+    same = np.full(graph.num_edges, 10.0**weight)
+    problem = PGOProblem(replace(graph, t_ij=t_ij, kappa=same, tau=same))
+    assert judged(problem, Poses(graph.truth.R, t)).verdict is Verdict.EXACT
+    moved = (far + 1) % n
+    near = (graph.i != far) & (graph.j != far)
+    hold = near & ((graph.i == moved) | (graph.j == moved))
+    t[moved] += 10.0**size
+    off = Poses(graph.truth.R, t)
+    assert not hold.any() or judged(problem, off).verdict is Verdict.TRIVIAL
+
+
+@pytest.mark.parametrize("origin", [0, 3])
+def test_poses_that_cost_two_where_nothing_is_possible_are_not_exact(origin: int) -> None:
+    """One of four poses is 1e9 m away, and pose 2 is off by a millionth of a metre."""
+    i = np.array([0, 1, 0, 0])
+    j = np.array([1, 2, 2, 3])
+    t_ij = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1e9, 0.0]])
+    straight = np.tile(np.eye(2), (4, 1, 1))
+    weights = np.full(4, 1e12)
+    t = np.array([[0.0, 0.0], [1.0, 0.0], [1.0 + 1e-6, 1.0], [1e9, 0.0]])
+    order = np.argsort([pose != origin for pose in range(4)], kind="stable")
+    number = np.argsort(order)
+    problem = PGOProblem(PoseGraph(4, number[i], number[j], straight, t_ij, weights, weights))
+    poses = Poses(straight, t[order])
+    assert problem.objective(poses) == pytest.approx(2.0, rel=1e-6)
+    certificate = certify(problem, poses)
+    assert certificate.verdict is Verdict.TRIVIAL
+    assert certificate.proven_gap == 1.0
+    right = t.copy()
+    right[2, 0] = 1.0
+    assert certify(problem, Poses(straight, right[order])).verdict is Verdict.EXACT
+
+
+@pytest.mark.parametrize("robots", [None, 3])
+@pytest.mark.parametrize("d", [2, 3])
+def test_roads_of_kilometres_are_exact_where_they_have_no_noise(d: int, robots: int | None) -> None:
+    """A solve leaves errors in proportion to the last bits of the farthest poses, at first."""
+    pattern = road(0, 1000, 10.0, d)
+    assert pattern.truth is not None
+    truth = pattern.truth
+    back = np.swapaxes(truth.R[pattern.i], 1, 2)
+    t_ij = np.einsum("mab,mb->ma", back, truth.t[pattern.j] - truth.t[pattern.i])
+    graph = replace(pattern, R_ij=back @ truth.R[pattern.j], t_ij=t_ij, truth=None, initial=None)
+    solution = solvers.solve(graph, robots=robots, progress=False)
+    assert solution.certificate.verdict is Verdict.EXACT
+
+
+def test_exact_poses_may_cost_more_than_others_by_what_rounding_makes() -> None:
+    """So no gap of them is proven; the exact verdict says what is known."""
+    graph = exact_graph(0, 8, 3)
+    problem = PGOProblem(graph)
+    poses = polish(problem, chordal_start(problem))
+    certificate = certify(problem, poses)
+    assert certificate.verdict is Verdict.EXACT
+    assert ExactGraph.of_doubles(graph).objective_of(poses) > 0
+    assert (certificate.proven_gap, certificate.digits) == (1.0, 0)
+    assert certificate.printed_gap == 0.0
+    assert certificate.gap_text == "0: every edge fits to its rounding"
+    assert "gap=0, EXACT" in repr(certificate)

@@ -238,6 +238,20 @@ def test_certify_judges_poses_that_are_not_optimal_with_3(pgo_command, tmp_path)
     assert record["lower_bound"] <= record["best_known_objective"] < record["objective"]
 
 
+def test_a_gap_that_rounding_hides_is_not_certified_and_ends_with_3(pgo_command):
+    code, out, err = pgo_command("solve", "grid", "--cost", "isotropic", "--gap", "1e-14")
+    assert (code, err) == (3, "")
+    text = " ".join(out.split())
+    assert "NOT_CERTIFIED" in text
+    assert "wider than asked for, and rounding in doubles leaves no smaller one" in text
+    printed = re.search(r"^gap +(\S+),", out, re.M)
+    assert printed is not None
+    assert float(printed[1]) > 1e-14
+    # Other poses would be known no better, so no further attempt is made.
+    assert [line.split()[0] for line in out.splitlines()[-4:] if line][:2] == ["chordal", "Newton"]
+    assert pgo_command("solve", "grid", "--cost", "isotropic", "--gap", printed[1])[0] == 0
+
+
 def test_not_converged_ends_with_2_and_writes_the_result(pgo_command, tmp_path):
     code, out, _ = pgo_command(
         "solve", "grid", "--time-limit", "1e-9", "--out", tmp_path / "so_far.json"

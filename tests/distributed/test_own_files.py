@@ -18,6 +18,7 @@ from robots import PARTITIONERS, Partitioner, Recording, arrays_in
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import BoundSource, Verdict, certify_at
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -192,6 +193,20 @@ def test_poses_that_their_frame_rounds_are_no_longer_exact(away: float, tmp_path
     assert 0.5 * error <= certificate.objective_error <= 2.0 * error
 
 
+def test_a_gap_that_rounding_hides_is_not_certified(tmp_path: Path) -> None:
+    graph = pgo.grid(np.random.default_rng(0))
+    write_g2o_folder(graph.with_robots(pgo.partition(graph, 3).robot), tmp_path)
+    first = solve_folder(tmp_path).certificate
+    assert 0.0 < first.gap < first.proven_gap < 1e-12
+    between = 0.5 * (first.gap + first.proven_gap)
+    solution = solve_folder(tmp_path, solvers.Pipeline(gap=between))
+    certificate = solution.certificate
+    assert certificate.verdict.name == "NOT_CERTIFIED"
+    assert not certificate.can_improve
+    assert [stage.name for stage in solution.stages] == ["chordal start", "SOC", "Newton"]
+    assert solve_folder(tmp_path, solvers.Pipeline(gap=first.proven_gap)).certificate.is_certified
+
+
 def test_an_edge_that_no_end_has_counts_all_the_same(tmp_path: Path) -> None:
     """Edges between robots 0 and 1 stand in the file of robot 2, twice in that of robot 3."""
     shutil.copytree(ROBOTS, tmp_path / "in")
@@ -272,12 +287,13 @@ def test_what_no_edge_between_robots_ties_together_is_named(what: str, tmp_path:
         solve_folder(tmp_path)
 
 
-@pytest.mark.parametrize("first", [True, False])
-def test_the_cost_is_exact_where_the_part_of_every_robot_is(first: bool) -> None:
-    parts = [ObjectiveRounding(1.0, 0.25, first), ObjectiveRounding(2.0, 0.5, not first)]
-    assert robots_with_files._sum_of_roundings(parts) == ObjectiveRounding(3.0, 0.75, False)
-    same = [replace(part, is_exact=True) for part in parts]
-    assert robots_with_files._sum_of_roundings(same).is_exact
+@pytest.mark.parametrize("fits", [(Fit.ROUNDING, Fit.NONE), (Fit.NONE, Fit.ROUNDING)])
+def test_the_cost_is_exact_where_the_part_of_every_robot_is(fits: tuple[Fit, Fit]) -> None:
+    first, second = fits
+    parts = [ObjectiveRounding(1.0, 0.25, first), ObjectiveRounding(2.0, 0.5, second)]
+    assert robots_with_files._sum_of_roundings(parts) == ObjectiveRounding(3.0, 0.75, Fit.NONE)
+    same = [replace(part, fit=Fit.ROUNDING) for part in parts]
+    assert robots_with_files._sum_of_roundings(same).fit is Fit.ROUNDING
 
 
 # What crosses.

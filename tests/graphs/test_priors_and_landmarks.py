@@ -207,6 +207,42 @@ def test_what_is_not_determined_is_said(graph, message):
             r"\(1, 3\) positions seen from 2 poses in 3D",
         ),
         (
+            lambda graph: graph.with_position_prior(0, np.ones((1, 3)), 1.0),
+            "poses is the number 0; give an array",
+        ),
+        (
+            lambda graph: graph.with_position_prior(0, np.ones(3), 1.0),
+            "poses is the number 0; give an array",
+        ),
+        (
+            lambda graph: graph.with_position_prior([[0]], np.ones((1, 3)), 1.0),
+            r"are \[\[0\]\]; give one or more, 0 to 3, in a row",
+        ),
+        (
+            lambda graph: graph.with_position_prior([0], np.ones(3), 1.0),
+            r"points have shape \(3,\); give \(n, d\), a row for each point",
+        ),
+        (
+            lambda graph: graph.with_position_prior([0], 5.0, 1.0),
+            r"points have shape \(\); give \(n, d\)",
+        ),
+        (
+            lambda graph: graph.with_position_prior([0], np.ones((1, 3)), [1.0, 2.0]),
+            r"tau has shape \(2,\) for 1 edges; give one number for all, or each",
+        ),
+        (
+            lambda graph: graph.with_edges(0, 1, Poses.identity(1, 3), 1.0, 1.0),
+            "i is the number 0; give an array",
+        ),
+        (
+            lambda graph: graph.with_edges([0], [1], Poses.identity(1, 3), [[1.0]], 1.0),
+            r"kappa has shape \(1, 1\) for 1 edges; give one number for all, or each",
+        ),
+        (
+            lambda graph: graph.with_landmark(0, np.ones((1, 3)), 1.0),
+            "poses is the number 0; give an array",
+        ),
+        (
             lambda graph: graph.with_landmark([0], np.ones((1, 2)), 1.0),
             r"\(1, 2\) positions seen from 1 poses in 3D",
         ),

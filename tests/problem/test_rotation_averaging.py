@@ -14,8 +14,9 @@ from hypothesis import given, settings, strategies as st
 import solvers
 from pgo_models.certificates.certificate import Certificate, Verdict, certify_at
 from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.lower_bound import best_bound, prove_bound
-from pgo_models.certificates.rounding_errors import fits_to_rounding, objective_rounding
+from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension

@@ -10,6 +10,7 @@ from pages import Page, own_part
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import BoundSource
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
@@ -202,18 +203,27 @@ def test_the_command_line_writes_one_whose_commands_can_be_typed(unit_weights, t
     assert all(("--cost unit" in command) == unit_weights for command in commands)
 
 
+def with_gap(certificate, gap):
+    """The certificate with a lower bound, and so with a wider gap."""
+    bound = replace(certificate.bound, value=(1.0 - gap) * certificate.objective)
+    return replace(certificate, bound=bound, gap=gap, verdict=pgo.Verdict.NOT_CERTIFIED)
+
+
 def cases(solution, uncertain):
     graph = solution.problem.graph
     certificate = solution.certificate
     yield graph, certificate, solvers.Status.CONVERGED
     yield graph, replace(certificate, wanted_gap=1e-9), solvers.Status.CONVERGED
-    yield graph, replace(certificate, verdict=pgo.Verdict.EXACT, gap=0.0), solvers.Status.CONVERGED
+    for fit in (Fit.ROUNDING, Fit.DIGITS):
+        exact = replace(certificate, verdict=pgo.Verdict.EXACT, fit=fit)
+        yield graph, exact, solvers.Status.CONVERGED
     for status in solvers.Status:
         yield uncertain.problem.graph, uncertain.certificate, status
-    wide = replace(certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=0.25)
+    wide = with_gap(certificate, 0.25)
     yield graph, wide, solvers.Status.CONVERGED
     yield graph, replace(wide, source=BoundSource.RELAXATION), solvers.Status.CONVERGED
-    yield graph, replace(wide, gap=3e-9, wanted_gap=1e-12), solvers.Status.CONVERGED
+    nearly = replace(with_gap(certificate, 3e-9), wanted_gap=1e-12)
+    yield graph, nearly, solvers.Status.CONVERGED
     yield (
         graph,
         replace(wide, verdict=pgo.Verdict.TRIVIAL, gap=1.0, bound=NO_BOUND),
@@ -257,9 +267,7 @@ def options_of(command):
 
 def test_a_gap_that_was_nearly_reached_is_offered(solution):
     fit = EdgeFit("F", solution.edge_residuals)
-    nearly = replace(
-        solution.certificate, verdict=pgo.Verdict.NOT_CERTIFIED, gap=3e-9, wanted_gap=1e-12
-    )
+    nearly = replace(with_gap(solution.certificate, 3e-9), wanted_gap=1e-12)
     commands = [
         piece.command
         for piece in advice(
@@ -308,6 +316,16 @@ def test_exact_measurements_are_reported_too():
     assert solution.certificate.verdict is pgo.Verdict.EXACT
     assert "F cannot be told from zero" in page.text
     assert "nan" not in page.text
+
+
+def test_what_is_exact_to_the_digits_of_a_file_is_reported_as_that(tmp_path):
+    edges = [f"EDGE_SE2 {i} {(i + 1) % 4} 1 0 1.570796327 1 0 0 1 0 1" for i in range(4)]
+    (tmp_path / "square.g2o").write_text("\n".join(edges))
+    page = Page(report_page(solvers.solve(pgo.read_g2o(tmp_path / "square.g2o"))))
+    assert "Certified: the measurements agree to the last digits of their file" in page.text
+    assert "rounding the measurements to the last digits of their file makes of it" in page.text
+    assert "double precision" not in page.text
+    assert "Ask for a tighter proof" not in page.text
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pgo_models.certificates.rounding_errors import fits_to_rounding
+from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.interior import Interior
