@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +11,37 @@ from pgo_models.certificates.certificate import BoundSource, Certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_at
+from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError
 from pgo_models.files import replace_when_done
+from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
+from pgo_models.problem.excess import CoupledExcess
+from pgo_models.problem.information_costs import ExcessCost
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
 FORMAT = "pgo-splitting proof 1"
+# Relative error of the entries of information matrices, as of the verifier: the 2^-45 of the
+# diagonal that is added to a matrix which is semidefinite but for rounding, and the rounding of the
+# numbers and of what is computed from them.
+WEIGHT_ERROR = 2.0**-44
 
 
 def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) -> None:
     """Write what proves the bound of a certificate, as JSON; `verify_proof` checks it.
 
     All digits are written of poses, multipliers Lambda and the shift eta, and what they claim: the
-    cost of the poses, and the lower bound. Of rotations alone no translations are written. Of a
-    tangent of chi2 the multipliers are left out: they depend on how it was chosen, and the verifier
-    has its own.
+    cost of the poses, and the lower bound. Of rotations alone no translations are written. Of chi2
+    the file has, edge by edge, how it is split into a quadratic form and a convex rest, whose
+    tangent at the poses takes its place: the multipliers are those of this tangent.
+
+    The certificate bounds the cost of the numbers as they are stored, in doubles. `verify_proof`
+    bounds that of the decimal numbers of the file, and tolerates nothing. So the bound that is
+    claimed is the one of the certificate less what the rounding of these numbers can make of it.
 
     Parameters
     ----------
@@ -72,9 +86,10 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         what = "the bound is that of smaller information matrices, not the file's"
         way_out = "leave out --proof, or add --cost isotropic to prove F"
         raise SettingError(f"no proof to write: {what}; {way_out}")
-    poses = _poses_of_bound(problem, certificate)
-    transposed = np.swapaxes(certificate.Lambda, 1, 2)
-    Lambda = 0.5 * (certificate.Lambda + transposed)
+    proven = _proven_at(problem, certificate)
+    poses = proven.poses
+    transposed = np.swapaxes(proven.Lambda, 1, 2)
+    Lambda = 0.5 * (proven.Lambda + transposed)
     upper_triangle = np.triu_indices(d)
     rows: list[dict[str, object]] = []
     for pose in range(graph.num_poses):
@@ -83,17 +98,15 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
             row["t"] = poses.t[pose].tolist()
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
-            if problem.is_quadratic:
-                row["Lambda"] = Lambda[pose][upper_triangle].tolist()
+            row["Lambda"] = Lambda[pose][upper_triangle].tolist()
         rows.append(row)
     eta = None if math.isnan(certificate.eta) else certificate.eta
     record: dict[str, object] = {
         "format": FORMAT,
         "cost": cost,
         "d": d,
-        "objective": problem.objective(poses),
-        "lower_bound": certificate.lower_bound,
-        "rounding_level": certificate.rounding_level,
+        "objective": max(problem.objective(poses), 0.0),  # chi2 may come out below zero
+        "lower_bound": _claimed_bound(problem, certificate, proven),
         "eta": eta,
         "ground": _name(graph, _ground(graph)),
         "poses": rows,
@@ -101,6 +114,8 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     terms = certificate.bound.terms
     if terms is not None:
         record["handedness"] = _rows_of_terms(graph, terms)
+    if isinstance(problem.weights, ExcessCost):
+        record["splits"] = _rows_of_splits(graph, problem.weights)
     return record
 
 
@@ -118,25 +133,107 @@ def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, o
     ]
 
 
-def _poses_of_bound(problem: PGOProblem, certificate: Certificate) -> Poses:
-    """Poses with the translations that the bound was found at: their own, or the best ones.
+def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object]]:
+    """Rows of tau and K of every edge, in the frame that was measured.
 
-    Where M hardly holds a direction that chi2 holds, a tangent elsewhere proves much less.
+    The rounding of K by the turn is far below its distance from the least K that is allowed
+    (`pgo_models.problem.weighting`).
+    """
+    upper_triangle = np.triu_indices(1 if graph.d == 2 else 3)
+    K = cost.excess.K if isinstance(cost.excess, CoupledExcess) else None
+    if K is not None and graph.d == 3:
+        K = np.swapaxes(graph.R_ij, 1, 2) @ K @ graph.R_ij
+    is_point = np.isin(graph.j, graph.landmarks) | (graph.is_prior & (graph.kappa == 0.0))
+    rows: list[dict[str, object]] = []
+    for e in range(graph.num_edges):
+        row: dict[str, object] = {
+            "i": _name(graph, int(graph.i[e])),
+            "j": _name(graph, int(graph.j[e])),
+            "tau": float(cost.tau[e]),
+        }
+        if K is not None and not is_point[e]:
+            row["K"] = K[e][upper_triangle].tolist()
+        rows.append(row)
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class _Proven:
+    """Poses and multipliers that are written, and the bound that they prove."""
+
+    poses: Poses
+    Lambda: Array
+    bound: float
+
+
+def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
+    """What proves the bound of a certificate.
+
+    The poses have their own translations, or the best ones. For given multipliers the bound of a
+    quadratic cost does not depend on them. That of chi2 does, as the tangent is taken there: where
+    M hardly holds a direction that chi2 holds, a tangent elsewhere proves much less. So the best of
+    a few is chosen.
     """
     best = problem.at_best_translations(certificate.poses)
+    of_certificate = _Proven(best, certificate.Lambda, certificate.lower_bound)
     if problem.is_quadratic or certificate.eta != 0.0:
-        return best
+        return of_certificate
     terms = certificate.bound.terms
-    bounds = []
-    for poses in (best, certificate.poses):
+    candidates = []
+    for poses, Lambda in (
+        (best, certificate.Lambda),
+        (best, multipliers(problem, best)),
+        (certificate.poses, multipliers(problem, certificate.poses)),
+    ):
         tangent = problem.tangent_at(poses)
         if terms is not None:
             tangent = terms.taken_off(tangent)
-        Lambda = multipliers(problem, poses)
         bound = prove_at(tangent, Lambda, poses)
-        bounds.append(-math.inf if bound is None else bound.value)
-    bound_at_best, bound_at_own = bounds
-    return best if bound_at_best >= bound_at_own else certificate.poses
+        if bound is not None:
+            lost = 0.0 if terms is None else terms.loss()
+            candidates.append(_Proven(poses, Lambda, bound.value - lost))
+    return max(candidates, key=lambda proven: proven.bound, default=of_certificate)
+
+
+def _claimed_bound(problem: PGOProblem, certificate: Certificate, proven: _Proven) -> float:
+    """The bound of the certificate, less what the rounding of the numbers of the file can take.
+
+    To first order the least cost changes by what the cost of the best poses does. Its residuals
+    are known to `objective_rounding`. A relative error of the entries of information matrices
+    changes chi2 by that share of the sizes sum_a I_aa z_a^2 of the residuals z, and so it changes F
+    (`pgo_models.verification.doubles`). The loss of second order is as large as what the
+    certificate subtracts for rounding, which is subtracted once more.
+    """
+    bound = min(certificate.lower_bound, proven.bound)
+    if bound == 0.0:
+        return 0.0
+    of_residuals = objective_rounding(problem, proven.poses).error
+    of_weights = WEIGHT_ERROR * _sizes_of_weights(problem, proven.poses)
+    claimed = bound - of_residuals - of_weights - certificate.bound.rounding
+    return max(claimed, 0.0)
+
+
+def _sizes_of_weights(problem: PGOProblem, poses: Poses) -> float:
+    """Sum of tr(I_tt) ||r||^2 + tr(I_rr) 2 (1 - cos theta) over the edges."""
+    graph = problem.graph
+    d = graph.d
+    information = graph.information
+    if information is None:
+        information = isotropic_information(graph.kappa, graph.tau, d)
+    diagonals = np.einsum("mkk->mk", information)
+    poses = problem.seen_poses(poses)
+    R_i = poses.R[graph.i]
+    turned_offsets = np.einsum("mab,mb->ma", R_i, graph.t_ij)
+    r = poses.t[graph.j] - poses.t[graph.i] - turned_offsets
+    squared_r = inner_products(r, r)
+    defects = poses.R[graph.j] - R_i @ graph.R_ij
+    # The squared Frobenius norm of E - I is 4 (1 - cos theta).
+    squared_R = 0.5 * inner_products(defects, defects)
+    size_t = np.sum(diagonals[:, :d], axis=1) * squared_r
+    size_R = np.sum(diagonals[:, d:], axis=1) * squared_R
+    if not problem.has_translations:
+        return float(np.sum(size_R))
+    return float(np.sum(size_t + size_R))
 
 
 def _ground(graph: PoseGraph) -> int:

@@ -90,6 +90,9 @@ class Edge:
     j: int
     measured: tuple[fmpq, ...]
     triangle: tuple[fmpq, ...]
+    # Upper triangle of the covariance matrix, whose inverse the information is; empty where the
+    # file has the information.
+    covariance: tuple[fmpq, ...] = ()
 
     @property
     def t(self) -> arb_mat:
