@@ -14,6 +14,7 @@ from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.certificates.rounding_errors import fits_to_rounding
 from pgo_models.convex.graph_subproblem import GraphQP, ModelChange
 from pgo_models.errors import SettingError
+from pgo_models.figures import scaled_above, scaled_below
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
 from solvers.convex.extended_newton import ExtendedNewton, kinks
@@ -163,7 +164,11 @@ def _certificate_with_terms(
     is_exact = False
     if is_F and not has_replaced_edges:
         is_exact = fits_to_rounding(priors, priors.graph.completed(poses))
-    gap = relative_gap(objective, bound.value, is_exact)
+    gap = relative_gap(
+        scaled_above(objective, certificate.weights_error),
+        scaled_below(bound.value, certificate.weights_error),
+        is_exact,
+    )
     return replace(
         certificate,
         objective=objective,

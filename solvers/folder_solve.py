@@ -405,7 +405,9 @@ def _sum_of_roundings(parts: Sequence[ObjectiveRounding]) -> ObjectiveRounding:
     """How accurately a sum is known of whose parts that is known."""
     level = math.fsum(part.level for part in parts)
     error = math.fsum(part.error for part in parts)
-    return ObjectiveRounding(level, error, all(part.is_exact for part in parts))
+    is_exact = all(part.is_exact for part in parts)
+    weights_error = max(part.weights_error for part in parts)
+    return ObjectiveRounding(level, error, is_exact, weights_error)
 
 
 def _frame(answers: Sequence[RobotAnswer]) -> tuple[Array, Array, str]:

@@ -149,7 +149,16 @@ class GrowingSolution:
         ends_j = [self._numbers_of(graph)[graph.j] for graph in self.graphs]
         i = np.concatenate(ends_i)
         j = np.concatenate(ends_j)
-        return PoseGraph(len(ids), i, j, **arrays, ids=ids, fixed=first.fixed, name=first.name)
+        return PoseGraph(
+            len(ids),
+            i,
+            j,
+            **arrays,
+            ids=ids,
+            fixed=first.fixed,
+            name=first.name,
+            weights_error=max(graph.weights_error for graph in self.graphs),
+        )
 
     def with_edges(self, graph: PoseGraph) -> GrowingSolution:
         """Return the solution after new edges.

@@ -1,5 +1,6 @@
 """Small graphs of every kind that a file can hold, drawn from a seed and written to a file."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from pgo_models.geometry.rotations import (
     tangent_dimension,
 )
 from pgo_models.graphs.g2o import write_g2o
+from pgo_models.graphs.g2o_rows import numbers_of
 from pgo_models.graphs.pose_graph import PoseGraph
 from solvers.studies.tightness import SweptScene, noisy_scene
 
@@ -161,6 +163,31 @@ def noise_free(rng: np.random.Generator) -> PoseGraph:
     return exact_graph(seed_of(rng), n, d)
 
 
+def covariances(rng: np.random.Generator) -> PoseGraph:
+    """Poses in the plane that see points, with covariances."""
+    n = int(rng.integers(3, 9))
+    graph = varied_graph(seed_of(rng), n, 2, LOUD_NOISE)
+    assert graph.truth is not None
+    decades = rng.uniform(0.0, 8.0)
+    graph = replace(graph, information=spread_matrices(rng, graph.num_edges, 3, decades))
+    seen_from = rng.permutation(n)[:3]
+    return graph.with_landmark(seen_from, rng.standard_normal((3, 2)), tau=2.0)
+
+
+def robot_log(rng: np.random.Generator) -> PoseGraph:
+    """Poses with covariances, and priors of a few."""
+    n, d = size_and_dimension(rng)
+    k = d + tangent_dimension(d)
+    graph = varied_graph(seed_of(rng), n, d, LOUD_NOISE)
+    assert graph.truth is not None
+    chosen = rng.integers(0, n, 2)
+    t = graph.truth.t[chosen] + 0.3 * rng.standard_normal((2, d))
+    priors = Poses(graph.truth.R[chosen], t)
+    graph = graph.with_prior(chosen, priors, np.ones(2), np.ones(2))
+    decades = rng.uniform(0.0, 8.0)
+    return replace(graph, information=spread_matrices(rng, graph.num_edges, k, decades))
+
+
 GRAPHS: tuple[Draw, ...] = (
     plain,
     loud,
@@ -174,11 +201,69 @@ GRAPHS: tuple[Draw, ...] = (
     handed,
     few_and_coupled,
     noise_free,
+    covariances,
+    robot_log,
 )
 
 
 def drawn_file(draw: Draw, seed: int, folder: Path) -> Path:
-    """The g2o file of a graph."""
+    """The file of a graph: with covariances where the graph is to have them, else as g2o."""
+    graph = draw(np.random.default_rng(seed))
+    if draw is robot_log:
+        path = folder / "graph.jrl"
+        write_robot_log(graph, path)
+        return path
     path = folder / "graph.g2o"
-    write_g2o(draw(np.random.default_rng(seed)), path)
+    if draw is covariances:
+        write_covariances(graph, path)
+    else:
+        write_g2o(graph, path)
     return path
+
+
+def write_covariances(graph: PoseGraph, path: Path) -> None:
+    """Write a graph in the plane as ODOMETRY and LANDMARK lines, ids of landmarks from 0."""
+    information = graph.information
+    assert information is not None
+    lines = []
+    edges = zip(graph.i, graph.j, graph.R_ij, graph.t_ij, information, strict=True)
+    for i, j, R, t, matrix in edges:
+        if j in graph.landmarks:
+            C = np.linalg.inv(matrix[:2, :2])
+            numbers = [*t, *C[np.triu_indices(2)]]
+            ends = f"LANDMARK {i} {j - graph.landmarks[0]}"
+        else:
+            C = np.linalg.inv(matrix)
+            numbers = [*t, np.arctan2(R[1, 0], R[0, 0]), *C[np.triu_indices(3)]]
+            ends = f"ODOMETRY {i} {j}"
+        lines.append(f"{ends} {' '.join(repr(float(x)) for x in numbers)}\n")
+    path.write_text("".join(lines))
+
+
+def write_robot_log(graph: PoseGraph, path: Path) -> None:
+    """Write a graph as a JSON robot log of one robot, priors included."""
+    assert graph.information is not None
+    d = graph.d
+    k = d + tangent_dimension(d)
+    order = [3, 4, 5, 0, 1, 2] if d == 3 else [0, 1, 2]
+    rows = numbers_of(graph.R_ij, graph.t_ij)
+    measurements = []
+    for i, j, numbers, matrix in zip(
+        graph.i, graph.j, rows.tolist(), graph.information, strict=True
+    ):
+        if d == 2:
+            value = {"type": "Pose2"} | dict(zip(("x", "y", "theta"), numbers, strict=True))
+        else:
+            *xyz, w = numbers[3:]
+            value = {"type": "Pose3", "translation": numbers[:3], "rotation": [w, *xyz]}
+        C = np.linalg.inv(matrix)
+        C = (0.5 * (C + C.T))[np.ix_(order, order)]
+        entry: dict[str, object] = {"covariance": C.reshape(k * k).tolist()}
+        if i == graph.world:
+            entry |= {"type": f"PriorFactorPose{d}", "key": int(j), "prior": value}
+        else:
+            entry |= {"type": f"BetweenFactorPose{d}", "measurement": value}
+            entry |= {"key1": int(i), "key2": int(j)}
+        measurements.append(entry)
+    log = {"name": "log", "robots": ["a"], "measurements": {"a": [{"measurements": measurements}]}}
+    path.write_text(json.dumps(log))

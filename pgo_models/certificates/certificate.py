@@ -24,7 +24,15 @@ from pgo_models.certificates.rounding_errors import (
     objective_rounding,
 )
 from pgo_models.errors import ProofError, SettingError
-from pgo_models.figures import gap_above, proven_digits, rounded_down, rounded_up, sum_above
+from pgo_models.figures import (
+    gap_above,
+    proven_digits,
+    rounded_down,
+    rounded_up,
+    scaled_above,
+    scaled_below,
+    sum_above,
+)
 from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -78,7 +86,8 @@ class BoundSource(enum.Enum):
 class Certificate(ReadOnly):
     """A proven lower bound on the global optimum beside the cost of given poses.
 
-    `lower_bound` is proven: F(R, t) >= lower_bound for all poses, in exact arithmetic. What is
+    `lower_bound` is proven: F(R, t) >= lower_bound for all poses, in exact arithmetic. Where the
+    weights are inverses of the covariances of a file, that is F of the exact inverses. What is
     printed holds of the exact cost: `objective_at_most` rounded up, `lower_bound` rounded down, and
     `proven_gap` rounded up.
 
@@ -116,6 +125,10 @@ class Certificate(ReadOnly):
         nearest to theirs); nan where none is known.
     has_translations : bool
         Whether this is said of poses; otherwise of rotations alone.
+    weights_error : float
+        The cost of the file is between 1 - weights_error and 1 + weights_error times that of the
+        weights as they are stored (`PoseGraph.weights_error`), of which `objective` and `bound`
+        are. `lower_bound`, `objective_at_most` and what follows from them count it.
     """
 
     objective: float
@@ -132,6 +145,7 @@ class Certificate(ReadOnly):
     weighting: Weighting = Weighting.ISOTROPIC
     objective_error: float = math.nan
     has_translations: bool = True
+    weights_error: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
@@ -139,7 +153,7 @@ class Certificate(ReadOnly):
     @property
     def lower_bound(self) -> float:
         """Proven: F(R, t) >= lower_bound for every choice of poses."""
-        return self.bound.value
+        return scaled_below(self.bound.value, self.weights_error)
 
     @property
     def eta(self) -> float:
@@ -151,11 +165,12 @@ class Certificate(ReadOnly):
 
     @property
     def is_best_in_doubles(self) -> bool:
-        """Whether S_r is definite and the gap below 1e-6.
+        """Whether S_r is definite and the gap below 1e-6, but for what is not known of the weights.
 
         A smaller gap takes more precision, not other poses.
         """
-        return self.bound.is_grounded and self.eta == 0.0 and self.gap <= DEFAULT_GAP
+        hidden_gap = DEFAULT_GAP + 2.0 * self.weights_error
+        return self.bound.is_grounded and self.eta == 0.0 and self.gap <= hidden_gap
 
     @property
     def can_improve(self) -> bool:
@@ -182,11 +197,12 @@ class Certificate(ReadOnly):
 
         It is the objective as computed where no such bound is known.
         """
-        return (
+        at_most = (
             self.objective
             if math.isnan(self.objective_error)
             else sum_above(self.objective, self.objective_error)
         )
+        return scaled_above(at_most, self.weights_error)
 
     @property
     def proven_gap(self) -> float:
@@ -283,7 +299,10 @@ class Certificate(ReadOnly):
         shift = f", eta = {rounded_up(self.eta, 3)}" if self.eta > 0 else ""
         cap = f", conditions cut to {self.bound.cap:.3g}" if self.bound.cap < math.inf else ""
         rounding = rounded_up(self.bound.rounding, 2)
-        return f"proved {form}{shift}{cap}{self._terms_text}, less {rounding} for rounding"
+        less = f"less {rounding} for rounding"
+        if self.weights_error > 0.0:
+            less += f" and {rounded_up(self.weights_error, 2)} of it for inverted covariances"
+        return f"proved {form}{shift}{cap}{self._terms_text}, {less}"
 
     @property
     def _terms_text(self) -> str:
@@ -360,7 +379,7 @@ def with_terms(
     gap = certificate.wanted_gap
     tangent = problem.tangent_at(ground)
     bound = best_bound_with_terms(tangent, Lambda, ground, gap, certificate.objective, terms)
-    if bound.value <= certificate.lower_bound:
+    if bound.value <= certificate.bound.value:
         return certificate
     stationarity = certificate.stationarity
     return certify_with(
@@ -444,7 +463,12 @@ def judge_cost(
             "a defect of pgo_models; please report it with the graph"
         )
     # F may come out below a true bound by its own rounding, which is then what the gap is known to.
-    gap = relative_gap(F, bound.value if bound.value < F else F - rounding.error, rounding.is_exact)
+    known = bound.value if bound.value < F else F - rounding.error
+    gap = relative_gap(
+        scaled_above(F, rounding.weights_error),
+        scaled_below(known, rounding.weights_error),
+        rounding.is_exact,
+    )
     # chi2, which is never negative, may come out below zero.
     bound = replace(bound, value=min(bound.value, max(F, 0.0)))
     verdict = verdict_of(rounding.is_exact, gap, bound, given.wanted_gap)
@@ -456,6 +480,7 @@ def judge_cost(
         bound=bound,
         gap=gap,
         verdict=verdict,
+        weights_error=rounding.weights_error,
     )
 
 

@@ -13,10 +13,11 @@ from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_at
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError
+from pgo_models.figures import scaled_below
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.problem.excess import CoupledExcess
@@ -91,6 +92,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     transposed = np.swapaxes(proven.Lambda, 1, 2)
     Lambda = 0.5 * (proven.Lambda + transposed)
     upper_triangle = np.triu_indices(d)
+    has_multipliers = _has_form_of_verifier(problem)
     rows: list[dict[str, object]] = []
     for pose in range(graph.num_poses):
         row: dict[str, object] = {"id": _name(graph, pose)}
@@ -98,7 +100,8 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
             row["t"] = poses.t[pose].tolist()
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
-            row["Lambda"] = Lambda[pose][upper_triangle].tolist()
+            if has_multipliers:
+                row["Lambda"] = Lambda[pose][upper_triangle].tolist()
         rows.append(row)
     eta = None if math.isnan(certificate.eta) else certificate.eta
     record: dict[str, object] = {
@@ -143,7 +146,7 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
     K = cost.excess.K if isinstance(cost.excess, CoupledExcess) else None
     if K is not None and graph.d == 3:
         K = np.swapaxes(graph.R_ij, 1, 2) @ K @ graph.R_ij
-    is_point = np.isin(graph.j, graph.landmarks) | (graph.is_prior & (graph.kappa == 0.0))
+    is_point = _measures_position(graph)
     rows: list[dict[str, object]] = []
     for e in range(graph.num_edges):
         row: dict[str, object] = {
@@ -155,6 +158,24 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
             row["K"] = K[e][upper_triangle].tolist()
         rows.append(row)
     return rows
+
+
+def _measures_position(graph: PoseGraph) -> BoolArray:
+    """Whether an edge measures a position alone, (m,)."""
+    is_position_prior = graph.is_prior & (graph.kappa == 0.0)
+    return np.asarray(np.isin(graph.j, graph.landmarks) | is_position_prior)
+
+
+def _has_form_of_verifier(problem: PGOProblem) -> bool:
+    """Whether the verifier has the same quadratic form, to which the multipliers belong.
+
+    In a coupled chi2 the solver gives edges that measure a position alone a small K, too, and the
+    verifier none. The multipliers are then left to the verifier, which takes those of its own form
+    at the poses.
+    """
+    cost = problem.weights
+    is_coupled = isinstance(cost, ExcessCost) and isinstance(cost.excess, CoupledExcess)
+    return not (is_coupled and _measures_position(problem.graph).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,16 +196,15 @@ def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
     a few is chosen.
     """
     best = problem.at_best_translations(certificate.poses)
-    of_certificate = _Proven(best, certificate.Lambda, certificate.lower_bound)
+    of_certificate = _Proven(best, certificate.Lambda, certificate.bound.value)
     if problem.is_quadratic or certificate.eta != 0.0:
         return of_certificate
     terms = certificate.bound.terms
+    points = [(poses, multipliers(problem, poses)) for poses in (best, certificate.poses)]
+    if _has_form_of_verifier(problem):
+        points.append((best, certificate.Lambda))
     candidates = []
-    for poses, Lambda in (
-        (best, certificate.Lambda),
-        (best, multipliers(problem, best)),
-        (certificate.poses, multipliers(problem, certificate.poses)),
-    ):
+    for poses, Lambda in points:
         tangent = problem.tangent_at(poses)
         if terms is not None:
             tangent = terms.taken_off(tangent)
@@ -204,7 +224,8 @@ def _claimed_bound(problem: PGOProblem, certificate: Certificate, proven: _Prove
     (`pgo_models.verification.doubles`). The loss of second order is as large as what the
     certificate subtracts for rounding, which is subtracted once more.
     """
-    bound = min(certificate.lower_bound, proven.bound)
+    stored_bound = min(certificate.bound.value, proven.bound)
+    bound = scaled_below(stored_bound, certificate.weights_error)
     if bound == 0.0:
         return 0.0
     of_residuals = objective_rounding(problem, proven.poses).error

@@ -218,6 +218,8 @@ class ObjectiveRounding:
     error: float
     # whether every edge fits (`fits_to_rounding`): then F is at most 4 level, exactly
     is_exact: bool
+    # how far the cost of the file can be from F, relatively (`PoseGraph.weights_error`)
+    weights_error: float = 0.0
 
 
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
@@ -264,7 +266,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
         error += of_cost
     level = rounding_level(problem, poses)
     is_exact = _is_exact(problem, poses, level)
-    return ObjectiveRounding(level, OUTWARD * error, is_exact)
+    return ObjectiveRounding(level, OUTWARD * error, is_exact, graph.weights_error)
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:

@@ -174,6 +174,7 @@ def graph_of_files(
         name=printable(name_of(path)),
         world=world,
         landmarks=np.flatnonzero(is_landmark),
+        weights_error=max(file.weights_error for file in files),
     )
 
 

@@ -104,6 +104,10 @@ class PoseGraph(ReadOnly):
     uncoupled : BoolArray, (m,), optional
         Which information matrices have lost their coupling block because they were indefinite with
         it, see `pgo_models.without_indefinite_coupling`.
+    weights_error : float
+        How far the weights can be from those of a file, whose covariances were inverted: those of
+        the file are between 1 - weights_error and 1 + weights_error times these. Certificates count
+        it. 0 where the file has the weights itself, and of weights that are given.
 
     Raises
     ------
@@ -141,6 +145,7 @@ class PoseGraph(ReadOnly):
     world: int | None = None
     landmarks: IntArray = field(default_factory=_no_poses)
     uncoupled: BoolArray | None = None
+    weights_error: float = 0.0
 
     def __post_init__(self) -> None:
         self._convert(_WHOLE_NUMBERS, whole_number)
@@ -740,7 +745,13 @@ class PoseGraph(ReadOnly):
         rows = self._edge_rows(edges)
         rows["i"] = np.searchsorted(poses, rows["i"])
         rows["j"] = np.searchsorted(poses, rows["j"])
-        return PoseGraph(len(poses), **rows, ids=self.pose_ids[poses], name=self.name)
+        return PoseGraph(
+            len(poses),
+            **rows,
+            ids=self.pose_ids[poses],
+            name=self.name,
+            weights_error=self.weights_error,
+        )
 
     def unit_weights(self) -> PoseGraph:
         """Return the graph with kappa = tau = 1, as in the paper, but where they are zero.
@@ -773,7 +784,7 @@ class PoseGraph(ReadOnly):
         PoseGraph
             The same measurements; information matrices as read are left out.
         """
-        return replace(self, kappa=kappa, tau=tau, information=None)
+        return replace(self, kappa=kappa, tau=tau, information=None, weights_error=0.0)
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
         """Return the graph with other owners of the poses.

@@ -119,6 +119,7 @@ from pgo_models.verification.proof import (
     Split,
     read_proof,
 )
+from pgo_models.verification.robot_logs import SUFFIX as LOG_SUFFIX, read_robot_log
 
 # Bits; the next where a ball is too wide to decide. With the last ones every pivot that is not zero
 # to 2,400 digits has a sign, and a proof that needs more is not one of doubles.
@@ -264,12 +265,12 @@ def verify_proof(
     *,
     skip_unknown: bool = False,
 ) -> Verification:
-    """Check the proof of a lower bound, as `save_proof` writes it, for the numbers of a g2o file.
+    """Check the proof of a lower bound, as `save_proof` writes it, for the numbers of a file.
 
     Parameters
     ----------
     graph : Path or str
-        The g2o file.
+        The g2o file, or JSON robot log (JRL). Covariance matrices are inverted exactly.
     proof : Path or str
         The proof, JSON: cost, poses with their multipliers, the pose that is grounded, and eta.
     skip_unknown : bool
@@ -299,7 +300,9 @@ def verify_proof(
     >>> found.is_verified, found.bound.str(10, radius=False)
     (True, '97.01402085')
     """
-    measured = read_graph(Path(graph), skip_unknown)
+    path = Path(graph)
+    read = read_robot_log if path.suffix == LOG_SUFFIX else read_graph
+    measured = read(path, skip_unknown)
     given = read_proof(Path(proof), measured.d)
     name = f"{graph}: {len(measured.nodes)} nodes, {len(measured.edges)} edges, {measured.d}D"
     failure = ""

@@ -227,6 +227,7 @@ def join_neighbours(agent: FileAgent, received: Mapping[int, Edges]) -> Border:
         ids=ids,
         fixed=fixed,
         name=agent.path.stem,
+        weights_error=lines.weights_error,
     )
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
     agent.given = _given_pose(lines, ids[holding])

@@ -369,7 +369,7 @@ class AscentByRobots:
         self.job.stages.append(stage_of_search(outcome))
         bound = best_bound_with_terms(driver, self.gap, return_to_best(driver))
         certificate = answer.current_certificate
-        if bound.value <= certificate.lower_bound:
+        if bound.value <= certificate.bound.value:
             return answer
         with_terms = certify_with(
             self.problem,

@@ -95,18 +95,23 @@ def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Ce
     if problem.weighting is not Weighting.INFORMATION or _bound_is_tight(problem, certificate):
         return certificate
     shrunk = bound_by_shrinking(problem, certificate.poses)
-    if shrunk.bound.value <= certificate.lower_bound:
+    if shrunk.bound.value <= certificate.bound.value:
         return certificate
     by_smaller_cost = replace(
         certificate, bound=shrunk.bound, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED
     )
     is_exact = certificate.verdict is Verdict.EXACT
     # Of the poses given, which need not be those that the bound was found at.
-    rounding = ObjectiveRounding(certificate.rounding_level, certificate.objective_error, is_exact)
+    rounding = ObjectiveRounding(
+        certificate.rounding_level,
+        certificate.objective_error,
+        is_exact,
+        certificate.weights_error,
+    )
     return judge_cost(problem, by_smaller_cost, certificate.objective, rounding)
 
 
 def _bound_is_tight(problem: PGOProblem, certificate: Certificate) -> bool:
     """Whether the poses that the bound was found at have the gap asked for, or are exact."""
-    gap = relative_gap(certificate.poses_objective, certificate.lower_bound)
+    gap = relative_gap(certificate.poses_objective, certificate.bound.value)
     return gap <= certificate.wanted_gap or fits_to_rounding(problem, certificate.poses)

@@ -12,17 +12,28 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawn_graphs import GRAPHS, Draw, drawn_file, handed, landmarks, positions
+from drawn_graphs import (
+    GRAPHS,
+    Draw,
+    covariances,
+    drawn_file,
+    handed,
+    landmarks,
+    positions,
+    robot_log,
+)
 from graphs import COSTS, COSTS_OF_POSES, informed
 from proofs import PLANE, assert_verified, edited, proof_of, written
 
 import solvers
 from pgo_models.certificates.certificate import BoundSource, Verdict
-from pgo_models.errors import GraphWarning
-from pgo_models.graphs.g2o import read_g2o
+from pgo_models.errors import FileFormatError, GraphWarning
+from pgo_models.graphs.datasets import load
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.verification.measurements import read_graph
 from pgo_models.verification.proof import read_proof
+from pgo_models.verification.robot_logs import read_robot_log
 from pgo_models.verification.verify import PRECISIONS, verify_proof
 
 CASES = Path(__file__).parent / "cases"
@@ -32,10 +43,13 @@ SEEDS_OF_ALL = 45  # of every kind of graph, 500 in all
 def verify_the_proof_of(draw: Draw, seed: int, folder: Path) -> None:
     """Solve a drawn graph for one of the costs, by robots or not, and verify the proof."""
     path = drawn_file(draw, seed, folder)
-    costs = COSTS_OF_POSES if draw in (landmarks, positions) else COSTS
+    costs = COSTS_OF_POSES if draw in (landmarks, positions, covariances) else COSTS
     weighting = costs[seed % len(costs)]
     robots = 2 if seed % 5 == 4 else None
-    problem = PGOProblem(read_g2o(path), weighting=weighting)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GraphWarning)  # which says what covariances are taken for
+        graph = load(path)
+    problem = PGOProblem(graph, weighting=weighting)
     solution = solvers.solve(problem, robots=robots) if robots else solvers.solve(problem)
     certificate = solution.certificate
     assert certificate is not None
@@ -50,6 +64,10 @@ def verify_the_proof_of(draw: Draw, seed: int, folder: Path) -> None:
     claimed = json.loads(proof.read_text())["lower_bound"]
     assert claimed <= found.bound
     assert claimed >= certificate.lower_bound - 1e-6 * certificate.objective_at_most
+    if draw in (covariances, robot_log):
+        # What is printed is a bound on the cost of the file, as that of all poses.
+        assert found.objective is not None
+        assert certificate.lower_bound <= found.objective
 
 
 @pytest.mark.parametrize("draw", GRAPHS)
@@ -87,6 +105,83 @@ def test_proofs_with_terms_and_of_stiff_matrices_are_verified(
     assert_verified(found, certificate)
     assert found.gap is not None
     assert found.gap < 1e-12
+
+
+LEAST_OF_STIFF = 422245656.8  # of F of the exact inverses, rounded up
+
+
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+def test_the_bound_of_inverted_covariances_is_one_on_the_cost_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_bytes((CASES / "stiff_covariances.g2o").read_bytes())
+    certificate, proof = proof_of(path, Weighting.ISOTROPIC)
+    assert 0.99 * LEAST_OF_STIFF < certificate.lower_bound <= LEAST_OF_STIFF
+    assert certificate.objective_at_most >= LEAST_OF_STIFF
+    assert certificate.verdict is Verdict.NOT_CERTIFIED
+    assert certificate.digits == 2
+    assert certificate.proven_gap > 1.9 * certificate.weights_error > 1e-4
+    assert "for inverted covariances" in str(certificate)
+    found = verify_proof(path, proof)
+    assert found.failure == ""
+    assert found.bound is not None
+    assert 422245656.79 < found.bound < LEAST_OF_STIFF
+
+
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+def test_landmarks_with_ids_of_poses_are_read_as_by_the_solver(tmp_path: Path) -> None:
+    path = drawn_file(covariances, 0, tmp_path)
+    graph = read_graph(path, skip_unknown=False)
+    ids = load(path).pose_ids
+    assert graph.nodes == set(ids.tolist())
+    assert graph.landmarks == {int(ids[-1])}
+
+
+def test_measurements_in_the_logs_of_two_robots_count_once(tmp_path: Path) -> None:
+    path = drawn_file(robot_log, 0, tmp_path)
+    log = json.loads(path.read_text())
+    once = read_robot_log(path, skip_unknown=False)
+    entries = log["measurements"]["a"]
+    log["measurements"]["b"] = entries
+    path.write_text(json.dumps(log))
+    twice = read_robot_log(path, skip_unknown=False)
+    assert len(twice.edges) == len(once.edges) == load(path).num_edges
+    entries[0]["measurements"].append({"type": "Unknown"})
+    path.write_text(json.dumps(log))
+    with pytest.raises(FileFormatError, match="measurement type Unknown"):
+        read_robot_log(path, skip_unknown=False)
+    assert len(read_robot_log(path, skip_unknown=True).edges) == len(once.edges)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"covariance": [1.0] * 9}, "not positive definite"),
+        ({"covariance": [1.0, 0.5, 0.0, 0.4, 1.0, 0.0, 0.0, 0.0, 1.0]}, "not symmetric"),
+        ({"covariance": "9"}, "are not 9 numbers"),
+        ({"measurement": {"x": 1.0}}, "no entry 'y'"),
+        ({"measurement": {"x": 1.0, "y": 0.0, "theta": "a"}}, "are not 3 numbers"),
+        ({"key1": -1}, "a key is none"),
+        ({"key1": 1}, "an edge from a pose to itself"),
+    ],
+)
+def test_a_wrong_measurement_of_a_log_is_named(
+    change: dict[str, object], words: str, tmp_path: Path
+) -> None:
+    eye = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    between: dict[str, object] = {"type": "BetweenFactorPose2", "key1": 0, "key2": 1}
+    between |= {"measurement": {"x": 1.0, "y": 0.0, "theta": 0.5}, "covariance": eye}
+    path = tmp_path / "log.jrl"
+    for measurement in (between, between | change):
+        path.write_text(json.dumps({"measurements": {"a": [{"measurements": [measurement]}]}}))
+        if measurement is between:
+            assert len(read_robot_log(path, skip_unknown=False).edges) == 1
+    with pytest.raises(FileFormatError, match=words) as error:
+        read_robot_log(path, skip_unknown=False)
+    assert error.value.line == 1
+    for text in ("", "[]", '{"measurements": {"a": 5}}', '{"measurements": {"a": [NaN]}}'):
+        path.write_text(text)
+        with pytest.raises(FileFormatError):
+            read_robot_log(path, skip_unknown=False)
 
 
 def test_a_matrix_that_is_singular_fails_when_all_bits_are_used(tmp_path: Path) -> None:
