@@ -301,7 +301,7 @@ class Certificate(ReadOnly):
         rounding = rounded_up(self.bound.rounding, 2)
         less = f"less {rounding} for rounding"
         if self.weights_error > 0.0:
-            less += f" and {rounded_up(self.weights_error, 2)} of it for inverted covariances"
+            less += f" and {rounded_up(self.weights_error, 2)} of it for that of the weights"
         return f"proved {form}{shift}{cap}{self._terms_text}, {less}"
 
     @property

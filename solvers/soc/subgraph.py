@@ -110,6 +110,7 @@ class Subgraph:
             graph.kappa[kept],
             graph.tau[kept],
             name=graph.name,
+            weights_error=graph.weights_error,
         )
         final = None
         if self.final is not None:
@@ -364,6 +365,7 @@ def _subgraph(
         graph.tau[edges],
         ids=graph.pose_ids[poses],
         name=f"{graph.name}, robot {robot}",
+        weights_error=graph.weights_error,
     )
     convex_part = problem.convex_part
     in_cover, is_counted, copies, common = placement.of(robot, local, poses, owner)

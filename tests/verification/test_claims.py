@@ -120,7 +120,7 @@ def test_the_bound_of_inverted_covariances_is_one_on_the_cost_of_the_file(tmp_pa
     assert certificate.verdict is Verdict.NOT_CERTIFIED
     assert certificate.digits == 2
     assert certificate.proven_gap > 1.9 * certificate.weights_error > 1e-4
-    assert "for inverted covariances" in str(certificate)
+    assert "for that of the weights" in str(certificate)
     found = verify_proof(path, proof)
     assert found.failure == ""
     assert found.bound is not None
