@@ -120,6 +120,46 @@ def test_squared_square_roots_are_within_their_errors(seed: int, decades: float)
         assert error < 1e-12 * 10.0**decades
 
 
+def rational_rotation(quaternion: Array) -> fmpq_mat:
+    """Rotation of a quaternion x y z w of any length, exactly."""
+    x, y, z, w = (exact(float(number)) for number in quaternion)
+    twice = 2 / (x * x + y * y + z * z + w * w)
+    rows = [
+        [1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)],
+        [twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)],
+        [twice * (x * z - y * w), twice * (y * z + x * w), 1 - twice * (x * x + y * y)],
+    ]
+    return fmpq_mat(rows)
+
+
+@given(SEEDS, st.floats(0.0, 5.0))
+def test_matrices_of_sensors_beside_their_poses_are_within_their_errors(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, decades: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    q = rng.standard_normal(4)
+    t = 10.0 * rng.standard_normal(3)
+    information = spread_matrices(rng, 1, 6, decades)[0]
+    triangle = information[np.triu_indices(6)]
+    path = tmp_path_factory.mktemp("offset") / "graph.g2o"
+    path.write_text(
+        f"PARAMS_SE3OFFSET 1 {' '.join(map(repr, [*t.tolist(), *q.tolist()]))}\n"
+        f"EDGE_SE3_OFFSET 0 1 0 1 1 2 3 0 0 0 1 {' '.join(map(repr, triangle.tolist()))}\n"
+    )
+    graph = read_g2o(path)
+    assert graph.information is not None
+    R_T = rational_rotation(q).transpose()
+    x, y, z = (exact(float(number)) for number in t)
+    cross = fmpq_mat([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    of_turn = -1 * (R_T * cross)
+    top = [[R_T[a, b] for b in range(3)] + [of_turn[a, b] for b in range(3)] for a in range(3)]
+    bottom = [[fmpq(0)] * 3 + [R_T[a, b] for b in range(3)] for a in range(3)]
+    A = fmpq_mat(top + bottom)
+    of_file = A.transpose() * exact_matrix(np.triu(information) + np.triu(information, 1).T) * A
+    assert is_between(graph.information[0], of_file, graph.weights_error)
+    assert 0.0 < graph.weights_error < 1e-9 * 10.0**decades
+
+
 def test_bearings_have_small_errors_and_information_none() -> None:
     polar = np.array([[0.3, 5.0, 0.01, 0.1], [3.0, 1.0, 0.1, 0.1]])
     assert (TAGS["BR"].weights_error(polar) < 1e-11).all()
