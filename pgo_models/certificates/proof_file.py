@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,12 +114,29 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         "ground": _name(graph, _ground(graph)),
         "poses": rows,
     }
-    terms = certificate.bound.terms
+    terms = _terms_of_poses(graph, certificate.bound.terms)
     if terms is not None:
         record["handedness"] = _rows_of_terms(graph, terms)
     if isinstance(problem.weights, ExcessCost):
         record["splits"] = _rows_of_splits(graph, problem.weights)
     return record
+
+
+def _terms_of_poses(graph: PoseGraph, terms: HandednessTerms | None) -> HandednessTerms | None:
+    """The terms of pairs of poses with rotations, None without any.
+
+    Robots, who do not tell landmarks from poses, may have terms of landmarks, too. Those are true,
+    as a landmark has a rotation in the solver, but a proof has none.
+    """
+    if terms is None:
+        return None
+    ends = np.stack([terms.i, terms.j])
+    is_kept = ~np.isin(ends, graph.landmarks).any(axis=0)
+    if not is_kept.any():
+        return None
+    return replace(
+        terms, i=terms.i[is_kept], j=terms.j[is_kept], T=terms.T[is_kept], P=terms.P[is_kept]
+    )
 
 
 def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, object]]:
@@ -199,7 +216,7 @@ def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
     of_certificate = _Proven(best, certificate.Lambda, certificate.bound.value)
     if problem.is_quadratic or certificate.eta != 0.0:
         return of_certificate
-    terms = certificate.bound.terms
+    terms = _terms_of_poses(problem.graph, certificate.bound.terms)
     points = [(poses, multipliers(problem, poses)) for poses in (best, certificate.poses)]
     if _has_form_of_verifier(problem):
         points.append((best, certificate.Lambda))

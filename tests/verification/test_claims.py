@@ -107,6 +107,12 @@ def test_proofs_with_terms_and_of_stiff_matrices_are_verified(
     assert found.gap < 1e-12
 
 
+@pytest.mark.parametrize("seed", [9, 35])
+def test_coupled_matrices_beside_landmarks_are_verified(seed: int, tmp_path: Path) -> None:
+    # Seed 9 is solved by robots, whose handedness terms are of landmarks, too.
+    verify_the_proof_of(landmarks, seed, tmp_path)
+
+
 LEAST_OF_STIFF = 422245656.8  # of F of the exact inverses, rounded up
 
 
