@@ -103,6 +103,34 @@ def sum_above(cost: float, error: float) -> float:
     return math.nextafter(total, math.inf) if error > 0.0 else total
 
 
+def scaled_below(value: float, error: float) -> float:
+    """Double that is not above (1 - error) value, for a value and an error that are not negative.
+
+    Examples
+    --------
+    >>> scaled_below(1.0, 0.0), scaled_below(1.0, 0.25) <= 0.75
+    (1.0, True)
+    """
+    if error == 0.0:
+        return value
+    factor = math.nextafter(1.0 - error, -math.inf)
+    return max(0.0, math.nextafter(factor * value, -math.inf))
+
+
+def scaled_above(value: float, error: float) -> float:
+    """Double that is not below (1 + error) value, for a value and an error that are not negative.
+
+    Examples
+    --------
+    >>> scaled_above(1.0, 0.0), scaled_above(1.0, 0.25) >= 1.25
+    (1.0, True)
+    """
+    if error == 0.0:
+        return value
+    factor = math.nextafter(1.0 + error, math.inf)
+    return math.nextafter(factor * value, math.inf)
+
+
 def proven_digits(cost: float, lower_bound: float) -> int:
     """Digits of a cost that a lower bound proves.
 

@@ -14,6 +14,7 @@ from pgo_models.certificates.fit import Fit, fit_of
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.convex.graph_subproblem import GraphQP, ModelChange
 from pgo_models.errors import SettingError
+from pgo_models.figures import gap_above, scaled_above, scaled_below
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
 from solvers.convex.extended_newton import ExtendedNewton, kinks
@@ -160,13 +161,15 @@ def _certificate_with_terms(
     fit = Fit.NONE
     if is_F and not has_replaced_edges:
         fit = fit_of(priors, priors.graph.completed(poses))
+    at_most = scaled_above(objective, certificate.weights_error)
+    at_least = scaled_below(bound.value, certificate.weights_error)
     return replace(
         certificate,
         objective=objective,
         objective_error=math.nan,
         bound=bound,
-        gap=relative_gap(objective, bound.value, fit is Fit.ROUNDING),
-        verdict=verdict_of(fit, objective, bound, certificate.wanted_gap),
+        gap=relative_gap(at_most, at_least, fit is Fit.ROUNDING),
+        verdict=verdict_of(fit, gap_above(at_most, at_least), bound, certificate.wanted_gap),
         fit=fit,
         stationarity=answer.decrement,
     )

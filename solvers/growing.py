@@ -165,6 +165,7 @@ class GrowingSolution:
             fixed=first.fixed,
             name=first.name,
             written_error=_written_error(self.graphs),
+            weights_error=max(graph.weights_error for graph in self.graphs),
         )
 
     def with_edges(self, graph: PoseGraph) -> GrowingSolution:

@@ -547,6 +547,7 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
         "grounded": certificate.bound.is_grounded,
         "rounding": certificate.bound.rounding,
         "objective_error": finite_or_none(certificate.objective_error),
+        "weights_error": certificate.weights_error,
         "digits": certificate.digits,
         "stationarity": finite_or_none(certificate.stationarity),
         "verdict": certificate.verdict.name,

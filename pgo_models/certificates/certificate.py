@@ -25,7 +25,15 @@ from pgo_models.certificates.rounding_errors import (
     objective_rounding,
 )
 from pgo_models.errors import ProofError, SettingError
-from pgo_models.figures import gap_above, proven_digits, rounded_down, rounded_up, sum_above
+from pgo_models.figures import (
+    gap_above,
+    proven_digits,
+    rounded_down,
+    rounded_up,
+    scaled_above,
+    scaled_below,
+    sum_above,
+)
 from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -81,7 +89,8 @@ class BoundSource(enum.Enum):
 class Certificate(ReadOnly):
     """A proven lower bound on the global optimum beside the cost of given poses.
 
-    `lower_bound` is proven: F(R, t) >= lower_bound for all poses, in exact arithmetic. What is
+    `lower_bound` is proven: F(R, t) >= lower_bound for all poses, in exact arithmetic. Where the
+    weights are inverses of the covariances of a file, that is F of the exact inverses. What is
     printed holds of the exact cost: `objective_at_most` rounded up, `lower_bound` rounded down, and
     `proven_gap` rounded up.
 
@@ -121,6 +130,10 @@ class Certificate(ReadOnly):
         Whether this is said of poses; otherwise of rotations alone.
     fit : Fit
         How closely the poses fit every edge; the verdict is EXACT unless that is NONE.
+    weights_error : float
+        The cost of the file is between 1 - weights_error and 1 + weights_error times that of the
+        weights as they are stored (`PoseGraph.weights_error`), of which `objective` and `bound`
+        are. `lower_bound`, `objective_at_most` and what follows from them count it.
     """
 
     objective: float
@@ -138,6 +151,7 @@ class Certificate(ReadOnly):
     objective_error: float = math.nan
     has_translations: bool = True
     fit: Fit = Fit.NONE
+    weights_error: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
@@ -145,7 +159,7 @@ class Certificate(ReadOnly):
     @property
     def lower_bound(self) -> float:
         """Proven: F(R, t) >= lower_bound for every choice of poses."""
-        return self.bound.value
+        return scaled_below(self.bound.value, self.weights_error)
 
     @property
     def eta(self) -> float:
@@ -159,9 +173,10 @@ class Certificate(ReadOnly):
     def is_best_in_doubles(self) -> bool:
         """Whether S_r is definite and the gap below 1e-6, or below the one asked for.
 
-        A smaller gap takes more precision, not other poses.
+        A smaller gap takes more precision, not other poses. What is not known of the weights does
+        not count.
         """
-        small = max(DEFAULT_GAP, self.wanted_gap)
+        small = max(DEFAULT_GAP + 2.0 * self.weights_error, self.wanted_gap)
         return self.bound.is_grounded and self.eta == 0.0 and self.gap <= small
 
     @property
@@ -193,7 +208,7 @@ class Certificate(ReadOnly):
 
         It is the objective as computed where no such bound is known.
         """
-        return _cost_at_most(self.objective, self.objective_error)
+        return _cost_at_most(self.objective, self.objective_error, self.weights_error)
 
     @property
     def proven_gap(self) -> float:
@@ -305,7 +320,10 @@ class Certificate(ReadOnly):
         shift = f", eta = {rounded_up(self.eta, 3)}" if self.eta > 0 else ""
         cap = f", conditions cut to {self.bound.cap:.3g}" if self.bound.cap < math.inf else ""
         rounding = rounded_up(self.bound.rounding, 2)
-        return f"proved {form}{shift}{cap}{self._terms_text}, less {rounding} for rounding"
+        less = f"less {rounding} for rounding"
+        if self.weights_error > 0.0:
+            less += f" and {rounded_up(self.weights_error, 2)} of it for that of the weights"
+        return f"proved {form}{shift}{cap}{self._terms_text}, {less}"
 
     @property
     def _terms_text(self) -> str:
@@ -407,7 +425,7 @@ def with_terms(
     gap = certificate.wanted_gap
     tangent = problem.tangent_at(ground)
     bound = best_bound_with_terms(tangent, Lambda, ground, gap, certificate.objective, terms)
-    if bound.value <= certificate.lower_bound:
+    if bound.value <= certificate.bound.value:
         return certificate
     stationarity = certificate.stationarity
     return certify_with(
@@ -466,6 +484,7 @@ def certify_with(
         objective_error=rounding.error,
         has_translations=problem.has_translations,
         fit=rounding.fit,
+        weights_error=rounding.weights_error,
     )
 
 
@@ -501,6 +520,7 @@ class Judgement:
             objective_error=self.rounding.error,
             rounding_level=self.rounding.level,
             fit=self.rounding.fit,
+            weights_error=self.rounding.weights_error,
             bound=self.bound,
             gap=self.gap,
             verdict=self.verdict,
@@ -521,27 +541,31 @@ def judge_cost(
             "a defect of pgo_models; please report it with the graph"
         )
     # F may come out below a true bound by its own rounding, which is then what the gap is known to.
+    known = bound.value if bound.value < F else F - rounding.error
+    weights_error = rounding.weights_error
     gap = relative_gap(
-        F,
-        bound.value if bound.value < F else F - rounding.error,
+        scaled_above(F, weights_error),
+        scaled_below(known, weights_error),
         rounding.fit is Fit.ROUNDING,
     )
     # chi2, which is never negative, may come out below zero.
     bound = replace(bound, value=min(bound.value, max(F, 0.0)))
-    verdict = verdict_of(rounding.fit, _cost_at_most(F, rounding.error), bound, wanted_gap)
+    proven_gap = gap_above(
+        _cost_at_most(F, rounding.error, weights_error), scaled_below(bound.value, weights_error)
+    )
+    verdict = verdict_of(rounding.fit, proven_gap, bound, wanted_gap)
     return Judgement(F, rounding, bound, gap, verdict)
 
 
-def verdict_of(fit: Fit, cost_at_most: float, bound: LowerBound, wanted_gap: float) -> Verdict:
-    """Verdict on poses that fit the edges so closely and cost no more than that.
+def verdict_of(fit: Fit, proven_gap: float, bound: LowerBound, wanted_gap: float) -> Verdict:
+    """Verdict on poses that fit the edges so closely and have that `Certificate.proven_gap`.
 
-    The gap is that of `Certificate.proven_gap`: what was asked for has to be proven.
+    What was asked for has to be proven.
     """
     if fit is not Fit.NONE:
         return Verdict.EXACT
     if math.isnan(bound.eta):
         return Verdict.TRIVIAL
-    proven_gap = gap_above(cost_at_most, bound.value)
     return Verdict.CERTIFIED if proven_gap <= wanted_gap else Verdict.NOT_CERTIFIED
 
 
@@ -555,6 +579,7 @@ def relative_gap(objective: float, lower_bound: float, is_exact: bool = False) -
     return (objective - lower_bound) / objective if 0.0 < objective < math.inf else 1.0
 
 
-def _cost_at_most(objective: float, error: float) -> float:
-    """A cost and the bound on its error; the cost as computed where no such bound is known."""
-    return objective if math.isnan(error) else sum_above(objective, error)
+def _cost_at_most(objective: float, error: float, weights_error: float) -> float:
+    """A cost and the bounds on its error; the cost as computed where none is known of rounding."""
+    at_most = objective if math.isnan(error) else sum_above(objective, error)
+    return scaled_above(at_most, weights_error)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +11,40 @@ from pgo_models.certificates.certificate import BoundSource, Certificate, Verdic
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_at
+from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError
+from pgo_models.figures import scaled_below
 from pgo_models.files import replace_when_done
+from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
+from pgo_models.problem.excess import CoupledExcess
+from pgo_models.problem.floating_point import UNIT_ROUNDOFF
+from pgo_models.problem.information_costs import ExcessCost
 from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
 FORMAT = "pgo-splitting proof 1"
+# Relative error of the entries of information matrices, as of the verifier: the 2^-45 of the
+# diagonal that is added to a matrix which is semidefinite but for rounding, and the rounding of the
+# numbers and of what is computed from them.
+WEIGHT_ERROR = 2.0**-44
 
 
 def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) -> None:
     """Write what proves the bound of a certificate, as JSON; `verify_proof` checks it.
 
     All digits are written of poses, multipliers Lambda and the shift eta, and what they claim: the
-    cost of the poses, and the lower bound. Of rotations alone no translations are written. Of a
-    tangent of chi2 the multipliers are left out: they depend on how it was chosen, and the verifier
-    has its own.
+    cost of the poses, and the lower bound. Of rotations alone no translations are written. Of chi2
+    the file has, edge by edge, how it is split into a quadratic form and a convex rest, whose
+    tangent at the poses takes its place: the multipliers are those of this tangent.
+
+    The certificate bounds the cost of the numbers as they are stored, in doubles. `verify_proof`
+    bounds that of the decimal numbers of the file, and tolerates nothing. So the bound that is
+    claimed is the one of the certificate less what the rounding of these numbers can make of it.
 
     Parameters
     ----------
@@ -80,10 +95,18 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         what = "the bound is that of smaller information matrices, not the file's"
         way_out = "leave out --proof, or add --cost isotropic to prove F"
         raise SettingError(f"no proof to write: {what}; {way_out}")
-    poses, objective = _point_of_bound(problem, certificate)
-    transposed = np.swapaxes(certificate.Lambda, 1, 2)
-    Lambda = 0.5 * (certificate.Lambda + transposed)
+    at_bound = certificate
+    local = LocalWorld.of(problem)
+    if local is not None:
+        # The poses stay with their small coordinates, unrounded, and the world pose far from them.
+        at_bound = replace(certificate, poses=local.local_poses(certificate.poses))
+    of_bound = problem if local is None else local.problem
+    proven = _proven_at(of_bound, at_bound)
+    poses = proven.poses if local is None else local.unrounded_poses(proven.poses)
+    transposed = np.swapaxes(proven.Lambda, 1, 2)
+    Lambda = 0.5 * (proven.Lambda + transposed)
     upper_triangle = np.triu_indices(d)
+    has_multipliers = _has_form_of_verifier(problem)
     rows: list[dict[str, object]] = []
     for pose in range(graph.num_poses):
         row: dict[str, object] = {"id": _name(graph, pose)}
@@ -91,7 +114,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
             row["t"] = poses.t[pose].tolist()
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
-            if problem.is_quadratic:
+            if has_multipliers:
                 row["Lambda"] = Lambda[pose][upper_triangle].tolist()
         rows.append(row)
     eta = None if math.isnan(certificate.eta) else certificate.eta
@@ -99,17 +122,36 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         "format": FORMAT,
         "cost": cost,
         "d": d,
-        "objective": objective,
-        "lower_bound": certificate.lower_bound,
-        "rounding_level": certificate.rounding_level,
+        # chi2 may come out below zero
+        "objective": max(of_bound.objective(proven.poses), 0.0),
+        "lower_bound": _claimed_bound(of_bound, at_bound, proven, graph),
         "eta": eta,
         "ground": _name(graph, _ground(graph)),
         "poses": rows,
     }
-    terms = certificate.bound.terms
+    terms = _terms_of_poses(graph, certificate.bound.terms)
     if terms is not None:
         record["handedness"] = _rows_of_terms(graph, terms)
+    if isinstance(of_bound.weights, ExcessCost):
+        record["splits"] = _rows_of_splits(of_bound.graph, of_bound.weights)
     return record
+
+
+def _terms_of_poses(graph: PoseGraph, terms: HandednessTerms | None) -> HandednessTerms | None:
+    """The terms of pairs of poses with rotations, None without any.
+
+    Robots, who do not tell landmarks from poses, may have terms of landmarks, too. Those are true,
+    as a landmark has a rotation in the solver, but a proof has none.
+    """
+    if terms is None:
+        return None
+    ends = np.stack([terms.i, terms.j])
+    is_kept = ~np.isin(ends, graph.landmarks).any(axis=0)
+    if not is_kept.any():
+        return None
+    return replace(
+        terms, i=terms.i[is_kept], j=terms.j[is_kept], T=terms.T[is_kept], P=terms.P[is_kept]
+    )
 
 
 def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, object]]:
@@ -126,40 +168,148 @@ def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, o
     ]
 
 
-def _point_of_bound(problem: PGOProblem, certificate: Certificate) -> tuple[Poses, float]:
-    """Poses that the bound was found at, and their cost.
+def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object]]:
+    """Rows of tau and J_ss of every edge, in the frame that was measured.
 
-    Where priors are far away, the poses stay with their small coordinates, unrounded, and the world
-    pose is far from them.
+    The rounding of J_ss by the turn is far below its distance from the least that is allowed
+    (`pgo_models.problem.weighting`).
     """
-    local = LocalWorld.of(problem)
-    if local is None:
-        poses = _poses_of_bound(problem, certificate)
-        return poses, problem.objective(poses)
-    at_bound = local.local_poses(certificate.poses)
-    poses, objective = _point_of_bound(local.problem, replace(certificate, poses=at_bound))
-    return local.unrounded_poses(poses), objective
+    upper_triangle = np.triu_indices(1 if graph.d == 2 else 3)
+    J_ss = cost.excess.J_ss if isinstance(cost.excess, CoupledExcess) else None
+    if J_ss is not None and graph.d == 3:
+        J_ss = np.swapaxes(graph.R_ij, 1, 2) @ J_ss @ graph.R_ij
+    is_point = _measures_position(graph)
+    rows: list[dict[str, object]] = []
+    for e in range(graph.num_edges):
+        row: dict[str, object] = {
+            "i": _name(graph, int(graph.i[e])),
+            "j": _name(graph, int(graph.j[e])),
+            "tau": float(cost.tau[e]),
+        }
+        if J_ss is not None and not is_point[e]:
+            row["J_ss"] = J_ss[e][upper_triangle].tolist()
+        rows.append(row)
+    return rows
 
 
-def _poses_of_bound(problem: PGOProblem, certificate: Certificate) -> Poses:
-    """Poses with the translations that the bound was found at: their own, or the best ones.
+def _measures_position(graph: PoseGraph) -> BoolArray:
+    """Whether an edge measures a position alone, (m,)."""
+    is_position_prior = graph.is_prior & (graph.kappa == 0.0)
+    return np.asarray(np.isin(graph.j, graph.landmarks) | is_position_prior)
 
-    Where M hardly holds a direction that chi2 holds, a tangent elsewhere proves much less.
+
+def _has_form_of_verifier(problem: PGOProblem) -> bool:
+    """Whether the verifier has the same quadratic form, to which the multipliers belong.
+
+    In a coupled chi2 the solver gives edges that measure a position alone a small J_ss, too, and
+    the verifier none. The multipliers are then left to the verifier, which takes those of its own
+    form at the poses.
+    """
+    cost = problem.weights
+    is_coupled = isinstance(cost, ExcessCost) and isinstance(cost.excess, CoupledExcess)
+    return not (is_coupled and _measures_position(problem.graph).any())
+
+
+@dataclass(frozen=True, eq=False)
+class _Proven:
+    """Poses and multipliers that are written, and the bound that they prove."""
+
+    poses: Poses
+    Lambda: Array
+    bound: float
+
+
+def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
+    """What proves the bound of a certificate.
+
+    The poses have their own translations, or the best ones. For given multipliers the bound of a
+    quadratic cost does not depend on them. That of chi2 does, as the tangent is taken there: where
+    M hardly holds a direction that chi2 holds, a tangent elsewhere proves much less. So the best of
+    a few is chosen.
     """
     best = problem.at_best_translations(certificate.poses)
+    of_certificate = _Proven(best, certificate.Lambda, certificate.bound.value)
     if problem.is_quadratic or certificate.eta != 0.0:
-        return best
-    terms = certificate.bound.terms
-    bounds = []
-    for poses in (best, certificate.poses):
+        return of_certificate
+    terms = _terms_of_poses(problem.graph, certificate.bound.terms)
+    points = [(poses, multipliers(problem, poses)) for poses in (best, certificate.poses)]
+    if _has_form_of_verifier(problem):
+        points.append((best, certificate.Lambda))
+    candidates = []
+    for poses, Lambda in points:
         tangent = problem.tangent_at(poses)
         if terms is not None:
             tangent = terms.taken_off(tangent)
-        Lambda = multipliers(problem, poses)
         bound = prove_at(tangent, Lambda, poses)
-        bounds.append(-math.inf if bound is None else bound.value)
-    bound_at_best, bound_at_own = bounds
-    return best if bound_at_best >= bound_at_own else certificate.poses
+        if bound is not None:
+            lost = 0.0 if terms is None else terms.loss()
+            candidates.append(_Proven(poses, Lambda, bound.value - lost))
+    return max(candidates, key=lambda proven: proven.bound, default=of_certificate)
+
+
+def _claimed_bound(
+    problem: PGOProblem, certificate: Certificate, proven: _Proven, of_file: PoseGraph
+) -> float:
+    """The bound of the certificate, less what the rounding of the numbers of the file can take.
+
+    To first order the least cost changes by what the cost of the best poses does. Its residuals
+    are known to `objective_rounding`. A relative error of the entries of information matrices
+    changes chi2 by that share of the sizes sum_a I_aa z_a^2 of the residuals z, and so it changes F
+    (`pgo_models.verification.doubles`). The loss of second order is as large as what the
+    certificate subtracts for rounding, which is subtracted once more. Priors, which the problem may
+    have with smaller coordinates, were rounded as the file has them (`_loss_of_priors`).
+    """
+    stored_bound = min(certificate.bound.value, proven.bound)
+    bound = scaled_below(stored_bound, certificate.weights_error)
+    if bound == 0.0:
+        return 0.0
+    of_residuals = objective_rounding(problem, proven.poses).error
+    of_weights = WEIGHT_ERROR * _sizes_of_weights(problem, proven.poses)
+    of_priors = _loss_of_priors(problem, proven.poses, of_file)
+    claimed = bound - of_residuals - of_weights - of_priors - certificate.bound.rounding
+    return max(claimed, 0.0)
+
+
+def _loss_of_priors(problem: PGOProblem, poses: Poses, of_file: PoseGraph) -> float:
+    """What the rounding of positions p in the decimals of a file can make of the cost.
+
+    It is up to u ||p||, and with I_tt and the cost c of its edge sum 2 sqrt(c tr(I_tt)) u ||p|| +
+    tr(I_tt) (u ||p||)^2.
+    """
+    of_priors = of_file.is_prior
+    error = UNIT_ROUNDOFF * block_norms(of_file.t_ij[of_priors])
+    weight = np.einsum(
+        "mkk->m", _information_of(problem.graph)[of_priors, : of_file.d, : of_file.d]
+    )
+    cost = np.maximum(problem.edge_costs(poses)[of_priors], 0.0)
+    return float(np.sum(2.0 * np.sqrt(cost * weight) * error + weight * error**2))
+
+
+def _information_of(graph: PoseGraph) -> Array:
+    """Information matrices of the edges, isotropic where the graph has none."""
+    if graph.information is None:
+        return isotropic_information(graph.kappa, graph.tau, graph.d)
+    return graph.information
+
+
+def _sizes_of_weights(problem: PGOProblem, poses: Poses) -> float:
+    """Sum of tr(I_tt) ||r||^2 + tr(I_rr) 2 (1 - cos theta) over the edges."""
+    graph = problem.graph
+    d = graph.d
+    diagonals = np.einsum("mkk->mk", _information_of(graph))
+    poses = problem.seen_poses(poses)
+    R_i = poses.R[graph.i]
+    turned_offsets = np.einsum("mab,mb->ma", R_i, graph.t_ij)
+    r = poses.t[graph.j] - poses.t[graph.i] - turned_offsets
+    squared_r = inner_products(r, r)
+    defects = poses.R[graph.j] - R_i @ graph.R_ij
+    # The squared Frobenius norm of E - I is 4 (1 - cos theta).
+    squared_R = 0.5 * inner_products(defects, defects)
+    size_t = np.sum(diagonals[:, :d], axis=1) * squared_r
+    size_R = np.sum(diagonals[:, d:], axis=1) * squared_R
+    if not problem.has_translations:
+        return float(np.sum(size_R))
+    return float(np.sum(size_t + size_R))
 
 
 def _ground(graph: PoseGraph) -> int:

@@ -216,6 +216,8 @@ class ObjectiveRounding:
     error: float
     # how closely every edge fits: where it is to rounding, F is at most 4 level, exactly
     fit: Fit
+    # how far the cost of the file can be from F, relatively (`PoseGraph.weights_error`)
+    weights_error: float = 0.0
 
 
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
@@ -259,7 +261,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     for of_cost in problem.weights.value_errors(problem, poses, e_t, e_R):
         error += of_cost
     level = rounding_cost(problem, poses)
-    return ObjectiveRounding(level, OUTWARD * error, fit_of(problem, poses))
+    return ObjectiveRounding(level, OUTWARD * error, fit_of(problem, poses), graph.weights_error)
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:

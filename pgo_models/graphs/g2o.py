@@ -202,6 +202,7 @@ def graph_of_files(
         world=world,
         landmarks=np.flatnonzero(is_landmark),
         written_error=written_errors(measurements_of(d, rows), digits),
+        weights_error=max(file.weights_error for file in files),
     )
 
 

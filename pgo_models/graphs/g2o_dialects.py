@@ -13,9 +13,10 @@ from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
-from pgo_models.graphs.g2o_tags import SINGULAR, TAGS, Tag
+from pgo_models.graphs.g2o_tags import TAGS, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.precisions import are_definite
+from pgo_models.graphs.weight_errors import SINGULAR, congruence_error, entry_error
 
 # In place of the id of an offset, on lines that name none: the sensor is at its pose.
 NO_OFFSET = -(2**63)
@@ -49,8 +50,10 @@ def _all_are_definite(rows: Array) -> bool:
     return bool((diagonals > 0.0).all()) and bool(are_definite(matrices, SINGULAR).all())
 
 
-def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> Array:
+def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> tuple[Array, Array]:
     """EDGE rows, measured by sensors that are not at their poses, in the frames of the poses.
+
+    Returned with the errors, (n,), of their information matrices (`weight_errors`).
 
     With the poses O of the sensors in the frames of x_i and x_j, and one of them the identity where
     a tag has one offset, the measurement is Z of (x_i O_i)^-1 x_j O_j (`computeError` of g2o's
@@ -76,9 +79,19 @@ def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> Arra
         t = first.t + np.einsum("nab,nb->na", first.R, Z.t) - np.einsum("nab,nb->na", R, second.t)
         measured = Poses(R, t)
         A = _adjoint_of_inverse(second)
+    side = d if kind.is_point else len(A[0])
+    of_sensor = information[:, :side, :side]
+    # An entry of a rotation is at most 1, and one of R^T [t]x at most ||t||.
+    sizes = np.ones((len(rows), side, side))
+    if not kind.is_point:
+        sizes[:, :d, d:] = np.linalg.norm(second.t, axis=1)[:, None, None]
+        sizes[:, d:, :d] = 0.0
     information = A.mT @ information @ A
+    own = information[:, :side, :side]
+    error = entry_error(own, congruence_error(sizes, of_sensor))
     triangle = np.triu_indices(information.shape[1])
-    return np.concatenate([numbers_of(measured.R, measured.t), information[:, *triangle]], axis=1)
+    turned = np.concatenate([numbers_of(measured.R, measured.t), information[:, *triangle]], axis=1)
+    return turned, error
 
 
 def _adjoint_of_inverse(poses: Poses) -> Array:

@@ -36,7 +36,6 @@ from pgo_models.graphs.g2o_source import ParsedLines, Source
 from pgo_models.graphs.g2o_tags import (
     OFFSET_TAGS,
     SHORT_TAGS,
-    SINGULAR,
     TAGS,
     TAGS_IN_FILES,
     Noise,
@@ -44,11 +43,16 @@ from pgo_models.graphs.g2o_tags import (
 )
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.precisions import are_definite
+from pgo_models.graphs.weight_errors import MOST, SINGULAR
 from pgo_models.graphs.written_digits import WrittenDigits, digits_of
 
 _NAMED_TAGS = 10  # unknown tags that a warning names
 _KNOWN_TAGS = ", ".join(TAGS_IN_FILES)
 _SQUARE_ROOTS = "iSAM's own files have square roots of information (pgo info --square-roots --out)"
+HIDDEN_INFORMATION = (
+    "doubles cannot hold the information matrix, as its condition is too large; give a larger "
+    "smallest deviation, or an EDGE line with the information matrix itself"
+)
 _TAKEN_AS_INFORMATION = f"matrices are taken as information; {_SQUARE_ROOTS}"
 
 
@@ -70,6 +74,7 @@ class G2OLines:
     fixed_lines: IntArray  # (f,)
     landmarks: IntArray  # (l,): ids of points
     digits: WrittenDigits  # of the measurements as they are written
+    weights_error: float = 0.0  # the largest of the edges, see `weight_errors`
     landmark_shift: int = 0  # what was added to the ids of landmarks, which the file has for poses
 
 
@@ -184,11 +189,13 @@ def _text_of_unknown(source: Source) -> str:
 class _Assembly:
     """The parsed lines of a file put together: in common units and axes, in the order of the file.
 
-    `notes` says what was assumed where files differ.
+    `notes` says what was assumed where files differ, and `weights_error` how far the weights can
+    be from those of the file (`weight_errors`).
     """
 
     def __init__(self, source: Source, d: int, square_roots: bool) -> None:
         self.notes: list[str] = []
+        self.weights_error = 0.0
         self._source = source
         self._d = d
         self._square_roots = square_roots
@@ -215,6 +222,7 @@ class _Assembly:
             fixed_lines=fixed_lines,
             landmarks=np.zeros(0, dtype=np.int64),
             digits=digits,
+            weights_error=self.weights_error,
         )
         if vertices.is_point.any() or edges.is_point.any():
             return self._with_landmarks(file, vertices.is_point, edges.is_point)
@@ -324,6 +332,7 @@ class _Assembly:
         if self._square_roots and kind.has_matrix:
             kind = replace(kind, noise=Noise.SQUARE_ROOT)
         part = self._without(part, *kind.problem(part.numbers))
+        part = self._with_known_weights(part, kind.weights_error(part.numbers))
         numbers = kind.rows(part.numbers)
         if kind.noise is not Noise.INFORMATION or kind.num_offsets:
             part, numbers = self._without_wrong_rows(part, numbers)
@@ -334,6 +343,16 @@ class _Assembly:
         last_two_ids = ids_behind_world[:, -2:]
         is_point = np.full(len(part.lines), kind.to_landmark)
         return _Rows(last_two_ids, numbers, part.lines, is_point)
+
+    def _with_known_weights(self, part: ParsedLines, errors: Array) -> ParsedLines:
+        """Lines with information that doubles can hold, by its errors, (n,), which are noted."""
+        is_hidden = errors > MOST
+        self._count_weights_error(errors[~is_hidden])
+        return self._without(part, is_hidden, HIDDEN_INFORMATION)
+
+    def _count_weights_error(self, errors: Array) -> None:
+        largest = float(errors.max(initial=0.0))
+        self.weights_error = max(self.weights_error, largest)
 
     def _without(self, part: ParsedLines, is_wrong: BoolArray, problem: str) -> ParsedLines:
         """Note the problem of wrong lines, (n,), and return the others."""
@@ -383,7 +402,10 @@ class _Assembly:
             return numbers
         offsets = [offsets_named(ids, self._d, offset_of) for ids in offset_ids[is_moved].T]
         numbers = numbers.copy()
-        numbers[is_moved] = in_frames_of_poses(kind, numbers[is_moved], offsets)
+        numbers[is_moved], errors = in_frames_of_poses(kind, numbers[is_moved], offsets)
+        is_hidden = errors > MOST
+        self._note_problem(part.lines[is_moved][is_hidden], HIDDEN_INFORMATION)
+        self._count_weights_error(errors[~is_hidden])
         return numbers
 
     def _check_unknown_offset(self, kind: Tag, offset_id: int, lines: IntArray) -> None:

@@ -20,11 +20,17 @@ from pgo_models.files import LARGEST
 from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map, quaternions_from_rotations
 from pgo_models.graphs.precisions import are_definite
+from pgo_models.graphs.weight_errors import (
+    SINGULAR,
+    both,
+    congruence_error,
+    entry_error,
+    inverse_error,
+    precision_error,
+)
 
 # Places of the numbers of an EDGE2 line of TORO: x y theta, then the triangle as ff fs ss rr fr sr.
 _TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
-# An eigenvalue below this, of a matrix with ones on its diagonal, is rounding.
-SINGULAR = 1e-15
 
 
 class Noise(enum.Enum):
@@ -87,6 +93,29 @@ class Tag:
             problem = "the covariance matrix is not positive definite; correct or remove it"
             return ~is_covariance, problem
         return np.zeros(len(numbers), dtype=bool), ""
+
+    def weights_error(self, numbers: Array) -> Array:
+        """Errors of the weights that `rows` makes of lines, (n,) (`weight_errors`).
+
+        They are 0 where the lines have the information itself, and inf where rounding hides it.
+        """
+        if not self.is_edge or self.noise in (Noise.INFORMATION, Noise.MISSING):
+            return np.zeros(len(numbers))
+        places = triangle_places(self._side)
+        information = self._with_information(numbers)[:, self.num_measured + places]
+        if self.noise is Noise.COVARIANCE:
+            covariances = numbers[:, self.num_measured + places]
+            error = inverse_error(covariances, information)
+        elif self.noise is Noise.SQUARE_ROOT:
+            U = np.triu(numbers[:, self.num_measured + places])
+            identity = np.tile(np.eye(self._side), (len(U), 1, 1))
+            error = entry_error(information, congruence_error(np.abs(U), identity))
+        else:
+            _, precisions = _polar_precisions(numbers)
+            largest = precisions[:, :, None] * np.eye(2)
+            everywhere = np.ones((len(numbers), 2, 2))
+            error = entry_error(information, congruence_error(everywhere, largest))
+        return both(error, precision_error(information, self.d))
 
     def rows(self, numbers: Array) -> Array:
         """Numbers of lines, (n, num_numbers), as rows of `G2OLines`."""
@@ -169,15 +198,21 @@ def _cartesian(numbers: Array) -> Array:
     information is therefore R(bearing) diag(1 / std_range^2, 1 / (range std_bearing)^2)
     R(bearing)^T, in the axes of the pose. This is an approximation: the exact density is bent.
     """
-    bearing, distance, bearing_std, range_std = numbers.T
-    to_pose = exp_map(bearing[:, None])
+    to_pose, precisions = _polar_precisions(numbers)
+    distance = numbers[:, 1]
     points = distance[:, None] * to_pose[:, :, 0]
-    deviations = np.stack([range_std, distance * bearing_std], axis=1)
-    with np.errstate(over="ignore", divide="ignore"):
-        precisions = np.minimum(deviations**-2.0, LARGEST)
     information = (to_pose * precisions[:, None, :]) @ to_pose.mT
     triangle = information[:, *np.triu_indices(2)]
     return np.concatenate([points, triangle], axis=1)
+
+
+def _polar_precisions(numbers: Array) -> tuple[Array, Array]:
+    """Rotations from the line of sight to the pose, (n, 2, 2), and precisions along it, (n, 2)."""
+    bearing, distance, bearing_std, range_std = numbers.T
+    deviations = np.stack([range_std, distance * bearing_std], axis=1)
+    with np.errstate(over="ignore", divide="ignore"):
+        precisions = np.minimum(deviations**-2.0, LARGEST)
+    return exp_map(bearing[:, None]), precisions
 
 
 # Tags that are read and written. EDGE_SE3_XYZ_PRIOR is a position of the pose itself.

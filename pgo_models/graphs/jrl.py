@@ -17,10 +17,16 @@ from pgo_models.errors import FileFormatError, GraphWarning, printable
 from pgo_models.files import LARGEST, Problem, check_lines, far_lines, zero_quaternion_lines
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import edge_rows_to_keep, graph_of_files
-from pgo_models.graphs.g2o_parser import G2OLines, far_information, problems_of
+from pgo_models.graphs.g2o_parser import (
+    HIDDEN_INFORMATION,
+    G2OLines,
+    far_information,
+    problems_of,
+)
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
+from pgo_models.graphs.weight_errors import MOST
 from pgo_models.graphs.written_digits import digits_of
 
 SUFFIX = ".jrl"
@@ -261,6 +267,7 @@ def _file(
     places = [np.zeros(0, dtype=np.int64)]
     landmarks = [np.zeros(0, dtype=np.int64)]
     measured = [np.zeros(0)]
+    weights_error = 0.0
     for of_type in by_type.values():
         kind = of_type.kind
         if kind.d != d:  # none of its measurements could be read
@@ -269,6 +276,12 @@ def _file(
         is_wrong, problem = kind.problem(numbers)
         of_kind = np.array(of_type.places, dtype=np.int64)
         problems += [(place, problem) for place in of_kind[is_wrong].tolist()]
+        errors = np.zeros(len(numbers))
+        errors[~is_wrong] = kind.weights_error(numbers[~is_wrong])
+        is_hidden = errors > MOST
+        problems += [(place, HIDDEN_INFORMATION) for place in of_kind[is_hidden].tolist()]
+        is_wrong = is_wrong | is_hidden
+        weights_error = max(weights_error, float(errors[~is_wrong].max(initial=0.0)))
         ids_of_kind = np.array(of_type.ids, dtype=np.int64).reshape(-1, 2)[~is_wrong]
         rows_of_kind = kind.rows(numbers[~is_wrong])
         is_right = (np.abs(rows_of_kind) <= LARGEST).all(axis=1)
@@ -296,6 +309,7 @@ def _file(
         fixed_lines=no_ids,
         landmarks=np.unique(np.concatenate(landmarks)),
         digits=digits_of(np.concatenate(measured)),
+        weights_error=weights_error,
     )
 
 

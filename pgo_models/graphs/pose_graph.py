@@ -121,6 +121,10 @@ class PoseGraph(ReadOnly):
         What ||t_ij|| and ||R_ij||_F may be off by because a file writes measurements with so many
         digits: half a unit of the last one (`pgo_models.graphs.written_digits`). 0 where nothing is
         known of that, as of measurements that no file has.
+    weights_error : float
+        How far the weights can be from those of a file, whose covariances were inverted: those of
+        the file are between 1 - weights_error and 1 + weights_error times these. Certificates count
+        it. 0 where the file has the weights itself, and of weights that are given.
 
     Raises
     ------
@@ -160,6 +164,7 @@ class PoseGraph(ReadOnly):
     uncoupled: BoolArray | None = None
     absent: IntArray = field(default_factory=_no_poses)
     written_error: Array | None = None
+    weights_error: float = 0.0
 
     def __post_init__(self) -> None:
         self._convert(_WHOLE_NUMBERS, whole_number)
@@ -766,7 +771,13 @@ class PoseGraph(ReadOnly):
         rows = self._edge_rows(edges)
         rows["i"] = np.searchsorted(poses, rows["i"])
         rows["j"] = np.searchsorted(poses, rows["j"])
-        return PoseGraph(len(poses), **rows, ids=self.pose_ids[poses], name=self.name)
+        return PoseGraph(
+            len(poses),
+            **rows,
+            ids=self.pose_ids[poses],
+            name=self.name,
+            weights_error=self.weights_error,
+        )
 
     def unit_weights(self) -> PoseGraph:
         """Return the graph with kappa = tau = 1, as in the paper, but where they are zero.
@@ -799,7 +810,7 @@ class PoseGraph(ReadOnly):
         PoseGraph
             The same measurements; information matrices as read are left out.
         """
-        return replace(self, kappa=kappa, tau=tau, information=None)
+        return replace(self, kappa=kappa, tau=tau, information=None, weights_error=0.0)
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
         """Return the graph with other owners of the poses.

@@ -58,10 +58,10 @@ def edge_precisions(
     if information.shape[-1] == 3:
         factor = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
         kappa = factor * information[:, 2, 2]
-        tau = 2.0 / _trace_of_inverse(information[:, :2, :2])
+        tau = 2.0 / trace_of_inverse(information[:, :2, :2])
         return kappa, tau
-    kappa = 1.5 / _trace_of_inverse(information[:, 3:, 3:])
-    tau = 3.0 / _trace_of_inverse(information[:, :3, :3])
+    kappa = 1.5 / trace_of_inverse(information[:, 3:, 3:])
+    tau = 3.0 / trace_of_inverse(information[:, :3, :3])
     return kappa, tau
 
 
@@ -292,7 +292,7 @@ def filled(A: Array) -> Array:
     return np.asarray(A + is_zero * identity)
 
 
-def _trace_of_inverse(A: Array) -> Array:
+def trace_of_inverse(A: Array) -> Array:
     """tr(A^-1), (m,), of symmetric blocks (m, k, k); inf of blocks of zeros.
 
     All blocks are eliminated at once, A = L D L^T, in a fraction of the time of their inverses. The

@@ -74,6 +74,12 @@ def symmetric(triangle: Sequence[Entry], side: int) -> list[list[Entry]]:
     return matrix
 
 
+def exact(number: float) -> fmpq:
+    """The rational number that a double is."""
+    numerator, denominator = number.as_integer_ratio()
+    return fmpq(numerator, denominator)
+
+
 def sum_of(matrices: Iterable[arb_mat]) -> arb_mat:
     """Sum of one matrix or more."""
     first, *others = matrices

@@ -22,9 +22,17 @@ terms are a convex function of Z = rho R_i, in which u and H are linear. Let 2 C
 some Z'. The function is quadratic, so that its value at Z' is <C, Z'>, and being convex it is at
 least its tangent 2 <C, Z> - <C, Z'>. There <C, rho R_i> = <C R_i^T, rho> is bilinear in the rows of
 X.
+
+Any tau and K will do that make J positive semidefinite, of which K is a block. A proof may say
+which: its multipliers and its handedness terms belong to the form that follows from them.
+
+**A matrix that is semidefinite but for rounding**, as a file of so many digits has it, would make
+chi2 negative somewhere. As everywhere in this project, chi2 is then that of the matrix with 2^-45
+of its diagonal added (`proper_edge`).
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 from pgo_models.verification.balls import (
@@ -35,6 +43,7 @@ from pgo_models.verification.balls import (
     beside,
     blocks_on_diagonal,
     diagonal,
+    exact,
     first_bad_pivot,
     fmpq,
     fmpq_mat,
@@ -45,12 +54,13 @@ from pgo_models.verification.balls import (
     symmetric,
 )
 from pgo_models.verification.measurements import Edge
-from pgo_models.verification.proof import ROTATION_COSTS
+from pgo_models.verification.proof import ROTATION_COSTS, UNIT_COSTS, Split
 
 RESOLUTION = 2.0**-26  # of a bisection, relative
 BELOW = 1.0 - 2.0**-24  # of the largest tau: what is left of the matrix is well above rounding
 COUPLED_SHARE = 0.5  # of the largest tau, so that K stays moderate
 SINGULAR_SHARE = 2.0**-20  # of it where the coupling leaves nothing of a matrix
+ROUNDED_ENTRIES = fmpq(1, 2**45)  # share of the diagonal that the rounding of entries can hide
 KEPT = 2**16  # information matrices whose weights are remembered
 
 
@@ -92,12 +102,21 @@ class Tangent:
     value: arb
 
 
-def add_edge(form: QuadraticForm, edge: Edge, cost: str, X: dict[int, arb_mat]) -> arb:
-    """Add an edge to the form, and return its share of the cost at X, from the definition."""
+def add_edge(
+    form: QuadraticForm,
+    edge: Edge,
+    cost: str,
+    X: dict[int, arb_mat],
+    splits: Sequence[Split] = (),
+) -> arb:
+    """Add an edge to the form, and return its share of the cost at X, from the definition.
+
+    Of the splits of chi2 the first that fits the edge is taken.
+    """
     begin, end = residual_matrices(edge, X[edge.j].nrows())
     tangent: Tangent | None = None
     if cost == "chi2":
-        share, W, tangent = information_cost(edge, X[edge.i], X[edge.j])
+        share, W, tangent = information_cost(proper_edge(edge), X[edge.i], X[edge.j], splits)
     else:
         share, W = isotropic_cost(edge, cost, end * X[edge.j] - begin * X[edge.i])
     weighted_begin = begin.transpose() * W
@@ -131,7 +150,7 @@ def residual_matrices(edge: Edge, rows_j: int) -> tuple[arb_mat, arb_mat]:
 def isotropic_cost(edge: Edge, cost: str, rho: arb_mat) -> tuple[arb, arb_mat]:
     """Share of an edge in F, and W."""
     kappa, tau = precisions(edge.triangle, edge.tag.d, edge.tag.is_point)
-    if cost in ("unit", "unit rotations"):
+    if cost in UNIT_COSTS:
         kappa = fmpq(kappa != 0)
         tau = fmpq(tau != 0)
     if cost in ROTATION_COSTS:
@@ -190,13 +209,17 @@ def one_over_trace_of_inverse(rows: list[list[fmpq]]) -> fmpq:
     return 1 / sum(diagonal_entries, fmpq(0))
 
 
-def information_cost(edge: Edge, X_i: arb_mat, X_j: arb_mat) -> tuple[arb, arb_mat, Tangent | None]:
+def information_cost(
+    edge: Edge, X_i: arb_mat, X_j: arb_mat, splits: Sequence[Split]
+) -> tuple[arb, arb_mat, Tangent | None]:
     """Share of an edge in chi2, W, and the tangent of what W leaves of it, if anything."""
     d = edge.tag.d
     R = edge.R
     translation = range(d)
+    axes = range(d, edge.tag.side)
     I_tt = edge.block(translation, translation)
-    tau = translation_weight(edge.triangle, d, edge.tag.is_point)
+    I_tr = edge.block(translation, axes)
+    tau, K = translation_weight(edge, I_tr, splits)
     I_tt_less_tau = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
     # Translations: the residual r and I_tt - tau I, both in the frame of pose i.
     r = translation_residual(edge, X_i, X_j)
@@ -207,13 +230,7 @@ def information_cost(edge: Edge, X_i: arb_mat, X_j: arb_mat) -> tuple[arb, arb_m
         tangent = Tangent(Dr.transpose(), inner(r, Dr))
         return share, diagonal([tau]), tangent
     # Rotations: s = a sin theta and H = (1 - cos theta) a a^T of E.
-    axes = range(d, edge.tag.side)
-    I_tr = edge.block(translation, axes)
     I_rr = edge.block(axes, axes)
-    is_coupled = any(I_tr.entries())
-    K = 0 * I_rr
-    if is_coupled:
-        K = I_tr.transpose() * I_tt_less_tau.inv() * I_tr
     V = rotation_weight(arb_mat(I_rr - K), d)
     W = blocks_on_diagonal(diagonal([tau]), V)
     turn = R if d == 3 else identity(1)  # of axes of rotations
@@ -223,7 +240,7 @@ def information_cost(edge: Edge, X_i: arb_mat, X_j: arb_mat) -> tuple[arb, arb_m
     B = R * arb_mat(I_tr) * turn.transpose()
     turned_I_rr = turn * arb_mat(I_rr) * turn.transpose()
     share += 2 * inner(r, B * s) + 2 * inner(H, turned_I_rr)
-    if not (is_coupled or any(I_tt_less_tau.entries())):
+    if not any([*I_tt_less_tau.entries(), *I_tr.entries(), *K.entries()]):
         return share, W, None
     # The tangent of u^T J u + tr(H K H): half its gradients in r, s and H are y_r, y_s and
     # (N + N^T) / 2.
@@ -255,23 +272,79 @@ def rotation_residual(R_ij: arb_mat, X_i: arb_mat, X_j: arb_mat) -> arb_mat:
     return R_i_transposed * R_j_transposed.transpose() * R_ij.transpose()
 
 
+def proper_edge(edge: Edge) -> Edge:
+    """The edge with a positive semidefinite information matrix; itself where it has one.
+
+    A matrix that is semidefinite but for rounding has 2^-45 of its diagonal added. An indefinite
+    one, whose chi2 can be negative, is refused.
+    """
+    triangle = proper_triangle(edge.triangle, edge.tag.d, edge.tag.is_point)
+    return edge if triangle == edge.triangle else replace(edge, triangle=triangle)
+
+
 @lru_cache(maxsize=KEPT)
-def translation_weight(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> fmpq:
-    """The tau of an edge: I_tt where that is isotropic and not coupled, else as large as it may be.
+def proper_triangle(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> tuple[fmpq, ...]:
+    """Upper triangle of the matrix of `proper_edge`."""
+    side = information_side(d, is_point)
+    rows = symmetric(triangle, side)
+    check_weights([row[:d] for row in rows[:d]])
+    check_weights([row[d:] for row in rows[d:]])
+    if is_semidefinite(rows):
+        return triangle
+    for a in range(side):
+        rows[a][a] += ROUNDED_ENTRIES * rows[a][a]
+    if not is_semidefinite(rows):
+        raise StepFailedError("the weights: an information matrix is indefinite")
+    return tuple(rows[a][b] for a in range(side) for b in range(a, side))
+
+
+def translation_weight(
+    edge: Edge, I_tr: fmpq_mat, splits: Sequence[Split]
+) -> tuple[fmpq, fmpq_mat]:
+    """The tau and K of an edge: of the first split that fits it, else of the verifier's choice."""
+    d = edge.tag.d
+    num_axes = edge.tag.side - d
+    for split in splits:
+        tau = exact(split.tau)
+        K = tuple(map(exact, split.K)) or (fmpq(0),) * (num_axes * (num_axes + 1) // 2)
+        if fits(edge.triangle, d, edge.tag.is_point, tau, K):
+            return tau, fmpq_mat(symmetric(K, num_axes)) if K else fmpq_mat(0, 0)
+    tau = own_translation_weight(edge.triangle, d, edge.tag.is_point)
+    if not any(I_tr.entries()):
+        return tau, fmpq_mat(num_axes, num_axes)
+    translation = range(d)
+    I_tt = edge.block(translation, translation)
+    I_tt_less_tau = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
+    return tau, I_tr.transpose() * I_tt_less_tau.inv() * I_tr
+
+
+@lru_cache(maxsize=KEPT)
+def fits(
+    triangle: tuple[fmpq, ...], d: int, is_point: bool, tau: fmpq, K: tuple[fmpq, ...]
+) -> bool:
+    """Whether tau and K, an upper triangle, make J positive semidefinite, exactly."""
+    side = information_side(d, is_point)
+    if len(K) != (side - d) * (side - d + 1) // 2:
+        return False
+    J = less_tau(symmetric(triangle, side), tau, d)
+    if K:
+        for a, row in enumerate(symmetric(K, side - d), d):
+            J[a][d:] = row
+    return is_semidefinite(J)
+
+
+@lru_cache(maxsize=KEPT)
+def own_translation_weight(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> fmpq:
+    """A tau for any edge: I_tt where that is isotropic and not coupled, else as large as it may be.
 
     What it may be is below the largest tau with I - blockdiag(tau I, 0) positive definite, which
     keeps the term with V convex. A coupled I that is only semidefinite leaves no such tau: there it
     is a small share of the smallest eigenvalue of I_tt, and V a little indefinite, of which the
-    proof asks nothing. An indefinite I, whose chi2 can be negative, is refused.
+    proof asks nothing.
     """
     rows = symmetric(triangle, information_side(d, is_point))
     I_tt = [row[:d] for row in rows[:d]]
     I_tr = [row[d:] for row in rows[:d]]
-    I_rr = [row[d:] for row in rows[d:]]
-    check_weights(I_tt)
-    check_weights(I_rr)
-    if not is_semidefinite(rows):
-        raise StepFailedError("the weights: an information matrix is indefinite")
     tau: fmpq | None
     if is_nonzero(I_tr):
         tau = definite_tau(rows, d, COUPLED_SHARE)
@@ -302,8 +375,7 @@ def definite_tau(rows: list[list[fmpq]], d: int, share: float) -> fmpq | None:
             low = middle
         else:
             high = middle
-    numerator, denominator = (share * low).as_integer_ratio()
-    tau = fmpq(numerator, denominator)
+    tau = exact(share * low)
     if not tau > 0:
         return None
     is_definite = first_bad_pivot(less_tau(rows, tau, d)) is None

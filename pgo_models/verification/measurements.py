@@ -1,11 +1,13 @@
 """Measurements of a g2o file as exact numbers: the verifier's own reader, which nothing else uses.
 
-A number of the file is the rational number that its digits say. Tags and conventions are those of
-g2o, GTSAM and TORO: information is in the frame measured, of a position prior in the world's, of a
-landmark in the pose's.
+A number of the file is the rational number that its digits say, and the information that belongs to
+a covariance matrix is its inverse, exactly. Tags and conventions are those of g2o, GTSAM and TORO:
+information is in the frame measured, of a position prior in the world's, of a landmark in the
+pose's.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from pgo_models.errors import FileFormatError
 from pgo_models.verification.balls import (
     angles_rotation,
     arb_mat,
+    first_bad_pivot,
     fmpq,
     fmpq_mat,
     identity,
@@ -28,6 +31,7 @@ class Tag:
 
     `has_offset`: the id of a PARAMS_SE3OFFSET line may follow the ids. `is_toro`: in space angles
     roll, pitch, yaw instead of a quaternion, in the plane another order of the triangle.
+    `has_covariance`: the triangle is that of the covariance matrix.
     """
 
     d: int
@@ -36,6 +40,7 @@ class Tag:
     to_landmark: bool = False
     has_offset: bool = False
     is_toro: bool = False
+    has_covariance: bool = False
 
     @property
     def num_measured(self) -> int:
@@ -68,10 +73,13 @@ TAGS = {
     "EDGE_POINTXYZ_PRIOR": Tag(3, num_ids=1, is_point=True, to_landmark=True),
     "EDGE2": Tag(2, is_toro=True),
     "EDGE3": Tag(3, is_toro=True),
+    "ODOMETRY": Tag(2, has_covariance=True),
+    "LANDMARK": Tag(2, is_point=True, to_landmark=True, has_covariance=True),
 }
 LANDMARK_TAGS = ("VERTEX_XY", "VERTEX_TRACKXYZ")
+POSE_TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "VERTEX2", "VERTEX3")
 # They are no part of the cost.
-IGNORED_TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "VERTEX2", "VERTEX3", "FIX", "EQUIV")
+IGNORED_TAGS = (*POSE_TAGS, "FIX", "EQUIV")
 # Places of xx xy xr yy yr rr in TORO's order of the plane, xx xy yy rr xr yr.
 TORO_TRIANGLE = (0, 1, 4, 2, 5, 3)
 WRITTEN_FILE = "verify the proof of the file that pgo solve --out one.g2o writes"
@@ -90,6 +98,9 @@ class Edge:
     j: int
     measured: tuple[fmpq, ...]
     triangle: tuple[fmpq, ...]
+    # Upper triangle of the covariance matrix, whose inverse the information is; empty where the
+    # file has the information.
+    covariance: tuple[fmpq, ...] = ()
 
     @property
     def t(self) -> arb_mat:
@@ -132,6 +143,7 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
     """Edges of a g2o file; a FileFormatError names the line that is wrong."""
     edges: list[Edge] = []
     landmarks: set[int] = set()
+    pose_vertices: set[int] = set()
     offset_line = 0  # of a sensor that is not at its pose
     lines = read_text(path).split("\n")
     for number, line in enumerate(lines, 1):
@@ -143,19 +155,49 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
                 landmarks.add(edge.j)
         elif tag in LANDMARK_TAGS:
             landmarks.add(read_id(path, number, words[0] if words else ""))
+        elif tag in POSE_TAGS:
+            pose_vertices.add(read_id(path, number, words[0] if words else ""))
         elif tag == "PARAMS_SE3OFFSET":
             if any(exact_number(path, number, word) != 0 for word in words[1:7]):
                 offset_line = number
         elif not skip_unknown:
             check_ignored_tag(path, number, tag)
+    check_offset(path, edges, offset_line)
+    edges, landmarks = apart_from_poses(in_order_of_isam(edges), landmarks, pose_vertices)
+    return checked_graph(path, edges, landmarks)
+
+
+def checked_graph(path: Path, edges: list[Edge], landmarks: set[int]) -> Graph:
+    """Graph of edges and landmarks; a FileFormatError where they are none."""
     if not edges:
         raise FileFormatError(path, None, "no measurement in it; give the file that was solved")
-    check_offset(path, edges, offset_line)
-    edges = in_order_of_isam(edges)
     graph = Graph(edges[0].tag.d, edges, landmarks)
     for edge in edges:
         check_edge(path, graph, edge)
     return graph
+
+
+def apart_from_poses(
+    edges: list[Edge], landmarks: set[int], pose_vertices: set[int]
+) -> tuple[list[Edge], set[int]]:
+    """Edges and landmarks with ids that no pose has.
+
+    GTSAM numbers landmarks and poses each from zero. Where an edge to a landmark names the id of a
+    pose, the least power of ten that puts all landmarks above the poses is added to their ids.
+    """
+    poses = set(pose_vertices)
+    for edge in edges:
+        poses.add(edge.i)
+        if not edge.tag.to_landmark:
+            poses.add(edge.j)
+    poses.discard(WORLD)
+    if not any(edge.tag.to_landmark and edge.j in poses for edge in edges):
+        return edges, landmarks
+    shift = 10
+    while shift + min(*landmarks, 0) <= max(poses):
+        shift *= 10
+    shifted = [replace(edge, j=edge.j + shift) if edge.tag.to_landmark else edge for edge in edges]
+    return shifted, {landmark + shift for landmark in landmarks}
 
 
 def in_order_of_isam(edges: list[Edge]) -> list[Edge]:
@@ -236,7 +278,22 @@ def read_edge(path: Path, line: int, tag: Tag, words: list[str]) -> Edge:
     if tag.num_ids == 1:
         ids = [WORLD, *ids]
     i, j = ids
+    if tag.has_covariance:
+        information = inverse_triangle(path, line, triangle, tag.side)
+        return Edge(line, tag, i, j, tuple(measured), information, tuple(triangle))
     return Edge(line, tag, i, j, tuple(measured), tuple(triangle))
+
+
+def inverse_triangle(
+    path: Path, line: int, covariance: Sequence[fmpq], side: int
+) -> tuple[fmpq, ...]:
+    """Upper triangle of the information matrix of a covariance matrix, exactly."""
+    rows = symmetric(covariance, side)
+    if first_bad_pivot(rows) is not None:
+        problem = "the covariance matrix is not positive definite; correct or remove it"
+        raise FileFormatError(path, line, problem)
+    information = fmpq_mat(rows).inv()
+    return tuple(information[a, b] for a in range(side) for b in range(a, side))
 
 
 def read_id(path: Path, line: int, word: str) -> int:

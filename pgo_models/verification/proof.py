@@ -2,7 +2,7 @@
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ COSTS = {
 }
 # Costs of rotations alone; a proof of them has no translations.
 ROTATION_COSTS = ("rotations", "unit rotations")
+UNIT_COSTS = ("unit", "unit rotations")
 WAY_OUT = "give a file of pgo solve --proof, as it was written"
 
 
@@ -33,13 +34,20 @@ class HandednessTerm:
 
 
 @dataclass(frozen=True, eq=False)
+class Split:
+    """How the proof splits chi2 of an edge into a quadratic form and a convex rest: tau and K."""
+
+    tau: float
+    K: tuple[float, ...]  # upper triangle, row by row; empty for a K of zeros
+
+
+@dataclass(frozen=True, eq=False)
 class Proof:
     """What a proof file says; all numbers are doubles, exactly."""
 
     cost: str
     objective: float
     lower_bound: float
-    rounding_level: float  # cost that the solver could not tell from zero
     eta: float | None  # None: nothing is claimed but that the cost is never negative
     ground: int
     t: dict[int, list[float]]
@@ -47,6 +55,9 @@ class Proof:
     # Upper triangles, row by row. Where there are none, those of a stationary point are taken.
     Lambda: dict[int, list[float]]
     terms: list[HandednessTerm]
+    # Of the edges from a pose to another, in the order of the file of the graph. The verifier
+    # chooses tau and K itself where they are missing or do not fit.
+    splits: dict[tuple[int, int], list[Split]] = field(default_factory=dict)
 
 
 def read_proof(path: Path, d: int) -> Proof:
@@ -81,13 +92,13 @@ def read_proof(path: Path, d: int) -> Proof:
         cost=cost,
         objective=number_entry(path, record, "objective"),
         lower_bound=number_entry(path, record, "lower_bound"),
-        rounding_level=number_entry(path, record, "rounding_level"),
         eta=read_shift(path, entry(path, record, "eta")),
         ground=name_of(path, entry(path, record, "ground")),
         t=t,
         R=R,
         Lambda=Lambda,
         terms=read_terms(path, record, d),
+        splits=read_splits(path, record, d),
     )
 
 
@@ -105,6 +116,24 @@ def read_terms(path: Path, record: dict[str, Any], d: int) -> list[HandednessTer
         )
         for row in rows
     ]
+
+
+def read_splits(path: Path, record: dict[str, Any], d: int) -> dict[tuple[int, int], list[Split]]:
+    """The splits of chi2, none where the proof has no such entry."""
+    rows = record.get("splits", [])
+    if not isinstance(rows, list):
+        raise FileFormatError(path, None, f"splits is no list of splits of edges; {WAY_OUT}")
+    size_of_triangle = 1 if d == 2 else 6
+    splits: dict[tuple[int, int], list[Split]] = {}
+    for row in rows:
+        i = name_of(path, entry(path, row, "i"))
+        j = name_of(path, entry(path, row, "j"))
+        K = row.get("J_ss", [])
+        if K:
+            K = numbers(path, K, "J_ss of a split", size_of_triangle)
+        split = Split(number_entry(path, row, "tau"), tuple(K))
+        splits.setdefault((i, j), []).append(split)
+    return splits
 
 
 def entry(path: Path, record: object, name: str) -> Any:  # noqa: ANN401 - of JSON

@@ -77,6 +77,11 @@ and only if all pivots are. Doubles serve to guess a weight, which is then check
 (`pgo_models.verification.costs.definite_tau`), and for nothing else.
 
 Nothing in a proof is believed: other poses or multipliers give another bound, which holds as well.
+A proof is verified if the bound that it claims is not above the one that is proven here, without
+any tolerance. That the poses cost what it claims is checked to what doubles can tell
+(`pgo_models.verification.doubles`). Where balls are too wide to decide, all is computed again with
+more bits.
+
 Nothing outside `pgo_models.verification` is imported but `pgo_models.errors`.
 """
 
@@ -94,6 +99,7 @@ from pgo_models.verification.balls import (
     beside,
     blocks_on_diagonal,
     ctx,
+    exact,
     exact_parts,
     first_bad_pivot,
     fmpq,
@@ -108,21 +114,25 @@ from pgo_models.verification.costs import (
     UndecidedError,
     add_edge,
     measures_translation,
+    proper_edge,
 )
+from pgo_models.verification.doubles import Resolution
 from pgo_models.verification.measurements import WORLD, Graph, read_graph
 from pgo_models.verification.proof import (
     COSTS,
     ROTATION_COSTS,
     HandednessTerm,
     Proof,
+    Split,
     read_proof,
 )
+from pgo_models.verification.robot_logs import SUFFIX as LOG_SUFFIX, read_robot_log
 
-PRECISIONS = (128, 512, 2048)  # bits; the next where a ball is too wide to tell its sign
-# Relative tolerance between what a proof claims and what is verified. The solver computed its
-# claims for doubles, and here they are compared with figures for the decimal numbers of the file.
-# The cost below which the solver could tell nothing from zero, the `rounding_level` of the proof,
-# is added to the tolerance. The bound itself uses neither.
+# Bits; the next where a ball is too wide to decide. With the last ones every pivot that is not zero
+# to 2,400 digits has a sign, and a proof that needs more is not one of doubles.
+PRECISIONS = (128, 512, 2048, 8192)
+# Relative tolerance between the cost that a proof claims for its poses and the exact one, beside
+# what doubles cannot tell. The bound has none.
 CLAIM_SLACK = 1e-9
 FARTHEST = 8  # the largest squared Frobenius norm of the difference of two rotations
 NO_ROTATION = 1e-6  # entries that far from those of the rotation made of them are a mistake
@@ -148,6 +158,9 @@ class Verification:
         (objective - bound) / objective.
     failure : str
         The step that failed, and why; empty where the proof is verified.
+    num_raised : int
+        Number of information matrices that are semidefinite but for the rounding of their entries:
+        2^-45 of their diagonals is added to them, as everywhere in this project.
     """
 
     graph: str
@@ -156,13 +169,15 @@ class Verification:
     bound: arb | None = None
     gap: arb | None = None
     failure: str = ""
+    num_raised: int = 0
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the balls by their mantissas and exponents, which python-flint does not do."""
         objective = exact_parts(self.objective)
         bound = exact_parts(self.bound)
         gap = exact_parts(self.gap)
-        return _unpickled, (self.graph, self.cost, objective, bound, gap, self.failure)
+        rest = self.failure, self.num_raised
+        return _unpickled, (self.graph, self.cost, objective, bound, gap, *rest)
 
     @property
     def is_verified(self) -> bool:
@@ -199,6 +214,9 @@ class Verification:
             ("graph", self.graph),
             ("cost", f"{COSTS[self.cost]}; numbers as the file has them, in decimals"),
         ]
+        if self.num_raised:
+            raised = f"{self.num_raised} information matrices are semidefinite but for rounding"
+            facts.append(("weights", f"{raised}; taken with 2^-45 of their diagonals added"))
         balls = [(self.cost_name, self.objective), ("lower bound", self.bound), ("gap", self.gap)]
         for label, ball in balls:
             if ball is not None:
@@ -220,6 +238,7 @@ class Verification:
             "objective": _text(self.objective),
             "lower_bound": _text(self.bound),
             "gap": _text(self.gap),
+            "matrices_raised": self.num_raised,
             "verified": self.is_verified,
             "failure": self.failure,
         }
@@ -240,10 +259,11 @@ def _unpickled(
     bound: Parts | None,
     gap: Parts | None,
     failure: str,
+    num_raised: int,
 ) -> Verification:
     """Verification that was pickled, its balls from `exact_parts`."""
     balls = ball_of_parts(objective), ball_of_parts(bound), ball_of_parts(gap)
-    return Verification(graph, cost, *balls, failure)
+    return Verification(graph, cost, *balls, failure, num_raised)
 
 
 def verify_proof(
@@ -252,12 +272,12 @@ def verify_proof(
     *,
     skip_unknown: bool = False,
 ) -> Verification:
-    """Check the proof of a lower bound, as `save_proof` writes it, for the numbers of a g2o file.
+    """Check the proof of a lower bound, as `save_proof` writes it, for the numbers of a file.
 
     Parameters
     ----------
     graph : Path or str
-        The g2o file.
+        The g2o file, or JSON robot log (JRL). Covariance matrices are inverted exactly.
     proof : Path or str
         The proof, JSON: cost, poses with their multipliers, the pose that is grounded, and eta.
     skip_unknown : bool
@@ -287,7 +307,9 @@ def verify_proof(
     >>> found.is_verified, found.bound.str(10, radius=False)
     (True, '97.01402085')
     """
-    measured = read_graph(Path(graph), skip_unknown)
+    path = Path(graph)
+    read = read_robot_log if path.suffix == LOG_SUFFIX else read_graph
+    measured = read(path, skip_unknown)
     given = read_proof(Path(proof), measured.d)
     measured, given = with_world_at_zero(measured, given)
     name = f"{graph}: {len(measured.nodes)} nodes, {len(measured.edges)} edges, {measured.d}D"
@@ -311,20 +333,42 @@ def prove(graph: Graph, proof: Proof, name: str) -> Verification:
     """Cost of the poses and the bound of the theorem; a StepFailedError where it does not apply."""
     X = grounded_poses(graph, proof)
     form = QuadraticForm()
+    resolution = Resolution(proof.cost)
     objective = arb(0)
-    for edge in graph.edges:
+    for edge, splits in zip(graph.edges, splits_of_edges(graph, proof), strict=True):
         try:
-            objective += add_edge(form, edge, proof.cost, X)
+            objective += add_edge(form, edge, proof.cost, X, splits)
         except StepFailedError as failed:
-            raise StepFailedError(f"{failed} (line {edge.line})") from failed
+            raise type(failed)(f"{failed} (line {edge.line})") from failed
+        resolution.add_edge(edge, X)
     # The cost is a sum of squares, with weights that are not negative. A proof without eta claims
     # nothing beyond that.
     bound = arb(0)
     if proof.eta is not None:
         bound = lower_bound(graph, proof, form, X, objective).max(bound)
     gap = (objective - bound) / objective if objective > 0 else None
-    failure = broken_claim(proof, objective, bound)
-    return Verification(name, proof.cost, objective, bound, gap, failure)
+    num_raised = 0
+    if proof.cost == "chi2":
+        num_raised = sum(proper_edge(edge) is not edge for edge in graph.edges)
+    failure = broken_claim(proof, objective, resolution.of(objective), bound)
+    return Verification(name, proof.cost, objective, bound, gap, failure, num_raised)
+
+
+def splits_of_edges(graph: Graph, proof: Proof) -> list[list[Split]]:
+    """The splits to try for every edge, in this order.
+
+    The k-th edge between two poses begins with their k-th split. The others are tried as well, for
+    a file that is written anew may have its lines in another order.
+    """
+    counts: dict[tuple[int, int], int] = {}
+    splits_of_edges = []
+    for edge in graph.edges:
+        ends = edge.i, edge.j
+        k = counts.get(ends, 0)
+        counts[ends] = k + 1
+        splits = proof.splits.get(ends, [])
+        splits_of_edges.append(splits[k:] + splits[:k])
+    return splits_of_edges
 
 
 def lower_bound(
@@ -407,7 +451,7 @@ def subtract_terms(
 
 def weight_of_term(term: HandednessTerm) -> arb_mat:
     """(tr(P) / 2 I - P) / 4, once P is shown to be positive semidefinite, exactly."""
-    triangle = [fmpq(*number.as_integer_ratio()) for number in term.P]
+    triangle = [exact(number) for number in term.P]
     if not is_semidefinite(symmetric(triangle, 3)):
         raise StepFailedError(
             f"the handedness terms: P of {pose_name(term.i)} and {pose_name(term.j)} "
@@ -642,14 +686,18 @@ def pose_name(pose: int) -> str:
     return "the world" if pose == WORLD else f"pose {pose}"
 
 
-def broken_claim(proof: Proof, objective: arb, bound: arb) -> str:
-    """What the proof claims and does not prove, or nothing."""
-    slack = CLAIM_SLACK * arb(proof.objective) + proof.rounding_level
+def broken_claim(proof: Proof, objective: arb, tolerance: arb, bound: arb) -> str:
+    """What the proof claims and does not prove, or nothing; an UndecidedError if balls overlap."""
     difference = abs(objective - proof.objective)
-    least_bound = proof.lower_bound - slack
-    # `not a <= b`, here and below, for a claim that is not decided counts as broken.
-    if not difference <= slack:
-        return f"the claims: the cost of the poses is not {proof.objective!r}"
-    if not bound >= least_bound:
-        return f"the claims: what is proven is less than {proof.lower_bound!r}"
+    slack = CLAIM_SLACK * objective + tolerance
+    claims = (
+        (difference, slack, f"the cost of the poses is not {proof.objective!r}"),
+        (arb(proof.lower_bound), bound, f"what is proven is less than {proof.lower_bound!r}"),
+    )
+    for smaller, larger, problem in claims:
+        if smaller <= larger:
+            continue
+        if smaller > larger:
+            return f"the claims: {problem}"
+        raise UndecidedError(f"the claims: it is not known whether {problem}")
     return ""

@@ -14,7 +14,9 @@ _INDENT = 13  # columns of the labels of a verification
 
 
 def verify_command(
-    graph: Annotated[str, typer.Argument(help="The g2o file, or the name of a data set.")],
+    graph: Annotated[
+        str, typer.Argument(help="The g2o file or robot log, or the name of a data set.")
+    ],
     proof: Annotated[Path, typer.Argument(help="The proof, of pgo solve --proof.")],
     skip_unknown: SkipUnknownOption = False,
     quiet: QuietOption = False,

@@ -265,6 +265,7 @@ def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) 
         fixed=fixed,
         name=agent.path.stem,
         written_error=written_errors(measurements_of(lines.d, edges.rows), agent.digits),
+        weights_error=lines.weights_error,
     )
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
     agent.given = _given_pose(lines, ids[holding])

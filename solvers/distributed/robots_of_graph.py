@@ -172,7 +172,7 @@ class RobotsOfGraph(DriverPlace):
         self.stages.append(stage)
         bound = best_bound_with_terms(driver, here.gap, return_to_best(driver))
         certificate = best.proof
-        if bound.value > certificate.lower_bound:
+        if bound.value > certificate.bound.value:
             certificate = certify_with(
                 here.problem,
                 poses,

@@ -129,6 +129,7 @@ class RobotsWithFiles(DriverPlace):
             weighting=self.weighting,
             objective_error=kept.rounding.error,
             fit=kept.rounding.fit,
+            weights_error=kept.rounding.weights_error,
         )
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
@@ -192,7 +193,8 @@ def _sum_of_roundings(parts: Sequence[ObjectiveRounding]) -> ObjectiveRounding:
     """How accurately a sum is known of whose parts that is known."""
     level = math.fsum(part.level for part in parts)
     error = math.fsum(part.error for part in parts)
-    return ObjectiveRounding(level, error, Fit.of_all(part.fit for part in parts))
+    weights_error = max(part.weights_error for part in parts)
+    return ObjectiveRounding(level, error, Fit.of_all(part.fit for part in parts), weights_error)
 
 
 def _frame(answers: Sequence[Answer]) -> tuple[Array, Array, str]:

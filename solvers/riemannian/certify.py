@@ -103,12 +103,15 @@ def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Ce
     if problem.weighting is not Weighting.INFORMATION or _bound_is_tight(problem, certificate):
         return certificate
     shrunk = bound_by_shrinking(problem, certificate.poses)
-    if shrunk.bound.value <= certificate.lower_bound:
+    if shrunk.bound.value <= certificate.bound.value:
         return certificate
     by_smaller_cost = replace(certificate, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED)
     # Of the poses given, which need not be those that the bound was found at.
     rounding = ObjectiveRounding(
-        certificate.rounding_level, certificate.objective_error, certificate.fit
+        certificate.rounding_level,
+        certificate.objective_error,
+        certificate.fit,
+        certificate.weights_error,
     )
     judgement = judge_cost(
         repr(problem), certificate.objective, rounding, shrunk.bound, certificate.wanted_gap

@@ -117,6 +117,7 @@ class Subgraph:
             graph.tau[kept],
             name=graph.name,
             written_error=written_error_of(graph, kept),
+            weights_error=graph.weights_error,
         )
         final = None
         if self.final is not None:
@@ -372,6 +373,7 @@ def _subgraph(
         ids=graph.pose_ids[poses],
         name=f"{graph.name}, robot {robot}",
         written_error=written_error_of(graph, edges),
+        weights_error=graph.weights_error,
     )
     convex_part = problem.convex_part
     in_cover, is_counted, copies, common = placement.of(robot, local, poses, owner)

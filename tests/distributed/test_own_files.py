@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from budget import examples
+from drawn_graphs import covariances, drawn_file, write_covariances
 from graphs import DIMENSIONS, SEEDS, exact_graph, informed, varied_graph
 from hypothesis import given, settings, strategies as st
 from processes import LimitedProcesses, under_limit
@@ -140,6 +141,24 @@ def test_chi2_of_the_files_is_solved_as_that_of_the_whole_graph(
     )
     check_same(isotropic, written, tmp_path / "out")
     assert isotropic.F < solution.F
+
+
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+def test_robots_whose_files_have_covariances_count_the_error_of_their_inverses(
+    tmp_path: Path,
+) -> None:
+    graph = pgo.read_g2o(drawn_file(covariances, 1, tmp_path))
+    poses = graph.without_edges(np.isin(graph.j, graph.landmarks)).subgraph(graph.bodies)
+    folder = tmp_path / "in"
+    folder.mkdir()
+    is_first = poses.i < poses.num_poses // 2
+    for robot, edges in enumerate((is_first, ~is_first)):
+        write_covariances(poses.without_edges(~edges), folder / f"{robot}.g2o")
+    written = read_g2o(folder)
+    solution = solve_folder(folder, weighting=pgo.Weighting.ISOTROPIC, out=tmp_path / "out")
+    certificate = solution.certificate
+    assert certificate.weights_error == written.weights_error > 0.0
+    assert certificate.lower_bound < certificate.bound.value
 
 
 def test_an_indefinite_matrix_in_one_file_makes_the_cost_f(tmp_path: Path) -> None:

@@ -43,9 +43,8 @@ from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification import verify
-from pgo_models.verification.balls import arb, arb_mat
+from pgo_models.verification.balls import arb
 from pgo_models.verification.costs import QuadraticForm, add_edge
-from pgo_models.verification.measurements import Edge
 from pgo_models.verification.verify import verify_proof
 from solvers.riemannian.certify import certify
 from solvers.riemannian.polish import polish
@@ -349,8 +348,8 @@ def test_a_form_that_is_not_the_cost_is_said_to_be_a_defect(
     path = written(tmp_path, varied_graph(1, 5, 2))
     _, proof = proof_of(path)
 
-    def one_more(form: QuadraticForm, edge: Edge, cost: str, X: dict[int, arb_mat]) -> arb:
-        return add_edge(form, edge, cost, X) + 1
+    def one_more(form: QuadraticForm, *edge: object) -> arb:
+        return add_edge(form, *edge) + 1
 
     monkeypatch.setattr(verify, "add_edge", one_more)
     found = verify_proof(path, proof)
