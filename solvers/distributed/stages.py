@@ -20,7 +20,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
-from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
+from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.elimination_choice import choose_elimination
 from solvers.distributed.handedness import (
@@ -211,16 +211,18 @@ class SOCByRobots:
         if self.soc.effective_coupling is not Coupling.CONSENSUS:
             substructured = SubstructuredSOC(self.soc)
             finished = journal.run(substructured, driver, monitor)
-            substructured.finish(driver)
+            substructured.finish(driver, finished.state)
             return finished
         if self.faults is None:
-            waiting = journal.run(ConsensusSOC(self.soc), driver, monitor)
-            RobotsOfDriver(driver).finish()
+            consensus = ConsensusSOC(self.soc)
+            waiting = journal.run(consensus, driver, monitor)
+            consensus.finish(driver, waiting.state)
             return waiting
         # No checkpoint can hold the messages that are under way.
-        asynchronous = monitor.run(AsynchronousSOC(self.soc, self.faults), driver)
-        RobotsOfDriver(driver).finish()
-        return asynchronous
+        asynchronous = AsynchronousSOC(self.soc, self.faults)
+        impatient = monitor.run(asynchronous, driver)
+        asynchronous.finish(driver, impatient.state)
+        return impatient
 
 
 @dataclass(frozen=True, eq=False)

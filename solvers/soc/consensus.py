@@ -7,7 +7,7 @@ network (`solvers.distributed.consensus`).
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -17,6 +17,8 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import relative_length
 from solvers.network.counted_pool import Count, by_link, delivered
+from solvers.network.moments import Moment
+from solvers.network.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import (
@@ -82,6 +84,8 @@ class ConsensusState(SharedSteps):
         Sums of the next step (a), unless the penalties change before.
     rows : sequence of Rows
         Rows of the next step (a), as their receivers have them.
+    moment : Moment or None
+        When robots on a network hold their rows of the iterate.
     """
 
     separators: SeparatorPenalty
@@ -90,6 +94,7 @@ class ConsensusState(SharedSteps):
     rotation_square: float
     ahead: Array | None = None
     rows: Sequence[Rows] = ()
+    moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
 
 
 @dataclass(frozen=True)
