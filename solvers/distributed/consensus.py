@@ -128,7 +128,7 @@ class ConsensusSOC:
 
         The gradient is that at the poses which the robots hold.
         """
-        return self.soc.converged(state, measurement)
+        return self.soc.status_at(measurement)
 
     def finish(self, driver: Driver, state: ConsensusState) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""

@@ -1,7 +1,7 @@
 """SUBSTRUCTURED: the recursion of JOINT, with step (a) split by eliminating the robots' interiors.
 
-The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.soc` is
-the recursion to read.
+The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.joint`
+is the recursion to read.
 """
 
 import math
@@ -116,7 +116,7 @@ class SubstructuredSOC:
 
         Both hold within the tolerance in the norm of rho.
         """
-        return self.soc.converged(state, measurement) or self.soc.stall_of(state)
+        return self.soc.status_at(measurement) or self.soc.stall_of(state)
 
     def finish(self, driver: Driver, state: SubstructuredState) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""
@@ -152,7 +152,7 @@ class SubstructuredSOC:
         )
 
     def _with_due_penalty(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
-        """State with the penalty that the rule or the safeguard requires, see `solvers.soc.soc`."""
+        """State with the penalty that the rule or the safeguard asks for, see `Joint`."""
         due, factor = next_penalty(self.soc.penalty, state.ratio, state)
         if due is Due.RAISE:
             rescaled = self._rescaled(driver, state, factor, from_best=True)

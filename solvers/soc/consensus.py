@@ -19,7 +19,7 @@ from pgo_models.problem.stationarity import relative_length
 from solvers.network.counted_pool import Count, by_link, delivered
 from solvers.network.moments import Moment
 from solvers.network.serialization import COMPUTED_AGAIN
-from solvers.result import Measurement
+from solvers.result import Measurement, Status
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import (
     CopiesState,
@@ -68,7 +68,7 @@ def ask_all(robots: Robots, order: Order[Q, A], request: Q, count: Count) -> lis
 
 @dataclass(frozen=True, eq=False)
 class ConsensusState(SharedSteps):
-    """Iterate k: the sums that all robots know; x, z and B are with the robots.
+    """Iterate k: the sums that all robots know, and the robots, who have x, omega, B and rho.
 
     Parameters
     ----------
@@ -84,8 +84,10 @@ class ConsensusState(SharedSteps):
         Sums of the next step (a), unless the penalties change before.
     rows : sequence of Rows
         Rows of the next step (a), as their receivers have them.
+    robots : tuple of ConsensusRobot
+        The robots with their rows, in one process.
     moment : Moment or None
-        When robots on a network hold their rows of the iterate.
+        When the robots hold their rows of the iterate, on a network.
     """
 
     separators: SeparatorPenalty
@@ -94,7 +96,28 @@ class ConsensusState(SharedSteps):
     rotation_square: float
     ahead: Array | None = None
     rows: Sequence[Rows] = ()
+    robots: tuple[ConsensusRobot, ...] = ()
     moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
+
+    @property
+    def x(self) -> Array:
+        """Solution of step (a), of the robots that own the poses, (n, d, d)."""
+        return _owned([robot.x for robot in self.robots], self.robots)
+
+    @property
+    def omega(self) -> Array:
+        """Rotations agreed on, (n, d, d)."""
+        return owned_rotations(self.robots)
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of x = omega, of the robots that own the poses, (n, d, d)."""
+        return _owned([robot.B for robot in self.robots], self.robots)
+
+    @property
+    def rho(self) -> Array:
+        """Penalty of every rotation, shared equally among its copies, (n,)."""
+        return _owned([robot.state.rho for robot in self.robots], self.robots)
 
 
 @dataclass(frozen=True)
@@ -297,36 +320,13 @@ class LocalRobots:
         return delivered(by_link(sent), self.num_robots)
 
 
-@dataclass(frozen=True, eq=False)
-class ConsensusIterate:
-    """Iterate k of CONSENSUS in one process."""
-
-    shared: ConsensusState  # what all robots know
-    robots: tuple[ConsensusRobot, ...]  # their copies: `robots[a].block` has x, z, s and B
-
-    @property
-    def k(self) -> int:
-        """Number of the iterate."""
-        return self.shared.k
-
-    @property
-    def omega(self) -> Array:
-        """Rotations agreed on, (n, d, d)."""
-        return owned_rotations(self.robots)
-
-    @property
-    def rho(self) -> Array:
-        """Penalty of every rotation, (n,)."""
-        return _owned([robot.state.rho for robot in self.robots], self.robots)
-
-
 @dataclass(frozen=True)
 class LocalConsensus:
     """CONSENSUS in one process, robot by robot; `soc` has the settings."""
 
     soc: SOCSettings
 
-    def init(self, problem: PGOProblem, start: Poses) -> ConsensusIterate:
+    def init(self, problem: PGOProblem, start: Poses) -> ConsensusState:
         """State 0: omega = the rotations of `start`."""
         assert self.soc.robots is not None
         problem.stacked(start)  # raises unless the poses fit
@@ -335,22 +335,26 @@ class LocalConsensus:
             layout = CopyLayout(subgraph, problem.backend, self.soc.r_step)
             robots.append(ConsensusRobot(layout, CopiesState()))
         local = LocalRobots(problem, tuple(robots), start)
-        shared = Consensus(self.soc).init(local)
-        return ConsensusIterate(shared, local.robots)
+        state = Consensus(self.soc).init(local)
+        return replace(state, robots=local.robots)
 
-    def step(self, problem: PGOProblem, state: ConsensusIterate) -> ConsensusIterate:
+    def step(self, problem: PGOProblem, state: ConsensusState) -> ConsensusState:
         """One iteration: (a), (b), (c)."""
         local = LocalRobots(problem, state.robots)
-        shared = Consensus(self.soc).step(local, state.shared)
-        return ConsensusIterate(shared, local.robots)
+        following = Consensus(self.soc).step(local, state)
+        return replace(following, robots=local.robots)
 
-    def measure(self, problem: PGOProblem, state: ConsensusIterate) -> Measurement:
+    def measure(self, problem: PGOProblem, state: ConsensusState) -> Measurement:
         """As of `Consensus.measurement`."""
-        return Consensus(self.soc).measurement(state.shared)
+        return Consensus(self.soc).measurement(state)
 
-    def poses(self, problem: PGOProblem, state: ConsensusIterate) -> Poses:
+    def poses(self, problem: PGOProblem, state: ConsensusState) -> Poses:
         """Omega, and the translations that the robots hold."""
         return Poses(state.omega, _owned([robot.poses.t for robot in state.robots], state.robots))
+
+    def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
+        """CONVERGED when primal residual and relative gradient are within tolerance."""
+        return self.soc.status_at(measurement)
 
 
 def owned_rotations(robots: Sequence[ConsensusRobot]) -> Array:

@@ -286,6 +286,16 @@ class ConsensusRobot:
         return project_to_rotations(R) if self.block.settings.rotations is Rotations.RELAXED else R
 
     @property
+    def x(self) -> Array:
+        """Solution of the last step (a), (n_a, d, d)."""
+        return unstack_transposes(self.block.x[self.layout.problem.num_poses :])
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of x = omega, (n_a, d, d)."""
+        return unstack_transposes(self.block.B[self.layout.problem.num_poses :])
+
+    @property
     def poses(self) -> Poses:
         """The robot's poses, (n_a): omega and the current translations."""
         X = np.where(self.layout.held, self.block.z, self.state.X)

@@ -1,7 +1,7 @@
 """The recursion of many robots: the rows of it that one party answers for, from (a) to (c).
 
 The party is a robot that holds copies (CONSENSUS), or a robot's interior or the driver's cover
-(SUBSTRUCTURED). Steps (a), (b) and (c) are those of `solvers.soc.soc`, written for rows of the
+(SUBSTRUCTURED). Steps (a), (b) and (c) are those of `solvers.soc.joint`, written for rows of the
 stacked rotations. The parties need of each other the rows that they agree on in (b), and sums of
 squares and of products for the acceleration.
 """

@@ -32,9 +32,10 @@ from solvers.distributed.substructured import SubstructuredSOC, SubstructuredSta
 from solvers.loop import iterate, run
 from solvers.result import Status
 from solvers.soc.anderson import Anderson
+from solvers.soc.joint import SOCState
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, SOCState
+from solvers.soc.soc import SOC
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

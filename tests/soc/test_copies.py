@@ -24,7 +24,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.network.counted_pool import Count
 from solvers.riemannian.polish import polish
-from solvers.soc.consensus import ConsensusIterate, LocalConsensus, LocalRobots
+from solvers.soc.consensus import ConsensusState, LocalConsensus, LocalRobots
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.penalty import FixedPenalty, MultiplierPenalty
 from solvers.soc.recursion_block import Agreement
@@ -37,16 +37,14 @@ FEWER = settings(max_examples=examples(40))  # each example splits a graph and s
 
 def started(
     problem: PGOProblem, parts: Partition, poses: Poses, soc: SOC | None = None
-) -> ConsensusIterate:
+) -> ConsensusState:
     """Robots at poses with penalties; B in balance as under a MultiplierPenalty."""
     return LocalConsensus(replace(soc if soc is not None else SOC(), robots=parts)).init(
         problem, poses
     )
 
 
-def drawn(
-    seed: int, n: int, d: int, partitioner: Partitioner
-) -> tuple[PGOProblem, ConsensusIterate]:
+def drawn(seed: int, n: int, d: int, partitioner: Partitioner) -> tuple[PGOProblem, ConsensusState]:
     problem = varied_problem(seed, n, d, LOUD_NOISE)
     soc = SOC(penalty=FixedPenalty(RHO), translation_penalty=0.3)
     return problem, started(
@@ -129,7 +127,7 @@ def test_the_penalty_of_a_pose_is_shared_among_its_copies(
     np.testing.assert_allclose(total[known], whole[known], rtol=1e-14, atol=0)
     assert (total[~known] == 0).all()
     np.testing.assert_allclose(state.rho, RHO, rtol=1e-15)
-    assert state.shared.size == pytest.approx(np.sqrt(d * RHO * n), rel=1e-12)
+    assert state.size == pytest.approx(np.sqrt(d * RHO * n), rel=1e-12)
 
 
 @FEWER
@@ -177,7 +175,7 @@ def test_agreement_is_the_mean_and_its_nearest_rotation(
         np.testing.assert_allclose(robot.block.z, expected, rtol=0, atol=1e-9)
         np.testing.assert_allclose(robot.block.B, robot.block.s - expected, rtol=0, atol=1e-9)
         assert before.block.z is not robot.block.z
-    omega = ConsensusIterate(state.shared, here.robots).omega
+    omega = replace(state, robots=here.robots).omega
     np.testing.assert_allclose(stack_transposes(omega), mean[n:], rtol=0, atol=1e-9)
 
 
@@ -236,7 +234,7 @@ def test_at_an_optimum_nothing_pulls_at_any_copy(
 def stiffness_of(problem: PGOProblem, parts: Partition) -> float:
     """Stiffness that the translation penalty at the start is 0.6 times of."""
     soc = SOC(penalty=FixedPenalty(float(rotation_scale(problem).mean())))
-    return started(problem, parts, chordal_start(problem), soc).shared.separators.translation / 0.6
+    return started(problem, parts, chordal_start(problem), soc).separators.translation / 0.6
 
 
 @FEWER
@@ -280,7 +278,7 @@ def test_stiffness_is_that_of_springs_in_series(links: int) -> None:
     without_shift = np.eye(4) - np.full((4, 4), 0.25)
     C = without_shift @ (root[:, None] * C * root) @ without_shift
     # An estimate of the trace: its standard deviation is at most a quarter.
-    assert state.shared.separators.translation / 0.6 == pytest.approx(3.0 / np.trace(C), rel=0.5)
+    assert state.separators.translation / 0.6 == pytest.approx(3.0 / np.trace(C), rel=0.5)
 
 
 @FEWER
@@ -293,7 +291,7 @@ def test_separator_penalties_follow_from_the_stiffness(
     start = chordal_start(problem)
     state = started(problem, parts, start)
     wanted = MultiplierPenalty().initial(problem, start)
-    relative = state.shared.separators.translation
+    relative = state.separators.translation
     shared = parts.separators(problem.graph)
     wanted[shared] = np.maximum(
         wanted[shared], min(0.7 * relative**0.5, 0.3) * rotation_scale(problem)[shared]
@@ -302,5 +300,5 @@ def test_separator_penalties_follow_from_the_stiffness(
     given_state = started(
         problem, parts, start, SOC(translation_penalty=0.02, separator_penalty=5.0)
     )
-    assert given_state.shared.separators.translation == 0.02
+    assert given_state.separators.translation == 0.02
     assert (given_state.rho[shared] >= 5.0 * rotation_scale(problem)[shared] * (1 - 1e-12)).all()
