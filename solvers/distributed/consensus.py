@@ -121,14 +121,14 @@ class ConsensusSOC:
         is_joint = self.has_driver and driver.network.ledger.num_robots == 1
         if is_joint and not math.isnan(state.primal_residual):
             return driver.measured(state.measurement(state.objective))
-        return driver.measured(self._method.measurement(state))
+        return driver.measured(self._method.measure(state))
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when primal residual and relative gradient of F are within tolerance.
 
         The gradient is that at the poses which the robots hold.
         """
-        return self.soc.status_at(measurement)
+        return self._method.converged(state, measurement)
 
     def finish(self, driver: Driver, state: ConsensusState) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""

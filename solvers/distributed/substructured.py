@@ -82,14 +82,15 @@ class SubstructuredSOC:
         """One round, step (a) by elimination, and one all-reduce, steps (b) and (c)."""
         driver.return_to(state.moment)
         state = self._with_due_penalty(driver, state)
-        block, sums = _solve_a(driver, state)  # (a)
+        block, sums = _solve_a(driver, state)  # (a) R-step
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
             return replace(state.broken(), moment=driver.moment())
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         agreement = Agreement(gamma, state.is_best(merit))
-        block, own_squares = block.extrapolated(agreement).projected()  # (b), (c)
-        orders = [Agree(agreement, z) for z in driver.scattered_rotations(block.z)]
+        block = block.extrapolated(agreement)  # s = x_ahead + B
+        block, own_squares = block.projected()  # (b) omega, (c) B = s - omega; as the robots do
+        orders = [Agree(agreement, part) for part in driver.scattered_rotations(block.omega)]
         answers = driver.ask_each(Interior.agree, orders, Count.ALL_REDUCE)
         squares = own_squares + np.sum([answer.sums for answer in answers], axis=0)
         return replace(
@@ -107,8 +108,8 @@ class SubstructuredSOC:
         objective = state.objective
         if math.isnan(objective):
             driver.return_to(state.moment)
-            z = driver.scattered_rotations(state.block.z)
-            objective = math.fsum(driver.ask_each(Interior.cost, z, Count.OFF))
+            parts = driver.scattered_rotations(state.block.omega)
+            objective = math.fsum(driver.ask_each(Interior.cost, parts, Count.OFF))
         return driver.measured(state.measurement(objective))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
@@ -171,7 +172,7 @@ class SubstructuredSOC:
     ) -> SubstructuredState:
         """State with the penalty factor * rho and the same unscaled multiplier rho B."""
         block = state.block.back_at_best() if from_best else state.block
-        block = block.rescaled(factor * block.penalty)
+        block = block.rescaled(factor * block.rho)
         order = RescaleInterior(factor, from_best)
         reduced = driver.ask(Interior.rescale, order)
         return replace(
@@ -184,9 +185,9 @@ class SubstructuredSOC:
 
 def _finish(driver: Driver, state: SubstructuredState) -> None:
     """Go from an iterate, which driver and robots hold, to its poses."""
-    z = state.block.z
-    driver.current = replace(driver.current, R=unstack_transposes(z))
-    driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(z)))
+    omega = state.block.omega
+    driver.current = replace(driver.current, R=unstack_transposes(omega))
+    driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(omega)))
 
 
 def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock, Array]:
@@ -195,7 +196,7 @@ def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock,
     rows = driver.rotation_rows
     block = state.block
     b = np.zeros((len(driver.diagonal), driver.d))
-    b[rows] = (0.5 * block.penalty)[:, None] * block.shift
+    b[rows] = (0.5 * block.rho)[:, None] * block.shift
     x, parts, _ = state.factor.solve([right.b for right in state.right], b)
     block, own_sums = block.after_solve(x[rows])
     sums_of_robots = driver.ask_each(Interior.solve, parts, is_along=True)
@@ -211,6 +212,6 @@ def _factorize(
     grounding of pose 0.
     """
     rows = driver.rotation_rows[:, None]
-    half_penalty = (0.5 * block.penalty)[:, None, None]
+    half_penalty = (0.5 * block.rho)[:, None, None]
     own = [(rows, half_penalty), *driver.grounding_block()]
     return driver.interface(1, driver.d).factorize([answer.schur for answer in reduced], own)

@@ -1,8 +1,18 @@
 """CONSENSUS: SOC by robots that hold copies, and send each other rows of the poses they share.
 
-`solvers.soc.consensus_robot` is what one robot does. `Consensus` calls the robots in turn and
-decides what follows from sums over them. The robots may be in one process (`LocalRobots`) or on a
-network (`solvers.distributed.consensus`).
+A robot a holds its own poses and copies of its neighbours' separators; an edge between two robots
+counts half with each. f_a is the cost of the robot's edges, and omega, on which all copies of a
+pose agree, is the rotations and the separators' translations. A copy has an equal share of the
+penalty rho of its pose. One iteration is that of `solvers.soc.joint`, robot by robot:
+
+    (a) R-step      x_a   = argmin_x  f_a(x) + 1/2 ||x - omega + B_a||_rho^2
+    (b) projection  omega = the rotations nearest to the mean over the copies of x_a + B_a
+    (c) Bregman     B_a   = B_a + x_a - omega
+
+Only (b) needs the neighbours: the robots send each other s_a = x_a + B_a on the poses that both
+hold. Translations of separators take their mean in (b). `ConsensusRobot.step` is the iteration on
+one robot. `Consensus.step` calls the robots and decides what follows from sums over them. They may
+be in one process (`LocalRobots`) or on a network (`solvers.distributed.consensus`).
 """
 
 import math
@@ -20,6 +30,7 @@ from solvers.network.counted_pool import Count, by_link, delivered
 from solvers.network.moments import Moment
 from solvers.network.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
+from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import (
     CopiesState,
@@ -155,23 +166,20 @@ class Consensus:
         return _first_state(separators, replies)
 
     def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """Make one exchange: (b) and (c) on every robot, and (a) of the next step."""
-        with_penalty = state
-        if self.rotations is Rotations.PROJECTED:
-            with_penalty = self._with_due_penalty(robots, state)
+        """Make one iteration, with one exchange; (a) was done at the end of the last one."""
+        with_penalty = self._with_due_penalty(robots, state)
         if with_penalty is not state or state.ahead is None:
-            solved = ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE)  # (a)
+            solved = ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE)  # (a) R-step
             state = _with_solution(robots, with_penalty, solved)
         assert state.ahead is not None
         merit = math.sqrt(state.ahead[0])
         if not math.isfinite(merit):
             return state.broken()
-        is_per_robot = self.soc.step_settings.alone is not None
-        acceleration = None if is_per_robot else self.soc.acceleration
-        gamma, anderson = state.sums.coefficients(acceleration, state.ahead)
+        gamma, anderson = state.sums.coefficients(self._common_acceleration, state.ahead)
         agreement = Agreement(gamma, state.is_best(merit))
         orders = [(agreement, rows) for rows in state.rows]
-        answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)  # (b), (c)
+        # (b) projection and (c) Bregman update, and (a) of the next iteration
+        answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)
         squares = np.sum([answer.squares for answer in answers], axis=0)
         stationarities = [answer.stationarity for answer in answers]
         objective, gradient = objective_and_gradient(stationarities, state.rotation_square)
@@ -179,7 +187,7 @@ class Consensus:
         following = replace(following, objective=objective, gradient=gradient)
         return _with_solution(robots, following, [answer.solved for answer in answers])
 
-    def measurement(self, state: ConsensusState) -> Measurement:
+    def measure(self, state: ConsensusState) -> Measurement:
         """F at the poses that the robots hold, and the residuals.
 
         The dual residual is the relative gradient of F. Where rotations are relaxed or fixed F is
@@ -191,8 +199,23 @@ class Consensus:
         dual_residual = state.gradient if is_projected else state.dual_residual
         return Measurement(state.objective, state.primal_residual, dual_residual)
 
+    def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
+        """CONVERGED when both residuals of `measure` are within tolerance."""
+        return self.soc.status_at(measurement)
+
+    @property
+    def _common_acceleration(self) -> Anderson | None:
+        """Settings of an acceleration that sums over all robots, if there is one."""
+        acceleration = self.soc.acceleration
+        return None if acceleration is None or acceleration.per_robot else acceleration
+
     def _with_due_penalty(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """State with the penalty that the rule or the safeguard asks for; usually unchanged."""
+        """State with the penalty that the rule or the safeguard asks for; usually unchanged.
+
+        The relaxations of the start keep their penalties.
+        """
+        if self.rotations is not Rotations.PROJECTED:
+            return state
         due, factor = next_penalty(self.soc.penalty, state.ratio, state)
         if due is Due.RAISE:
             rescaled = self._rescaled(robots, state, factor, from_best=True)
@@ -345,8 +368,8 @@ class LocalConsensus:
         return replace(following, robots=local.robots)
 
     def measure(self, problem: PGOProblem, state: ConsensusState) -> Measurement:
-        """As of `Consensus.measurement`."""
-        return Consensus(self.soc).measurement(state)
+        """As of `Consensus.measure`."""
+        return Consensus(self.soc).measure(state)
 
     def poses(self, problem: PGOProblem, state: ConsensusState) -> Poses:
         """Omega, and the translations that the robots hold."""
@@ -354,7 +377,7 @@ class LocalConsensus:
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when primal residual and relative gradient are within tolerance."""
-        return self.soc.status_at(measurement)
+        return Consensus(self.soc).converged(state, measurement)
 
 
 def owned_rotations(robots: Sequence[ConsensusRobot]) -> Array:

@@ -98,7 +98,7 @@ def test_without_faults_the_states_are_those_of_the_plain_recursion(
             mine = agent.copies
             assert mine is not None
             allowed = 1e-8 * (1 + np.abs(new.block.s).max())
-            np.testing.assert_allclose(mine.block.z, old.block.z, rtol=0, atol=allowed)
+            np.testing.assert_allclose(mine.block.omega, old.block.omega, rtol=0, atol=allowed)
             way = old.block.s + damping * (new.block.s - old.block.s)
             np.testing.assert_allclose(mine.block.s, way, rtol=0, atol=allowed)
         if damping != 1.0:

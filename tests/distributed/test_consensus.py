@@ -70,7 +70,7 @@ def check_state(expected: ConsensusState, other: ConsensusState, engine: Recordi
         mine = agent.copies
         assert mine is not None
         np.testing.assert_allclose(mine.state.rho, robot.state.rho, rtol=SAME, atol=0)
-        np.testing.assert_allclose(mine.block.penalty, robot.block.penalty, rtol=SAME, atol=0)
+        np.testing.assert_allclose(mine.block.rho, robot.block.rho, rtol=SAME, atol=0)
         known = mine.block.anderson, robot.block.anderson
         assert len(known[0].residual_differences) == len(known[1].residual_differences)
         for local, whole in zip(rows_in(mine.block), rows_in(robot.block), strict=True):
@@ -78,7 +78,7 @@ def check_state(expected: ConsensusState, other: ConsensusState, engine: Recordi
 
 
 def rows_in(block: RecursionBlock) -> tuple[Array, Array, Array]:
-    return block.x, block.z, block.s
+    return block.x, block.omega, block.s
 
 
 def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> ConsensusState:

@@ -36,12 +36,12 @@ def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(see
     classes = (Poses, AndersonShare, StepSettings, Rotations, type(block))
     restored = deserialize(serialize({"block": block, "poses": (poses, None)}), classes)
     assert restored["block"].anderson.residual_differences == ()
-    for name in ("penalty", "z", "s", "x", "best"):
+    for name in ("rho", "omega", "s", "x", "best"):
         np.testing.assert_array_equal(getattr(restored["block"], name), getattr(block, name))
     np.testing.assert_array_equal(restored["block"].anderson.image, block.anderson.image)
     np.testing.assert_array_equal(restored["poses"][0].t, poses.t)
-    restored["block"].z[:] = 0.0
-    assert block.z.any()
+    restored["block"].omega[:] = 0.0
+    assert block.omega.any()
 
 
 def test_an_array_that_a_record_has_twice_is_stored_once():

@@ -120,7 +120,7 @@ def test_the_penalty_of_a_pose_is_shared_among_its_copies(
     seed: int, n: int, d: int, partitioner: Partitioner
 ) -> None:
     problem, state = drawn(seed, n, d, partitioner)
-    penalties = [robot.block.penalty for robot in state.robots]
+    penalties = [robot.block.rho for robot in state.robots]
     total = sums_over(problem, state.robots, penalties)
     known = held_by(problem, state.robots) > 0
     whole = np.concatenate([0.3 * translation_scale(problem), np.full(d * n, RHO)])
@@ -138,8 +138,8 @@ def test_every_robot_minimises_its_own_subproblem(
     _, state = drawn(seed, n, d, partitioner)
     for robot in state.robots:
         assert robot.step_a is not None
-        penalty = robot.block.penalty
-        shift = np.random.default_rng(seed).standard_normal(robot.block.z.shape)
+        penalty = robot.block.rho
+        shift = np.random.default_rng(seed).standard_normal(robot.block.omega.shape)
         K = robot.layout.problem.M.toarray() + np.diag(0.5 * penalty)
         if not len(robot.layout.separators):
             K[0, 0] *= 2  # no translation is held: t_0 = 0
@@ -172,9 +172,9 @@ def test_agreement_is_the_mean_and_its_nearest_rotation(
     mean[n:] = stack_transposes(project_by_svd(unstack_transposes(mean[n:])))
     for robot, before in zip(here.robots, state.robots, strict=True):
         expected = np.where(robot.layout.held, mean[rows_of(robot, problem)], 0.0)
-        np.testing.assert_allclose(robot.block.z, expected, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(robot.block.omega, expected, rtol=0, atol=1e-9)
         np.testing.assert_allclose(robot.block.B, robot.block.s - expected, rtol=0, atol=1e-9)
-        assert before.block.z is not robot.block.z
+        assert before.block.omega is not robot.block.omega
     omega = replace(state, robots=here.robots).omega
     np.testing.assert_allclose(stack_transposes(omega), mean[n:], rtol=0, atol=1e-9)
 
@@ -191,7 +191,7 @@ def test_balanced_multipliers_have_the_stationary_mean_and_pull_all_copies_alike
         return
     forces = []
     for robot in state.robots:
-        pull = robot.block.penalty[:, None] * robot.block.B
+        pull = robot.block.rho[:, None] * robot.block.B
         forces.append(2.0 * robot.layout.problem.apply_M(robot.state.X) + pull)
     count = held_by(problem, state.robots)
     scale = 1 + max(np.abs(force).max() for force in forces)
@@ -223,7 +223,7 @@ def test_at_an_optimum_nothing_pulls_at_any_copy(
         return
     for robot in state.robots:
         gradient = 2.0 * robot.layout.problem.apply_M(robot.state.X)
-        force = gradient + robot.block.penalty[:, None] * robot.block.B
+        force = gradient + robot.block.rho[:, None] * robot.block.B
         scale = float(np.abs(gradient).max()) + float(problem.M.diagonal().max())
         assert np.abs(force[robot.layout.held[:, 0]]).max() <= 1e-6 * scale
 

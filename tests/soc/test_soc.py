@@ -173,7 +173,7 @@ def test_consensus_is_its_recursion_robot_by_robot(
     penalty = np.concatenate([0.1 * translation_scale(problem), np.full(d * n, rule.rho)])
     parts = [part_of(problem, robots, robot) for robot in range(robots.num_robots)]
     count = np.bincount(np.concatenate([part.held for part in parts]), minlength=problem.side)
-    z = [robot.block.z[robot.layout.held[:, 0]] for robot in first.robots]
+    z = [robot.block.omega[robot.layout.held[:, 0]] for robot in first.robots]
     B = [robot.block.B[robot.layout.held[:, 0]] for robot in first.robots]
     for state in islice(states, 8):
         total = np.zeros((problem.side, d))
@@ -189,7 +189,7 @@ def test_consensus_is_its_recursion_robot_by_robot(
         atol = 1e-7 * (1 + np.abs(mean).max())
         for a, robot in enumerate(state.robots):
             held = robot.layout.held[:, 0]
-            np.testing.assert_allclose(robot.block.z[held], z[a], rtol=0, atol=atol)
+            np.testing.assert_allclose(robot.block.omega[held], z[a], rtol=0, atol=atol)
             np.testing.assert_allclose(robot.block.B[held], B[a], rtol=0, atol=atol)
         np.testing.assert_allclose(stack_transposes(state.omega), mean[n:], rtol=0, atol=atol)
 
@@ -240,7 +240,7 @@ def test_anderson_per_robot_sums_nothing_over_the_robots(
         for a, (before, after) in enumerate(zip(image.robots, following.robots, strict=True)):
             moved, _ = before.solve(None)
             x = moved.state.ahead[1].x
-            residual = np.sqrt(before.block.penalty)[:, None] * (x - before.block.z)
+            residual = np.sqrt(before.block.rho)[:, None] * (x - before.block.omega)
             share, sums = known[a]
             observed, share = share.observe(residual, x + before.block.B, Anderson().memory)
             gamma, sums = sums.coefficients(Anderson(), observed)

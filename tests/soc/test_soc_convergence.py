@@ -323,7 +323,7 @@ def penalties_and_multipliers(
     if isinstance(state, SOCState):
         return [(state.rho[:, None, None], state.omega + state.B - state.x, state.B)]
     blocks = [robot.block for robot in state.robots]
-    return [(block.penalty[:, None], block.s - block.x, block.B) for block in blocks]
+    return [(block.rho[:, None], block.s - block.x, block.B) for block in blocks]
 
 
 def test_rescaling_keeps_the_unscaled_multiplier(
