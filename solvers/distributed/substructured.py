@@ -54,6 +54,26 @@ class SubstructuredState(SharedSteps):
     factor: InterfaceFactor | None = field(default=None, metadata=COMPUTED_AGAIN)
     objective: float = math.nan
 
+    @property
+    def x(self) -> Array:
+        """Solution of step (a) on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.x)
+
+    @property
+    def omega(self) -> Array:
+        """Rotations nearest to x + B on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.omega)
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of x = omega on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.B)
+
+    @property
+    def rho(self) -> Array:
+        """Penalty of every rotation of the cover, (g,)."""
+        return self.block.rho[:: self.block.omega.shape[1]]
+
 
 @dataclass(frozen=True)
 class SubstructuredSOC:
@@ -185,9 +205,9 @@ class SubstructuredSOC:
 
 def _finish(driver: Driver, state: SubstructuredState) -> None:
     """Go from an iterate, which driver and robots hold, to its poses."""
-    omega = state.block.omega
-    driver.current = replace(driver.current, R=unstack_transposes(omega))
-    driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(omega)))
+    driver.current = replace(driver.current, R=state.omega)
+    parts = driver.scattered_rotations(state.block.omega)
+    driver.set_translations(driver.ask_each(Interior.finish, parts))
 
 
 def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock, Array]:

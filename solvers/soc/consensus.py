@@ -81,6 +81,8 @@ def ask_all(robots: Robots, order: Order[Q, A], request: Q, count: Count) -> lis
 class ConsensusState(SharedSteps):
     """Iterate k: the sums that all robots know, and the robots, who have x, omega, B and rho.
 
+    In one process the state shows these of all poses.
+
     Parameters
     ----------
     separators : SeparatorPenalty

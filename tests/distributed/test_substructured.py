@@ -75,6 +75,12 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[
         np.testing.assert_allclose(
             other.dual_residual, expected.dual_residual, rtol=1e-6, atol=1e-8
         )
+        cover = driver.cover
+        for letter in ("x", "omega", "B"):
+            np.testing.assert_allclose(
+                getattr(other, letter), getattr(expected, letter)[cover], rtol=0, atol=1e-6
+            )
+        np.testing.assert_allclose(other.rho, expected.rho[cover], rtol=1e-6, atol=0)
         ratio = expected.rho / rotation_scale(problem)
         np.testing.assert_allclose(np.sort(other.ratio), np.sort(ratio), rtol=1e-6, atol=0)
     SubstructuredSOC(soc).finish(driver, distributed[-1])
