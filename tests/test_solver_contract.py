@@ -543,6 +543,18 @@ def test_a_step_twice_from_one_state_gives_the_same_state_twice(begin: Begin, pl
             state = other
 
 
+def test_a_state_of_another_driver_is_refused() -> None:
+    method = SubstructuredNewton()
+    with driver_in(fronts_with_driver) as driver, driver_in(fronts_with_driver) as other:
+        state = method.init(other, None)
+        with pytest.raises(SettingError, match="not of a run with this driver; begin with"):
+            method.step(driver, state)
+        resumed = dataclasses.replace(state, moment=None)
+        with pytest.raises(SettingError, match="not of a run with this driver; begin with"):
+            method.step(other, resumed)
+        assert method.step(other, method.init(other, resumed)).k == 1
+
+
 @IN_EVERY_PLACE
 def test_two_factors_at_a_time(place: Any) -> None:
     # The second one leaves the first alone, whatever matrix it is of, and none holds the memory of

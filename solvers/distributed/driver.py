@@ -53,7 +53,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -263,10 +263,17 @@ class Driver:
         return moment
 
     def return_to(self, moment: Moment | None) -> None:
-        """Hold again what was held at a moment, here and on the robots."""
-        assert moment is not None  # only a state of a checkpoint has none, and `init` gives it one
+        """Hold again what was held at a moment, here and on the robots.
+
+        A state that a checkpoint was read from has none until `init` gives it one. A SettingError
+        for it, and for a moment of another driver.
+        """
+        held = self._moments.get(moment) if moment is not None else None
+        if moment is None or held is None:
+            raise SettingError(
+                "the state is not of a run with this driver; begin with the `init` of its method"
+            )
         self.network.moments.return_to(moment)
-        held = self._moments[moment]
         self.current = held.current
         self.saved = held.saved
         self.is_final = held.is_final
