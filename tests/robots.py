@@ -21,7 +21,7 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed import robots_of_graph
+from solvers.distributed import multifrontal, robots_of_graph
 from solvers.distributed.driver import Driver
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import Interface
@@ -148,6 +148,12 @@ def sparse_interface_of(
     return SparseInterface(num_separators, widths, touched, fronts, pattern=pattern)
 
 
+def share(patch: pytest.MonkeyPatch) -> None:
+    """Every front but the root is a robot's, however small it is."""
+    patch.setattr(multifrontal, "LEAST_SEPARATORS", 0)
+    patch.setattr(multifrontal, "LEAST_FRONTS", 0)
+
+
 @contextmanager
 def sparse_elimination(most_coupled: int) -> Iterator[None]:
     """Robots leave poses to the driver, whether that is cheaper or not."""
@@ -170,8 +176,9 @@ def matrix_of_schur(found: Elimination) -> Array:
 
 def name_of(order: object) -> str:
     """Class and method of an order, or the function that it is."""
-    inner = order.args[0] if isinstance(order, partial) else order
-    return str(getattr(inner, "__qualname__", inner))
+    while isinstance(order, partial):
+        order = order.args[-1]
+    return str(getattr(order, "__qualname__", order))
 
 
 def arrays_in(record: object, name: str = "value") -> Iterator[tuple[str, Array]]:

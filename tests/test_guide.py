@@ -196,6 +196,7 @@ ROOMS_OF_AN_ITERATION = (
     "solvers.network.engine",
     "solvers.network.ledger",
     "solvers.network.messages",
+    "solvers.network.moments",
     "solvers.network.ray_engine",
     "solvers.soc.anderson",
     "solvers.soc.consensus",
@@ -207,7 +208,7 @@ ROOMS_OF_AN_ITERATION = (
     "solvers.soc.subgraph",
 )
 # Fields that `__init__` sets, which a class does not show, and which the examples below them read.
-SET_AT_WORK = {"Driver.block", "Driver.right_hand_sides", "Agent.interior", "Agent.copies"}
+SET_AT_WORK = {"Agent.interior", "Agent.copies"}
 DATA_SETS = {"robots"}
 
 

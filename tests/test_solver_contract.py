@@ -1,9 +1,11 @@
-"""What every solver promises, whatever its method."""
+"""What every solver promises, whatever its method, in one place and by robots."""
 
 import copy
 import dataclasses
 import enum
-from collections.abc import Callable
+import importlib.util
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from itertools import islice, pairwise
 from typing import Any
 
@@ -12,7 +14,9 @@ import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings, strategies as st
+from robots import metis, share, sparse_elimination
 from scipy.sparse import issparse
+from solvers.distributed.robots_of_graph import open_driver
 
 import pgo_models
 import solvers
@@ -27,17 +31,31 @@ from solvers.baselines.gauss_seidel import GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.baselines.sweep_order import Sweep
 from solvers.convex.extended_soc import ExtendedSOC
+from solvers.distributed.asynchronous import AsynchronousSOC
 from solvers.distributed.checkpoint import Checkpoint
-from solvers.loop import Solver, iterate, run
+from solvers.distributed.consensus import ConsensusSOC
+from solvers.distributed.driver import Driver
+from solvers.distributed.handedness import RobotsPoint, begin_without_terms
+from solvers.distributed.newton import SubstructuredNewton, model_at
+from solvers.distributed.robust import SharedGNC
+from solvers.distributed.staircase import SubstructuredStaircase
+from solvers.distributed.substructured import SubstructuredSOC
+from solvers.handedness.ascent import HandednessAscent
+from solvers.loop import Method, Solver, iterate, run
+from solvers.network.counted_pool import Count
+from solvers.network.engine import Engine, InProcess
+from solvers.network.faults import Faults
 from solvers.result import Record, Status
 from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.newton_step import ModelOrder
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC, GNCState
 from solvers.robust.losses import RobustLoss
+from solvers.soc.anderson import Anderson
 from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import BalancedPenalty, FixedPenalty
+from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.soc import SOC
 
 Make = Callable[..., Any]
@@ -411,3 +429,210 @@ def test_settings_with_an_array_compare_by_value(kind: Any) -> None:
 def test_settings_of_two_classes_differ() -> None:
     assert GNC() != PCM()
     assert FixedPenalty(2.0) == FixedPenalty(2.0) != FixedPenalty(3.0)
+
+
+# By robots: what a state stands for is with them, and they are where the last order has left them.
+
+# Every step is a stall, so that the penalties are chosen anew.
+RESTLESS = MultiplierPenalty(stall_window=2, stall_ratio=1e-6, max_refreshes=2)
+Begin = Callable[[Driver], tuple[Method[Any, Any, Any], Any]]
+
+
+def ascent(driver: Driver) -> tuple[Method[Any, Any, Any], Any]:
+    begin_without_terms(driver)
+    method = HandednessAscent(num_eigenvalues=3)
+    return method, RobotsPoint.first(driver, method.num_eigenvalues)
+
+
+METHODS_OF_ROBOTS: dict[str, Begin] = {
+    "substructured": lambda driver: (SubstructuredSOC(), driver),
+    "substructured_restless": lambda driver: (SubstructuredSOC(SOC(penalty=RESTLESS)), driver),
+    "substructured_balanced": lambda driver: (
+        SubstructuredSOC(SOC(penalty=BalancedPenalty(scale=100.0))),
+        driver,
+    ),
+    "consensus": lambda driver: (ConsensusSOC(), driver),
+    "consensus_restless": lambda driver: (ConsensusSOC(SOC(penalty=RESTLESS)), driver),
+    "consensus_alone": lambda driver: (
+        ConsensusSOC(SOC(acceleration=Anderson(per_robot=True)), has_driver=False),
+        driver,
+    ),
+    "asynchronous": lambda driver: (
+        AsynchronousSOC(faults=Faults(loss=0.3, max_delay=2)),
+        driver,
+    ),
+    "newton": lambda driver: (SubstructuredNewton(), driver),
+    "staircase": lambda driver: (SubstructuredStaircase(), driver),
+    "gnc": lambda driver: (SharedGNC(GNC(spread=None), 1e-9), driver),
+    "ascent": ascent,
+}
+BY_ROBOTS = pytest.mark.parametrize("begin", METHODS_OF_ROBOTS.values(), ids=METHODS_OF_ROBOTS)
+
+
+@contextmanager
+def fronts_with_robots() -> Iterator[Engine]:
+    with pytest.MonkeyPatch.context() as patch:
+        share(patch)
+        yield InProcess()
+
+
+@contextmanager
+def fronts_with_driver() -> Iterator[Engine]:
+    yield InProcess(threads=2)
+
+
+@contextmanager
+def sparse_matrix_with_driver() -> Iterator[Engine]:
+    with sparse_elimination(2):
+        yield InProcess()
+
+
+PLACES = [fronts_with_driver, fronts_with_robots]
+if importlib.util.find_spec("cvxopt") is not None:  # CHOLMOD, of the extra `fast`
+    PLACES.append(sparse_matrix_with_driver)
+IN_EVERY_PLACE = pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)
+
+
+@contextmanager
+def driver_in(place: Any) -> Iterator[Driver]:
+    """Driver and four robots at random poses."""
+    problem = varied_problem(3, 24, 3)
+    thresholds = np.ones(problem.graph.num_edges)
+    with (
+        place() as engine,
+        closing(
+            open_driver(problem, metis(problem.graph, 3), engine, thresholds=thresholds)
+        ) as driver,
+    ):
+        driver.set_poses(random_poses(24, 3, 5))
+        yield driver
+
+
+def figures(method: Method[Any, Any, Any], problem: Any, state: Any) -> Any:
+    measurement = method.measure(problem, state)
+    return snapshot((measurement.objective, measurement.primal_residual, measurement.dual_residual))
+
+
+@BY_ROBOTS
+@IN_EVERY_PLACE
+def test_a_list_of_states_by_robots_is_a_film(begin: Begin, place: Any) -> None:
+    # Two steps from an old state give the two frames that followed it: the robots return.
+    with driver_in(place) as driver:
+        method, problem = begin(driver)
+        film = list(islice(iterate(method, problem), 7))
+        before = [snapshot(state) for state in film]
+        for k in (4, 0, 3):
+            following = method.step(problem, film[k])
+            assert_same(figures(method, problem, following), figures(method, problem, film[k + 1]))
+            after = method.step(problem, following)
+            assert_same(figures(method, problem, after), figures(method, problem, film[k + 2]))
+        assert_same([snapshot(state) for state in film], before)
+
+
+@BY_ROBOTS
+@IN_EVERY_PLACE
+def test_a_step_twice_from_one_state_gives_the_same_state_twice(begin: Begin, place: Any) -> None:
+    with driver_in(place) as driver:
+        method, problem = begin(driver)
+        state = method.init(problem, None)
+        for _ in range(3):
+            one = method.step(problem, state)
+            other = method.step(problem, state)
+            assert_same(figures(method, problem, other), figures(method, problem, one))
+            assert one.k == other.k == state.k + 1
+            state = other
+
+
+def test_a_state_of_another_driver_is_refused() -> None:
+    method = SubstructuredNewton()
+    with driver_in(fronts_with_driver) as driver, driver_in(fronts_with_driver) as other:
+        state = method.init(other, None)
+        with pytest.raises(SettingError, match="not of a run with this driver; begin with"):
+            method.step(driver, state)
+        resumed = dataclasses.replace(state, moment=None)
+        with pytest.raises(SettingError, match="not of a run with this driver; begin with"):
+            method.step(other, resumed)
+        assert method.step(other, method.init(other, resumed)).k == 1
+
+
+@IN_EVERY_PLACE
+def test_two_factors_at_a_time(place: Any) -> None:
+    # The second one leaves the first alone, whatever matrix it is of, and none holds the memory of
+    # one that is gone.
+    with driver_in(place) as driver:
+        first = model_at(driver, ModelOrder(second_order=False, damping=1.0))
+        assert first is not None
+        y, parts, energy = first.factor.solve(first.parts)
+        second = model_at(driver, ModelOrder(second_order=False, damping=0.1))
+        assert second is not None
+        assert not np.allclose(second.factor.solve(first.parts)[0], y, rtol=1e-2)
+        driver.adopt(driver.current.R)
+        again, parts_again, energy_again = first.factor.solve(first.parts)
+        np.testing.assert_array_equal(again, y)
+        assert_same(snapshot(parts_again), snapshot(parts))
+        assert energy_again == energy
+
+
+def test_fronts_forget_the_factors_that_nobody_holds() -> None:
+    with driver_in(fronts_with_driver) as driver:
+        fronts = driver.interface(1, 3).fronts
+        driver.adopt(driver.current.R)  # the factor of the translations stays
+        for _ in range(3):
+            model = model_at(driver, ModelOrder(second_order=False, damping=1.0))
+            assert all(len(front.factors) == 2 for front in fronts.held.values())
+            assert len(fronts.factors_in_use) == 2
+            del model
+
+
+def test_robots_forget_the_moments_of_states_that_are_gone() -> None:
+    with driver_in(fronts_with_driver) as driver:
+        method = SubstructuredSOC()
+        state = method.init(driver, None)
+        for _ in range(6):
+            state = method.step(driver, state)
+
+        def count(agent: Any, _: None) -> int:
+            return len(agent.moments)
+
+        # Those of the last state and of the one that it came from, whose step forgot all others.
+        robots = driver.network.ledger.num_robots
+        assert driver.network.ask(count, [None] * robots, Count.OFF) == [1] * robots
+
+
+@BY_ROBOTS
+def test_a_step_by_robots_that_was_interrupted_can_be_taken_again(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Ctrl-C reaches the second of four robots, order by order.
+    with driver_in(fronts_with_robots) as driver:
+        method, problem = begin(driver)
+        state = method.step(problem, method.init(problem, None))
+        expected = figures(method, problem, method.step(problem, state))
+        workers = driver.network.workers
+        ask = workers.ask
+        for last in range(1, 12):
+            orders = 0
+
+            def interrupted(order: Any, requests: Any, last: int = last) -> Any:
+                nonlocal orders
+                orders += 1
+                if orders < last:
+                    return ask(order, requests)
+
+                def fails(agent: Any, request: Any) -> Any:
+                    if agent.subgraph.robot == 1:
+                        raise KeyboardInterrupt
+                    return order(agent, request)
+
+                return ask(fails, requests)
+
+            with monkeypatch.context() as patch:
+                patch.setattr(workers, "ask", interrupted)
+                try:
+                    method.step(problem, state)
+                except KeyboardInterrupt:
+                    pass
+                else:
+                    break
+            following = method.step(problem, state)
+            assert_same(figures(method, problem, following), expected)

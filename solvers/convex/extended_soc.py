@@ -16,10 +16,11 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.result import Measurement, Status
+from solvers.soc.joint import Joint, SOCState
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep, RSubproblem
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, Joint, SOCState
+from solvers.soc.soc import SOC
 
 _FAINT = 1e-3  # weight that is small beside terms of metres and radians
 _SAME = 1e-9  # relative difference up to which two values of a term count as equal
@@ -183,7 +184,7 @@ class ExtendedSOC:
 
     def converged(self, state: SOCState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
-        return self.soc.converged(state, measurement)
+        return self.soc.status_at(measurement)
 
     def _recursion(self, problem: PGOProblem) -> Joint:
         r_step = ExtendedStep(problem.graph, self.changer, self.solver)

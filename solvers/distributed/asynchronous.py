@@ -15,6 +15,7 @@ from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.driver import Driver
 from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults, LossyChannel
+from solvers.network.moments import Moment
 from solvers.result import Measurement, Status
 from solvers.soc.consensus import Consensus, ask_all, objective_and_gradient
 from solvers.soc.consensus_robot import ConsensusRobot
@@ -26,10 +27,11 @@ from solvers.soc.soc import SOC
 class AsynchronousState:
     """Round k: what the robots reported, and the messages under way.
 
-    A step changes the channel of the messages in place.
+    The rows of the robots are with them, which hold them at a moment.
     """
 
     k: int
+    moment: Moment
     size: float  # ||omega||_rho
     channel: LossyChannel[Array]
     rows: list[Rows]  # what has arrived for the next turn of every robot, by sender
@@ -81,11 +83,13 @@ class AsynchronousSOC:
         state = Consensus(self.soc).init(robots)
         settings = TurnSettings(self.alpha, self.damping)
         sent = ask_all(robots, ConsensusRobot.announce, settings, Count.PIGGYBACKED)
+        rows = robots.exchange(sent)
         return AsynchronousState(
             k=0,
+            moment=driver.moment(),
             size=state.size,
             channel=LossyChannel(self.faults),
-            rows=robots.exchange(sent),
+            rows=rows,
             objective=state.objective,
             gradient=state.gradient,
             rotation_square=state.rotation_square,
@@ -96,21 +100,25 @@ class AsynchronousSOC:
 
         If it may be the last one, a round follows that confirms it.
         """
+        driver.return_to(state.moment)
         robots = RobotsOfDriver(driver)
         turns = robots.ask(ConsensusRobot.turn, state.rows, Count.PIGGYBACKED)
         squares = np.sum([turn.sums for turn in turns], axis=0)
         if not np.isfinite(squares).all():
-            return replace(state, k=state.k + 1, primal_residual=np.nan, dual_residual=np.nan)
+            broken = replace(state, primal_residual=np.nan, dual_residual=np.nan)
+            return replace(broken, k=state.k + 1, moment=driver.moment())
         primal = math.sqrt(squares[0]) / state.size
         dual = math.sqrt(squares[1]) / state.size
         objective, gradient = objective_and_gradient(
             [turn.stationarity for turn in turns], state.rotation_square
         )
         is_within = max(primal, dual, gradient) <= self.soc.tolerance
+        channel = state.channel.copy()
         following = replace(
             state,
             k=state.k + 1,
-            rows=robots.exchange([turn.rows for turn in turns], state.channel),
+            channel=channel,
+            rows=robots.exchange([turn.rows for turn in turns], channel),
             objective=objective,
             gradient=gradient,
             primal_residual=primal,
@@ -120,8 +128,8 @@ class AsynchronousSOC:
         )
         oldest_in_use = following.waited + self.faults.max_delay
         if following.quiet > oldest_in_use:
-            return self._confirmed(robots, following)
-        return following
+            following = self._confirmed(robots, following)
+        return replace(following, moment=driver.moment())
 
     def _confirmed(self, robots: RobotsOfDriver, state: AsynchronousState) -> AsynchronousState:
         """State with the gradient at the poses that the robots hold.
@@ -154,3 +162,8 @@ class AsynchronousSOC:
         there has to be within tolerance, too.
         """
         return Status.CONVERGED if state.is_confirmed else None
+
+    def finish(self, driver: Driver, state: AsynchronousState) -> None:
+        """Give driver and robots omega, and the best translations for it: two rounds."""
+        driver.return_to(state.moment)
+        RobotsOfDriver(driver).finish()

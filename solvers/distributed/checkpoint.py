@@ -30,6 +30,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import CoverPoses, Driver, DriverState
 from solvers.distributed.newton import SubstructuredNewtonState
+from solvers.distributed.robots.records import RightHandSide
 from solvers.distributed.run_lock import RunLock
 from solvers.distributed.substructured import SubstructuredState
 from solvers.loop import Method, RunMonitor
@@ -50,7 +51,7 @@ from solvers.soc.soc import SOC
 S = TypeVar("S")
 JudgedPoses = tuple[Poses, Certificate]
 # First line of a file; the second is the SHA-256 of all that follows.
-_FORMAT = b"pgo-splitting checkpoint 5\n"
+_FORMAT = b"pgo-splitting checkpoint 6\n"
 _DIGEST_SIZE = 65
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")
@@ -143,6 +144,7 @@ _CLASSES = (
     ConsensusState,
     SubstructuredNewtonState,
     RecursionBlock,
+    RightHandSide,
     StepSettings,
     AndersonShare,
     AndersonSums,

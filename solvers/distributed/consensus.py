@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
@@ -79,7 +79,7 @@ class RobotsOfDriver:
 class ConsensusSOC:
     """SOC by robots, from the poses that they and the driver hold.
 
-    The iterates are with the robots, and a step replaces them.
+    The rows of an iterate are with the robots, which hold them at its moment.
     """
 
     soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are ignored
@@ -101,13 +101,16 @@ class ConsensusSOC:
 
         Poses, penalties and forces take two rounds.
         """
-        if start is not None:
-            return start
-        return self._method.init(RobotsOfDriver(driver, self.has_driver, self.goes_on))
+        state = start
+        if state is None:
+            state = self._method.init(RobotsOfDriver(driver, self.has_driver, self.goes_on))
+        return replace(state, moment=driver.moment())
 
     def step(self, driver: Driver, state: ConsensusState) -> ConsensusState:
         """One round between neighbours, and with it an all-reduce."""
-        return self._method.step(RobotsOfDriver(driver, self.has_driver), state)
+        driver.return_to(state.moment)
+        following = self._method.step(RobotsOfDriver(driver, self.has_driver), state)
+        return replace(following, moment=driver.moment())
 
     def measure(self, driver: Driver, state: ConsensusState) -> Measurement:
         """F of the poses that the robots hold, the residuals, and what crossed the network.
@@ -118,11 +121,16 @@ class ConsensusSOC:
         is_joint = self.has_driver and driver.network.ledger.num_robots == 1
         if is_joint and not math.isnan(state.primal_residual):
             return driver.measured(state.measurement(state.objective))
-        return driver.measured(self._method.measurement(state))
+        return driver.measured(self._method.measure(state))
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when primal residual and relative gradient of F are within tolerance.
 
         The gradient is that at the poses which the robots hold.
         """
-        return self.soc.converged(state, measurement)
+        return self._method.converged(state, measurement)
+
+    def finish(self, driver: Driver, state: ConsensusState) -> None:
+        """Give driver and robots omega, and the best translations for it: two rounds."""
+        driver.return_to(state.moment)
+        RobotsOfDriver(driver).finish()

@@ -49,10 +49,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar, cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -65,7 +66,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.matrices import columns_of
 from pgo_models.relaxations.low_rank import poses_from, tangent_widths
 from solvers.distributed.elimination_choice import CoverSystem
-from solvers.distributed.interface import Interface
+from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.agent import order_interior
 from solvers.distributed.robots.interior import Interior
@@ -73,7 +74,6 @@ from solvers.distributed.robots.records import (
     CostParts,
     ReducedTranslations,
     Reweigh,
-    RightHandSide,
 )
 from solvers.distributed.robots.reweighting import reweigh
 from solvers.distributed.robots.subdomain_blocks import Widths
@@ -81,8 +81,8 @@ from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import DEFAULT_MEMORY, WorkerPool
 from solvers.network.ledger import Ledger
 from solvers.network.messages import Snapshot, restore, take_snapshot
+from solvers.network.moments import Moment
 from solvers.result import Measurement
-from solvers.soc.recursion_block import RecursionBlock
 from solvers.soc.subgraph import RobotSummary
 
 Q = TypeVar("Q")
@@ -110,12 +110,22 @@ class CoverPoses:
 
 
 @dataclass(frozen=True, eq=False)
+class HeldByDriver:
+    """What the driver holds at a moment; as the attributes of `Driver`."""
+
+    current: CoverPoses
+    saved: CoverPoses
+    is_final: bool
+    diagonal: Array
+    laplacian: InterfaceFactor | None
+
+
+@dataclass(frozen=True, eq=False)
 class DriverState:
     """State of a driver between two steps: its attributes, and the ledger of its network."""
 
     current: CoverPoses
     saved: CoverPoses
-    block: RecursionBlock | None
     ledger: Ledger
     is_final: bool = False
 
@@ -132,10 +142,6 @@ class Driver:
         cover.
     diagonal : ndarray, ((d + 1) g,)
         Diagonal of M on the cover.
-    block : RecursionBlock, optional
-        Rows of the recursion of SOC that belong to the rotations of the cover.
-    right_hand_sides : list of RightHandSide
-        Reduced right-hand sides of the robots for the next step (a).
     is_final : bool
         Which of two costs is the current one, where a graph has two: the cost that is asked for
         (`Part.final`; chi2, or one that is not convex), or the convex quadratic cost near it that
@@ -173,11 +179,9 @@ class Driver:
         R = np.broadcast_to(np.eye(self.d), (g, self.d, self.d)).copy()
         self.current = CoverPoses(R, np.zeros((g, self.d)), np.zeros(((self.d + 1) * g, self.d)))
         self.saved = self.current
-        self.block: RecursionBlock | None = None
-        self.right_hand_sides: list[RightHandSide] = []
         self.is_final = False
         # Factor of the matrix of the translations on the cover, once it is needed.
-        self._laplacian: Interface | None = None
+        self._laplacian: InterfaceFactor | None = None
 
         has_interface = memory != 0
         system = CoverSystem.of(summaries)
@@ -190,6 +194,7 @@ class Driver:
         self._interfaces: dict[Widths, Interface] = {}
         if has_interface:
             self.interface(*self.tangent).check_memory(memory)
+        self._moments: WeakKeyDictionary[Moment, HeldByDriver] = WeakKeyDictionary()
         pool = open_pool()
         self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(summaries))
         try:
@@ -246,6 +251,35 @@ class Driver:
         )
         return [cast(A, answers[robot]) for robot in self.robots_with_edges.tolist()]
 
+    def moment(self) -> Moment:
+        """Return the moment of what driver and robots hold now, which they keep while it lives.
+
+        A state of a method that begins and ends its steps with `return_to` and `moment` is a value:
+        a step from it gives the same result whatever was done meanwhile.
+        """
+        moment = self.network.moments.now()
+        held = HeldByDriver(self.current, self.saved, self.is_final, self.diagonal, self._laplacian)
+        self._moments.setdefault(moment, held)
+        return moment
+
+    def return_to(self, moment: Moment | None) -> None:
+        """Hold again what was held at a moment, here and on the robots.
+
+        A state that a checkpoint was read from has none until `init` gives it one. A SettingError
+        for it, and for a moment of another driver.
+        """
+        held = self._moments.get(moment) if moment is not None else None
+        if moment is None or held is None:
+            raise SettingError(
+                "the state is not of a run with this driver; begin with the `init` of its method"
+            )
+        self.network.moments.return_to(moment)
+        self.current = held.current
+        self.saved = held.saved
+        self.is_final = held.is_final
+        self.diagonal = held.diagonal
+        self._laplacian = held.laplacian
+
     def gather_diagonal(self, parts: Sequence[Array]) -> Array:
         """Diagonal of M on the cover, ((d + 1) g,), of the robots' parts."""
         columns = [part[:, None] for part in parts]
@@ -293,7 +327,7 @@ class Driver:
     def release_newton(self) -> None:
         """Let go of the interface of Newton's unknowns, whose memory a proof may need.
 
-        Only a sparse one holds a factor of its own; the next step of Newton builds it again.
+        Only a sparse one holds much, its pattern; the next step of Newton builds it again.
         """
         self._interfaces.pop(self.tangent, None)
 
@@ -371,7 +405,7 @@ class Driver:
     @property
     def state(self) -> DriverState:
         """State of the driver for `resume`, without factors, which are computed again."""
-        return DriverState(self.current, self.saved, self.block, self.network.ledger, self.is_final)
+        return DriverState(self.current, self.saved, self.network.ledger, self.is_final)
 
     def snapshots(self) -> list[Snapshot]:
         """State of every robot for `resume`, interior poses too; its bytes are counted apart."""
@@ -385,7 +419,6 @@ class Driver:
         self.network.ask(restore, snapshots, Count.OFF)
         self.current = state.current
         self.saved = state.saved
-        self.block = state.block
         self.network.ledger = state.ledger
         self.is_final = state.is_final
         answers = self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)

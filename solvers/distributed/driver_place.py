@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.checkpoint import Journal
-from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
+from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
@@ -133,16 +133,18 @@ class DriverPlace(Place):
         if soc.effective_coupling is not Coupling.CONSENSUS:
             substructured = SubstructuredSOC(soc)
             finished = self.journal.run(substructured, driver, self.monitor)
-            substructured.finish(driver)
+            substructured.finish(driver, finished.state)
             return finished
         if self.faults is None:
-            waiting = self.journal.run(ConsensusSOC(soc), driver, self.monitor)
-            RobotsOfDriver(driver).finish()
+            consensus = ConsensusSOC(soc)
+            waiting = self.journal.run(consensus, driver, self.monitor)
+            consensus.finish(driver, waiting.state)
             return waiting
         # No checkpoint can hold the messages that are under way.
-        asynchronous = self.monitor.run(AsynchronousSOC(soc, self.faults), driver)
-        RobotsOfDriver(driver).finish()
-        return asynchronous
+        asynchronous = AsynchronousSOC(soc, self.faults)
+        impatient = self.monitor.run(asynchronous, driver)
+        asynchronous.finish(driver, impatient.state)
+        return impatient
 
     def run_newton(self, attempt: Attempt, newton: Newton) -> Attempt:
         """Run Newton from the current poses."""

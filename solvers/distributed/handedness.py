@@ -23,6 +23,7 @@ from solvers.distributed.robots import handedness as robot_orders
 from solvers.distributed.robots.records import VectorsOrder
 from solvers.handedness.certificate_spectrum import shifts_below
 from solvers.network.counted_pool import Count
+from solvers.network.moments import Moment
 
 # Relative change of the distance from the shift to the smallest eigenvalue that ends an iteration.
 _SETTLED = 1e-3
@@ -45,14 +46,14 @@ class LowestVectors:
 class RobotsPoint:
     """`ascent.AscentPoint` by driver and robots, which hold the P of their edges' pairs.
 
-    The robots are where the last step has led: an earlier point is theirs no longer. They keep the
-    P of the best one.
+    They hold the point, and the P of the best one so far, at its moment.
     """
 
     driver: Driver
     less_terms: Array  # ((d+1) g,): diagonal of M less the terms on the cover
     vectors: LowestVectors
     best: float  # largest of the smallest eigenvalues so far
+    moment: Moment
 
     @classmethod
     def first(cls, driver: Driver, num_eigenvalues: int) -> "RobotsPoint":
@@ -67,7 +68,7 @@ class RobotsPoint:
         X[is_free] = np.random.default_rng(g).standard_normal((int(is_free.sum()), count))
         expected = -float(driver.scale.mean())
         vectors = lowest_vectors(driver, less_terms, X, expected)
-        return cls(driver, less_terms, vectors, float(vectors.values[0]))
+        return cls(driver, less_terms, vectors, float(vectors.values[0]), driver.moment())
 
     @property
     def values(self) -> Array:
@@ -87,6 +88,7 @@ class RobotsPoint:
     def ascended(self, weights: Array, rise: float) -> "RobotsPoint":
         """Go along the derivative, as long as `rise` asks for."""
         driver = self.driver
+        driver.return_to(self.moment)
         weighted = self.vectors.C * np.sqrt(weights)
         square = math.fsum(driver.ask(robot_orders.find_derivative, weighted))
         described = driver.ask(robot_orders.ascend, rise / square)
@@ -96,7 +98,8 @@ class RobotsPoint:
         smallest = float(vectors.values[0])
         if smallest > self.best:
             driver.ask(robot_orders.keep_best, None, Count.PIGGYBACKED)
-        return RobotsPoint(driver, less_terms, vectors, max(self.best, smallest))
+        best = max(self.best, smallest)
+        return RobotsPoint(driver, less_terms, vectors, best, driver.moment())
 
 
 def begin_without_terms(driver: Driver) -> None:

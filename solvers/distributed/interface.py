@@ -1,4 +1,8 @@
-"""Interface problem of substructuring: the sum of Schur complements, factored along a tree."""
+"""Interface problem of substructuring: the sum of Schur complements, factored along a tree.
+
+An interface says which unknowns there are. Its factors are values: each stays as it is when another
+one is computed.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -14,14 +19,24 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, column_error, gamma
 from pgo_models.problem.matrices import columns_of
-from solvers.distributed.multifrontal import FrontOwners, levels
-from solvers.distributed.robots.elimination import FrontParts, HeldFront
+from solvers.distributed.multifrontal import FactorName, FrontOwners, levels
+from solvers.distributed.robots.elimination import FrontMatrix, FrontParts, HeldFront
 from solvers.distributed.robots.subdomain_blocks import Widths
 
 # memory of a front at work, in fronts: itself, and copies of what is added to it or split off
 _AT_WORK = 4.25
 
 Solved = tuple[Array, list[Array], float]
+
+
+class InterfaceFactor(Protocol):
+    """A factor of the sum of the robots' Schur complements and the driver's own blocks."""
+
+    def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
+        """Solve for the sum of the robots' right-hand sides and the driver's `own`, (side, k).
+
+        The answer is x, (side, k), x on every robot's boundary, and b^T x.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +98,8 @@ class Interface:
 
     def factorize(
         self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()
-    ) -> Interface:
-        """Sum the robots' Schur complements and the driver's own blocks, and factor for `solve`.
-
-        The factor takes the place of the one before: a driver has one `Interface` for all unknowns
-        of these widths.
+    ) -> InterfaceFactor:
+        """Sum the robots' Schur complements and the driver's own blocks, and factor the sum.
 
         The contributions, (g (g + 1) / 2,) for a robot with g columns, are as `Elimination.schur`;
         the driver's own are pairs of columns (q, w) and values (q, w, w), each block on unknowns of
@@ -102,72 +114,14 @@ class Interface:
             np.add.at(
                 blocks, (separator[:, :1, None], number[:, :, None], number[:, None, :]), values
             )
+        name = self.fronts.new_factor()
+        matrix = FrontMatrix(name.number, self.widths, self.fronts.factors_in_use)
         schur: dict[int, Array] = {}
         for level in levels(self.fronts.tree):
-            orders = self._orders(level, contributions, schur, blocks)
+            parts = parts_of_fronts(self.fronts, level, contributions, schur, blocks)
+            orders = {number: (matrix, of_front) for number, of_front in parts.items()}
             schur.update(self.fronts.ask(HeldFront.eliminate, orders))
-        return self
-
-    def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
-        """Solve for the sum of the robots' right-hand sides and the driver's `own`, (side, k).
-
-        The answer is x, (side, k), x on every robot's boundary, and b^T x.
-        """
-        k = parts[0].shape[1]
-        width = sum(self.widths)
-        blocks = own[self.order].reshape(-1, width, k) if own is not None else None
-        reduced, energy = self._reduce(parts, blocks)
-        x = np.empty((self.num_separators, width, k))
-        on_parts = list(parts)
-        known = reduced  # x on the boundary of fronts; that of the root is empty
-        for level in reversed(levels(self.fronts.tree)):
-            orders = {number: (known.pop(number), self.widths) for number in level}
-            answers = self.fronts.ask(HeldFront.substitute, orders)
-            for number, (x_E, below) in answers.items():
-                front = self.fronts.tree[number]
-                x[front.eliminated] = x_E.reshape(-1, width, k)
-                num_robots = len(front.robots)
-                for robot, part in zip(front.robots, below[:num_robots], strict=True):
-                    on_parts[robot] = part
-                known.update(zip(front.children, below[num_robots:], strict=True))
-        stacked = np.empty((self.side, k))
-        stacked[self.order] = x.reshape(stacked.shape)
-        return stacked, on_parts, energy
-
-    def _reduce(
-        self, parts: Sequence[Array], blocks: Array | None
-    ) -> tuple[dict[int, Array], float]:
-        """Reduce right-hand sides front by front, to what the root leaves, and compute b^T x."""
-        energy = 0.0
-        reduced: dict[int, Array] = {}
-        for level in levels(self.fronts.tree):
-            orders = self._orders(level, parts, reduced, blocks)
-            answers = self.fronts.ask(HeldFront.reduce, orders)
-            reduced.update({number: b for number, (b, _) in answers.items()})
-            energy += math.fsum(square for _, square in answers.values())
-        return reduced, energy
-
-    def _orders(
-        self,
-        level: Sequence[int],
-        robots: Sequence[Array],
-        children: dict[int, Array],
-        own: Array | None,
-    ) -> dict[int, FrontParts]:
-        """Collect what the fronts of a level are the sum of.
-
-        The driver's part goes along where it is not zero; those of children are used up.
-        """
-        orders: dict[int, FrontParts] = {}
-        for number in level:
-            front = self.fronts.tree[number]
-            of_robots = [robots[robot] for robot in front.robots]
-            of_children = [children.pop(child) for child in front.children]
-            of_driver = own[front.eliminated] if own is not None else None
-            if of_driver is not None and not of_driver.any():
-                of_driver = None
-            orders[number] = FrontParts(self.widths, (*of_robots, *of_children), of_driver)
-        return orders
+        return TreeFactor(self, name)
 
     @cached_property
     def order(self) -> IntArray:
@@ -227,3 +181,76 @@ class Interface:
     def scatter(self, x: Array) -> list[Array]:
         """Cut a vector of the driver into what every robot is sent, (g_a sum(widths), k) each."""
         return [x[columns] for columns in self.columns]
+
+
+@dataclass(frozen=True, eq=False)
+class TreeFactor:
+    """A factor along the tree; every front keeps its part under the name, as long as this lives."""
+
+    interface: Interface
+    name: FactorName
+
+    def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
+        """Solve as `InterfaceFactor.solve`: down to the root, and back."""
+        space = self.interface
+        fronts = space.fronts
+        k = parts[0].shape[1]
+        width = sum(space.widths)
+        blocks = own[space.order].reshape(-1, width, k) if own is not None else None
+        reduced, energy = self._reduce(parts, blocks)
+        x = np.empty((space.num_separators, width, k))
+        on_parts = list(parts)
+        known = reduced  # x on the boundary of fronts; that of the root is empty
+        for level in reversed(levels(fronts.tree)):
+            orders = {number: (self.name.number, known.pop(number)) for number in level}
+            answers = fronts.ask(HeldFront.substitute, orders)
+            for number, (x_E, below) in answers.items():
+                front = fronts.tree[number]
+                x[front.eliminated] = x_E.reshape(-1, width, k)
+                num_robots = len(front.robots)
+                for robot, part in zip(front.robots, below[:num_robots], strict=True):
+                    on_parts[robot] = part
+                known.update(zip(front.children, below[num_robots:], strict=True))
+        stacked = np.empty((space.side, k))
+        stacked[space.order] = x.reshape(stacked.shape)
+        return stacked, on_parts, energy
+
+    def _reduce(
+        self, parts: Sequence[Array], blocks: Array | None
+    ) -> tuple[dict[int, Array], float]:
+        """Reduce right-hand sides front by front, to what the root leaves, and compute b^T x."""
+        fronts = self.interface.fronts
+        energy = 0.0
+        reduced: dict[int, Array] = {}
+        for level in levels(fronts.tree):
+            parts_of_level = parts_of_fronts(fronts, level, parts, reduced, blocks)
+            orders = {
+                number: (self.name.number, of_front) for number, of_front in parts_of_level.items()
+            }
+            answers = fronts.ask(HeldFront.reduce, orders)
+            reduced.update({number: b for number, (b, _) in answers.items()})
+            energy += math.fsum(square for _, square in answers.values())
+        return reduced, energy
+
+
+def parts_of_fronts(
+    fronts: FrontOwners,
+    level: Sequence[int],
+    robots: Sequence[Array],
+    children: dict[int, Array],
+    own: Array | None,
+) -> dict[int, FrontParts]:
+    """Collect what the fronts of a level are the sum of.
+
+    The driver's part goes along where it is not zero; those of children are used up.
+    """
+    parts: dict[int, FrontParts] = {}
+    for number in level:
+        front = fronts.tree[number]
+        of_robots = [robots[robot] for robot in front.robots]
+        of_children = [children.pop(child) for child in front.children]
+        of_driver = own[front.eliminated] if own is not None else None
+        if of_driver is not None and not of_driver.any():
+            of_driver = None
+        parts[number] = FrontParts((*of_robots, *of_children), of_driver)
+    return parts

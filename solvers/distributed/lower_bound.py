@@ -27,7 +27,7 @@ from pgo_models.geometry.rotations import Array, BoolArray, stack_transposes
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
-from solvers.distributed.interface import Interface
+from solvers.distributed.interface import InterfaceFactor
 from solvers.distributed.robots.handedness import report_terms, take_closed_form
 from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
@@ -39,7 +39,7 @@ from solvers.network.counted_pool import Count
 class InterfaceProof:
     """S on the separators, shown to be positive definite."""
 
-    factor: Interface
+    factor: InterfaceFactor
     slack: Array  # ((d+1) g,): diagonal that it is at least
     answers: list[ProofAnswer]  # of the robots
     Lambda: Array  # (g, d, d): multipliers of the separators

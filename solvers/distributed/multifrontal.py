@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from typing import Any, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -180,6 +181,13 @@ def flops_of_fronts(fronts: FrontOwners, width: int) -> float:
     return sum(max(flops[number] for number in level) for level in levels(fronts.tree))
 
 
+@dataclass(frozen=True, eq=False)
+class FactorName:
+    """Number under which the fronts hold a factor, as long as this object lives."""
+
+    number: int
+
+
 class FrontOwners:
     """The tree of fronts, and who holds which; the driver holds all, until they are handed out."""
 
@@ -192,6 +200,20 @@ class FrontOwners:
         self.owner = [DRIVER] * len(tree)
         self.held = {number: _held_front(tree, front, touched) for number, front in enumerate(tree)}
         self._robots: list[int] = []
+        self._num_factors = 0
+        self._names: WeakSet[FactorName] = WeakSet()
+
+    def new_factor(self) -> FactorName:
+        """Name a factor that is to be computed."""
+        name = FactorName(self._num_factors)
+        self._num_factors += 1
+        self._names.add(name)
+        return name
+
+    @property
+    def factors_in_use(self) -> tuple[int, ...]:
+        """Numbers of the factors whose names are alive."""
+        return tuple(sorted(name.number for name in self._names))
 
     def hand_out(self, network: CountedPool, robots: IntArray) -> None:
         """Give every front but the root to a robot of its group, none two, if there are not few.
@@ -247,11 +269,12 @@ class FrontOwners:
         of_robots = [self._robots[robot] for robot in front.robots]
         of_children = [self.owner[child] for child in front.children]
         below = [*of_robots, *of_children]
-        if isinstance(request, FrontParts):  # its parts; the driver's; |y|^2 to the driver
+        _, content = request
+        if isinstance(content, FrontParts):  # its parts; the driver's; |y|^2 to the driver
             links = [
-                (sender, own, part.size) for sender, part in zip(below, request.parts, strict=True)
+                (sender, own, part.size) for sender, part in zip(below, content.parts, strict=True)
             ]
-            links.append((DRIVER, own, request.own.size if request.own is not None else 0))
+            links.append((DRIVER, own, content.own.size if content.own is not None else 0))
             links.append((own, DRIVER, int(isinstance(answer, tuple))))
             return links
         x_E, on_parts = answer

@@ -6,7 +6,7 @@ robots for their parts and solves for the separators, and the method that the lo
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,10 +16,12 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.hessian import TangentLayout
 from pgo_models.relaxations.low_rank import LiftedPoses, poses_from
 from solvers.distributed.driver import CoverPoses, Driver
-from solvers.distributed.interface import Interface
+from solvers.distributed.interface import InterfaceFactor
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Move, Reduced, RightHandSide, TrialEvaluation
 from solvers.network.counted_pool import Count
+from solvers.network.moments import Moment
+from solvers.network.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton, newton_status
 from solvers.riemannian.newton_step import (
@@ -35,9 +37,10 @@ from solvers.riemannian.polish import MOST_FITTING_STEPS, NEARLY_EXACT
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SubstructuredNewtonState(NewtonFigures):
-    """Figures of iterate k; the poses are with driver and robots."""
+    """Figures of iterate k; the poses are with driver and robots, which hold them at a moment."""
 
     k: int
+    moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
     eta: float = 0.0  # last one that was added to S
     is_convex: bool = True  # whether the last step needed none
 
@@ -47,7 +50,7 @@ class Model:
     """A factored matrix H at poses, and the solution y = H^-1 g on the cover."""
 
     order: ModelOrder
-    factor: Interface
+    factor: InterfaceFactor
     at: CoverPoses
     y: Array
     parts: list[Array]  # of y, at every robot
@@ -186,12 +189,14 @@ class SubstructuredNewton:
         self, driver: Driver, start: SubstructuredNewtonState | None
     ) -> SubstructuredNewtonState:
         """State 0, at the poses that driver and robots hold."""
+        moment = driver.moment()
         if start is not None:
-            return start
-        return SubstructuredNewtonState(k=0, objective=driver.current.objective)
+            return replace(start, moment=moment)
+        return SubstructuredNewtonState(k=0, moment=moment, objective=driver.current.objective)
 
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
         """One factorisation and the moves it serves, two rounds each."""
+        driver.return_to(state.moment)
         tolerance = stationary_tolerance(not driver.is_final, self.newton.share)
         shift = None
         if self.is_shifted:
@@ -206,6 +211,7 @@ class SubstructuredNewton:
         eta = result.model.order.eta
         return SubstructuredNewtonState(
             k=state.k + 1,
+            moment=driver.moment(),
             objective=driver.current.objective,
             decrement=result.decrement,
             moved=result.moved,
@@ -266,7 +272,7 @@ def _own(
 
 
 def _solved(
-    order: ModelOrder, factor: Interface, at: CoverPoses, right: Sequence[RightHandSide]
+    order: ModelOrder, factor: InterfaceFactor, at: CoverPoses, right: Sequence[RightHandSide]
 ) -> Model:
     """Solution y = H^-1 g on the cover, and g^T H^-1 g."""
     y, parts, energy = factor.solve([part.b for part in right])

@@ -186,6 +186,7 @@ class FileAgent(Agent):
         self.interior = None
         self.copies = None
         self.front = None
+        self.moments = {}
 
 
 def read_file(agent: FileAgent, _: None) -> Claim:

@@ -53,7 +53,8 @@ _NUM_HALVINGS = 26
 class SharedEdges:
     """The edges that robots hold at their poses.
 
-    `newton` has the figures of the last weighted cost.
+    `newton` has the figures of the last weighted cost, and the moment when driver and robots hold
+    these edges and poses.
     """
 
     driver: Driver
@@ -67,10 +68,12 @@ class SharedEdges:
 
     def sums(self, loss: RobustLoss, mu: float, scale: float) -> RatioSums:
         """Sums over the edges of all robots."""
+        self.driver.return_to(self.newton.moment)
         return RatioSums.total(self.driver.ask(sum_ratios, self._order(loss, mu, scale)))
 
     def median_ratio(self, scale: float, num_kept: float) -> float:
         """Median ratio of the edges within their thresholds, by counts of those below a bound."""
+        self.driver.return_to(self.newton.moment)
         low = _LEAST_EXPONENT
         high = 0.0
         for _ in range(_NUM_HALVINGS):
@@ -84,6 +87,7 @@ class SharedEdges:
 
     def reweighted(self, loss: RobustLoss, mu: float, scale: float) -> SharedEdges:
         """Edges with the weights that belong to their residuals."""
+        self.driver.return_to(self.newton.moment)
         self.driver.reweigh(self._order(loss, mu, scale))
         return replace(self, newton=SubstructuredNewton().init(self.driver, None))
 

@@ -88,21 +88,13 @@ class CoverPattern:
         return float(np.sum((width * self.counts.astype(float)) ** 2) * width)
 
 
-@dataclass(eq=False)
-class CoverFactor:
-    """The pattern of the unknowns, and the last factor; a driver has one for these widths."""
+@dataclass(frozen=True, eq=False)
+class UnknownsPattern:
+    """The pattern of the unknowns, and its analysis."""
 
     lower: csc_array
     robots: tuple[Int32Array, ...]  # positions of every robot's entries among those of `lower`
     analysis: SymbolicCholesky
-    factor: CholeskyFactor | None = None
-
-    @property
-    def keys(self) -> IntArray:
-        """`entry_keys` of the entries, column by column, ascending."""
-        side = self.lower.shape[1]
-        columns = np.repeat(np.arange(side), np.diff(self.lower.indptr))
-        return entry_keys(columns, self.lower.indices, side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,35 +123,32 @@ class SparseInterface(Interface):
         ]
 
     @cached_property
-    def held(self) -> CoverFactor:
+    def unknowns(self) -> UnknownsPattern:
         """The pattern of the unknowns, analysed when it is first needed."""
         side = self.side
         lower = csc_array(coupled_unknowns(csr_array(self.pattern.lower), self.widths))
         order = row_order(self.pattern.order, *self.widths)
         most = partial(most_counts, self.pattern.analysis, *self.widths)
         analysis = analyze(lower, CholeskyBackend.CHOLMOD, order, most)
-        held = CoverFactor(lower, (), analysis)
-        keys = held.keys
+        keys = _keys(lower)
         positions = []
         for columns, coupled in zip(self.columns, self.pattern.robots, strict=True):
             entries = coupled_unknowns(coupled, self.widths).tocoo()
             of_robot = entry_keys(columns[entries.col], columns[entries.row], side)
             positions.append(positions_of(of_robot, keys).astype(np.int32))
-        held.robots = tuple(positions)
-        return held
+        return UnknownsPattern(lower, tuple(positions), analysis)
 
     def factorize(
         self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()
-    ) -> Interface:
+    ) -> SparseFactor:
         """Sum the contributions and the driver's own blocks, as `Interface.factorize`.
 
         The contributions are the entries that the blocks of a robot's cut store.
         """
-        held = self.held
-        held.factor = None  # its memory may be needed
-        values = np.zeros(held.lower.nnz)
-        keys = held.keys
-        for positions, part in zip(held.robots, contributions, strict=True):
+        unknowns = self.unknowns
+        values = np.zeros(unknowns.lower.nnz)
+        keys = _keys(unknowns.lower)
+        for positions, part in zip(unknowns.robots, contributions, strict=True):
             values[positions] += part
         for columns, blocks in own:
             row = np.broadcast_to(columns[:, :, None], blocks.shape)
@@ -168,21 +157,9 @@ class SparseInterface(Interface):
             of_blocks = entry_keys(column[is_lower], row[is_lower], self.side)
             np.add.at(values, positions_of(of_blocks, keys), blocks[is_lower])
         del keys
-        matrix = csc_array((values, held.lower.indices, held.lower.indptr), held.lower.shape)
-        held.factor = held.analysis.factorize(matrix)
-        return self
-
-    def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
-        """Solve for the sum of right-hand sides, as `Interface.solve`."""
-        factor = self.held.factor
-        assert factor is not None
-        b = self.gather(parts)
-        if own is not None:
-            b += own
-        if not b.size:
-            return b, self.scatter(b), 0.0
-        x = factor.solve(b)
-        return x, self.scatter(x), inner(b, x)
+        lower = unknowns.lower
+        matrix = csc_array((values, lower.indices, lower.indptr), lower.shape)
+        return SparseFactor(self, unknowns.analysis.factorize(matrix))
 
     def rounding(
         self, sizes: Sequence[Array], own: Sequence[tuple[IntArray, Array]], diagonal: Array
@@ -193,7 +170,32 @@ class SparseInterface(Interface):
         """
         num_terms = float(len(sizes) + len(own))
         of_sums = gamma(num_terms + 8.0)
-        of_factor = self.held.analysis.backward_error(NonZeros.MOST)
+        of_factor = self.unknowns.analysis.backward_error(NonZeros.MOST)
         sums = self._row_sums(sizes, own, diagonal)
         error: Array = of_sums * sums + of_factor / (1.0 - of_sums) * diagonal
         return OUTWARD * error
+
+
+@dataclass(frozen=True, eq=False)
+class SparseFactor:
+    """A factor of the sum of one sparse interface."""
+
+    interface: SparseInterface
+    factor: CholeskyFactor
+
+    def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
+        """Solve as `InterfaceFactor.solve`."""
+        b = self.interface.gather(parts)
+        if own is not None:
+            b += own
+        if not b.size:
+            return b, self.interface.scatter(b), 0.0
+        x = self.factor.solve(b)
+        return x, self.interface.scatter(x), inner(b, x)
+
+
+def _keys(lower: csc_array) -> IntArray:
+    """Return the `entry_keys` of the entries of a pattern, column by column, ascending."""
+    side = lower.shape[1]
+    columns = np.repeat(np.arange(side), np.diff(lower.indptr))
+    return entry_keys(columns, lower.indices, side)

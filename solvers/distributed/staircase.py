@@ -21,6 +21,7 @@ from solvers.distributed.lower_bound import eliminate_S, prove_with_eta
 from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
 from solvers.distributed.robots import climbing
 from solvers.distributed.robots.records import Move
+from solvers.network.moments import Moment
 from solvers.result import Measurement, Status
 from solvers.riemannian.climb import ClimbEnding, DualBound, climb, staircase_status
 from solvers.riemannian.newton import Newton, newton_status
@@ -37,9 +38,10 @@ _SETTLED = 1e-2
 
 @dataclass(frozen=True)
 class SubstructuredStaircaseState:
-    """Figures of iterate k; the poses are with driver and robots."""
+    """Figures of iterate k; the poses are with driver and robots, which hold them at a moment."""
 
     k: int
+    moment: Moment
     newton: SubstructuredNewtonState  # at the current rank
     # the best that was proven so far; with multipliers where this process has the graph
     bound: DualBound | None = None
@@ -72,20 +74,22 @@ class SubstructuredStaircase:
         """State 0, at the poses that driver and robots hold."""
         if start is not None:
             return start
-        return SubstructuredStaircaseState(0, self._newton.init(driver, None))
+        return SubstructuredStaircaseState(0, driver.moment(), self._newton.init(driver, None))
 
     def step(
         self, driver: Driver, state: SubstructuredStaircaseState
     ) -> SubstructuredStaircaseState:
         """One step of Newton; at a stationary point the bound and, if that is loose, the climb."""
+        driver.return_to(state.moment)
         rank = driver.current.R.shape[1]
         figures = state.newton
         is_low = rank < driver.d + _LOW
         is_saddle = is_low and not figures.is_convex and figures.decrement <= _AT_SADDLE
         if is_saddle or newton_status(figures) is not None:
-            return self._climb(driver, replace(state, k=state.k + 1))
-        following = self._newton.step(driver, figures)
-        return replace(state, k=state.k + 1, newton=following)
+            following = self._climb(driver, state)
+        else:
+            following = replace(state, newton=self._newton.step(driver, figures))
+        return replace(following, k=state.k + 1, moment=driver.moment())
 
     def measure(self, driver: Driver, state: SubstructuredStaircaseState) -> Measurement:
         """F of the lifted poses, and the relative decrement."""

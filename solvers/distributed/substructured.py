@@ -1,7 +1,7 @@
 """SUBSTRUCTURED: the recursion of JOINT, with step (a) split by eliminating the robots' interiors.
 
-The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.soc` is
-the recursion to read.
+The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.joint`
+is the recursion to read.
 """
 
 import math
@@ -13,9 +13,12 @@ import numpy as np
 from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.rotations import Array, unstack_transposes
 from solvers.distributed.driver import Driver
+from solvers.distributed.interface import InterfaceFactor
 from solvers.distributed.robots.interior import Interior
-from solvers.distributed.robots.records import Agree, Reduced, RescaleInterior
+from solvers.distributed.robots.records import Agree, Reduced, RescaleInterior, RightHandSide
 from solvers.network.counted_pool import Count
+from solvers.network.moments import Moment
+from solvers.network.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.soc.copies import Norms, subsampled
 from solvers.soc.recursion_block import Agreement, RecursionBlock
@@ -28,10 +31,48 @@ ENOUGH_NORMS = 2**12
 
 @dataclass(frozen=True, eq=False)
 class SubstructuredState(SharedSteps):
-    """Figures of iterate k; its rows are with driver and robots, and a step replaces them."""
+    """Iterate k: the driver's rows; those of the interiors are with the robots.
 
-    # F at omega and the translations of step (a); nan where the step did not evaluate it.
+    Parameters
+    ----------
+    block : RecursionBlock
+        Rows of the rotations of the cover.
+    right : sequence of RightHandSide
+        The robots' reduced right-hand sides of the next step (a).
+    moment : Moment or None
+        When the robots hold their rows of the iterate.
+    factor : InterfaceFactor or None
+        Of the driver's matrix of step (a), for this rho. A checkpoint has neither moment nor
+        factor.
+    objective : float
+        F at omega and the translations of step (a); nan where the step did not evaluate it.
+    """
+
+    block: RecursionBlock
+    right: Sequence[RightHandSide]
+    moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
+    factor: InterfaceFactor | None = field(default=None, metadata=COMPUTED_AGAIN)
     objective: float = math.nan
+
+    @property
+    def x(self) -> Array:
+        """Solution of step (a) on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.x)
+
+    @property
+    def omega(self) -> Array:
+        """Rotations nearest to x + B on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.omega)
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of x = omega on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.B)
+
+    @property
+    def rho(self) -> Array:
+        """Penalty of every rotation of the cover, (g,)."""
+        return self.block.rho[:: self.block.omega.shape[1]]
 
 
 @dataclass(frozen=True)
@@ -50,29 +91,35 @@ class SubstructuredSOC:
 
         With `start` the run continues from that state, to which driver and robots were resumed.
         """
-        if start is not None:
-            # The driver needs the factor of step (a) again.
-            _take(driver, _block(driver), driver.ask(Interior.eliminated, None, Count.PIGGYBACKED))
-            return start
-        return self._penalized(driver, is_stationary=False)
+        if start is None:
+            state = self._penalized(driver, is_stationary=False)
+        else:
+            reduced = driver.ask(Interior.eliminated, None, Count.PIGGYBACKED)
+            state = replace(start, factor=_factorize(driver, start.block, reduced))
+        return replace(state, moment=driver.moment())
 
     def step(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """One round, step (a) by elimination, and one all-reduce, steps (b) and (c)."""
-        state = self._with_penalty_due(driver, state)
-        block, sums = _solve_a(driver)  # (a)
+        driver.return_to(state.moment)
+        state = self._with_due_penalty(driver, state)
+        block, sums = _solve_a(driver, state)  # (a) R-step
         merit = math.sqrt(sums[0])
         if not math.isfinite(merit):
-            return state.broken()
+            return replace(state.broken(), moment=driver.moment())
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
         agreement = Agreement(gamma, state.is_best(merit))
-        block, own_squares = block.extrapolated(agreement).projected()  # (b), (c)
-        orders = [Agree(agreement, z) for z in driver.scattered_rotations(block.z)]
+        block = block.extrapolated(agreement)  # s = x_ahead + B
+        block, own_squares = block.projected()  # (b) omega, (c) B = s - omega; as the robots do
+        orders = [Agree(agreement, part) for part in driver.scattered_rotations(block.omega)]
         answers = driver.ask_each(Interior.agree, orders, Count.ALL_REDUCE)
-        driver.block = block
-        driver.right_hand_sides = [answer.right for answer in answers]
         squares = own_squares + np.sum([answer.sums for answer in answers], axis=0)
-        objective = math.fsum(answer.measured for answer in answers)
-        return replace(state.after(merit, squares, state.size, anderson), objective=objective)
+        return replace(
+            state.after(merit, squares, state.size, anderson),
+            block=block,
+            right=[answer.right for answer in answers],
+            moment=driver.moment(),
+            objective=math.fsum(answer.measured for answer in answers),
+        )
 
     def measure(self, driver: Driver, state: SubstructuredState) -> Measurement:
         """F at omega and the translations of step (a), and the residuals."""
@@ -80,8 +127,9 @@ class SubstructuredSOC:
             return driver.measured(Measurement(np.nan, np.nan, np.nan))
         objective = state.objective
         if math.isnan(objective):
-            z = driver.scattered_rotations(_block(driver).z)
-            objective = math.fsum(driver.ask_each(Interior.cost, z, Count.OFF))
+            driver.return_to(state.moment)
+            parts = driver.scattered_rotations(state.block.omega)
+            objective = math.fsum(driver.ask_each(Interior.cost, parts, Count.OFF))
         return driver.measured(state.measurement(objective))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
@@ -89,14 +137,12 @@ class SubstructuredSOC:
 
         Both hold within the tolerance in the norm of rho.
         """
-        return self.soc.converged(state, measurement) or self.soc.stall_of(state)
+        return self.soc.status_at(measurement) or self.soc.stall_of(state)
 
-    def finish(self, driver: Driver) -> None:
+    def finish(self, driver: Driver, state: SubstructuredState) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""
-        z = _block(driver).z
-        driver.right_hand_sides = []
-        driver.current = replace(driver.current, R=unstack_transposes(z))
-        driver.set_translations(driver.ask_each(Interior.finish, driver.scattered_rotations(z)))
+        driver.return_to(state.moment)
+        _finish(driver, state)
 
     def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
         """State 0 at the poses that driver and robots hold: one round, for the penalties.
@@ -115,19 +161,25 @@ class SubstructuredSOC:
         order = self.soc.penalty_order(norms / scales, is_stationary)
         ratio = order.rho(norms, scales) / scales
         block = order.block(driver.current.R, Lambda, driver.diagonal[driver.rotation_rows])
-        _take(driver, block, driver.ask(Interior.penalize, order))
+        reduced = driver.ask(Interior.penalize, order)
         # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
         squared_size = driver.d * (step or 1) * float(ratio @ scales)
-        return SubstructuredState(ratio=ratio, size=math.sqrt(squared_size))
+        return SubstructuredState(
+            block=block,
+            right=[answer.right for answer in reduced],
+            factor=_factorize(driver, block, reduced),
+            ratio=ratio,
+            size=math.sqrt(squared_size),
+        )
 
-    def _with_penalty_due(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
-        """State with the penalty that the rule or the safeguard requires, see `solvers.soc.soc`."""
+    def _with_due_penalty(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
+        """State with the penalty that the rule or the safeguard asks for, see `Joint`."""
         due, factor = next_penalty(self.soc.penalty, state.ratio, state)
         if due is Due.RAISE:
             rescaled = self._rescaled(driver, state, factor, from_best=True)
             return replace(rescaled, raises=state.raises + 1)
         if due is Due.REFRESH:
-            self.finish(driver)
+            _finish(driver, state)
             fresh = self._penalized(driver, is_stationary=True)
             return fresh.in_place_of(state)
         if due is Due.RESCALE:
@@ -139,42 +191,47 @@ class SubstructuredSOC:
         self, driver: Driver, state: SubstructuredState, factor: float, from_best: bool
     ) -> SubstructuredState:
         """State with the penalty factor * rho and the same unscaled multiplier rho B."""
-        block = _block(driver)
-        if from_best:
-            block = block.back_at_best()
-        block = block.rescaled(factor * block.penalty)
-        _take(driver, block, driver.ask(Interior.rescale, RescaleInterior(factor, from_best)))
-        return state.rescaled(factor)
+        block = state.block.back_at_best() if from_best else state.block
+        block = block.rescaled(factor * block.rho)
+        order = RescaleInterior(factor, from_best)
+        reduced = driver.ask(Interior.rescale, order)
+        return replace(
+            state.rescaled(factor),
+            block=block,
+            right=[answer.right for answer in reduced],
+            factor=_factorize(driver, block, reduced),
+        )
 
 
-def _block(driver: Driver) -> RecursionBlock:
-    assert driver.block is not None
-    return driver.block
+def _finish(driver: Driver, state: SubstructuredState) -> None:
+    """Go from an iterate, which driver and robots hold, to its poses."""
+    driver.current = replace(driver.current, R=state.omega)
+    parts = driver.scattered_rotations(state.block.omega)
+    driver.set_translations(driver.ask_each(Interior.finish, parts))
 
 
-def _solve_a(driver: Driver) -> tuple[RecursionBlock, Array]:
+def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock, Array]:
     """Step (a): the driver's rows after it, and the sums over all parties."""
+    assert state.factor is not None
     rows = driver.rotation_rows
-    block = _block(driver)
-    interface = driver.interface(1, driver.d)
-    b = np.zeros((interface.side, driver.d))
-    b[rows] = (0.5 * block.penalty)[:, None] * block.shift
-    x, parts, _ = interface.solve([right.b for right in driver.right_hand_sides], b)
+    block = state.block
+    b = np.zeros((len(driver.diagonal), driver.d))
+    b[rows] = (0.5 * block.rho)[:, None] * block.shift
+    x, parts, _ = state.factor.solve([right.b for right in state.right], b)
     block, own_sums = block.after_solve(x[rows])
     sums_of_robots = driver.ask_each(Interior.solve, parts, is_along=True)
     return block, own_sums + np.sum(sums_of_robots, axis=0)
 
 
-def _take(driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]) -> None:
-    """Continue from a block, of whose penalty the robots have sent their eliminations.
+def _factorize(
+    driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]
+) -> InterfaceFactor:
+    """Factor the driver's matrix of step (a).
 
-    The driver factors its matrix of step (a): the sum of the robots' Schur complements, of rho / 2
-    on the rows of rotations, and of the grounding of pose 0.
+    It is the sum of the robots' Schur complements, of rho / 2 on the rows of rotations, and of the
+    grounding of pose 0.
     """
     rows = driver.rotation_rows[:, None]
-    half_penalty = (0.5 * block.penalty)[:, None, None]
+    half_penalty = (0.5 * block.rho)[:, None, None]
     own = [(rows, half_penalty), *driver.grounding_block()]
-    matrices = [answer.schur for answer in reduced]
-    driver.interface(1, driver.d).factorize(matrices, own)
-    driver.block = block
-    driver.right_hand_sides = [answer.right for answer in reduced]
+    return driver.interface(1, driver.d).factorize([answer.schur for answer in reduced], own)

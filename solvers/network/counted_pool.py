@@ -2,6 +2,7 @@
 
 import enum
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,11 +11,14 @@ from pgo_models.graphs.pose_graph import IntArray
 from solvers.network.engine import WorkerPool
 from solvers.network.faults import LossyChannel
 from solvers.network.ledger import BYTES_PER_NUMBER, DRIVER, Ledger, Traffic
-from solvers.network.messages import count_numbers, snapshot_bytes, take_snapshot
+from solvers.network.messages import count_numbers, restore, snapshot_bytes, take_snapshot
+from solvers.network.moments import Moments, obey_after
 from solvers.network.recovery import RecoveringPool
 
 Q = TypeVar("Q")
 A = TypeVar("A")
+# Orders about a whole worker with its moments; these are not told of any.
+_ABOUT_SNAPSHOTS = (take_snapshot, restore)
 
 
 class Count(enum.Enum):
@@ -42,6 +46,7 @@ class CountedPool:
         # Robots without a driver sum along a tree to its root: all of them, parents first, and the
         # parent of each.
         self.tree: tuple[IntArray, IntArray] | None = None
+        self.moments = Moments()
 
     def ask(
         self,
@@ -57,7 +62,7 @@ class CountedPool:
         other workers are counted when they are exchanged. If there is a tree of workers, requests
         with `is_along` go along it, and are counted there.
         """
-        answers = self.workers.ask(order, requests)
+        answers = self._obeyed(order, requests)
         self._count_snapshots(answers if order is take_snapshot else [])
         if count is Count.OFF:
             return answers
@@ -66,6 +71,15 @@ class CountedPool:
         self._count_exchange_with_driver(robots, asked, answers, count)
         if count in (Count.ALL_REDUCE, Count.GATHER):
             self.ledger = self.ledger.after_all_reduce(0)
+        return answers
+
+    def _obeyed(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
+        """Answers of all workers to an order, before which they are told of moments."""
+        recall = None if order in _ABOUT_SNAPSHOTS else self.moments.before_order()
+        if recall is None:
+            return self.workers.ask(order, requests)
+        answers = self.workers.ask(partial(obey_after, recall, order), requests)
+        self.moments.after_order()
         return answers
 
     def _count_exchange_with_driver(

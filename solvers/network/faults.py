@@ -1,5 +1,6 @@
 """Faults between robots, for study: messages lost, messages late, and a robot that is silent."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
@@ -122,6 +123,14 @@ class LossyChannel(Generic[T]):
         self._under_way: list[_Letter[T]] = []
         # Round in which the newest message that has arrived was sent, by link.
         self._newest: dict[Link, int] = {}
+
+    def copy(self) -> "LossyChannel[T]":
+        """Return a channel with the same messages under way and the same faults to come."""
+        other = copy.copy(self)
+        other._rng = copy.deepcopy(self._rng)
+        other._under_way = [*self._under_way]
+        other._newest = {**self._newest}
+        return other
 
     def carry(self, messages: Mapping[Link, T]) -> dict[Link, T]:
         """Carry out one round: take what is sent in it, by link, and return what arrives in it."""

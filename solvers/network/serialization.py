@@ -13,6 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TREE = "tree"
+# Numbers and arrays by the identity of the arrays: one that a record has twice is stored once.
+_Arrays = dict[int, tuple[int, NDArray[Any]]]
+# Metadata of a field that is left out, and takes its default: what it holds is computed again.
+COMPUTED_AGAIN = {"is_computed_again": True}
 
 
 def serialize(value: object) -> dict[str, NDArray[Any]]:
@@ -22,9 +26,9 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
     of such, or a mapping of strings or integers to such; a sequence comes back as a tuple. Raises a
     TypeError if it contains anything else.
     """
-    arrays: list[NDArray[Any]] = []
+    arrays: _Arrays = {}
     tree = json.dumps(_describe(value, arrays))
-    numbered = {str(number): array for number, array in enumerate(arrays)}
+    numbered = {str(number): array.copy() for number, array in arrays.values()}
     return {_TREE: np.array(tree), **numbered}
 
 
@@ -41,19 +45,23 @@ def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> 
         raise ValueError(f"arrays that were not serialized here: {error!r}") from error
 
 
-def _describe(value: object, arrays: list[NDArray[Any]]) -> object:
-    """Describe a value as JSON; its arrays are appended to `arrays`."""
+def _describe(value: object, arrays: _Arrays) -> object:
+    """Describe a value as JSON; its arrays are put into `arrays`."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray):
-        arrays.append(value.copy())
-        return {"array": len(arrays) - 1}
+        number, _ = arrays.setdefault(id(value), (len(arrays), value))
+        return {"array": number}
     if isinstance(value, enum.Enum):
         return {"enum": type(value).__name__, "member": value.name}
     if dataclasses.is_dataclass(value):
-        names = [field.name for field in dataclasses.fields(value)]
+        names = [
+            field.name
+            for field in dataclasses.fields(value)
+            if not field.metadata.get("is_computed_again")
+        ]
         fields = {name: _describe(getattr(value, name), arrays) for name in names}
         return {"class": type(value).__name__, "fields": fields}
     if isinstance(value, Mapping):

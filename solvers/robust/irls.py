@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -111,7 +112,7 @@ class IRLS:
         """Weights for the current residuals, and steps towards the minimum with them."""
         weights = np.sqrt(state.thresholds / np.maximum(state.costs, state.thresholds))
         weighted = PGOProblem(problem.graph, problem.backend, problem.weights.scaled(weights))
-        method = self.inner
+        method: Any = self.inner  # either has states of its own
         inner = method.init(weighted, state.poses)
         for _ in range(self.inner_steps):
             inner = method.step(weighted, inner)

@@ -1,13 +1,23 @@
 """CONSENSUS: SOC by robots that hold copies, and send each other rows of the poses they share.
 
-`solvers.soc.consensus_robot` is what one robot does. `Consensus` calls the robots in turn and
-decides what follows from sums over them. The robots may be in one process (`LocalRobots`) or on a
-network (`solvers.distributed.consensus`).
+A robot a holds its own poses and copies of its neighbours' separators; an edge between two robots
+counts half with each. f_a is the cost of the robot's edges, and omega, on which all copies of a
+pose agree, is the rotations and the separators' translations. A copy has an equal share of the
+penalty rho of its pose. One iteration is that of `solvers.soc.joint`, robot by robot:
+
+    (a) R-step      x_a   = argmin_x  f_a(x) + 1/2 ||x - omega + B_a||_rho^2
+    (b) projection  omega = the rotations nearest to the mean over the copies of x_a + B_a
+    (c) Bregman     B_a   = B_a + x_a - omega
+
+Only (b) needs the neighbours: the robots send each other s_a = x_a + B_a on the poses that both
+hold. Translations of separators take their mean in (b). `ConsensusRobot.step` is the iteration on
+one robot. `Consensus.step` calls the robots and decides what follows from sums over them. They may
+be in one process (`LocalRobots`) or on a network (`solvers.distributed.consensus`).
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -17,7 +27,10 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import relative_length
 from solvers.network.counted_pool import Count, by_link, delivered
-from solvers.result import Measurement
+from solvers.network.moments import Moment
+from solvers.network.serialization import COMPUTED_AGAIN
+from solvers.result import Measurement, Status
+from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import (
     CopiesState,
@@ -66,7 +79,9 @@ def ask_all(robots: Robots, order: Order[Q, A], request: Q, count: Count) -> lis
 
 @dataclass(frozen=True, eq=False)
 class ConsensusState(SharedSteps):
-    """Iterate k: the sums that all robots know; x, z and B are with the robots.
+    """Iterate k: the sums that all robots know, and the robots, who have x, omega, B and rho.
+
+    In one process the state shows these of all poses.
 
     Parameters
     ----------
@@ -82,6 +97,10 @@ class ConsensusState(SharedSteps):
         Sums of the next step (a), unless the penalties change before.
     rows : sequence of Rows
         Rows of the next step (a), as their receivers have them.
+    robots : tuple of ConsensusRobot
+        The robots with their rows, in one process.
+    moment : Moment or None
+        When the robots hold their rows of the iterate, on a network.
     """
 
     separators: SeparatorPenalty
@@ -90,6 +109,28 @@ class ConsensusState(SharedSteps):
     rotation_square: float
     ahead: Array | None = None
     rows: Sequence[Rows] = ()
+    robots: tuple[ConsensusRobot, ...] = ()
+    moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
+
+    @property
+    def x(self) -> Array:
+        """Solution of step (a), of the robots that own the poses, (n, d, d)."""
+        return _owned([robot.x for robot in self.robots], self.robots)
+
+    @property
+    def omega(self) -> Array:
+        """Rotations agreed on, (n, d, d)."""
+        return owned_rotations(self.robots)
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of x = omega, of the robots that own the poses, (n, d, d)."""
+        return _owned([robot.B for robot in self.robots], self.robots)
+
+    @property
+    def rho(self) -> Array:
+        """Penalty of every rotation, shared equally among its copies, (n,)."""
+        return _owned([robot.state.rho for robot in self.robots], self.robots)
 
 
 @dataclass(frozen=True)
@@ -127,23 +168,20 @@ class Consensus:
         return _first_state(separators, replies)
 
     def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """Make one exchange: (b) and (c) on every robot, and (a) of the next step."""
-        with_penalty = state
-        if self.rotations is Rotations.PROJECTED:
-            with_penalty = self._with_due_penalty(robots, state)
+        """Make one iteration, with one exchange; (a) was done at the end of the last one."""
+        with_penalty = self._with_due_penalty(robots, state)
         if with_penalty is not state or state.ahead is None:
-            solved = ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE)  # (a)
+            solved = ask_all(robots, ConsensusRobot.solve, None, Count.ALL_REDUCE)  # (a) R-step
             state = _with_solution(robots, with_penalty, solved)
         assert state.ahead is not None
         merit = math.sqrt(state.ahead[0])
         if not math.isfinite(merit):
             return state.broken()
-        is_per_robot = self.soc.step_settings.alone is not None
-        acceleration = None if is_per_robot else self.soc.acceleration
-        gamma, anderson = state.sums.coefficients(acceleration, state.ahead)
+        gamma, anderson = state.sums.coefficients(self._common_acceleration, state.ahead)
         agreement = Agreement(gamma, state.is_best(merit))
         orders = [(agreement, rows) for rows in state.rows]
-        answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)  # (b), (c)
+        # (b) projection and (c) Bregman update, and (a) of the next iteration
+        answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)
         squares = np.sum([answer.squares for answer in answers], axis=0)
         stationarities = [answer.stationarity for answer in answers]
         objective, gradient = objective_and_gradient(stationarities, state.rotation_square)
@@ -151,7 +189,7 @@ class Consensus:
         following = replace(following, objective=objective, gradient=gradient)
         return _with_solution(robots, following, [answer.solved for answer in answers])
 
-    def measurement(self, state: ConsensusState) -> Measurement:
+    def measure(self, state: ConsensusState) -> Measurement:
         """F at the poses that the robots hold, and the residuals.
 
         The dual residual is the relative gradient of F. Where rotations are relaxed or fixed F is
@@ -163,8 +201,23 @@ class Consensus:
         dual_residual = state.gradient if is_projected else state.dual_residual
         return Measurement(state.objective, state.primal_residual, dual_residual)
 
+    def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
+        """CONVERGED when both residuals of `measure` are within tolerance."""
+        return self.soc.status_at(measurement)
+
+    @property
+    def _common_acceleration(self) -> Anderson | None:
+        """Settings of an acceleration that sums over all robots, if there is one."""
+        acceleration = self.soc.acceleration
+        return None if acceleration is None or acceleration.per_robot else acceleration
+
     def _with_due_penalty(self, robots: Robots, state: ConsensusState) -> ConsensusState:
-        """State with the penalty that the rule or the safeguard asks for; usually unchanged."""
+        """State with the penalty that the rule or the safeguard asks for; usually unchanged.
+
+        The relaxations of the start keep their penalties.
+        """
+        if self.rotations is not Rotations.PROJECTED:
+            return state
         due, factor = next_penalty(self.soc.penalty, state.ratio, state)
         if due is Due.RAISE:
             rescaled = self._rescaled(robots, state, factor, from_best=True)
@@ -292,36 +345,13 @@ class LocalRobots:
         return delivered(by_link(sent), self.num_robots)
 
 
-@dataclass(frozen=True, eq=False)
-class ConsensusIterate:
-    """Iterate k of CONSENSUS in one process."""
-
-    shared: ConsensusState  # what all robots know
-    robots: tuple[ConsensusRobot, ...]  # their copies: `robots[a].block` has x, z, s and B
-
-    @property
-    def k(self) -> int:
-        """Number of the iterate."""
-        return self.shared.k
-
-    @property
-    def omega(self) -> Array:
-        """Rotations agreed on, (n, d, d)."""
-        return owned_rotations(self.robots)
-
-    @property
-    def rho(self) -> Array:
-        """Penalty of every rotation, (n,)."""
-        return _owned([robot.state.rho for robot in self.robots], self.robots)
-
-
 @dataclass(frozen=True)
 class LocalConsensus:
     """CONSENSUS in one process, robot by robot; `soc` has the settings."""
 
     soc: SOCSettings
 
-    def init(self, problem: PGOProblem, start: Poses) -> ConsensusIterate:
+    def init(self, problem: PGOProblem, start: Poses) -> ConsensusState:
         """State 0: omega = the rotations of `start`."""
         assert self.soc.robots is not None
         problem.stacked(start)  # raises unless the poses fit
@@ -330,22 +360,26 @@ class LocalConsensus:
             layout = CopyLayout(subgraph, problem.backend, self.soc.r_step)
             robots.append(ConsensusRobot(layout, CopiesState()))
         local = LocalRobots(problem, tuple(robots), start)
-        shared = Consensus(self.soc).init(local)
-        return ConsensusIterate(shared, local.robots)
+        state = Consensus(self.soc).init(local)
+        return replace(state, robots=local.robots)
 
-    def step(self, problem: PGOProblem, state: ConsensusIterate) -> ConsensusIterate:
+    def step(self, problem: PGOProblem, state: ConsensusState) -> ConsensusState:
         """One iteration: (a), (b), (c)."""
         local = LocalRobots(problem, state.robots)
-        shared = Consensus(self.soc).step(local, state.shared)
-        return ConsensusIterate(shared, local.robots)
+        following = Consensus(self.soc).step(local, state)
+        return replace(following, robots=local.robots)
 
-    def measure(self, problem: PGOProblem, state: ConsensusIterate) -> Measurement:
-        """As of `Consensus.measurement`."""
-        return Consensus(self.soc).measurement(state.shared)
+    def measure(self, problem: PGOProblem, state: ConsensusState) -> Measurement:
+        """As of `Consensus.measure`."""
+        return Consensus(self.soc).measure(state)
 
-    def poses(self, problem: PGOProblem, state: ConsensusIterate) -> Poses:
+    def poses(self, problem: PGOProblem, state: ConsensusState) -> Poses:
         """Omega, and the translations that the robots hold."""
         return Poses(state.omega, _owned([robot.poses.t for robot in state.robots], state.robots))
+
+    def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
+        """CONVERGED when primal residual and relative gradient are within tolerance."""
+        return Consensus(self.soc).converged(state, measurement)
 
 
 def owned_rotations(robots: Sequence[ConsensusRobot]) -> Array:

@@ -140,20 +140,25 @@ class ConsensusRobot:
         rho = np.where(layout.subgraph.copies > 1, np.maximum(state.rho, floor), state.rho)
         if state.settings.rotations is Rotations.RELAXED:
             rho = np.where(layout.subgraph.poses == 0, np.maximum(rho, self._scale), rho)
-        penalty = self._penalty(rho, separators.translation)
+        rho_of_rows = self._rho_of_rows(rho, separators.translation)
         # B makes every subproblem stationary: it balances the difference between the robot's force
         # and the mean force. Its mean over the copies is the multiplier of the constraint.
         mean_B_of_rotations = (state.pull / rho[:, None]).reshape(d * n, d)
         mean_B = np.concatenate([np.zeros((n, d)), mean_B_of_rotations])
         excess_force = state.force - state.total_force / layout.copies
-        balanced_B = excess_force / np.where(held[:, 0], penalty, 1.0)[:, None]
-        z = np.where(held, state.X, 0.0)
+        balanced_B = excess_force / np.where(held[:, 0], rho_of_rows, 1.0)[:, None]
+        omega = np.where(held, state.X, 0.0)
         B = np.where(held, balanced_B + mean_B, 0.0)
         diagonal_of_M = np.concatenate([state.diagonal[:, 0], state.diagonal[:, 1:].ravel()])
         share_of_diagonal = diagonal_of_M / layout.copies[:, 0]
-        block = block_at(z, penalty, share_of_diagonal, state.settings, B)
+        block = block_at(omega, rho_of_rows, share_of_diagonal, state.settings, B)
         following = self._with(
-            rho=rho, block=block, origin=(z, block.s), sums=AndersonSums(), received={}, ahead=None
+            rho=rho,
+            block=block,
+            origin=(omega, block.s),
+            sums=AndersonSums(),
+            received={},
+            ahead=None,
         )
         rotations = float(rotation_squares(layout.whole)[own].sum())
         stationarity = replace(following.stationarity(None)[1], rotations=rotations)
@@ -169,8 +174,9 @@ class ConsensusRobot:
         Where robots accelerate alone the rows are extrapolated already, and of the sums only the
         merit is returned.
         """
-        X, z, _B, drift = self._solved_after_local_passes()
-        block, sums = self.block.after_solve(np.where(self.layout.held, X, 0.0), z, drift)
+        X, omega, _B, drift = self._solved_after_local_passes()
+        x = np.where(self.layout.held, X, 0.0)
+        block, sums = self.block.after_solve(x, omega, drift)
         alone = block.settings.alone
         own_sums = self.state.sums
         s = block.anderson.image
@@ -186,12 +192,24 @@ class ConsensusRobot:
         return self._with(ahead=(X, block, own_sums)), copies.SolveReply(sums, rows)
 
     def step(self, order: tuple[Agreement, copies.Rows]) -> tuple[ConsensusRobot, copies.StepReply]:
-        """Steps (b) and (c) with the neighbours' rows, and step (a) of the next iteration.
-
-        Own rows and the neighbours' are extrapolated first. A neighbour extrapolates its rows with
-        the same coefficients, so that nobody waits for them a second time.
-        """
+        """One iteration: (b) and (c) with the neighbours' rows, and (a) of the next one."""
         agreement, images = order
+        ahead, rows = self._accelerated(agreement, images)  # s = x_ahead + B, here and there
+        omega = ahead._agreed_omega(rows)  # (b) projection, of the mean over the copies
+        block, squares = ahead.block.agreed(omega)  # (c) Bregman update, B = s - omega
+        robot = ahead._with(block=block)
+        following, reply_of_solve = robot.solve(None)  # (a) R-step
+        stationarity = robot.stationarity(None)[1]
+        return following, copies.StepReply(squares, stationarity, reply_of_solve)
+
+    def _accelerated(
+        self, agreement: Agreement, images: copies.Rows
+    ) -> tuple[ConsensusRobot, copies.Rows]:
+        """Take the step (a) that was done ahead; extrapolate its s, and the neighbours' rows of s.
+
+        A neighbour extrapolates its rows with the same coefficients, so that nobody waits for them
+        a second time.
+        """
         before = self.block
         assert self.state.ahead is not None
         X, block, own_sums = self.state.ahead
@@ -207,11 +225,7 @@ class ConsensusRobot:
             share = self.state.received.get(robot, AndersonShare())
             share = share.after(np.zeros((0, 0)), image, memory)
             rows[robot], received[robot] = share.extrapolated(agreement.gamma)
-        moved = self._with(X=X, block=block, sums=own_sums, received=received)
-        block, squares = block.agreed(moved._mean(rows))  # (b), (c)
-        moved = moved._with(block=block)
-        following, reply_of_solve = moved.solve(None)  # (a)
-        return following, copies.StepReply(squares, moved.stationarity(None)[1], reply_of_solve)
+        return self._with(X=X, block=block, sums=own_sums, received=received), rows
 
     def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
         """Send the robot's rows to every neighbour, before the first turn."""
@@ -222,21 +236,23 @@ class ConsensusRobot:
         """Make one turn, (b), (c) and (a), with the newest rows that have arrived, damped.
 
         s <- s + damping (T(s) - s) with T the map of the synchronous recursion, and the neighbours'
-        rows as old as they are: an asynchronous fixed-point iteration (Peng et al. 2016). B = s - z
-        is never summed up, so nothing drifts. The answer has rows for every neighbour.
+        rows as old as they are: an asynchronous fixed-point iteration (Peng et al. 2016). The
+        answer has rows for every neighbour.
         """
         before = self.block
         waiting = self.state.waiting
         assert waiting is not None
         waiting = waiting.with_rows(rows)
         has_all = len(waiting.newest) == len(self.layout.common)
-        block = replace(before, z=self._mean(waiting.newest)) if has_all else before
-        X, z, B, _ = self._with(block=block)._solved_after_local_passes()
+        block = before
+        if has_all:
+            block = replace(before, omega=self._agreed_omega(waiting.newest))  # (b), (c)
+        X, omega, B, _ = self._with(block=block)._solved_after_local_passes()  # (a)
         alpha = 1.0 + waiting.excess * (waiting.settings.alpha - 1.0)
-        change = over_relax(np.where(self.layout.held, X, 0.0), z, alpha) + B - block.s
-        weight = np.sqrt(block.penalty)[:, None]
+        change = over_relax(np.where(self.layout.held, X, 0.0), omega, alpha) + B - block.s
+        weight = np.sqrt(block.rho)[:, None]
         primal = weight * change
-        dual = weight * (block.z - before.z)
+        dual = weight * (block.omega - before.omega)
         sums = np.array([inner(primal, primal), inner(dual, dual)])
         block = replace(block, s=block.s + waiting.settings.damping * change)
         waiting = waiting.after(math.sqrt(sums[0]))
@@ -253,10 +269,10 @@ class ConsensusRobot:
         assert self.state.origin is not None
         separators = self.layout.separators
         block = self.block
-        z_first, s_first = self.state.origin
-        moved = (block.z - z_first)[separators]
-        change_of_B = (block.B - s_first + z_first)[separators]
-        pulled = block.penalty[separators, None] * change_of_B
+        first_omega, first_s = self.state.origin
+        moved = (block.omega - first_omega)[separators]
+        change_of_B = (block.B - first_s + first_omega)[separators]
+        pulled = block.rho[separators, None] * change_of_B
         return self, travel(moved, pulled, block.diagonal[separators])
 
     def back_at_best(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
@@ -265,9 +281,11 @@ class ConsensusRobot:
 
     def rescale(self, order: copies.RescaleCopies) -> tuple[ConsensusRobot, None]:
         """Multiply rho and keep rho B; agree first on what was sent, if all are at their best."""
-        block = self.block if order.rows is None else replace(self.block, z=self._mean(order.rows))
+        block = self.block
+        if order.rows is not None:
+            block = replace(block, omega=self._agreed_omega(order.rows))
         rho = order.factor * self.state.rho
-        block = block.rescaled(self._penalty(rho, order.translation))
+        block = block.rescaled(self._rho_of_rows(rho, order.translation))
         following = self._with(rho=rho, block=block, sums=AndersonSums(), received={}, ahead=None)
         return following._prepared(), None
 
@@ -282,13 +300,23 @@ class ConsensusRobot:
     @property
     def omega(self) -> Array:
         """Rotations of the robot's poses, (n_a, d, d); a relaxation is projected to them."""
-        R = unstack_transposes(self.block.z[self.layout.problem.num_poses :])
+        R = unstack_transposes(self.block.omega[self.layout.problem.num_poses :])
         return project_to_rotations(R) if self.block.settings.rotations is Rotations.RELAXED else R
+
+    @property
+    def x(self) -> Array:
+        """Solution of the last step (a), (n_a, d, d)."""
+        return unstack_transposes(self.block.x[self.layout.problem.num_poses :])
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of x = omega, (n_a, d, d)."""
+        return unstack_transposes(self.block.B[self.layout.problem.num_poses :])
 
     @property
     def poses(self) -> Poses:
         """The robot's poses, (n_a): omega and the current translations."""
-        X = np.where(self.layout.held, self.block.z, self.state.X)
+        X = np.where(self.layout.held, self.block.omega, self.state.X)
         return Poses(self.omega, X[: self.layout.problem.num_poses])
 
     def own_poses(self, _: None) -> tuple[ConsensusRobot, copies.OwnPoses]:
@@ -347,38 +375,38 @@ class ConsensusRobot:
         """m_i, the mean diagonal of M over the rotation rows of pose i, (n_a,)."""
         return np.asarray(self.state.diagonal[:, 1:].mean(axis=1))
 
-    def _penalty(self, rho: Array, translation: float) -> Array:
-        """The robot's shares of the penalties of its rows, (rows,)."""
+    def _rho_of_rows(self, rho: Array, translation: float) -> Array:
+        """The robot's shares of the penalties of its rows, (rows,), with rho of all poses."""
         of_translations = translation * self.state.diagonal[:, 0]
         of_rotations = np.repeat(rho, self.layout.problem.d)
         whole = np.concatenate([of_translations, of_rotations])
         return np.where(self.layout.held[:, 0], whole / self.layout.copies[:, 0], 0.0)
 
     def _prepared(self) -> ConsensusRobot:
-        subproblem = self.layout.subproblem(self.block.penalty)
+        subproblem = self.layout.subproblem(self.block.rho)
         return replace(self, step_a=prepare(subproblem, self.layout.r_step))
 
     def _solved_after_local_passes(self) -> tuple[Array, Array, Array, Array | float]:
-        """X of step (a), with z, B and the change of z + B in the local passes before it.
+        """X of step (a), with omega, B and the change of their sum in the local passes before it.
 
         A local pass does (a) to (c) on the poses that no other robot holds.
         """
         assert self.step_a is not None
         block = self.block
         private = self.layout.private
-        z = block.z.copy()
+        omega = block.omega.copy()
         B = block.B
         drift = np.zeros((1, 1))
         passes = block.settings.local_passes - 1
         if passes and private.any() and block.is_finite:
             for _ in range(passes):
-                s = (self.step_a.solve(z - B) + B)[private]  # (a)
-                z[private] = nearest_rotations(s)  # (b)
-                B[private] = s - z[private]  # (c)
-            drift = z + B - block.s
-        return self.step_a.solve(z - B), z, B, drift
+                s = (self.step_a.solve(omega - B) + B)[private]  # (a)
+                omega[private] = nearest_rotations(s)  # (b)
+                B[private] = s - omega[private]  # (c)
+            drift = omega + B - block.s
+        return self.step_a.solve(omega - B), omega, B, drift
 
-    def _mean(self, received: copies.Rows) -> Array:
+    def _agreed_omega(self, received: copies.Rows) -> Array:
         """Step (b): omega and the mean translations, from s and the neighbours' rows.
 
         The rows are summed in the order of the robots, so that all get the same bits.
@@ -390,12 +418,12 @@ class ConsensusRobot:
         for robot in sorted(parts):
             total[self.layout.common.get(robot, slice(None))] += parts[robot]
         mean = total / self.layout.copies
-        z = np.where(self.layout.held, mean, 0.0)
+        omega = np.where(self.layout.held, mean, 0.0)
         if block.settings.rotations is Rotations.PROJECTED:
-            z[n:] = nearest_rotations(mean[n:])
+            omega[n:] = nearest_rotations(mean[n:])
         else:
             is_relaxed = block.settings.rotations is Rotations.RELAXED
             fixed = np.flatnonzero(self.layout.subgraph.poses == 0) if is_relaxed else np.arange(n)
             rotation_rows = self.layout.rows(fixed)[len(fixed) :]
-            z[rotation_rows] = block.z[rotation_rows]
-        return z
+            omega[rotation_rows] = block.omega[rotation_rows]
+        return omega

@@ -279,7 +279,7 @@ class CopiesState:
     block : RecursionBlock or None
         The robot's rows of the recursion.
     origin : pair of (rows, d) arrays or None
-        z and s when the penalties were set.
+        omega and s when the penalties were set.
     sums : AndersonSums
         Of a robot that accelerates alone.
     received : mapping from robots to AndersonShare

@@ -1,7 +1,7 @@
 """The recursion of many robots: the rows of it that one party answers for, from (a) to (c).
 
 The party is a robot that holds copies (CONSENSUS), or a robot's interior or the driver's cover
-(SUBSTRUCTURED). Steps (a), (b) and (c) are those of `solvers.soc.soc`, written for rows of the
+(SUBSTRUCTURED). Steps (a), (b) and (c) are those of `solvers.soc.joint`, written for rows of the
 stacked rotations. The parties need of each other the rows that they agree on in (b), and sums of
 squares and of products for the acceleration.
 """
@@ -55,18 +55,19 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class RecursionBlock:
-    """Rows of the recursion: the rows of every R_i^T, and of separator translations.
+    """Rows of x, omega, B and rho: the rows of every R_i^T, and of separator translations.
 
     Parameters
     ----------
-    penalty : (rows,) array
-        rho of every row; zero for rows that have no part in the iterates.
+    rho : (rows,) array
+        Penalty of every row; zero for rows that have no part in the iterates.
     diagonal : (rows,) array
         Diagonal of M on these rows.
-    z : (rows, d) array
-        What the parties have agreed on: omega, and the translations of separators.
+    omega : (rows, d) array
+        What the parties have agreed on: rotations, and the translations of separators.
     s : (rows, d) array
-        x + B before the projection, extrapolated: the variable of the fixed-point map.
+        omega + B, the variable of the fixed-point map, which is accelerated; what (b) is applied
+        to. B itself is not summed up from step to step, so that nothing drifts.
     x : (rows, d) array
         Solution of the last step (a).
     best : (rows, d) array
@@ -77,9 +78,9 @@ class RecursionBlock:
         Rows of what the acceleration remembers.
     """
 
-    penalty: Array
+    rho: Array
     diagonal: Array
-    z: Array
+    omega: Array
     s: Array
     x: Array
     best: Array
@@ -89,12 +90,12 @@ class RecursionBlock:
     @property
     def B(self) -> Array:
         """Scaled multiplier (Bregman variable), (rows, d)."""
-        return self.s - self.z
+        return self.s - self.omega
 
     @property
     def shift(self) -> Array:
         """Omega - B, (rows, d), towards which step (a) pulls x."""
-        return 2.0 * self.z - self.s
+        return 2.0 * self.omega - self.s
 
     @property
     def is_finite(self) -> bool:
@@ -102,16 +103,16 @@ class RecursionBlock:
         return bool(np.isfinite(self.s).all())
 
     def after_solve(
-        self, x: Array, z: Array | None = None, drift: Array | float = 0.0
+        self, x: Array, omega: Array | None = None, drift: Array | float = 0.0
     ) -> tuple[RecursionBlock, Array]:
         """Block with the x of step (a), (rows, d), and this party's sums for the acceleration.
 
-        After local passes, `z` is the one that they led to and `drift` their change of z + B, both
-        (rows, d).
+        After local passes, `omega` is the one that they led to and `drift` their change of omega +
+        B, both (rows, d).
         """
-        z = self.z if z is None else z
-        step = over_relax(x, z, self.settings.alpha) - z + drift
-        residual = np.sqrt(self.penalty)[:, None] * step
+        omega = self.omega if omega is None else omega
+        step = over_relax(x, omega, self.settings.alpha) - omega + drift
+        residual = np.sqrt(self.rho)[:, None] * step
         sums, anderson = self.anderson.observe(residual, self.s + step, self.settings.memory)
         return replace(self, x=x, anderson=anderson), sums
 
@@ -121,36 +122,36 @@ class RecursionBlock:
         best = self.s if agreement.is_best else self.best
         return replace(self, s=s, best=best, anderson=anderson)
 
-    def agreed(self, z: Array) -> tuple[RecursionBlock, Array]:
-        """Block after step (b), which gives z, and (c), B = s - z = B + x - z.
+    def agreed(self, omega: Array) -> tuple[RecursionBlock, Array]:
+        """Block after step (b), which gives omega, and (c), B = s - omega = B + x - omega.
 
         The sums, (2,), are this party's part of the squared residuals (`squared_residuals`).
         """
-        stiffness = np.maximum(1.0, self.penalty / self.diagonal)[:, None]
-        squares = squared_residuals(self.x, z, self.z, self.penalty[:, None], stiffness)
-        return replace(self, z=z), squares
+        stiffness = np.maximum(1.0, self.rho / self.diagonal)[:, None]
+        squares = squared_residuals(self.x, omega, self.omega, self.rho[:, None], stiffness)
+        return replace(self, omega=omega), squares
 
     def projected(self) -> tuple[RecursionBlock, Array]:
         """Block after (b) and (c), where all rows are rotations that no other party holds."""
         return self.agreed(nearest_rotations(self.s) if self.is_finite else self.s)
 
-    def rescaled(self, penalty: Array) -> RecursionBlock:
+    def rescaled(self, rho: Array) -> RecursionBlock:
         """Block with another penalty and the same unscaled multiplier rho B."""
-        ratio = np.divide(self.penalty, penalty, out=np.ones_like(penalty), where=penalty > 0)
-        s = self.z + ratio[:, None] * self.B
-        return replace(self, penalty=penalty, s=s, anderson=AndersonShare())
+        ratio = np.divide(self.rho, rho, out=np.ones_like(rho), where=rho > 0)
+        s = self.omega + ratio[:, None] * self.B
+        return replace(self, rho=rho, s=s, anderson=AndersonShare())
 
     def back_at_best(self) -> RecursionBlock:
         """Block at the s of the smallest merit."""
-        return replace(self, s=self.best, z=nearest_rotations(self.best))
+        return replace(self, s=self.best, omega=nearest_rotations(self.best))
 
 
 def block_at(
-    z: Array, rho: Array, diagonal: Array, settings: StepSettings, B: Array | float = 0.0
+    omega: Array, rho: Array, diagonal: Array, settings: StepSettings, B: Array | float = 0.0
 ) -> RecursionBlock:
-    """Block of parties that agree on z, (rows, d), with the multipliers B."""
-    s = z + B
-    return RecursionBlock(rho, diagonal, z, s, z, s, settings)
+    """Block of parties that agree on omega, (rows, d), with the multipliers B."""
+    s = omega + B
+    return RecursionBlock(rho, diagonal, omega, s, omega, s, settings)
 
 
 def nearest_rotations(rows: Array) -> Array:
@@ -159,14 +160,14 @@ def nearest_rotations(rows: Array) -> Array:
 
 
 def squared_residuals(
-    x: Array, omega: Array, omega_before: Array, penalty: Array, stiffness: Array
+    x: Array, omega: Array, omega_before: Array, rho: Array, stiffness: Array
 ) -> Array:
     """Squares of the primal and the dual residual, (2,), times ||omega||_rho^2.
 
-    The residuals are those of `solvers.soc.safeguard.Steps`. `penalty`, rho, and `stiffness`,
-    max(1, rho / diagonal of M), are broadcast against the other arrays.
+    The residuals are those of `solvers.soc.safeguard.Steps`. rho and `stiffness`, max(1, rho /
+    diagonal of M), are broadcast against the other arrays.
     """
-    weight = np.sqrt(penalty)
+    weight = np.sqrt(rho)
     primal = weight * (x - omega)
     change = stiffness * (weight * (omega - omega_before))
     taken_back = (stiffness - 1.0) * primal

@@ -79,7 +79,7 @@ class SOCSettings:
         """Whether more than one robot holds copies."""
         return self.effective_coupling is Coupling.CONSENSUS and self._has_many_robots
 
-    def converged(self, state: object, measurement: Measurement) -> Status | None:
+    def status_at(self, measurement: Measurement) -> Status | None:
         """CONVERGED when both residuals are within tolerance."""
         worst = max(measurement.primal_residual, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None

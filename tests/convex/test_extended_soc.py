@@ -26,10 +26,11 @@ from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import Run, Status
 from solvers.robust.gnc import GNC
+from solvers.soc.joint import SOCState
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, SOCState
+from solvers.soc.soc import SOC
 
 N = 7
 D = 2

@@ -88,17 +88,17 @@ def test_without_faults_the_states_are_those_of_the_plain_recursion(
     for _ in range(10):
         before = central
         central = here.step(problem, before)
-        if central.shared.raises:  # the safeguards of the two are not the same
+        if central.raises:  # the safeguards of the two are not the same
             return
         state = method.step(driver, state)
         # s goes the damped way of a plain step; omega is that of the s before.
-        expected = central.shared.merits[-1] / central.shared.size
+        expected = central.merits[-1] / central.size
         assert state.primal_residual == pytest.approx(expected, rel=1e-6, abs=1e-9)
         for old, new, agent in zip(before.robots, central.robots, engine.agents, strict=True):
             mine = agent.copies
             assert mine is not None
             allowed = 1e-8 * (1 + np.abs(new.block.s).max())
-            np.testing.assert_allclose(mine.block.z, old.block.z, rtol=0, atol=allowed)
+            np.testing.assert_allclose(mine.block.omega, old.block.omega, rtol=0, atol=allowed)
             way = old.block.s + damping * (new.block.s - old.block.s)
             np.testing.assert_allclose(mine.block.s, way, rtol=0, atol=allowed)
         if damping != 1.0:

@@ -1,4 +1,4 @@
-"""CONSENSUS by robots with copies takes the steps of `solvers.soc.soc` in one process."""
+"""CONSENSUS by robots with copies takes the steps of `solvers.soc.consensus` in one process."""
 
 from dataclasses import replace
 from itertools import islice
@@ -41,7 +41,7 @@ from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.soc import safeguard, separator_stiffness as stiffness
 from solvers.soc.anderson import Anderson
-from solvers.soc.consensus import ConsensusIterate, ConsensusState, LocalConsensus
+from solvers.soc.consensus import ConsensusState, LocalConsensus
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
@@ -58,9 +58,9 @@ SAME = 1e-7
 STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)
 
 
-def check_state(expected: ConsensusIterate, other: ConsensusState, engine: Recording) -> None:
+def check_state(expected: ConsensusState, other: ConsensusState, engine: Recording) -> None:
     """Every robot has the state that it has in one process, and so have the sums."""
-    steps = expected.shared
+    steps = expected
     assert (other.k, other.refreshes, other.raises) == (steps.k, steps.refreshes, steps.raises)
     np.testing.assert_allclose(other.primal_residual, steps.primal_residual, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(other.dual_residual, steps.dual_residual, rtol=1e-6, atol=1e-8)
@@ -70,7 +70,7 @@ def check_state(expected: ConsensusIterate, other: ConsensusState, engine: Recor
         mine = agent.copies
         assert mine is not None
         np.testing.assert_allclose(mine.state.rho, robot.state.rho, rtol=SAME, atol=0)
-        np.testing.assert_allclose(mine.block.penalty, robot.block.penalty, rtol=SAME, atol=0)
+        np.testing.assert_allclose(mine.block.rho, robot.block.rho, rtol=SAME, atol=0)
         known = mine.block.anderson, robot.block.anderson
         assert len(known[0].residual_differences) == len(known[1].residual_differences)
         for local, whole in zip(rows_in(mine.block), rows_in(robot.block), strict=True):
@@ -78,7 +78,7 @@ def check_state(expected: ConsensusIterate, other: ConsensusState, engine: Recor
 
 
 def rows_in(block: RecursionBlock) -> tuple[Array, Array, Array]:
-    return block.x, block.z, block.s
+    return block.x, block.omega, block.s
 
 
 def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> ConsensusState:
@@ -89,14 +89,14 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> Consen
     central = islice(iterate(LocalConsensus(replace(soc, robots=parts)), problem, start), steps + 1)
     for expected, other in zip(central, iterate(ConsensusSOC(soc), driver), strict=False):
         check_state(expected, other, engine)
-        if max(expected.shared.primal_residual, expected.shared.dual_residual) <= CONVERGED:
+        if max(expected.primal_residual, expected.dual_residual) <= CONVERGED:
             break
     RobotsOfDriver(driver).finish()
     check_end(problem, expected, driver)
-    return expected.shared
+    return expected
 
 
-def check_end(problem: PGOProblem, last: ConsensusIterate, driver: Driver) -> None:
+def check_end(problem: PGOProblem, last: ConsensusState, driver: Driver) -> None:
     poses, _ = collect(driver)
     expected = problem.with_best_translations(last.omega)
     size = 1 + np.abs(expected.t).max()

@@ -37,7 +37,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import collect
-from solvers.distributed.interface import Interface
+from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.robots_of_graph import open_driver
@@ -91,7 +91,7 @@ def test_the_translations_are_asked_for_again_when_their_first_factorisation_fai
     start = random_poses(15, 3, 0)
     driver.set_poses(start)
 
-    def failing(*_: object) -> Interface:
+    def failing(*_: object) -> InterfaceFactor:
         raise NotPositiveDefiniteError("once")
 
     with monkeypatch.context() as patch:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graphs import varied_graph
-from robots import Killed, Recording, arrays_in
+from robots import Killed, Recording, arrays_in, share
 
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -35,11 +35,6 @@ def shared() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         share(patch)
         yield
-
-
-def share(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(multifrontal, "LEAST_SEPARATORS", 0)
-    patch.setattr(multifrontal, "LEAST_FRONTS", 0)
 
 
 def world(seed: int, d: int, robots: int) -> tuple[PoseGraph, Partition]:

@@ -11,7 +11,7 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.distributed import multifrontal as rooms
-from solvers.distributed.interface import Interface
+from solvers.distributed.interface import Interface, TreeFactor
 from solvers.distributed.multifrontal import Front, FrontOwners, separator_tree
 from solvers.distributed.robots.elimination import packed
 
@@ -116,8 +116,9 @@ def check_system(seed: int, touched: tuple[IntArray, ...], separators: int, widt
     for poses, part in zip(touched, on_parts, strict=True):
         np.testing.assert_array_equal(part, x[rows_of(poses, width)])
     assert energy == pytest.approx(np.vdot(b, expected), rel=1e-9 * np.linalg.cond(total))
+    assert isinstance(factor, TreeFactor)
     logs = [
-        2.0 * np.log(np.diag(front.factors[str((width,))].L_EE)).sum()
+        2.0 * np.log(np.diag(front.factors[factor.name.number].L_EE)).sum()
         for front in fronts.held.values()
     ]
     assert sum(logs) == pytest.approx(np.linalg.slogdet(total)[1], rel=1e-9, abs=1e-9)

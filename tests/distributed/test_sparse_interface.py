@@ -116,11 +116,11 @@ def test_memory_is_known_before_it_is_spent() -> None:
         driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
     interface = driver.interface(1, 2)
     assert isinstance(interface, SparseInterface)
-    held = interface.held
+    unknowns = interface.unknowns
     width = 3
     factor = width**2 * int(interface.pattern.counts.sum())
-    sent = sum(len(positions) for positions in held.robots)
-    assert interface.num_bytes >= 8 * (factor + held.lower.nnz) + 12 * sent
+    sent = sum(len(positions) for positions in unknowns.robots)
+    assert interface.num_bytes >= 8 * (factor + unknowns.lower.nnz) + 12 * sent
 
 
 @pytest.mark.parametrize("is_sparse", [False, True])

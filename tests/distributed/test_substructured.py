@@ -32,9 +32,10 @@ from solvers.distributed.substructured import SubstructuredSOC, SubstructuredSta
 from solvers.loop import iterate, run
 from solvers.result import Status
 from solvers.soc.anderson import Anderson
+from solvers.soc.joint import SOCState
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, SOCState
+from solvers.soc.soc import SOC
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
@@ -74,9 +75,15 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[
         np.testing.assert_allclose(
             other.dual_residual, expected.dual_residual, rtol=1e-6, atol=1e-8
         )
+        cover = driver.cover
+        for letter in ("x", "omega", "B"):
+            np.testing.assert_allclose(
+                getattr(other, letter), getattr(expected, letter)[cover], rtol=0, atol=1e-6
+            )
+        np.testing.assert_allclose(other.rho, expected.rho[cover], rtol=1e-6, atol=0)
         ratio = expected.rho / rotation_scale(problem)
         np.testing.assert_allclose(np.sort(other.ratio), np.sort(ratio), rtol=1e-6, atol=0)
-    SubstructuredSOC(soc).finish(driver)
+    SubstructuredSOC(soc).finish(driver, distributed[-1])
     poses, _ = collect(driver)
     expected = soc.poses(problem, central[-1])
     size = 1 + np.abs(expected.t).max()
@@ -161,20 +168,30 @@ def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
     assert excess[-1] <= 10 * SOC.tolerance * central.objective
 
 
+@pytest.mark.parametrize("k", [1, 4, 7])
+def test_a_run_can_be_finished_at_any_of_its_states(k: int) -> None:
+    # Where a run ends at its limit, it is the best one.
+    problem = varied_problem(2, 20, 3, LOUD_NOISE)
+    soc = SOC(penalty=STALLED)
+    central, distributed, driver = pairs(problem, metis(problem.graph, 3), soc, 7)
+    SubstructuredSOC(soc).finish(driver, distributed[k])
+    poses, _ = collect(driver)
+    np.testing.assert_allclose(poses.R, soc.poses(problem, central[k]).R, rtol=0, atol=1e-7)
+
+
 def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
     problem = varied_problem(0, 12, 3)
     driver = driver_at(problem, metis(problem.graph, 2), None)
     start = driver.current.objective
     method = SubstructuredSOC()
     state = method.init(driver, None)
-    assert driver.block is not None
-    driver.block = replace(driver.block, s=np.full_like(driver.block.s, np.nan))
-    broken = method.step(driver, state)
+    spoiled = replace(state, block=replace(state.block, s=np.full_like(state.block.s, np.nan)))
+    broken = method.step(driver, spoiled)
     assert broken.k == 1
     measurement = method.measure(driver, broken)
     assert np.isnan(
         [measurement.objective, measurement.primal_residual, measurement.dual_residual]
     ).all()
     assert method.converged(broken, measurement) is None
-    method.finish(driver)
+    method.finish(driver, state)
     assert driver.current.objective == pytest.approx(start, rel=1e-12)

@@ -1,15 +1,22 @@
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 
 import numpy as np
 import pytest
-from graphs import varied_graph
+from graphs import random_poses, varied_graph
+from robots import driver_at
 
 import solvers
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.partitioning import PartitionMethod, partition
+from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import multifrontal
+from solvers.distributed.consensus import ConsensusSOC
+from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
+from solvers.distributed.substructured import SubstructuredSOC
+from solvers.loop import iterate
 from solvers.network.messages import obey, restore, take_snapshot
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
 from solvers.soc.subgraph import split_graph
@@ -79,6 +86,27 @@ def pipeline(coupling, robots):
     return replace(
         chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-5)
     )
+
+
+@pytest.mark.parametrize("method", [SubstructuredSOC(), ConsensusSOC(), SubstructuredNewton()])
+@pytest.mark.parametrize("orders", [1, 5, 1000])
+def test_lost_robots_return_to_the_moments_of_old_states(method, orders):
+    # With a snapshot after every order, all that a robot remembers comes from snapshots.
+    problem = PGOProblem(varied_graph(3, 30, 3))
+    robots = partition(problem.graph, 4, PartitionMethod.CONTIGUOUS)
+    start = random_poses(30, 3, 1)
+    expected = list(islice(iterate(method, driver_at(problem, robots, start)), 6))
+    losses = frozenset(np.random.default_rng(orders).integers(20, 200, 12).tolist())
+    engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000))
+    driver = driver_at(problem, robots, start, engine)
+    film = list(islice(iterate(method, driver), 5))
+    for k in (4, 1, 3, 0, 4):
+        following = method.measure(driver, method.step(driver, film[k]))
+        undisturbed = method.measure(driver, expected[k + 1])
+        assert following.objective == undisturbed.objective
+        assert following.dual_residual == undisturbed.dual_residual
+    (pool,) = engine.opened
+    assert pool.place.lost > 1
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import stack_transposes
-from solvers.network.serialization import deserialize, serialize
+from solvers.network.serialization import COMPUTED_AGAIN, deserialize, serialize
 from solvers.result import Measurement, Record, Status
 from solvers.soc.anderson import AndersonShare
 from solvers.soc.recursion_block import Rotations, StepSettings, block_at
@@ -36,12 +36,32 @@ def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(see
     classes = (Poses, AndersonShare, StepSettings, Rotations, type(block))
     restored = deserialize(serialize({"block": block, "poses": (poses, None)}), classes)
     assert restored["block"].anderson.residual_differences == ()
-    for name in ("penalty", "z", "s", "x", "best"):
+    for name in ("rho", "omega", "s", "x", "best"):
         np.testing.assert_array_equal(getattr(restored["block"], name), getattr(block, name))
     np.testing.assert_array_equal(restored["block"].anderson.image, block.anderson.image)
     np.testing.assert_array_equal(restored["poses"][0].t, poses.t)
-    restored["block"].z[:] = 0.0
-    assert block.z.any()
+    restored["block"].omega[:] = 0.0
+    assert block.omega.any()
+
+
+def test_an_array_that_a_record_has_twice_is_stored_once():
+    shared = np.arange(3.0)
+    arrays = serialize({"one": shared, "other": (shared, shared.copy())})
+    assert len(arrays) == 3  # two arrays, and the tree
+    restored = deserialize(arrays, ())
+    for array in (restored["one"], *restored["other"]):
+        np.testing.assert_array_equal(array, shared)
+
+
+@dataclass(frozen=True)
+class WithFactor:
+    matrix: float
+    factor: object = field(default=None, metadata=COMPUTED_AGAIN)
+
+
+def test_what_is_computed_again_is_left_out():
+    restored = deserialize(serialize(WithFactor(2.0, factor=object())), (WithFactor,))
+    assert restored == WithFactor(2.0)
 
 
 def test_enums_and_nested_classes_come_back():

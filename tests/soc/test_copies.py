@@ -24,7 +24,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.network.counted_pool import Count
 from solvers.riemannian.polish import polish
-from solvers.soc.consensus import ConsensusIterate, LocalConsensus, LocalRobots
+from solvers.soc.consensus import ConsensusState, LocalConsensus, LocalRobots
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.penalty import FixedPenalty, MultiplierPenalty
 from solvers.soc.recursion_block import Agreement
@@ -37,16 +37,14 @@ FEWER = settings(max_examples=examples(40))  # each example splits a graph and s
 
 def started(
     problem: PGOProblem, parts: Partition, poses: Poses, soc: SOC | None = None
-) -> ConsensusIterate:
+) -> ConsensusState:
     """Robots at poses with penalties; B in balance as under a MultiplierPenalty."""
     return LocalConsensus(replace(soc if soc is not None else SOC(), robots=parts)).init(
         problem, poses
     )
 
 
-def drawn(
-    seed: int, n: int, d: int, partitioner: Partitioner
-) -> tuple[PGOProblem, ConsensusIterate]:
+def drawn(seed: int, n: int, d: int, partitioner: Partitioner) -> tuple[PGOProblem, ConsensusState]:
     problem = varied_problem(seed, n, d, LOUD_NOISE)
     soc = SOC(penalty=FixedPenalty(RHO), translation_penalty=0.3)
     return problem, started(
@@ -122,14 +120,14 @@ def test_the_penalty_of_a_pose_is_shared_among_its_copies(
     seed: int, n: int, d: int, partitioner: Partitioner
 ) -> None:
     problem, state = drawn(seed, n, d, partitioner)
-    penalties = [robot.block.penalty for robot in state.robots]
+    penalties = [robot.block.rho for robot in state.robots]
     total = sums_over(problem, state.robots, penalties)
     known = held_by(problem, state.robots) > 0
     whole = np.concatenate([0.3 * translation_scale(problem), np.full(d * n, RHO)])
     np.testing.assert_allclose(total[known], whole[known], rtol=1e-14, atol=0)
     assert (total[~known] == 0).all()
     np.testing.assert_allclose(state.rho, RHO, rtol=1e-15)
-    assert state.shared.size == pytest.approx(np.sqrt(d * RHO * n), rel=1e-12)
+    assert state.size == pytest.approx(np.sqrt(d * RHO * n), rel=1e-12)
 
 
 @FEWER
@@ -140,8 +138,8 @@ def test_every_robot_minimises_its_own_subproblem(
     _, state = drawn(seed, n, d, partitioner)
     for robot in state.robots:
         assert robot.step_a is not None
-        penalty = robot.block.penalty
-        shift = np.random.default_rng(seed).standard_normal(robot.block.z.shape)
+        penalty = robot.block.rho
+        shift = np.random.default_rng(seed).standard_normal(robot.block.omega.shape)
         K = robot.layout.problem.M.toarray() + np.diag(0.5 * penalty)
         if not len(robot.layout.separators):
             K[0, 0] *= 2  # no translation is held: t_0 = 0
@@ -174,10 +172,10 @@ def test_agreement_is_the_mean_and_its_nearest_rotation(
     mean[n:] = stack_transposes(project_by_svd(unstack_transposes(mean[n:])))
     for robot, before in zip(here.robots, state.robots, strict=True):
         expected = np.where(robot.layout.held, mean[rows_of(robot, problem)], 0.0)
-        np.testing.assert_allclose(robot.block.z, expected, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(robot.block.omega, expected, rtol=0, atol=1e-9)
         np.testing.assert_allclose(robot.block.B, robot.block.s - expected, rtol=0, atol=1e-9)
-        assert before.block.z is not robot.block.z
-    omega = ConsensusIterate(state.shared, here.robots).omega
+        assert before.block.omega is not robot.block.omega
+    omega = replace(state, robots=here.robots).omega
     np.testing.assert_allclose(stack_transposes(omega), mean[n:], rtol=0, atol=1e-9)
 
 
@@ -192,7 +190,7 @@ def test_balanced_multipliers_have_the_stationary_mean_and_pull_all_copies_alike
     assume(len(state.robots) > 1)
     forces = []
     for robot in state.robots:
-        pull = robot.block.penalty[:, None] * robot.block.B
+        pull = robot.block.rho[:, None] * robot.block.B
         forces.append(2.0 * robot.layout.problem.apply_M(robot.state.X) + pull)
     count = held_by(problem, state.robots)
     scale = 1 + max(np.abs(force).max() for force in forces)
@@ -223,7 +221,7 @@ def test_at_an_optimum_nothing_pulls_at_any_copy(
     assume(len(state.robots) > 1)
     for robot in state.robots:
         gradient = 2.0 * robot.layout.problem.apply_M(robot.state.X)
-        force = gradient + robot.block.penalty[:, None] * robot.block.B
+        force = gradient + robot.block.rho[:, None] * robot.block.B
         scale = float(np.abs(gradient).max()) + float(problem.M.diagonal().max())
         assert np.abs(force[robot.layout.held[:, 0]]).max() <= 1e-6 * scale
 
@@ -234,7 +232,7 @@ def test_at_an_optimum_nothing_pulls_at_any_copy(
 def stiffness_of(problem: PGOProblem, parts: Partition) -> float:
     """Stiffness that the translation penalty at the start is 0.6 times of."""
     soc = SOC(penalty=FixedPenalty(float(rotation_scale(problem).mean())))
-    return started(problem, parts, chordal_start(problem), soc).shared.separators.translation / 0.6
+    return started(problem, parts, chordal_start(problem), soc).separators.translation / 0.6
 
 
 @FEWER
@@ -278,7 +276,7 @@ def test_stiffness_is_that_of_springs_in_series(links: int) -> None:
     without_shift = np.eye(4) - np.full((4, 4), 0.25)
     C = without_shift @ (root[:, None] * C * root) @ without_shift
     # An estimate of the trace: its standard deviation is at most a quarter.
-    assert state.shared.separators.translation / 0.6 == pytest.approx(3.0 / np.trace(C), rel=0.5)
+    assert state.separators.translation / 0.6 == pytest.approx(3.0 / np.trace(C), rel=0.5)
 
 
 @FEWER
@@ -291,7 +289,7 @@ def test_separator_penalties_follow_from_the_stiffness(
     start = chordal_start(problem)
     state = started(problem, parts, start)
     wanted = MultiplierPenalty().initial(problem, start)
-    relative = state.shared.separators.translation
+    relative = state.separators.translation
     shared = parts.separators(problem.graph)
     wanted[shared] = np.maximum(
         wanted[shared], min(0.7 * relative**0.5, 0.3) * rotation_scale(problem)[shared]
@@ -300,5 +298,5 @@ def test_separator_penalties_follow_from_the_stiffness(
     given_state = started(
         problem, parts, start, SOC(translation_penalty=0.02, separator_penalty=5.0)
     )
-    assert given_state.shared.separators.translation == 0.02
+    assert given_state.separators.translation == 0.02
     assert (given_state.rho[shared] >= 5.0 * rotation_scale(problem)[shared] * (1 - 1e-12)).all()

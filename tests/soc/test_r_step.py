@@ -239,6 +239,6 @@ def assert_teams_agree(problem: PGOProblem, robots: Partition) -> None:
     ]
     for same in zip(*teams, strict=True):
         held = same[0].layout.held
-        shift = np.where(held, rng.standard_normal(same[0].block.z.shape), 0.0)
+        shift = np.where(held, rng.standard_normal(same[0].block.omega.shape), 0.0)
         steps = [robot.step_a for robot in same if robot.step_a is not None]
         assert largest_difference([step.solve(shift)[held[:, 0]] for step in steps]) <= AGREEMENT

@@ -1,5 +1,5 @@
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -34,11 +34,12 @@ from solvers.loop import iterate, run
 from solvers.result import Measurement, Status
 from solvers.riemannian.polish import polish, relative_decrement
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
-from solvers.soc.consensus import ConsensusIterate
+from solvers.soc.consensus import ConsensusState
+from solvers.soc.joint import SOCState
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import FixedPenalty
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, SOCState
+from solvers.soc.soc import SOC
 
 SIZES = st.integers(3, 12)
 METHODS = st.sampled_from(
@@ -172,7 +173,7 @@ def test_consensus_is_its_recursion_robot_by_robot(
     penalty = np.concatenate([0.1 * translation_scale(problem), np.full(d * n, rule.rho)])
     parts = [part_of(problem, robots, robot) for robot in range(robots.num_robots)]
     count = np.bincount(np.concatenate([part.held for part in parts]), minlength=problem.side)
-    z = [robot.block.z[robot.layout.held[:, 0]] for robot in first.robots]
+    z = [robot.block.omega[robot.layout.held[:, 0]] for robot in first.robots]
     B = [robot.block.B[robot.layout.held[:, 0]] for robot in first.robots]
     for state in islice(states, 8):
         total = np.zeros((problem.side, d))
@@ -188,7 +189,7 @@ def test_consensus_is_its_recursion_robot_by_robot(
         atol = 1e-7 * (1 + np.abs(mean).max())
         for a, robot in enumerate(state.robots):
             held = robot.layout.held[:, 0]
-            np.testing.assert_allclose(robot.block.z[held], z[a], rtol=0, atol=atol)
+            np.testing.assert_allclose(robot.block.omega[held], z[a], rtol=0, atol=atol)
             np.testing.assert_allclose(robot.block.B[held], B[a], rtol=0, atol=atol)
         np.testing.assert_allclose(stack_transposes(state.omega), mean[n:], rtol=0, atol=atol)
 
@@ -239,7 +240,7 @@ def test_anderson_per_robot_sums_nothing_over_the_robots(
         for a, (before, after) in enumerate(zip(image.robots, following.robots, strict=True)):
             moved, _ = before.solve(None)
             x = moved.state.ahead[1].x
-            residual = np.sqrt(before.block.penalty)[:, None] * (x - before.block.z)
+            residual = np.sqrt(before.block.rho)[:, None] * (x - before.block.omega)
             share, sums = known[a]
             observed, share = share.observe(residual, x + before.block.B, Anderson().memory)
             gamma, sums = sums.coefficients(Anderson(), observed)
@@ -262,7 +263,7 @@ def test_one_robot_accelerates_the_same_whether_alone_or_together(alone: bool) -
     assert np.abs(states[-1].omega - plain[-1].omega).max() > 1e-9
 
 
-def with_settings(soc: SOC, state: ConsensusIterate) -> ConsensusIterate:
+def with_settings(soc: SOC, state: ConsensusState) -> ConsensusState:
     """State whose robots have other settings."""
     robots = [
         replace(
@@ -300,7 +301,7 @@ def test_graphs_without_noise_end_at_zero(
 # Endings and settings.
 
 
-def spoiled(state: SOCState | ConsensusIterate) -> SOCState | ConsensusIterate:
+def spoiled(state: SOCState | ConsensusState) -> SOCState | ConsensusState:
     if isinstance(state, SOCState):
         return replace(state, B=np.full_like(state.B, np.inf))
     robot = state.robots[0]
@@ -384,6 +385,19 @@ def test_robots_of_another_graph_are_refused() -> None:
         for method in (SOC(robots=robots), PaperSOC(robots=robots)):
             with pytest.raises(SettingError, match="give one robot for every pose"):
                 method.init(problem, None)
+
+
+@pytest.mark.parametrize("num_robots", [1, 3])
+def test_states_of_every_coupling_have_the_letters_of_algorithm_1(num_robots: int) -> None:
+    problem = varied_problem(0, 12, 3)
+    robots = partition(problem.graph, num_robots)
+    plain = SOC(robots=robots, acceleration=None, local_passes=1, penalty=FixedPenalty(30.0))
+    for state, following in pairwise(islice(iterate(plain, problem), 6)):
+        expected = state.B + following.x - following.omega  # (c)
+        np.testing.assert_allclose(following.B, expected, rtol=0, atol=1e-12)
+        assert orthogonality_error(following.omega).max() <= 1e-12
+        assert np.abs(following.x - following.omega).max() > 1e-6
+        np.testing.assert_array_equal(following.rho, np.full(12, 30.0))
 
 
 def test_tolerance_is_on_both_residuals() -> None:

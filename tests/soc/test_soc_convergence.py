@@ -31,11 +31,12 @@ from solvers.loop import iterate, run
 from solvers.result import Record, Status
 from solvers.riemannian.polish import polish
 from solvers.soc.anderson import Anderson
-from solvers.soc.consensus import ConsensusIterate
+from solvers.soc.consensus import ConsensusState
+from solvers.soc.joint import SOCState
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, SOCState
+from solvers.soc.soc import SOC
 
 SIZES = st.integers(3, 12)
 METHODS = st.sampled_from(
@@ -253,10 +254,10 @@ def test_the_translation_penalty_falls_where_the_start_is_far_away(
     optimum = problem.objective(benchmark_optimum("M3500"))
     robots = partition(problem.graph, 25, PartitionMethod.CONTIGUOUS)
     soc = SOC(robots=robots, tolerance=1e-9, max_iterations=300)
-    at_start = soc.init(problem, chordal_start(problem)).shared.separators.translation
+    at_start = soc.init(problem, chordal_start(problem)).separators.translation
     result = run(soc, problem, callback=until_gap(optimum))
     assert result.status is Status.STOPPED
-    assert result.state.shared.separators.translation < 0.5 * at_start
+    assert result.state.separators.translation < 0.5 * at_start
 
 
 @pytest.mark.parametrize("method", [PartitionMethod.METIS, PartitionMethod.CONTIGUOUS])
@@ -316,13 +317,13 @@ def test_a_penalty_far_too_large_is_not_taken_for_convergence(
 
 
 def penalties_and_multipliers(
-    state: SOCState | ConsensusIterate,
+    state: SOCState | ConsensusState,
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """rho, B before the projection, and B after it, of the state, or of every robot's rows."""
     if isinstance(state, SOCState):
         return [(state.rho[:, None, None], state.omega + state.B - state.x, state.B)]
     blocks = [robot.block for robot in state.robots]
-    return [(block.penalty[:, None], block.s - block.x, block.B) for block in blocks]
+    return [(block.rho[:, None], block.s - block.x, block.B) for block in blocks]
 
 
 def test_rescaling_keeps_the_unscaled_multiplier(

@@ -1,6 +1,6 @@
 """One robot as an engine runs it: its interior for the driver, and its copies for CONSENSUS."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -17,6 +17,7 @@ from solvers.distributed.robots.interior import Interior, InteriorState, interio
 from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import RobotAscent
 from solvers.network.messages import Snapshot
+from solvers.network.moments import Recall
 from solvers.network.serialization import deserialize, serialize
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
@@ -29,11 +30,27 @@ A = TypeVar("A")
 
 
 @dataclass(frozen=True, eq=False)
-class AgentRecord:
-    """State that orders leave with an agent; a checkpoint contains it."""
+class Held:
+    """What a robot holds at a moment: interior and copies, as values."""
+
+    interior: Interior | None  # None if it counts no edge
+    copies: ConsensusRobot | None  # None before CONSENSUS begins
+
+
+@dataclass(frozen=True, eq=False)
+class HeldStates:
+    """The states of what a robot holds, without what follows from its subgraph."""
 
     interior: InteriorState | None
     copies: CopiesState | None
+
+
+@dataclass(frozen=True, eq=False)
+class AgentRecord:
+    """State that orders leave with an agent; a checkpoint contains it."""
+
+    held: HeldStates
+    moments: Mapping[int, HeldStates]
     front: HeldFront | None
 
 
@@ -48,6 +65,7 @@ class CoverRotations:
 # Classes of the records in a snapshot.
 CLASSES = (
     AgentRecord,
+    HeldStates,
     InteriorState,
     CopiesState,
     Waiting,
@@ -75,30 +93,58 @@ class Agent:
     def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
         self.subgraph = subgraph
         self.backend = backend
-        self.interior = interior_of(subgraph, backend)  # None if it counts no edge
-        self.copies: ConsensusRobot | None = None  # None before CONSENSUS begins
+        # As in `Held`.
+        self.interior = interior_of(subgraph, backend)
+        self.copies: ConsensusRobot | None = None
         self.front: HeldFront | None = None  # None if it holds no front of the separator tree
+        self.moments: dict[int, Held] = {}
+
+    def recall(self, recall: Recall) -> None:
+        """Forget, keep, and return to moments."""
+        moments = {number: held for number, held in self.moments.items() if number in recall.in_use}
+        if recall.kept is not None:
+            moments.setdefault(recall.kept, Held(self.interior, self.copies))
+        if recall.returned_to is not None:
+            held = moments[recall.returned_to]
+            self.interior = held.interior
+            self.copies = held.copies
+        self.moments = moments
 
     def snapshot(self) -> Snapshot:
         """State that earlier orders left, as arrays, with matrices instead of their factors."""
-        interior = self.interior.state if self.interior is not None else None
-        copies = self.copies.state if self.copies is not None else None
-        return serialize(AgentRecord(interior, copies, self.front))
+        moments = {number: _states(held) for number, held in self.moments.items()}
+        held = _states(Held(self.interior, self.copies))
+        return serialize(AgentRecord(held, moments, self.front))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this robot."""
         record: AgentRecord = deserialize(snapshot, CLASSES)
-        if self.interior is not None and record.interior is not None:
-            self.interior = replace(self.interior, state=record.interior).restored()
-        self.copies = None
-        if record.copies is not None:
-            self.copies = self._new_copies.restored(record.copies)
+        held = self._restored(record.held)
+        self.interior = held.interior
+        self.copies = held.copies
         self.front = record.front
+        self.moments = {number: self._restored(states) for number, states in record.moments.items()}
+
+    def _restored(self, states: HeldStates) -> Held:
+        """What belongs to states."""
+        interior = self.interior
+        if interior is not None and states.interior is not None:
+            interior = replace(interior, state=states.interior).restored()
+        copies = None
+        if states.copies is not None:
+            copies = self._new_copies.restored(states.copies)
+        return Held(interior, copies)
 
     @property
     def _new_copies(self) -> ConsensusRobot:
         """Copies without a state."""
         return ConsensusRobot(CopyLayout(self.subgraph, self.backend), CopiesState())
+
+
+def _states(held: Held) -> HeldStates:
+    interior = held.interior.state if held.interior is not None else None
+    copies = held.copies.state if held.copies is not None else None
+    return HeldStates(interior, copies)
 
 
 # Orders are functions of an agent and a request, some of them once their first argument is given.

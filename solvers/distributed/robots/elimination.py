@@ -215,14 +215,22 @@ class FrontParts:
     The driver adds a part where the front eliminates.
     """
 
-    widths: Widths
     parts: tuple[Array, ...]  # lower triangles, packed; or (unknowns, k)
     own: Array | None  # the driver's: (e, w, w); or (e, w, k)
 
 
+@dataclass(frozen=True)
+class FrontMatrix:
+    """Which matrix the fronts factor."""
+
+    number: int  # of its factor
+    widths: Widths
+    in_use: tuple[int, ...]  # numbers of the factors that somebody still uses; others are dropped
+
+
 @dataclass(frozen=True, eq=False)
 class FrontFactor:
-    """Factor of a front for one kind of unknowns."""
+    """Factor of a front of one matrix."""
 
     L_EE: Array
     L_BE: Array
@@ -243,52 +251,56 @@ class HeldFront:
     # separators of every part: of robots, which stack field by field, then of fronts
     places: tuple[IntArray, ...]
     num_robots: int
-    factors: Mapping[str, FrontFactor] = field(default_factory=dict)  # by widths
+    factors: Mapping[int, FrontFactor] = field(default_factory=dict)  # by their numbers
 
-    def eliminate(self, order: FrontParts) -> tuple[HeldFront, Array]:
+    def eliminate(self, order: tuple[FrontMatrix, FrontParts]) -> tuple[HeldFront, Array]:
         """Sum the parts and factor; the answer is K_BB - L_BE L_BE^T, packed.
 
         A NotPositiveDefiniteError where K_EE is not positive definite.
         """
-        width = sum(order.widths)
-        rows = self._rows_of_parts(order.widths)
+        matrix, of_front = order
+        width = sum(matrix.widths)
+        rows = self._rows_of_parts(matrix.widths)
         e = width * self.num_eliminated
         side = width * self.num_separators
         K = np.zeros((side, side))
-        for of_part, part in zip(rows, order.parts, strict=True):
+        for of_part, part in zip(rows, of_front.parts, strict=True):
             K[np.ix_(of_part, of_part)] += unpacked(part, len(of_part))
-        if order.own is not None:
+        if of_front.own is not None:
             inside = np.arange(e).reshape(-1, width)
-            K[inside[:, :, None], inside[:, None, :]] += order.own
+            K[inside[:, :, None], inside[:, None, :]] += of_front.own
         L_EE = _cholesky(K[:e, :e])
         L_BE = np.ascontiguousarray(_solved(L_EE, K[:e, e:]).T)
         K = K[e:, e:] - L_BE @ L_BE.T  # frees the front before its complement is packed
-        return self._with(order.widths, FrontFactor(L_EE, L_BE, rows)), packed(K)
+        kept = {number: self.factors[number] for number in matrix.in_use if number in self.factors}
+        following = replace(self, factors={**kept, matrix.number: FrontFactor(L_EE, L_BE, rows)})
+        return following, packed(K)
 
-    def reduce(self, order: FrontParts) -> tuple[HeldFront, tuple[Array, float]]:
+    def reduce(self, order: tuple[int, FrontParts]) -> tuple[HeldFront, tuple[Array, float]]:
         """Compute b_B - L_BE y, (unknowns, k), with y = L_EE^-1 b_E, and |y|^2.
 
         The sum of |y|^2 over all fronts is b^T K^-1 b.
         """
-        factor = self.factors[str(order.widths)]
+        number, of_front = order
+        factor = self.factors[number]
         e = len(factor.L_EE)
         side = e + len(factor.L_BE)
-        num_columns = order.parts[0].shape[1]
+        num_columns = of_front.parts[0].shape[1]
         b = np.zeros((side, num_columns))
-        for of_part, part in zip(factor.rows, order.parts, strict=True):
+        for of_part, part in zip(factor.rows, of_front.parts, strict=True):
             b[of_part] += part
-        if order.own is not None:
-            b[:e] += order.own.reshape(e, -1)
+        if of_front.own is not None:
+            b[:e] += of_front.own.reshape(e, -1)
         y = _solved(factor.L_EE, b[:e])
-        following = self._with(order.widths, replace(factor, y=y))
+        following = replace(self, factors={**self.factors, number: replace(factor, y=y)})
         return following, (b[e:] - factor.L_BE @ y, inner(y, y))
 
     def substitute(
-        self, known: tuple[Array, Widths]
+        self, order: tuple[int, Array]
     ) -> tuple[HeldFront, tuple[Array, tuple[Array, ...]]]:
         """Compute x_E = L_EE^-T (y - L_BE^T x_B), (unknowns, k), and x on every part, from x_B."""
-        x_B, widths = known
-        factor = self.factors[str(widths)]
+        number, x_B = order
+        factor = self.factors[number]
         right = factor.y - factor.L_BE.T @ x_B
         x_E = _solved(factor.L_EE, right, is_transposed=True)
         x = np.concatenate([x_E, x_B])
@@ -308,9 +320,6 @@ class HeldFront:
             first_rows = width * places[:, None]
             rows.append(np.concatenate([(first_rows + block).ravel() for block in blocks]))
         return tuple(rows)
-
-    def _with(self, widths: Widths, factor: FrontFactor) -> HeldFront:
-        return replace(self, factors={**self.factors, str(widths): factor})
 
 
 def _cholesky(matrix: Array) -> Array:

@@ -132,10 +132,10 @@ class Interior:
         """Parts of F and of M X on the boundary, at the current poses."""
         return self, self.evaluation(self.state.poses)
 
-    def adopt(self, z: Array) -> tuple[Interior, ReducedTranslations]:
+    def adopt(self, rows: Array) -> tuple[Interior, ReducedTranslations]:
         """Take rotations of the cover's poses, rows (dg, d); then `translations`."""
         R = self.state.poses.R.copy()
-        R[self.part.boundary] = unstack_transposes(z)
+        R[self.part.boundary] = unstack_transposes(rows)
         return self._at(R).translations(None)
 
     def save_poses(self, _: None) -> tuple[Interior, None]:
@@ -176,7 +176,7 @@ class Interior:
     def rescale(self, order: RescaleInterior) -> tuple[Interior, Reduced]:
         """Multiply rho, from the best iterate on if asked to, and factor again."""
         block = self.block.back_at_best() if order.from_best else self.block
-        return self._penalized(block.rescaled(order.factor * block.penalty))
+        return self._penalized(block.rescaled(order.factor * block.rho))
 
     def solve(self, x: Array) -> tuple[Interior, Array]:
         """Step (a) in the interior, from x on the boundary; the sums for the acceleration."""
@@ -189,24 +189,25 @@ class Interior:
 
         With them goes the answer of `cost`.
         """
-        block, sums = self.block.extrapolated(order.agreement).projected()
+        block = self.block.extrapolated(order.agreement)  # s = x_ahead + B
+        block, sums = block.projected()  # (b) omega, (c) B = s - omega
         moved = self.with_changes(block=block)
         following, right = moved.reduced(self._pull(block))
         _, cost = following.cost(order.measured_at)
         return following, Agreed(sums, right, cost)
 
-    def cost(self, z: Array) -> tuple[Interior, float]:
-        """Part of F at omega, whose boundary rows are z, and the translations of step (a)."""
+    def cost(self, omega: Array) -> tuple[Interior, float]:
+        """Part of F at omega, here its rows of the boundary, and the translations of step (a)."""
         problem = self.part.problem
         x = self.state.x
         has_solved = x.size > 0
         X = x.copy() if has_solved else problem.stacked(self.state.poses)
-        X[problem.num_poses :] = stack_transposes(self._omega(z))
+        X[problem.num_poses :] = stack_transposes(self._rotations(omega))
         return self, problem.objective_stacked(X)
 
-    def finish(self, z: Array) -> tuple[Interior, ReducedTranslations]:
+    def finish(self, omega: Array) -> tuple[Interior, ReducedTranslations]:
         """Take omega for the rotations; then `translations`."""
-        return self._at(self._omega(z)).translations(None)
+        return self._at(self._rotations(omega)).translations(None)
 
     # Newton.
 
@@ -404,7 +405,7 @@ class Interior:
         problem = self.part.problem
         data = problem.M.data.copy()
         positions = problem.diagonal_positions[self.interior_rows]
-        data[positions] += 0.5 * block.penalty
+        data[positions] += 0.5 * block.rho
         if self.factors.grounds:
             data[problem.diagonal_positions[0]] *= 2.0
         K = problem.with_pattern_of_M(data)
@@ -415,14 +416,14 @@ class Interior:
         """Compute D/2 (omega - B), (side, d)."""
         problem = self.part.problem
         b = np.zeros((problem.side, problem.d))
-        b[self.interior_rows] = (0.5 * block.penalty)[:, None] * block.shift
+        b[self.interior_rows] = (0.5 * block.rho)[:, None] * block.shift
         return b
 
-    def _omega(self, z: Array) -> Array:
-        """Return omega of the part's poses, (p, d, d), from the block and the driver's rows z."""
+    def _rotations(self, omega: Array) -> Array:
+        """Return omega of the part's poses, (p, d, d), from the block and the driver's rows."""
         R = np.empty_like(self.state.poses.R)
-        R[self.part.interior] = unstack_transposes(self.block.z)
-        R[self.part.boundary] = unstack_transposes(z)
+        R[self.part.interior] = unstack_transposes(self.block.omega)
+        R[self.part.boundary] = unstack_transposes(omega)
         return R
 
     def _reduced_translations(self, R: Array) -> tuple[Interior, ReducedTranslations]:

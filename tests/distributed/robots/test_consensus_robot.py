@@ -127,7 +127,7 @@ class Watching(Recording):
                     hidden = ~np.isin(share.poses, other.poses) & (share.in_cover != grounded)
                     rows = np.concatenate([hidden, np.repeat(hidden, share.graph.d)])
                     block = holder.state.block
-                    known = (holder.state.X, *((block.z, block.s) if block is not None else ()))
+                    known = (holder.state.X, *((block.omega, block.s) if block is not None else ()))
                     secrets += [values[rows].ravel() for values in known]
         return answers
 

@@ -42,7 +42,7 @@ from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.ordering import analyze_poses, most_counts, row_order
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.elimination_choice import leave_poses
-from solvers.distributed.interface import Interface
+from solvers.distributed.interface import TreeFactor
 from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums, unpacked
 from solvers.distributed.robots.factors import Factors
 from solvers.distributed.robots.proof import verify_interior
@@ -369,6 +369,7 @@ def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
         ]
         lost = space.rounding([row_sums(*side) for side in sides], [(columns, values)], diagonal)
         factor = space.factorize(contributions, [(columns, values)])
+        assert isinstance(factor, TreeFactor)
         difference = square_of_tree(factor) - K
         assert max(largest_share(sign * difference, diagonal) for sign in (1, -1)) > 0.0
         assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
@@ -401,10 +402,7 @@ def test_the_drivers_sparse_factor_is_within_its_rounding(cancelling: float) -> 
         diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
         sizes = [row_sums(C, diagonal[at]) for C, at in zip(parts, space.columns, strict=True)]
         lost = space.rounding(sizes, [(columns, values)], diagonal)
-        space.factorize(contributions, [(columns, values)])
-        factor = space.held.factor
-        assert factor is not None
-        L, order = factor.take_apart()
+        L, order = space.factorize(contributions, [(columns, values)]).factor.take_apart()
         product = np.full((space.side, space.side), MP.mpf(0), dtype=object)
         exact_L = exact(L.toarray())
         product[np.ix_(order, order)] = exact_L @ exact_L.T
@@ -413,16 +411,17 @@ def test_the_drivers_sparse_factor_is_within_its_rounding(cancelling: float) -> 
         assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
 
 
-def square_of_tree(factor: Interface) -> Exact:
+def square_of_tree(factor: TreeFactor) -> Exact:
     """R^T R of the driver's factor, taken exactly, in the order of its unknowns."""
-    tree = factor.fronts.tree
-    width = sum(factor.widths)
-    side = factor.side
-    order = factor.order
+    space = factor.interface
+    tree = space.fronts.tree
+    width = sum(space.widths)
+    side = space.side
+    order = space.order
     product = np.full((side, side), MP.mpf(0), dtype=object)
     for number, front in enumerate(tree):
         if len(front.eliminated):
-            found = factor.fronts.held[number].factors[str(factor.widths)]
+            found = space.fronts.held[number].factors[factor.name.number]
             rows = order[(width * front.separators[:, None] + np.arange(width)).ravel()]
             L = exact(np.concatenate([found.L_EE, found.L_BE]))
             product[np.ix_(rows, rows)] += L @ L.T
