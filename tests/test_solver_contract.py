@@ -16,7 +16,6 @@ from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings, strategies as st
 from robots import metis, share, sparse_elimination
 from scipy.sparse import issparse
-from solvers.distributed.robots_of_graph import open_driver
 
 import pgo_models
 import solvers
@@ -37,6 +36,7 @@ from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
 from solvers.distributed.handedness import RobotsPoint, begin_without_terms
 from solvers.distributed.newton import SubstructuredNewton, model_at
+from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.robust import SharedGNC
 from solvers.distributed.staircase import SubstructuredStaircase
 from solvers.distributed.substructured import SubstructuredSOC

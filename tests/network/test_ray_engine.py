@@ -33,6 +33,7 @@ from solvers.network import ray_engine
 from solvers.network.ray_engine import RayEngine, connect
 from solvers.network.recovery import Recovery
 from solvers.soc.penalty import PenaltyOrder
+from solvers.soc.soc import WARM_START
 from solvers.soc.subgraph import Subgraph, split_graph
 
 pytestmark = pytest.mark.slow  # starts Ray
@@ -79,7 +80,7 @@ def actors(monkeypatch):
 def pipeline(coupling, robots):
     chosen = solvers.Pipeline()
     return replace(
-        chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-6)
+        chosen, soc=replace(WARM_START, coupling=coupling, robots=robots, tolerance=1e-6)
     )
 
 

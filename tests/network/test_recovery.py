@@ -19,6 +19,7 @@ from solvers.distributed.substructured import SubstructuredSOC
 from solvers.loop import iterate
 from solvers.network.messages import obey, restore, take_snapshot
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
+from solvers.soc.soc import WARM_START
 from solvers.soc.subgraph import split_graph
 
 
@@ -84,7 +85,7 @@ class LeakyEngine:
 def pipeline(coupling, robots):
     chosen = solvers.Pipeline()
     return replace(
-        chosen, soc=replace(chosen.soc, coupling=coupling, robots=robots, tolerance=1e-5)
+        chosen, soc=replace(WARM_START, coupling=coupling, robots=robots, tolerance=1e-5)
     )
 
 
