@@ -31,7 +31,7 @@ from solvers.network.messages import Worker as Worker
 from solvers.network.ray_engine import RayEngine as RayEngine
 from solvers.network.recovery import Recovery as Recovery
 from solvers.pipeline import solve as solve
-from solvers.place import AUTO as AUTO, Automatic as Automatic
+from solvers.place import Automatic as Automatic
 from solvers.reporting.edge_fit import EdgeFit as EdgeFit
 from solvers.reporting.report import write_report as write_report
 from solvers.request import Pipeline as Pipeline
@@ -123,7 +123,7 @@ __all__ += [
     "solve_folder",
     "write_report",
 ]
-__all__ += ["AUTO", "SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
+__all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
 __all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]

@@ -49,9 +49,9 @@ class Pipeline:
 
     Parameters
     ----------
-    soc : SOC, PaperSOC, ExtendedSOC, AUTO or None
+    soc : SOC, PaperSOC, ExtendedSOC, Automatic or None
         The first stage, whose tolerance says when Newton takes over. None goes from the start
-        straight to Newton. With AUTO, the default, the place chooses: a SOC with a coarse
+        straight to Newton. With Automatic.AUTO, the default, the place chooses: a SOC with a coarse
         tolerance, or none where Newton alone is faster.
     newton : Newton
         The second stage, which goes down to rounding level.

@@ -18,7 +18,7 @@ the rounding of its computation, and asks nothing of how the matrices were compu
 
 import numpy as np
 
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.precisions import are_definite, trace_of_inverse
 
 # An eigenvalue below this, of a matrix with ones on its diagonal, is rounding.
@@ -27,8 +27,10 @@ SINGULAR = 1e-15
 MOST = 2.0**-5
 _UNIT_ROUNDOFF = 2.0**-53
 _OUTWARD = 1.0 + 2.0**-30  # for the rounding of the bounds themselves
+_OF_DAMAGED_LINES = np.errstate(all="ignore")  # whose numbers overflow: nothing is known of them
 
 
+@_OF_DAMAGED_LINES
 def inverse_error(A: Array, X: Array) -> Array:
     """Errors e, (m,), of matrices X as inverses of A, (m, k, k) each, symmetric; inf if unknown.
 
@@ -51,6 +53,7 @@ def inverse_error(A: Array, X: Array) -> Array:
     return np.where(is_known, norm / (1.0 - np.minimum(norm, 0.5)), np.inf)
 
 
+@_OF_DAMAGED_LINES
 def entry_error(W: Array, entry_errors: Array) -> Array:
     """Errors e, (m,), of W, (m, k, k), whose entries are off by `entry_errors` at most.
 
@@ -76,6 +79,7 @@ def congruence_error(A_size: Array, B: Array) -> Array:
     return np.asarray(64.0 * _UNIT_ROUNDOFF * (A_size.mT @ np.abs(B) @ A_size))
 
 
+@_OF_DAMAGED_LINES
 def precision_error(information: Array, d: int) -> Array:
     """Errors, (m,), of the kappa and tau of F, computed from matrices (m, k, k) as stored.
 
@@ -87,7 +91,9 @@ def precision_error(information: Array, d: int) -> Array:
     if information.shape[1] == 6:
         blocks.append(information[:, d:, d:])
     for block in blocks:
-        is_known = are_definite(block, SINGULAR)
+        is_usable = _are_usable(block)
+        usable = np.where(is_usable[:, None, None], block, np.eye(d))
+        is_known = is_usable & are_definite(usable, SINGULAR)
         known = np.where(is_known[:, None, None], block, np.eye(d))
         X = np.linalg.inv(known)
         X = 0.5 * (X + X.mT)
@@ -101,6 +107,13 @@ def both(first: Array, second: Array) -> Array:
     """The error of what is off by one error from what is off by another, rounded up."""
     together = (1.0 + first) * (1.0 + second) - 1.0
     return np.asarray(_OUTWARD * together + 16.0 * _UNIT_ROUNDOFF)
+
+
+def _are_usable(blocks: Array) -> BoolArray:
+    """Whether blocks, (m, k, k), can be scaled to ones on their diagonals, (m,)."""
+    diagonals = np.einsum("mkk->mk", blocks)
+    is_normal = (diagonals >= np.finfo(np.float64).tiny).all(axis=1)
+    return np.asarray(is_normal & np.isfinite(blocks).all(axis=(1, 2)))
 
 
 def _scale_of_diagonal(A: Array) -> Array:

@@ -25,6 +25,7 @@ from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
+from solvers.distributed.interface import Interface
 from solvers.distributed.robots import proof as robot_proof
 from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
 from solvers.riemannian.polish import polish
@@ -304,7 +305,7 @@ def test_a_driver_counts_the_rounding_of_the_separators_entries(
     problem = PGOProblem(varied_graph(3, 16, 3))
     with closing(driver_at(problem, contiguous(problem.graph, 3), optimum(problem))) as driver:
         no_rounding = np.zeros(4 * len(driver.cover))
-        monkeypatch.setattr(distributed_bound.Interface, "rounding", lambda *_: no_rounding)
+        monkeypatch.setattr(Interface, "rounding", lambda *_: no_rounding)
         fixed = driver.columns_of_pose_0(1).ravel()
         proof = distributed_bound.eliminate_S(driver, None, 1.0, 0.0)
         assert proof is not None

@@ -213,7 +213,7 @@ def test_the_ledger_counts_what_was_sent(
         sent[0].sum() + received[0].sum(),
     )
     # A solve of M x = b, a step (a), a Newton direction, the best translations and a proof take one
-    # round each.
+    # round each, and so does a move at rounding level, whose translations move straight on.
     counted = (
         *(
             Interior.project,
@@ -223,7 +223,7 @@ def test_the_ledger_counts_what_was_sent(
             Interior.rescale,
             Interior.solve,
         ),
-        *(Interior.finish, Interior.move, Interior.evaluate_trial, *PROOF),
+        *(Interior.finish, Interior.move, Interior.evaluate_trial, Interior.move_straight, *PROOF),
     )
     assert ledger.rounds == engine.times(*counted)
     assert ledger.all_reduces == engine.times(Interior.agree)

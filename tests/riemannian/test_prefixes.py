@@ -156,9 +156,13 @@ def test_it_reaches_the_certified_optimum_where_a_batch_start_does_not(
     assert len(grown.stages[2].history) == grown.stages[2].iterations + 1
 
 
-def test_robots_go_on_from_a_start_that_grows_in_one_place(tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_checkpoint", [False, True])
+def test_robots_go_on_from_a_start_that_grows_in_one_place(
+    has_checkpoint: bool, tmp_path: Path
+) -> None:
     problem = PGOProblem(trees(3, 200, 0.12, 3.0))
-    shared = solvers.solve(problem, GROWING, robots=3)
+    checkpoint = solvers.Checkpoint(tmp_path / "state.ckpt") if has_checkpoint else None
+    shared = solvers.solve(problem, GROWING, robots=3, checkpoint=checkpoint)
     assert shared.certificate.verdict is Verdict.CERTIFIED
     assert shared.objective == pytest.approx(solvers.solve(problem, GROWING).objective, rel=1e-9)
     assert [stage.name for stage in shared.stages] == [
@@ -167,12 +171,6 @@ def test_robots_go_on_from_a_start_that_grows_in_one_place(tmp_path: Path) -> No
         "growing start, in one place",
         "Newton",
     ]
-    checkpoint = solvers.Checkpoint(tmp_path / "state.ckpt")
-    without = solvers.solve(problem, GROWING, robots=3, checkpoint=checkpoint)
-    assert not without.is_certified
-    assert without.note == (
-        "a start that grows may find better poses; it takes a solve without a checkpoint"
-    )
     assert solvers.solve(problem, FIRST_ALONE, robots=3).note == ""
 
 
@@ -186,17 +184,13 @@ def with_wrong_edges(seed: int, count: int) -> PGOProblem:
     return PGOProblem(graph.with_edges(i, j, measured, 100.0, 100.0))
 
 
-@pytest.mark.parametrize("num_steps", [100, 5])
-def test_a_start_that_grew_in_vain_leaves_robots_the_better_answer(num_steps: int) -> None:
-    """It follows a first attempt that is at its limit of steps, too."""
+def test_a_start_that_grew_in_vain_leaves_robots_the_better_answer() -> None:
     problem = with_wrong_edges(1, 3)
-    pipeline = replace(GROWING, second_try=True, newton=solvers.Newton(max_iterations=num_steps))
+    pipeline = replace(GROWING, second_try=True)
     solution = solvers.solve(problem, pipeline, robots=3)
     names = [stage.name for stage in solution.stages]
     second = ["chordal start", "SOC", "Newton"]
     assert names[2:] == ["growing start, in one place", "Newton", *second]
-    is_at_limit = solution.stages[1].status is Status.MAX_ITERATIONS
-    assert is_at_limit == (num_steps == 5)
     cheapest = min(stage.objective for stage in solution.stages)
     assert solution.objective <= cheapest * (1 + 1e-9)
     assert not solution.is_certified

@@ -74,6 +74,7 @@ ROUNDS = (  # orders that are, or end, a round
         Inner.set_translations,
         Inner.move,
         Inner.evaluate_trial,
+        Inner.move_straight,
         fits_part,
         prove_interior,
     ),
