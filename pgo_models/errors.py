@@ -214,3 +214,8 @@ def _check_type(settings: type, name: str, value: object) -> None:
 def _is_plain_class(annotated: object) -> bool:
     """Whether `isinstance` can tell its objects."""
     return isinstance(annotated, type) and not getattr(annotated, "_is_protocol", False)
+
+
+# What linear algebra raises where numbers are beyond it, and what is raised here. Errors in a
+# program, as a TypeError, are not among them. A step that can only improve an answer may end so.
+FAILURES = (PGOError, ArithmeticError, LookupError, ValueError, RuntimeError, MemoryError)

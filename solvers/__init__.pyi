@@ -15,6 +15,7 @@ from solvers.convex.orthogonal import (
 )
 from solvers.distributed.checkpoint import Checkpoint as Checkpoint
 from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
+from solvers.given_poses import certify as certify
 from solvers.growing import GrowingSolution as GrowingSolution, extend as extend
 from solvers.handedness.ascent import HandednessAscent as HandednessAscent
 from solvers.handedness.hull_lagrangian import HullLagrangian as HullLagrangian
@@ -44,7 +45,6 @@ from solvers.result import (
     Stage as Stage,
     Status as Status,
 )
-from solvers.riemannian.certify import certify as certify
 from solvers.riemannian.newton import Newton as Newton, gauss_newton as gauss_newton
 from solvers.riemannian.polish import polish as polish
 from solvers.riemannian.prefixes import GrowingStart as GrowingStart

@@ -29,10 +29,10 @@ from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.place import AUTO, BROKEN_OFF, Attempt, Ending, FirstStage, Place, after_search
 from solvers.result import History, Outcome, Record, Run, Stage, Status
-from solvers.riemannian.certify import with_shrunk_information
 from solvers.riemannian.newton import Newton, needs_no_soc
 from solvers.riemannian.polish import polish
 from solvers.riemannian.prefixes import GrowingStart
+from solvers.riemannian.shrunk_bound import with_shrunk_information
 from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
 from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC, WARM_START

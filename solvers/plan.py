@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pgo_models.errors import NotPositiveDefiniteError, PGOError
+from pgo_models.errors import FAILURES, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.handedness.hull_lagrangian import HullState
@@ -32,8 +32,6 @@ LANDMARK_STEPS = 16
 SECOND_TRY_TOLERANCE = 1e-6
 HULL_PASSES = 3
 CLOSER = 0.1  # factor on the tolerance of the next pass
-# What linear algebra raises where numbers are beyond it. Errors in a program are not among them.
-FAILURES = (PGOError, ArithmeticError, LookupError, ValueError, RuntimeError, MemoryError)
 Improvement = Callable[[Place, Pipeline, Attempt], Attempt]
 
 

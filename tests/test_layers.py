@@ -41,6 +41,7 @@ ORDER = {
         "robust",
         "loop",
         "handedness",
+        "given_poses",
         "convex",
         "baselines",
         "place",

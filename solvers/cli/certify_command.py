@@ -35,8 +35,8 @@ from solvers.cli.shell import (
     save_then_show,
     wrapped,
 )
+from solvers.given_poses import certify
 from solvers.reporting.versions import installed_versions
-from solvers.riemannian.certify import certify
 from solvers.solution import (
     both_costs,
     certificate_json,

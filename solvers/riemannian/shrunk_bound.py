@@ -10,14 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pgo_models.certificates.certificate import BoundSource, Certificate, judge, judge_cost
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, prove_at
+from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.certificates.shrunk_information import shrink_information
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.precisions import filled, proper_information
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
 BISECTIONS = 5
@@ -70,3 +73,30 @@ def _try_cap(problem: PGOProblem, cap: float, best: ShrunkBound) -> tuple[bool, 
     if bound.value <= best.bound.value:
         return True, best
     return True, ShrunkBound(replace(bound, cap=cap), minimum, Lambda)
+
+
+def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Certificate:
+    """The certificate, or a better one by `bound_by_shrinking` where its bound on chi2 is loose."""
+    if problem.weighting is not Weighting.INFORMATION or bound_is_tight(problem, certificate):
+        return certificate
+    shrunk = bound_by_shrinking(problem, certificate.poses)
+    if shrunk.bound.value <= certificate.bound.value:
+        return certificate
+    by_smaller_cost = replace(certificate, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED)
+    # Of the poses given, which need not be those that the bound was found at.
+    rounding = ObjectiveRounding(
+        certificate.rounding_level,
+        certificate.objective_error,
+        certificate.fit,
+        certificate.weights_error,
+    )
+    judgement = judge_cost(
+        repr(problem), certificate.objective, rounding, shrunk.bound, certificate.wanted_gap
+    )
+    return judgement.of(by_smaller_cost)
+
+
+def bound_is_tight(problem: PGOProblem, certificate: Certificate) -> bool:
+    """Whether the poses that the bound was found at have the gap asked for, but for rounding."""
+    judged = judge(problem, certificate.poses, certificate)
+    return judged.is_certified or judged.is_hidden_by_rounding

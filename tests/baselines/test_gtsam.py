@@ -29,8 +29,8 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
+from solvers.given_poses import certify
 from solvers.result import Status
-from solvers.riemannian.certify import certify
 from solvers.riemannian.polish import polish
 
 needs_gtsam = pytest.mark.skipif(

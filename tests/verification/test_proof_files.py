@@ -24,7 +24,7 @@ from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.verify import verify_proof
-from solvers.riemannian.certify import certify
+from solvers.given_poses import certify
 
 Call = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]

@@ -2,7 +2,7 @@
 
 `pgo_models.certificates` bounds at given poses. Here it is decided at which: the poses given, the
 stationary points that Newton reaches from them and from the chordal start, and for chi2 the minimum
-of a smaller cost.
+of a smaller cost. Where the relaxation is loose in space, handedness terms are sought as well.
 """
 
 from dataclasses import replace
@@ -14,9 +14,9 @@ from pgo_models.certificates.certificate import (
     certificate_of_whole,
     certify_at,
     judge,
-    judge_cost,
+    with_terms,
 )
-from pgo_models.certificates.rounding_errors import ObjectiveRounding
+from pgo_models.errors import FAILURES
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
@@ -24,9 +24,10 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
-from pgo_models.problem.weighting import Weighting
+from solvers.handedness.search import HandednessSearch
+from solvers.loop import RunMonitor
 from solvers.riemannian.polish import polish, relative_decrement
-from solvers.riemannian.shrunk_bound import bound_by_shrinking
+from solvers.riemannian.shrunk_bound import bound_is_tight, with_shrunk_information
 
 
 def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
@@ -38,6 +39,7 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     is always that of the poses given. `certify_at` bounds at the poses as they are. Of a problem
     with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its tangent at the
     stationary point, and where that fails by smaller information matrices (`bound_by_shrinking`).
+    In space, handedness terms follow where the bound is still wide (`HandednessAscent`).
 
     Parameters
     ----------
@@ -85,7 +87,7 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
         polished = certify_at(problem, polish(problem, poses), gap, stationarity)
         source = BoundSource.REFINED if is_stationary else BoundSource.POLISHED
         certificate = judge(problem, poses, replace(polished, source=source))
-    if not _bound_is_tight(problem, certificate):
+    if not bound_is_tight(problem, certificate):
         start = polish(problem.convex_part, chordal_start(problem.convex_part))
         other = certify_at(problem, polish(problem, start), gap, stationarity)
         # Of equal bounds, as two zeros, the one with the better poses.
@@ -95,31 +97,24 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
         ):
             certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
         certificate = with_shrunk_information(problem, certificate)
+    if problem.d == 3 and not bound_is_tight(problem, certificate):
+        certificate = _with_terms_found(problem, poses, certificate)
     return certificate
 
 
-def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Certificate:
-    """The certificate, or a better one by `bound_by_shrinking` where its bound on chi2 is loose."""
-    if problem.weighting is not Weighting.INFORMATION or _bound_is_tight(problem, certificate):
-        return certificate
-    shrunk = bound_by_shrinking(problem, certificate.poses)
-    if shrunk.bound.value <= certificate.bound.value:
-        return certificate
-    by_smaller_cost = replace(certificate, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED)
-    # Of the poses given, which need not be those that the bound was found at.
-    rounding = ObjectiveRounding(
-        certificate.rounding_level,
-        certificate.objective_error,
-        certificate.fit,
-        certificate.weights_error,
-    )
-    judgement = judge_cost(
-        repr(problem), certificate.objective, rounding, shrunk.bound, certificate.wanted_gap
-    )
-    return judgement.of(by_smaller_cost)
+def _with_terms_found(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
+    """The certificate, or a better one by handedness terms that an ascent finds.
 
-
-def _bound_is_tight(problem: PGOProblem, certificate: Certificate) -> bool:
-    """Whether the poses that the bound was found at have the gap asked for, but for rounding."""
-    judged = judge(problem, certificate.poses, certificate)
-    return judged.is_certified or judged.is_hidden_by_rounding
+    They vanish at the poses that the bound was found at. The certificate stays where the ascent
+    fails: it can only improve it.
+    """
+    ground = problem.at_best_translations(certificate.poses)
+    at_bound = replace(certificate, objective=certificate.poses_objective)
+    try:
+        terms, _ = HandednessSearch().run(problem, ground, RunMonitor())
+        found = with_terms(problem, at_bound, terms, ground)
+    except FAILURES:
+        return certificate
+    if found is at_bound:
+        return certificate
+    return judge(problem, poses, replace(found, source=certificate.source))
