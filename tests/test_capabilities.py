@@ -1,0 +1,309 @@
+"""What can be solved where: every cell of the guide's table is tried on a tiny graph.
+
+A cell works, and its result is the one that a solve in one place has, or it is refused in one
+sentence. `python tests/test_capabilities.py` prints the table anew.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from graphs import informed, varied_graph
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import PGOError
+from pgo_models.graphs.g2o import write_g2o_folder
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel, victoria_park
+from pgo_models.problem.weighting import Weighting
+from solvers.folder_solve import FolderSolution
+from solvers.solution import Solution
+from solvers.studies.tightness import SweptScene, noisy_scene
+
+PAGE = Path(__file__).parents[1] / "notebooks/site/guide/capabilities.md"
+WORKS = "yes"
+MISSING = "no"
+Answer = Solution | FolderSolution
+
+
+def consensus(graph: PoseGraph) -> solvers.SOC:
+    """SOC by two robots that agree on the poses that they share."""
+    return solvers.SOC(coupling=solvers.Coupling.CONSENSUS, robots=pgo.partition(graph, 2))
+
+
+class Place(ABC):
+    """Where a graph is solved, for the table."""
+
+    name: str
+
+    @abstractmethod
+    def solve(
+        self,
+        graph: PoseGraph,
+        pipeline: solvers.Pipeline | None = None,
+        weighting: Weighting = Weighting.OWN,
+        **options: Any,
+    ) -> Answer:
+        """Solve a graph; a PGOError where that is refused."""
+
+
+class Here(Place):
+    name = "here"
+
+    def solve(
+        self,
+        graph: PoseGraph,
+        pipeline: solvers.Pipeline | None = None,
+        weighting: Weighting = Weighting.OWN,
+        **options: Any,
+    ) -> Solution:
+        return solvers.solve(pgo.PGOProblem(graph, weighting=weighting), pipeline, **options)
+
+
+class Robots(Place):
+    name = "robots and a driver"
+
+    def solve(
+        self,
+        graph: PoseGraph,
+        pipeline: solvers.Pipeline | None = None,
+        weighting: Weighting = Weighting.OWN,
+        **options: Any,
+    ) -> Solution:
+        problem = pgo.PGOProblem(graph, weighting=weighting)
+        return solvers.solve(problem, pipeline, robots=2, **options)
+
+
+class Alone(Place):
+    name = "robots without a driver"
+
+    def solve(
+        self,
+        graph: PoseGraph,
+        pipeline: solvers.Pipeline | None = None,
+        weighting: Weighting = Weighting.OWN,
+        **options: Any,
+    ) -> Solution:
+        asked = pipeline if pipeline is not None else solvers.Pipeline()
+        if asked.soc is solvers.Automatic.AUTO:
+            asked = replace(asked, soc=consensus(graph))
+        problem = pgo.PGOProblem(graph, weighting=weighting)
+        return solvers.solve(problem, replace(asked, driver_memory=0.0), robots=2, **options)
+
+
+class OwnFiles(Place):
+    name = "robots with own files"
+
+    def solve(
+        self,
+        graph: PoseGraph,
+        pipeline: solvers.Pipeline | None = None,
+        weighting: Weighting = Weighting.OWN,
+        **options: Any,
+    ) -> FolderSolution:
+        unknown = set(options) - {"callback", "time_limit"}
+        if unknown:
+            raise pgo.PGOError(f"solve_folder has no option {unknown.pop()}")
+        with tempfile.TemporaryDirectory() as folder:
+            robots = np.arange(graph.num_poses) * 2 // graph.num_poses
+            if graph.world is not None:
+                robots[graph.world] = 0
+            write_g2o_folder(graph.with_robots(robots), Path(folder) / "robots")
+            return solvers.solve_folder(Path(folder) / "robots", pipeline, weighting=weighting)
+
+
+PLACES = (Here(), Robots(), Alone(), OwnFiles())
+
+
+def has_cost_of(place: Place, graph: PoseGraph, weighting: Weighting) -> bool:
+    """Whether a place finds the cost that a solve here has."""
+    answer = place.solve(graph, weighting=weighting)
+    best = Here().solve(graph, weighting=weighting).objective
+    return bool(answer.certificate.objective <= best * (1.0 + 1e-3))
+
+
+def graph_in_space() -> PoseGraph:
+    return varied_graph(3, 8, 3)
+
+
+def graph_with_matrices() -> PoseGraph:
+    return informed(2, 8, 2, False, 1.0, NoiseModel(0.02, 0.02))
+
+
+def graph_with_gps() -> PoseGraph:
+    graph = varied_graph(1, 8, 2)
+    assert graph.truth is not None
+    return graph.with_position_prior(np.arange(4), graph.truth.t[:4], 10.0)
+
+
+def solves_landmarks(place: Place) -> bool:
+    graph = victoria_park(np.random.default_rng(0), num_poses=30)
+    return has_cost_of(place, graph, Weighting.ISOTROPIC)
+
+
+def finds_a_wrong_edge(place: Place) -> bool:
+    graph = varied_graph(5, 30, 2, NoiseModel(0.01, 0.01))
+    measured = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
+    spoiled = graph.with_edges(np.array([2]), np.array([25]), measured, 1e4, 1e4)
+    answer = place.solve(spoiled, robust=solvers.GNC())
+    robust = getattr(answer, "robust", None)
+    return robust is not None and bool(robust.rejected[-1])
+
+
+def has_covariances(place: Place) -> bool:
+    answer = place.solve(graph_with_matrices(), weighting=Weighting.ISOTROPIC)
+    if not isinstance(answer, Solution):
+        raise pgo.PGOError("its solution has no poses, and so no covariances of them")
+    return answer.marginals().shape == (8, 3, 3)
+
+
+def certifies_by_terms(place: Place) -> bool:
+    noise = np.deg2rad(70.0)
+    graph = noisy_scene(SweptScene.CIRCLE, noise, np.random.default_rng(0))
+    answer = place.solve(graph, weighting=Weighting.ISOTROPIC)
+    refuse_what_the_note_names(answer, "handedness terms")
+    return answer.certificate.bound.terms is not None
+
+
+def refuse_what_the_note_names(answer: Answer, step: str) -> None:
+    """Raise a PGOError where a solution says that a step, or all after SOC, were not taken."""
+    if step in answer.note or "no driver" in answer.note:
+        raise pgo.PGOError(answer.note)
+
+
+def grows(place: Place) -> bool:
+    """On odometry with closures that fit no map."""
+    rng = np.random.default_rng(1)
+    along = np.arange(13)
+    far = np.array([rng.choice(14, 2, replace=False) for _ in range(12)])
+    i, j = np.concatenate([np.stack([along, along + 1], axis=1), far]).T
+    R_ij = pgo.random_rotations(25, 2, rng)
+    graph = PoseGraph(14, i, j, R_ij, rng.standard_normal((25, 2)), np.ones(25), np.ones(25))
+    pipeline = solvers.Pipeline(growing=solvers.GrowingStart(first_size=6), second_try=False)
+    answer = place.solve(graph, pipeline, Weighting.ISOTROPIC)
+    refuse_what_the_note_names(answer, "growing start")
+    return any(stage.name.startswith("growing start") for stage in answer.stages)
+
+
+def writes_checkpoints(place: Place) -> bool:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.checkpoint"
+        place.solve(
+            graph_in_space(),
+            checkpoint=solvers.Checkpoint(path),
+            callback=lambda *_: True,
+            weighting=Weighting.ISOTROPIC,
+        )
+        return path.exists()
+
+
+def extends(place: Place) -> bool:
+    answer = place.solve(graph_in_space(), weighting=Weighting.ISOTROPIC)
+    grown = varied_graph(3, 8, 3).with_edges(
+        np.array([0]), np.array([5]), pgo.Poses(np.eye(3)[None], np.zeros((1, 3))), 1e-3, 1e-3
+    )
+    if not isinstance(answer, Solution):
+        raise pgo.PGOError("extend takes a Solution, which has poses")
+    return solvers.extend(answer, grown).problem.graph.num_edges == grown.num_edges
+
+
+def bears_faults(place: Place) -> bool:
+    pipeline = solvers.Pipeline(soc=consensus(graph_in_space()), faults=solvers.Faults())
+    return place.solve(graph_in_space(), pipeline, Weighting.ISOTROPIC).status.is_success
+
+
+def runs_soc(soc: Callable[[], Any]) -> Callable[[Place], bool]:
+    def run(place: Place) -> bool:
+        pipeline = solvers.Pipeline(soc=soc())
+        answer = place.solve(graph_in_space(), pipeline, Weighting.ISOTROPIC)
+        return any("SOC" in stage.name for stage in answer.stages)
+
+    return run
+
+
+@dataclass(frozen=True)
+class Capability:
+    """A row of the table, and how it is tried in a place."""
+
+    name: str
+    works: Callable[[Place], bool]
+
+
+CAPABILITIES = (
+    Capability("F", lambda place: has_cost_of(place, graph_in_space(), Weighting.ISOTROPIC)),
+    Capability(
+        "chi2", lambda place: has_cost_of(place, graph_with_matrices(), Weighting.INFORMATION)
+    ),
+    Capability(
+        "priors, GPS", lambda place: has_cost_of(place, graph_with_gps(), Weighting.ISOTROPIC)
+    ),
+    Capability("landmarks", solves_landmarks),
+    Capability(
+        "rotations alone",
+        lambda place: has_cost_of(place, graph_in_space(), Weighting.ROTATIONS),
+    ),
+    Capability("robust (GNC)", finds_a_wrong_edge),
+    Capability("covariances", has_covariances),
+    Capability("handedness terms", certifies_by_terms),
+    Capability("a start that grows", grows),
+    Capability("checkpoints", writes_checkpoints),
+    Capability("`extend`", extends),
+    Capability("faults", bears_faults),
+    Capability("CONSENSUS", runs_soc(lambda: consensus(graph_in_space()))),
+    Capability(
+        "SUBSTRUCTURED", runs_soc(lambda: solvers.SOC(coupling=solvers.Coupling.SUBSTRUCTURED))
+    ),
+    Capability("`PaperSOC`", runs_soc(solvers.PaperSOC)),
+)
+
+
+def tried(capability: Capability, place: Place) -> str:
+    """What the table says of a cell: that it works, that it is missing, or why it is refused."""
+    try:
+        return WORKS if capability.works(place) else ""
+    except PGOError as error:
+        return str(error)
+
+
+def table() -> str:
+    """The table of the page."""
+    rows = [["", *(place.name for place in PLACES)], ["---"] * (1 + len(PLACES))]
+    for capability in CAPABILITIES:
+        cells = (tried(capability, place) for place in PLACES)
+        rows.append([capability.name, *(WORKS if cell == WORKS else MISSING for cell in cells)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def cells_of_page() -> dict[tuple[str, str], str]:
+    """What the page says of every capability and place."""
+    lines = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line[:1] == "|"]
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert head == ["", *(place.name for place in PLACES)]
+    return {
+        (name, place): cell
+        for name, *cells in rows
+        for place, cell in zip(head[1:], cells, strict=True)
+    }
+
+
+@pytest.mark.parametrize("place", PLACES, ids=lambda place: place.name)
+@pytest.mark.parametrize("capability", CAPABILITIES, ids=lambda capability: capability.name)
+def test_a_cell_of_the_table_works_or_is_refused_in_a_sentence(
+    capability: Capability, place: Place
+) -> None:
+    result = tried(capability, place)
+    says = cells_of_page()[capability.name, place.name]
+    assert says == (WORKS if result == WORKS else MISSING), result
+    assert result == WORKS or (len(result.split()) > 4 and "\n" not in result)
+
+
+if __name__ == "__main__":
+    print(table())
