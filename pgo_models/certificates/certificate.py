@@ -22,7 +22,7 @@ from pgo_models.certificates.lower_bound import (
 )
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
-    objective_rounding,
+    rounding_of,
 )
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.figures import (
@@ -453,8 +453,9 @@ def certify_with(
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
-    objective = problem.objective(poses)
-    rounding = objective_rounding(problem, poses)
+    at = problem.at(poses)
+    objective = at.value
+    rounding = rounding_of(at)
     if bound is None:
         ground = ground if ground is not None else problem.at_best_translations(poses)
         tangent = problem.tangent_at(ground)
@@ -494,8 +495,9 @@ def judge(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certif
     A ProofError when F of the poses is below it by more than the rounding of F: then one of the two
     is wrong.
     """
-    objective = problem.objective(poses)
-    rounding = objective_rounding(problem, poses)
+    at = problem.at(poses)
+    objective = at.value
+    rounding = rounding_of(at)
     judgement = judge_cost(
         repr(problem), objective, rounding, certificate.bound, certificate.wanted_gap
     )

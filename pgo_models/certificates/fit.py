@@ -16,7 +16,7 @@ from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF, gamma
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 _SHARE_OF_ONE = 8.0  # times sqrt(m) its own error: what an edge may be off by beside m - 1 that fit
 _NEARLY = 2.0  # times its level: above that there is no need to look at every edge
@@ -106,8 +106,9 @@ def fit_of(problem: PGOProblem, poses: Poses) -> Fit:
     R from rotations is at most e_t and e_R: that of r_t is (2 + d^1.5) u, and (2 d + 3) u is in
     e_t; that of r_R is (d + 1) (d + d^0.5) u, and 2 d^0.5 (2 d + 3) u is in e_R. So at the exact
     rotations nearest to the poses every residual is at most (8 sqrt(m) + 1) e_t and (8 sqrt(m) + 1)
-    e_R. And F, or chi2, is at most 4 `rounding_cost` there, by the triangle inequality in the norm
-    whose square the sum is. As neither is ever negative, no poses cost less by more than that.
+    e_R. And F, or chi2, is at most 4 times the cost of these errors there, by the triangle
+    inequality in the norm whose square the sum is. As neither is ever negative, no poses cost less
+    by more than that.
 
     A fit to the digits. Where the file rounds measurements without noise, the true poses have
     residuals of at most the written errors, and so the least cost is at most that of these errors.
@@ -126,15 +127,20 @@ def fit_of(problem: PGOProblem, poses: Poses) -> Fit:
     Fit
         NONE says nothing of how good the poses are.
     """
-    poses = problem.seen_poses(poses)
-    rounding = edge_roundings(problem, poses)
+    at = problem.at(poses)
+    return fit_at(at, edge_roundings(problem, problem.seen_poses(poses)))
+
+
+def fit_at(at: EvaluatedPoses, rounding: EdgeErrors) -> Fit:
+    """`fit_of` poses that are evaluated already, with their `edge_roundings`."""
+    problem = at.problem
     allowances = {Fit.ROUNDING: Allowance(rounding, rounding)}
     written = written_errors(problem)
     if written is not None:
         together = rounding.plus(written)
         alone = rounding.plus(written.with_levers(problem).not_below_median())
         allowances[Fit.DIGITS] = Allowance(together, alone)
-    return _closest_fit(problem, poses, allowances)
+    return _closest_fit(at, allowances)
 
 
 def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
@@ -145,7 +151,7 @@ def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
     poses = problem.seen_poses(poses)
     rounding = edge_roundings(problem, poses)
     allowances = {Fit.ROUNDING: Allowance(rounding, rounding)}
-    return _closest_fit(problem, poses, allowances) is Fit.ROUNDING
+    return _closest_fit(problem.at(poses), allowances) is Fit.ROUNDING
 
 
 def fits_to_coordinates(problem: PGOProblem, poses: Poses) -> bool:
@@ -167,12 +173,7 @@ def fits_to_coordinates(problem: PGOProblem, poses: Poses) -> bool:
     directions = coordinates / np.where(lengths > 0.0, lengths, np.inf)
     alone = EdgeErrors(together.translation, together.rotation + directions)
     allowances = {Fit.COORDINATES: Allowance(together, alone)}
-    return _closest_fit(problem, poses, allowances) is Fit.COORDINATES
-
-
-def rounding_cost(problem: PGOProblem, poses: Poses) -> float:
-    """Cost of poses whose residuals are as large as rounding can make each (`edge_roundings`)."""
-    return edge_roundings(problem, problem.seen_poses(poses)).cost(problem)
+    return _closest_fit(problem.at(poses), allowances) is Fit.COORDINATES
 
 
 def edge_roundings(problem: PGOProblem, poses: Poses) -> EdgeErrors:
@@ -222,17 +223,18 @@ def written_errors(problem: PGOProblem) -> EdgeErrors | None:
     return EdgeErrors(written[:, 0], written[:, 1])
 
 
-def _closest_fit(problem: PGOProblem, poses: Poses, allowances: dict[Fit, Allowance]) -> Fit:
-    """The closest fit, of seen poses, that allows their residuals."""
+def _closest_fit(at: EvaluatedPoses, allowances: dict[Fit, Allowance]) -> Fit:
+    """The closest fit that allows the residuals of the poses."""
+    problem = at.problem
     # The cost as a whole is cheap to compute, and mostly settles it.
-    objective = problem.objective(poses)
+    objective = at.value
     possible = {}
     for fit, allowance in allowances.items():
         if objective <= _NEARLY * allowance.together.cost(problem):
             possible[fit] = allowance
     if not possible:
         return Fit.NONE
-    residuals = _residual_norms(problem, poses)
+    residuals = _residual_norms(problem, problem.seen_poses(at.poses))
     for fit, allowance in possible.items():
         if _allows(problem, allowance, residuals):
             return fit

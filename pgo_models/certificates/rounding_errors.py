@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.certificates.fit import Fit, fit_of, residual_errors, rounding_cost
+from pgo_models.certificates.fit import Fit, edge_roundings, fit_at, residual_errors
 from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
@@ -25,7 +25,7 @@ from pgo_models.problem.floating_point import (
     gamma,
 )
 from pgo_models.problem.incidence import rows_of_blocks
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 # of weights: products of four stay far from underflow and overflow
 _SMALLEST = 1e-100
@@ -221,6 +221,11 @@ class ObjectiveRounding:
 
 
 def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
+    """`rounding_of` poses, which are evaluated for it."""
+    return rounding_of(problem.at(poses))
+
+
+def rounding_of(at: EvaluatedPoses) -> ObjectiveRounding:
     """Rounding level of F at poses, a bound on its error there, and how closely they fit.
 
     As computed, a residual is off by its evaluation and by the `orthogonality_error` of the stored
@@ -232,11 +237,12 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     in the Euclidean norm of its d, or d^2, numbers (`residual_errors`); the error is sum tau (2
     ||r_t|| e_t + e_t^2) + kappa (2 ||r_R|| e_R + e_R^2) and the rounding of the sum. In chi2, kappa
     r_R is W r_R, and its excess, whose half gradient is C, adds 2 <|C|, errors> + (size_t e_t +
-    size_R e_R)^2. The level is `rounding_cost`.
+    size_R e_R)^2. The level is the cost of `edge_roundings`.
 
     Whether the poses are exact is not asked of the level, a sum, but of every edge: `fit_of`.
     """
-    poses = problem.seen_poses(poses)
+    problem = at.problem
+    poses = problem.seen_poses(at.poses)
     graph = problem.graph
     d = problem.d
     m = problem.graph.num_edges
@@ -244,7 +250,7 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     errors = residual_errors(problem, block_norms(offsets), poses.orthogonality_error)
     e_t = errors.translation
     e_R = float(errors.rotation[0])  # the same of every edge
-    residuals = problem.at(poses).residuals
+    residuals = at.residuals
     _, w = problem.residual_matrix
     # sum ||D r|| e, the terms that are linear in the errors. Along the axes of W, which turn no
     # norm, kappa weighs row by row.
@@ -260,8 +266,9 @@ def objective_rounding(problem: PGOProblem, poses: Poses) -> ObjectiveRounding:
     error = quadratic + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * F
     for of_cost in problem.weights.value_errors(problem, poses, e_t, e_R):
         error += of_cost
-    level = rounding_cost(problem, poses)
-    return ObjectiveRounding(level, OUTWARD * error, fit_of(problem, poses), graph.weights_error)
+    roundings = edge_roundings(problem, poses)
+    fit = fit_at(at, roundings)
+    return ObjectiveRounding(roundings.cost(problem), OUTWARD * error, fit, graph.weights_error)
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:

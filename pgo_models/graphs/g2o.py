@@ -140,8 +140,10 @@ def read_g2o(
     if not trust_folder:
         check_one_graph(files)
     graph = graph_of_files(path, files, weights)
+    if not path.is_dir():
+        return graph
     absent = absent_ids(files)
-    if not path.is_dir() or not len(absent):
+    if not len(absent):
         return graph
     name = f"{graph.name}, {FILES_HERE}"
     return replace(graph, absent=np.searchsorted(graph.pose_ids, absent), name=name)

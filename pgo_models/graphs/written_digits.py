@@ -30,6 +30,7 @@ MOST_DECIMALS = 13
 MOST_SIGNIFICANT = 14
 _ALL_DECIMALS = 22  # powers of ten up to this one are doubles
 _ALL_SIGNIFICANT = 17  # so many tell any two doubles apart
+_FEW = 256
 _SAME = 2.0 * np.finfo(float).eps  # relative rounding of a multiple of a unit, as computed
 
 
@@ -119,12 +120,21 @@ def _units_of_significant(numbers: Array, significant: int) -> Array:
 
 def _have_decimals(numbers: Array, decimals: int) -> bool:
     """Whether so many decimals are enough for all numbers, none of them zero."""
-    return _are_multiples(numbers, np.array(10.0**-decimals))
+    unit = np.array(10.0**-decimals)
+    return all(_are_multiples(part, unit) for part in _first_and_rest(numbers))
 
 
 def _have_significant(numbers: Array, significant: int) -> bool:
     """Whether so many significant digits are enough for all numbers, none of them zero."""
-    return _are_multiples(numbers, _units_of_significant(numbers, significant))
+    return all(
+        _are_multiples(part, _units_of_significant(part, significant))
+        for part in _first_and_rest(numbers)
+    )
+
+
+def _first_and_rest(numbers: Array) -> tuple[Array, Array]:
+    """A few numbers, which mostly settle that more digits are needed, and the others."""
+    return numbers[:_FEW], numbers[_FEW:]
 
 
 def _are_multiples(numbers: Array, units: Array) -> bool:

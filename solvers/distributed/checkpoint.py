@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
+from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.errors import FileFormatError, PGOError, SettingError, check_settings
 from pgo_models.files import replace_when_done
@@ -127,6 +128,7 @@ _CLASSES = (
     LowerBound,
     BoundSource,
     Verdict,
+    Fit,
     Weighting,
     # The driver and the account of its network.
     DriverState,

@@ -71,9 +71,10 @@ class SubstructuredStaircase:
     def init(
         self, driver: Driver, start: SubstructuredStaircaseState | None
     ) -> SubstructuredStaircaseState:
-        """State 0, at the poses that driver and robots hold."""
+        """State 0, or that of a snapshot, at the poses that driver and robots hold."""
         if start is not None:
-            return start
+            newton = self._newton.init(driver, start.newton)
+            return replace(start, moment=driver.moment(), newton=newton)
         return SubstructuredStaircaseState(0, driver.moment(), self._newton.init(driver, None))
 
     def step(

@@ -52,7 +52,9 @@ def test_it_solves_the_relaxation_as_one_place_does(
     assert found.status is Status.CONVERGED
     # Where no noise is, F is zero: both are near it, above the level of rounding or below.
     value = central.state.point.value
+    # Robots go on there, so that their F may be far below that of one place.
     rounding = 10.0 * (central.state.rounding_level + driver.current.rounding_level)
+    rounding = max(rounding, 1e-25 * problem.objective(start))
     assert driver.current.objective == pytest.approx(value, rel=1e-7, abs=rounding)
     lifted, Lambda = collect(driver)
     assert problem.objective(lifted) == pytest.approx(
@@ -107,8 +109,8 @@ def test_a_climb_goes_on_from_a_snapshot() -> None:
     while first.current.R.shape[1] == problem.d:
         state = method.step(first, state)
     second.resume(first.state, first.snapshots())
-    for driver in (first, second):
-        other = method.step(driver, state)
+    for driver, begun in ((first, state), (second, method.init(second, state))):
+        other = method.step(driver, begun)
         assert np.isfinite(other.newton.objective)
     np.testing.assert_array_equal(first.current.R, second.current.R)
     np.testing.assert_array_equal(collect(first)[0].t, collect(second)[0].t)
