@@ -156,7 +156,8 @@ class Here(Place):
             )
             judged = max(judged, relaxed, key=lambda known: known.lower_bound)
         status = other.status if other.status in BROKEN_OFF else cheaper.status
-        return replace(best, poses=poses, certificate=judged, status=status)
+        decrement = cheaper.decrement
+        return replace(best, poses=poses, certificate=judged, status=status, decrement=decrement)
 
     def start_grown(self, growing: GrowingStart) -> Attempt | None:
         """Start at poses that prefixes lead to; None where odometry does not join the poses."""
@@ -194,11 +195,13 @@ class Here(Place):
         self.stages.append(Stage.of(finished))
         return Attempt(finished.poses, finished.status, dual_bound=bounds[-1])
 
-    def soften(self, best: Attempt) -> Attempt:
+    def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
         return replace(best, certificate=with_shrunk_information(self.problem, best.proof))
 
-    def ascend(self, best: Attempt, search: HandednessSearch, Pi: Array | None = None) -> Attempt:
+    def bound_by_terms(
+        self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
+    ) -> Attempt:
         """Return the same poses, with the bound of handedness terms if it is better."""
         problem = self.problem
         ground = problem.at_best_translations(best.known_poses)
@@ -249,7 +252,7 @@ class Here(Place):
         return self.without_bound(Attempt(poses, stage.status))
 
     def without_bound(self, attempt: Attempt) -> Attempt:
-        """Certificate of the poses with the bound F >= 0, which needs no proof."""
+        """Return the attempt with the bound F >= 0, which needs no proof."""
         poses = attempt.known_poses
         certificate = certify_with(
             self.problem,

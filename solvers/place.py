@@ -64,8 +64,7 @@ class Attempt:
     poses : Poses or None
         The poses; None before the start, and while robots hold them.
     status : Status
-        How the last run ended that looked for poses. TIME_LIMIT, INTERRUPTED and STOPPED stay, as
-        nothing is looked for after them.
+        How the last run ended that looked for poses.
     decrement : float
         Half the squared Newton decrement over the cost at the poses; inf where it was not measured.
     certificate : Certificate or None
@@ -99,7 +98,7 @@ class Attempt:
         return self.certificate
 
     @property
-    def is_done(self) -> bool:
+    def has_certificate(self) -> bool:
         """Whether the certificate has been found."""
         return self.certificate is not None
 
@@ -124,8 +123,10 @@ def after_search(best: Attempt, certificate: Certificate, stage: Stage) -> Attem
 class Place(ABC):
     """Where a solve runs.
 
-    Each verb takes an attempt and returns the next one; none changes an attempt. The verbs of the
-    first attempt are abstract. Those of the steps after it refuse what is `missing` in a place.
+    Each verb takes an attempt and returns the next one; none changes an attempt. Where robots hold
+    the poses, an attempt goes on from those that they hold now. The verbs of the first attempt are
+    abstract. A place that lacks the verb of a later step says so in `missing`, and does not write
+    it; then `way_out` says how to have the step taken.
 
     Parameters
     ----------
@@ -199,7 +200,7 @@ class Place(ABC):
         """
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
-        """Return the cheaper poses with the best bound that either has."""
+        """Return the cheaper poses with the best bound that either has: after any other step."""
         raise self._refusal(Step.SECOND)
 
     def start_grown(self, growing: GrowingStart) -> Attempt | None:
@@ -217,11 +218,13 @@ class Place(ABC):
         """
         raise self._refusal(Step.STAIRCASE)
 
-    def soften(self, best: Attempt) -> Attempt:
+    def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
         raise self._refusal(Step.SMALLER_MATRICES)
 
-    def ascend(self, best: Attempt, search: HandednessSearch, Pi: Array | None = None) -> Attempt:
+    def bound_by_terms(
+        self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
+    ) -> Attempt:
         """Return the same poses, with the bound of handedness terms if it is better.
 
         The ascent begins with the terms of the multipliers Pi, (pairs, 4, 4), or with none.

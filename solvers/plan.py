@@ -4,9 +4,23 @@ A place (`solvers.place`) is where a solve runs, and takes every step in its own
 process, by robots of one graph, or by robots that have files of their own. This page has the order
 of the steps, and what happens when one of them is interrupted, out of time, or fails.
 
-An answer is open as long as its certificate is wider than asked for and could improve, and time is
-left. The steps after the first attempt are taken while the answer is open. Whatever goes wrong in
-them, the answer before them stands, and says so.
+1. A start.
+2. SOC, the splitting of orthogonality constraints, until Newton can take over.
+3. Newton, down to rounding level.
+4. The certificate of the poses. Steps 1 to 4 are an attempt.
+5. Another attempt, from a start that grows; and Newton of the first one to its end, if it was given
+   few steps because this was to follow.
+6. A second attempt, by a finer SOC or from another start.
+7. The semidefinite relaxation: poses that its solution rounds to, and its bound. For chi2, bounds
+   by smaller information matrices, whose cost is below chi2.
+8. Handedness terms, which are never negative on rotations and tell them from reflections: the cost
+   less these terms has a better bound. If need be they begin where the relaxation with convex hulls
+   of rotations is solved.
+
+Steps 5 to 8 are taken while the answer is open: its certificate is wider than asked for and could
+improve, and neither the time limit nor Ctrl-C has ended the solve. They can only improve the
+answer. What fails in them, as linear algebra does (`pgo_models.errors.FAILURES`), leaves the answer
+before it, with a sentence.
 """
 
 from __future__ import annotations
@@ -31,7 +45,7 @@ from solvers.soc.soc import SOC
 LANDMARK_STEPS = 16
 SECOND_TRY_TOLERANCE = 1e-6
 HULL_PASSES = 3
-CLOSER = 0.1  # factor on the tolerance of the next pass
+CLOSER = 0.1  # factor on the tolerance of the next pass over the relaxation with hulls
 Improvement = Callable[[Place, Pipeline, Attempt], Attempt]
 
 
@@ -48,7 +62,8 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     except RobotSilentError as error:
         return replace(place.salvage(Stage.silence), failures=(str(error),))
     best = improved(Step.GROWING, from_growing_start, place, settings, first)  # step 5
-    if _was_cut_short(place, settings, first) and (best is first or best.is_open):
+    growth_was_enough = first.is_open and not best.is_open
+    if _was_cut_short(place, settings, first) and not growth_was_enough:
         best = unless_it_fails(Step.LAST_STEPS, _LastSteps(first), place, settings, best)
     best = improved(Step.SECOND, from_second_start, place, settings, best)  # step 6
     best = improved(Step.STAIRCASE, from_relaxation, place, settings, best)  # step 7
@@ -59,11 +74,11 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
 
 def attempt(place: Place, soc: FirstStage, newton: Newton, start: Poses | None) -> Attempt:
     """Start, SOC where it is asked for or pays, Newton unless time is up, and the certificate."""
-    found, chosen = place.start(start, soc)
-    if found.is_done:  # a checkpoint has the outcome
+    found, soc_to_run = place.start(start, soc)
+    if found.has_certificate:  # a checkpoint has the outcome
         return found
-    if chosen is not None and not found.is_out_of_time:
-        found = place.run_soc(found, chosen)
+    if soc_to_run is not None and not found.is_out_of_time:
+        found = place.run_soc(found, soc_to_run)
     return newton_and_certificate(place, newton, found)
 
 
@@ -77,7 +92,10 @@ def newton_and_certificate(place: Place, newton: Newton, found: Attempt) -> Atte
 def improved(
     step: Step, improve: Improvement, place: Place, settings: Pipeline, best: Attempt
 ) -> Attempt:
-    """Return the better of the answer and what a step makes of it, if it is open."""
+    """Take a step if the answer is open and the settings ask for it; return the better answer.
+
+    A step that the place cannot take is remembered, and named by the note of the solution.
+    """
     if not (best.is_open and settings.asks_for(step, place.d)):
         return best
     if step in place.missing:
@@ -88,7 +106,10 @@ def improved(
 def unless_it_fails(
     step: Step, improve: Improvement, place: Place, settings: Pipeline, best: Attempt
 ) -> Attempt:
-    """Return what a step makes of the answer, or the answer where it is interrupted or fails."""
+    """Take a step; return the answer as it was, marked, where the step is interrupted or fails.
+
+    After Ctrl-C the answer is INTERRUPTED, and so no step follows.
+    """
     try:
         return improve(place, settings, best)
     except KeyboardInterrupt:
@@ -103,21 +124,24 @@ def unless_it_fails(
 def from_growing_start(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Step 5: the better of the answer and an attempt from prefixes of the graph that grow.
 
-    How an attempt has to have ended for this: well, or for want of Newton steps on landmarks.
+    It is made after an attempt that ended well, or whose Newton was given few steps.
     """
     growing = settings.growing
     ended_well = best.status.is_success or _was_cut_short(place, settings, best)
     begun = place.start_grown(growing) if growing is not None and ended_well else None
     if begun is None:
         return best
-    if not begun.is_done:
+    if not begun.has_certificate:
         begun = newton_and_certificate(place, settings.newton, begun)
     return place.better(best, begun)
 
 
 @dataclass(frozen=True, eq=False)
 class _LastSteps:
-    """Newton of the first attempt to its end: no answer is worse for having cut it short."""
+    """Newton of the first attempt to its end, so that no answer is worse for having cut it short.
+
+    It goes on from the poses of the first attempt, whose place in the answer it takes.
+    """
 
     first: Attempt
 
@@ -127,7 +151,10 @@ class _LastSteps:
 
 
 def from_second_start(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Step 6: the better of the answer and an attempt by a finer SOC, or from another start."""
+    """Step 6: the better of the answer and an attempt by a finer SOC, or from another start.
+
+    An attempt that did not end well has reached a limit, and a second one would reach it, too.
+    """
     if not best.status.is_success:
         return best
     start = place.start_again()
@@ -136,7 +163,7 @@ def from_second_start(place: Place, settings: Pipeline, best: Attempt) -> Attemp
 
 
 def finer(soc: FirstStage) -> SOC | PaperSOC:
-    """SOC of a second attempt: a finer tolerance, and the default limit of iterations of `SOC`."""
+    """SOC of a second attempt: a finer tolerance, and as many iterations as that may take."""
     known = soc if isinstance(soc, SOC | PaperSOC) else SOC()
     tolerance = min(known.tolerance, SECOND_TRY_TOLERANCE)
     return replace(known, tolerance=tolerance, max_iterations=SOC.max_iterations)
@@ -145,7 +172,7 @@ def finer(soc: FirstStage) -> SOC | PaperSOC:
 def from_relaxation(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Step 7: the better of the answer and what the solution of the relaxation rounds to.
 
-    The bound is the best of both certificates and the relaxation's own.
+    The bound is the best of three: that of the answer, of the rounded poses, of the relaxation.
     """
     assert settings.staircase is not None
     rounded = place.climb(best, replace(settings.staircase, gap=settings.gap))
@@ -156,7 +183,7 @@ def from_relaxation(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
 
 def by_smaller_matrices(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Step 7 for chi2: the answer with the best bound that smaller information matrices give."""
-    return place.soften(best)
+    return place.bound_by_smaller_matrices(best)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,26 +197,26 @@ class _Terms:
 
     def __call__(self, place: Place, settings: Pipeline, best: Attempt) -> Attempt:
         search = settings.handedness
-        return best if search is None else place.ascend(best, search, self.Pi)
+        return best if search is None else place.bound_by_terms(best, search, self.Pi)
 
 
 @dataclass(frozen=True, eq=False)
 class _Hulls:
     """Step 8, continued: terms that begin where the relaxation with hulls of rotations is solved.
 
-    It is solved in passes, each from the `state` of the one before and `closeness` times as close
-    to poses. A pass that fails leaves the answer of the one before.
+    It is solved in passes. Each goes on from the `state` of the one before, with the tolerance of
+    the settings times a smaller factor. A pass that fails leaves the answer of the one before.
     """
 
     passes_left: int = HULL_PASSES
     state: HullState | None = None
-    closeness: float = 1.0
+    tolerance_factor: float = 1.0
 
     def __call__(self, place: Place, settings: Pipeline, best: Attempt) -> Attempt:
         method = None if settings.handedness is None else place.hulls(settings.handedness)
         if method is None:
             return best
-        method = replace(method, tolerance=self.closeness * method.tolerance)
+        method = replace(method, tolerance=self.tolerance_factor * method.tolerance)
         before = best
         best, state = place.solve_hulls(best, method, self.state)
         is_close = state.closeness <= method.tolerance
@@ -199,7 +226,7 @@ class _Hulls:
         best = unless_it_fails(Step.TERMS, _Terms(state.Pi), place, settings, best)
         if not best.is_open or not is_close or self.passes_left == 1:
             return best
-        closer = _Hulls(self.passes_left - 1, state, CLOSER * self.closeness)
+        closer = _Hulls(self.passes_left - 1, state, CLOSER * self.tolerance_factor)
         return unless_it_fails(Step.HULLS, closer, place, settings, best)
 
 
@@ -213,6 +240,6 @@ def _first_newton(place: Place, settings: Pipeline) -> Newton:
 
 
 def _was_cut_short(place: Place, settings: Pipeline, first: Attempt) -> bool:
-    """Whether Newton of the first attempt may take more steps than it was given."""
+    """Whether Newton of the first attempt was given few steps, and took them all."""
     has_more = _first_newton(place, settings) != settings.newton
     return has_more and first.status is Status.MAX_ITERATIONS

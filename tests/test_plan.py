@@ -54,8 +54,8 @@ VERBS = {
     Step.GROWING: "start_grown",
     Step.SECOND: "start_again",
     Step.STAIRCASE: "climb",
-    Step.SMALLER_MATRICES: "soften",
-    Step.TERMS: "ascend",
+    Step.SMALLER_MATRICES: "bound_by_smaller_matrices",
+    Step.TERMS: "bound_by_terms",
     Step.HULLS: "solve_hulls",
 }
 FAILURES = [

@@ -149,11 +149,13 @@ class RobotsOfGraph(DriverPlace):
         self.driver.set_poses(best.known_poses)
         return self.climb_from_current(staircase)
 
-    def soften(self, best: Attempt) -> Attempt:
+    def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Try smaller information matrices, in one place."""
-        return self.here.soften(best)
+        return self.here.bound_by_smaller_matrices(best)
 
-    def ascend(self, best: Attempt, search: HandednessSearch, Pi: Array | None = None) -> Attempt:
+    def bound_by_terms(
+        self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
+    ) -> Attempt:
         """Return the same poses, with the bound of terms that the robots have of their edges."""
         driver = self.driver
         here = self.here

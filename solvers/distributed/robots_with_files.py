@@ -2,7 +2,8 @@
 
 The driver knows the interface between the robots (`solvers.distributed.own_files`), and of the
 answer its cost and bound. The robots keep the poses of the cheapest attempt so far. A certificate
-is always one of these, and has neither poses nor multipliers.
+is always of the poses that they keep then, and has neither poses nor multipliers itself. A bound
+holds for all poses, and so belongs to whatever they keep.
 """
 
 from __future__ import annotations
@@ -107,9 +108,9 @@ class RobotsWithFiles(DriverPlace):
                 attempt.status,
             )
             self.kept.append(answer)
-        return replace(attempt, certificate=self.certificate(bound, source))
+        return replace(attempt, certificate=self.certificate_of_kept(bound, source))
 
-    def certificate(self, bound: LowerBound, source: BoundSource) -> Certificate:
+    def certificate_of_kept(self, bound: LowerBound, source: BoundSource) -> Certificate:
         """Certificate of the poses that the robots keep."""
         kept = self.kept[-1]
         no_poses = Poses(np.zeros((0, self.d, self.d)), np.zeros((0, self.d)))
@@ -135,7 +136,7 @@ class RobotsWithFiles(DriverPlace):
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the poses that the robots keep, with the best bound that either has."""
         highest = max(best.proof, other.proof, key=lambda known: known.lower_bound)
-        certificate = self.certificate(highest.bound, highest.source)
+        certificate = self.certificate_of_kept(highest.bound, highest.source)
         status = other.status if other.status in BROKEN_OFF else self.kept[-1].status
         return replace(best, certificate=certificate, status=status)
 
@@ -153,7 +154,7 @@ class RobotsWithFiles(DriverPlace):
         driver.current = kept.cover
         return self.climb_from_current(staircase)
 
-    def soften(self, best: Attempt) -> Attempt:
+    def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same answer: the cost is F, for which smaller matrices change nothing."""
         return best
 
@@ -168,7 +169,7 @@ class RobotsWithFiles(DriverPlace):
             raise PGOError(f"{self.name}: weights too far apart for doubles; see pgo info FILE")
         stage = ending(self.kept[-1].objective)
         self.stages.append(stage)
-        certificate = self.certificate(NO_BOUND, BoundSource.GIVEN)
+        certificate = self.certificate_of_kept(NO_BOUND, BoundSource.GIVEN)
         return Attempt(status=stage.status, certificate=certificate)
 
     def move_to_frame(self, best: Attempt) -> tuple[Attempt, str, float]:
@@ -184,7 +185,7 @@ class RobotsWithFiles(DriverPlace):
         objective = math.fsum(part.cost for part in parts)
         rounding = _sum_of_roundings([part.rounding for part in parts])
         self.kept.append(replace(kept, objective=objective, rounding=rounding))
-        certificate = self.certificate(best.proof.bound, best.proof.source)
+        certificate = self.certificate_of_kept(best.proof.bound, best.proof.source)
         F = math.fsum(part.F for part in parts)
         return replace(best, certificate=certificate), frame, F
 
@@ -202,10 +203,10 @@ def _frame(answers: Sequence[Answer]) -> tuple[Array, Array, str]:
     first = min(answers, key=lambda answer: (not answer.held[0], answer.held[1]))
     d = first.given.shape[1]
     target = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    place = "at the identity"
+    where = "at the identity"
     if np.isfinite(first.given).all():
         target = first.given
-        place = "where its file has it"
+        where = "where its file has it"
     R = target[1:].T @ first.solved[1:]
     t = target[0] - R @ first.solved[0]
-    return R, t, f"pose {first.held[2]} {place}"
+    return R, t, f"pose {first.held[2]} {where}"
