@@ -5,6 +5,8 @@ stationary points that Newton reaches from them and from the chordal start, and 
 of a smaller cost. Where the relaxation is loose in space, handedness terms are sought as well.
 """
 
+import warnings
+from collections.abc import Callable
 from dataclasses import replace
 
 from pgo_models.certificates.certificate import (
@@ -16,7 +18,7 @@ from pgo_models.certificates.certificate import (
     judge,
     with_terms,
 )
-from pgo_models.errors import FAILURES
+from pgo_models.errors import FAILURES, GraphWarning
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
@@ -87,34 +89,61 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
         polished = certify_at(problem, polish(problem, poses), gap, stationarity)
         source = BoundSource.REFINED if is_stationary else BoundSource.POLISHED
         certificate = judge(problem, poses, replace(polished, source=source))
-    if not bound_is_tight(problem, certificate):
-        start = polish(problem.convex_part, chordal_start(problem.convex_part))
-        other = certify_at(problem, polish(problem, start), gap, stationarity)
-        # Of equal bounds, as two zeros, the one with the better poses.
-        if (other.lower_bound, -other.poses_objective) > (
-            certificate.lower_bound,
-            -certificate.poses_objective,
-        ):
-            certificate = judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
-        certificate = with_shrunk_information(problem, certificate)
-    if problem.d == 3 and not bound_is_tight(problem, certificate):
-        certificate = _with_terms_found(problem, poses, certificate)
+    for improve in (_beside_the_chordal_start, _by_smaller_matrices, _by_terms):
+        if not bound_is_tight(problem, certificate):
+            certificate = _improved(improve, problem, poses, certificate)
     return certificate
 
 
-def _with_terms_found(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
-    """The certificate, or a better one by handedness terms that an ascent finds.
+def _improved(
+    improve: Callable[[PGOProblem, Poses, Certificate], Certificate],
+    problem: PGOProblem,
+    poses: Poses,
+    certificate: Certificate,
+) -> Certificate:
+    """The better certificate of a search for one; the given one, and a warning, where it fails."""
+    try:
+        return improve(problem, poses, certificate)
+    except FAILURES as error:
+        text = f"a search for a better bound failed ({error}); the bound before it stands"
+        warnings.warn(text, GraphWarning, stacklevel=3)
+        return certificate
 
-    They vanish at the poses that the bound was found at. The certificate stays where the ascent
-    fails: it can only improve it.
+
+def _beside_the_chordal_start(
+    problem: PGOProblem, poses: Poses, certificate: Certificate
+) -> Certificate:
+    """The better of the certificate and one from where the chordal start polishes to."""
+    start = polish(problem.convex_part, chordal_start(problem.convex_part))
+    reached = polish(problem, start)
+    other = certify_at(problem, reached, certificate.wanted_gap, certificate.stationarity)
+    # Of equal bounds, as two zeros, the one with the better poses.
+    if (other.lower_bound, -other.poses_objective) > (
+        certificate.lower_bound,
+        -certificate.poses_objective,
+    ):
+        return judge(problem, poses, replace(other, source=BoundSource.CHORDAL))
+    return certificate
+
+
+def _by_smaller_matrices(
+    problem: PGOProblem, poses: Poses, certificate: Certificate
+) -> Certificate:
+    """The certificate, or a better one of chi2 by smaller information matrices."""
+    return with_shrunk_information(problem, certificate)
+
+
+def _by_terms(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
+    """The certificate, or a better one in space by handedness terms that an ascent finds.
+
+    They vanish at the poses that the bound was found at.
     """
+    if problem.d == 2:
+        return certificate
     ground = problem.at_best_translations(certificate.poses)
     at_bound = replace(certificate, objective=certificate.poses_objective)
-    try:
-        terms, _ = HandednessSearch().run(problem, ground, RunMonitor())
-        found = with_terms(problem, at_bound, terms, ground)
-    except FAILURES:
-        return certificate
+    terms, _ = HandednessSearch().run(problem, ground, RunMonitor())
+    found = with_terms(problem, at_bound, terms, ground)
     if found is at_bound:
         return certificate
     return judge(problem, poses, replace(found, source=certificate.source))

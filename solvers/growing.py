@@ -15,7 +15,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import FAILURES, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
@@ -36,7 +36,7 @@ from solvers.result import OUT_OF_TIME
 from solvers.riemannian.growing_map import GrowingMap
 from solvers.riemannian.newton import Newton
 from solvers.soc.subgraph import PartProblem
-from solvers.solution import Solution
+from solvers.solution import Solution, joined_notes
 
 # Share of the gap by which Newton may leave F above its minimum: the bound can be ten times as far
 # below it.
@@ -413,7 +413,11 @@ def _solve_from(
     update = solve(problem, newton_alone, start, robots=robots, engine=engine)
     if update.status in OUT_OF_TIME or not update.certificate.can_improve:
         return update
-    whole = solve(problem, pipeline, start, robots=robots, engine=engine)
+    try:
+        whole = solve(problem, pipeline, start, robots=robots, engine=engine)
+    except FAILURES as error:
+        failure = f"a whole solve failed ({error}); the update before it stands"
+        return replace(update, note=joined_notes(update.note, failure))
     return replace(
         whole,
         stages=update.stages + whole.stages,

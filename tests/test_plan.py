@@ -10,7 +10,7 @@ from graphs import informed, varied_graph
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.errors import GraphWarning, NotPositiveDefiniteError
 from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
@@ -23,6 +23,9 @@ from solvers.handedness.search import HandednessSearch
 from solvers.here import Here
 from solvers.place import Place, Step
 from solvers.result import Status
+from solvers.robust_solves.attempts import Estimate, InOnePlace, Plan
+from solvers.robust_solves.robust_solve import _RobustSolve
+from solvers.solution import Solution
 
 LOUD = NoiseModel(translation_std=1.0, rotation_std=1.0)
 FIRST_ALONE = solvers.Pipeline(growing=None, second_try=False, staircase=None, handedness=None)
@@ -154,3 +157,73 @@ def test_a_failure_in_smaller_matrices_leaves_the_bound_on_chi2(
     solution = solvers.solve(problem, PIPELINES[Step.SMALLER_MATRICES])
     assert Step.SMALLER_MATRICES.value in [stage.name for stage in solution.stages]
     assert solution.lower_bound >= before.lower_bound
+
+
+@pytest.mark.parametrize("verb", ["chordal_start", "HandednessSearch.run"])
+def test_certify_keeps_its_bound_where_a_search_for_a_better_one_fails(
+    verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = loose_problem()
+    poses = solvers.solve(problem, FIRST_ALONE).poses
+    before = pgo.certify_at(problem, poses)
+    monkeypatch.setattr(f"solvers.given_poses.{verb}", failing(FAILURES[0]))
+    with pytest.warns(GraphWarning, match="a search for a better bound failed"):
+        certificate = solvers.certify(problem, poses)
+    assert certificate.lower_bound >= before.lower_bound * (1 - 1e-9) > 0.0
+
+
+def test_a_robust_solve_keeps_its_attempt_where_a_revision_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = varied_graph(5, 30, 2, NoiseModel(0.01, 0.01))
+    measured = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
+    spoiled = graph.with_edges(np.array([2]), np.array([25]), measured, 1e4, 1e4)
+    monkeypatch.setattr(_RobustSolve, "_cheapest_revision", failing(FAILURES[0]))
+    solution = solvers.solve(spoiled, robust=solvers.GNC())
+    assert solution.robust is not None
+    assert solution.robust.rejected[-1]
+    assert "the revision failed" in solution.note
+
+
+def test_an_attempt_of_a_robust_solve_that_fails_is_passed_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = varied_graph(5, 30, 2, NoiseModel(0.01, 0.01))
+    measured = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
+    spoiled = graph.with_edges(np.array([2]), np.array([25]), measured, 1e4, 1e4)
+    attempt = InOnePlace.attempt
+    plans: list[str] = []
+
+    def first_fails(place: InOnePlace, plan: Plan, start: pgo.Poses | None) -> Estimate:
+        plans.append(plan.name)
+        if len(plans) == 1:
+            raise FAILURES[0]
+        return attempt(place, plan, start)
+
+    monkeypatch.setattr(InOnePlace, "attempt", first_fails)
+    solution = solvers.solve(spoiled, robust=solvers.GNC())
+    assert len(plans) > 1
+    assert f"the attempt {plans[0]} failed" in solution.note
+    assert solution.robust is not None
+    assert solution.robust.rejected[-1]
+
+
+def test_an_update_stands_where_the_whole_solve_after_it_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = loose_problem()
+    solution = solvers.solve(problem, FIRST_ALONE)
+    calls: list[object] = []
+
+    def second_fails(*args: object, **options: object) -> Solution:
+        calls.append(args)
+        if len(calls) == 2:
+            raise FAILURES[0]
+        return solvers.solve(*args, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("solvers.growing.solve", second_fails)
+    pipeline = replace(PIPELINES[Step.STAIRCASE], handedness=None)
+    grown = solvers.extend(solution, problem.graph, pipeline=pipeline)
+    assert len(calls) == 2
+    assert "a whole solve failed" in grown.note
+    assert grown.lower_bound > 0.0

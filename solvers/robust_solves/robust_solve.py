@@ -9,7 +9,7 @@ from functools import partial, reduce
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import FAILURES, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.problem.problem import PGOProblem
@@ -34,7 +34,7 @@ from solvers.robust_solves.attempts import (
     plans_in_order,
 )
 from solvers.robust_solves.choice import Choice
-from solvers.solution import Solution
+from solvers.solution import Solution, joined_notes
 
 # Newton steps after one edge was dropped or added, and after a cluster of them was.
 _STEPS_AFTER_EDGE = 4
@@ -135,7 +135,8 @@ class _Revision:
 class _RobustSolve:
     """A robust solve under way: what its stages share, and the estimates made so far.
 
-    `least_squares` are the poses of the solution with every edge, once it was found.
+    `least_squares` are the poses of the solution with every edge, once it was found. `failures` are
+    sentences on what failed that could only have improved the answer.
     """
 
     doubted: DoubtedProblem
@@ -143,6 +144,7 @@ class _RobustSolve:
     start: Poses | None
     least_squares: Poses | None = None
     estimates: list[Estimate] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
     began: float = field(default_factory=time.perf_counter)
 
     @property
@@ -191,18 +193,21 @@ class _RobustSolve:
     def make_attempts(self, settings: GNC) -> Status:
         """Make attempts until no further one is needed, and return how the last one ended.
 
-        An attempt whose edges do not connect the poses is passed over; a GraphError when all are.
+        An attempt whose edges do not connect the poses, or in which linear algebra fails, is passed
+        over; the error of the last one is raised when all are.
         """
         ending = Status.CONVERGED
-        disconnected = GraphError()
+        last_failure: Exception = GraphError()
         try:
             for plan in plans_in_order(settings, self.doubted, self.place.is_central):
                 if plan.starts_at_least_squares and not self._has_least_squares():
                     continue
                 try:
                     estimate = self.place.attempt(plan, self._start_of(plan))
-                except GraphError as error:
-                    disconnected = error
+                except FAILURES as error:
+                    last_failure = error
+                    if not isinstance(error, GraphError):
+                        self.failures.append(f"the attempt {plan.name} failed ({error})")
                     continue
                 self.estimates.append(estimate)
                 ending = estimate.stage.status
@@ -213,7 +218,7 @@ class _RobustSolve:
             if not self.estimates:
                 raise
         if not self.estimates:
-            raise disconnected
+            raise last_failure
         return ending
 
     def _start_of(self, plan: Plan) -> Poses | None:
@@ -239,6 +244,8 @@ class _RobustSolve:
                 revision = self._cheapest_revision()
             except KeyboardInterrupt:
                 ending = Status.INTERRUPTED
+            except FAILURES as error:
+                self.failures.append(f"the revision failed ({error}); what it began with stands")
         solution = self._solution_of(revision)
         stages = [estimate.stage for estimate in self.estimates]
         status = ending if ending in OUT_OF_TIME else solution.status
@@ -257,7 +264,11 @@ class _RobustSolve:
         solution = self.place.solution(inliers, revision.poses)
         if not revision.has_changed or solution.is_certified:
             return solution
-        from_own_start = self.place.solution(solution.problem, None)
+        try:
+            from_own_start = self.place.solution(solution.problem, None)
+        except FAILURES as error:
+            self.failures.append(f"another start failed ({error}); the solution before it stands")
+            return solution
         return min(solution, from_own_start, key=lambda other: other.objective)
 
     def _cheapest_revision(self) -> _Revision:
@@ -329,4 +340,5 @@ class _RobustSolve:
         ledgers = self.place.ledgers
         ledger = reduce(Ledger.joined, ledgers) if ledgers else None
         seconds = time.perf_counter() - self.began
-        return replace(solution, robust=rejection, ledger=ledger, seconds=seconds)
+        note = joined_notes(solution.note, *self.failures)
+        return replace(solution, robust=rejection, ledger=ledger, seconds=seconds, note=note)
