@@ -27,6 +27,7 @@ from pgo_models.graphs.weight_errors import (
     entry_error,
     inverse_error,
     precision_error,
+    scaled_inverse,
 )
 
 # Places of the numbers of an EDGE2 line of TORO: x y theta, then the triangle as ff fs ss rr fr sr.
@@ -155,7 +156,7 @@ class Tag:
             information = np.tile(np.eye(self._side), (len(numbers), 1, 1))
         else:
             covariances = numbers[:, self.num_measured + triangle_places(self._side)]
-            information = np.asarray(np.linalg.inv(covariances), dtype=float)
+            information = scaled_inverse(covariances)
         triangles = information[:, *np.triu_indices(self._side)]
         return np.concatenate([measured, triangles], axis=1)
 

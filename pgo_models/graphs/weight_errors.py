@@ -30,6 +30,20 @@ _OUTWARD = 1.0 + 2.0**-30  # for the rounding of the bounds themselves
 _OF_DAMAGED_LINES = np.errstate(all="ignore")  # whose numbers overflow: nothing is known of them
 
 
+def scaled_inverse(A: Array) -> Array:
+    """Inverses of symmetric matrices, (m, k, k), as accurate as those with ones on the diagonals.
+
+    So the units of rows do not matter. Matrices with other diagonals than positive ones, which are
+    refused later, are inverted as they are.
+    """
+    diagonal = np.einsum("mkk->mk", A)
+    is_positive = (diagonal > 0.0).all(axis=1, keepdims=True)
+    scale = np.sqrt(np.where(is_positive, diagonal, 1.0))
+    scaled = A / scale[:, :, None] / scale[:, None, :]
+    X = np.linalg.inv(scaled)
+    return np.asarray(0.5 * (X + X.mT) / scale[:, :, None] / scale[:, None, :])
+
+
 @_OF_DAMAGED_LINES
 def inverse_error(A: Array, X: Array) -> Array:
     """Errors e, (m,), of matrices X as inverses of A, (m, k, k) each, symmetric; inf if unknown.
@@ -95,8 +109,7 @@ def precision_error(information: Array, d: int) -> Array:
         usable = np.where(is_usable[:, None, None], block, np.eye(d))
         is_known = is_usable & are_definite(usable, SINGULAR)
         known = np.where(is_known[:, None, None], block, np.eye(d))
-        X = np.linalg.inv(known)
-        X = 0.5 * (X + X.mT)
+        X = scaled_inverse(known)
         difference = np.abs(trace_of_inverse(known) / np.einsum("mkk->m", X) - 1.0)
         of_block = both(inverse_error(known, X), difference)
         error = np.maximum(error, np.where(is_known, of_block, np.inf))
