@@ -7,9 +7,9 @@ sentence. `python tests/test_capabilities.py` prints the table anew.
 from __future__ import annotations
 
 import tempfile
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +39,13 @@ def consensus(graph: PoseGraph) -> solvers.SOC:
     return solvers.SOC(coupling=solvers.Coupling.CONSENSUS, robots=pgo.partition(graph, 2))
 
 
-class Place(ABC):
-    """Where a graph is solved, for the table."""
+@dataclass(frozen=True)
+class Place:
+    """Where a graph is solved, for the table: `run` raises a PGOError where that is refused."""
 
     name: str
+    run: Callable[..., Answer]
 
-    @abstractmethod
     def solve(
         self,
         graph: PoseGraph,
@@ -52,81 +53,53 @@ class Place(ABC):
         weighting: Weighting = Weighting.OWN,
         **options: Any,
     ) -> Answer:
-        """Solve a graph; a PGOError where that is refused."""
+        return self.run(graph, pipeline or solvers.Pipeline(), weighting, **options)
 
 
-class Here(Place):
-    name = "here"
-
-    def solve(
-        self,
-        graph: PoseGraph,
-        pipeline: solvers.Pipeline | None = None,
-        weighting: Weighting = Weighting.OWN,
-        **options: Any,
-    ) -> Solution:
-        return solvers.solve(pgo.PGOProblem(graph, weighting=weighting), pipeline, **options)
+def here(
+    graph: PoseGraph, pipeline: solvers.Pipeline, weighting: Weighting, **options: Any
+) -> Answer:
+    return solvers.solve(pgo.PGOProblem(graph, weighting=weighting), pipeline, **options)
 
 
-class Robots(Place):
-    name = "robots and a driver"
-
-    def solve(
-        self,
-        graph: PoseGraph,
-        pipeline: solvers.Pipeline | None = None,
-        weighting: Weighting = Weighting.OWN,
-        **options: Any,
-    ) -> Solution:
-        problem = pgo.PGOProblem(graph, weighting=weighting)
-        return solvers.solve(problem, pipeline, robots=2, **options)
+def without_driver(
+    graph: PoseGraph, pipeline: solvers.Pipeline, weighting: Weighting, **options: Any
+) -> Answer:
+    if pipeline.soc is solvers.Automatic.AUTO:
+        pipeline = replace(pipeline, soc=consensus(graph))
+    pipeline = replace(pipeline, driver_memory=0.0)
+    return here(graph, pipeline, weighting, robots=2, **options)
 
 
-class Alone(Place):
-    name = "robots without a driver"
-
-    def solve(
-        self,
-        graph: PoseGraph,
-        pipeline: solvers.Pipeline | None = None,
-        weighting: Weighting = Weighting.OWN,
-        **options: Any,
-    ) -> Solution:
-        asked = pipeline if pipeline is not None else solvers.Pipeline()
-        if asked.soc is solvers.Automatic.AUTO:
-            asked = replace(asked, soc=consensus(graph))
-        problem = pgo.PGOProblem(graph, weighting=weighting)
-        return solvers.solve(problem, replace(asked, driver_memory=0.0), robots=2, **options)
-
-
-class OwnFiles(Place):
-    name = "robots with own files"
-
-    def solve(
-        self,
-        graph: PoseGraph,
-        pipeline: solvers.Pipeline | None = None,
-        weighting: Weighting = Weighting.OWN,
-        **options: Any,
-    ) -> FolderSolution:
-        unknown = set(options) - {"callback", "time_limit"}
-        if unknown:
-            raise pgo.PGOError(f"solve_folder has no option {unknown.pop()}")
-        with tempfile.TemporaryDirectory() as folder:
-            robots = np.arange(graph.num_poses) * 2 // graph.num_poses
-            if graph.world is not None:
-                robots[graph.world] = 0
-            write_g2o_folder(graph.with_robots(robots), Path(folder) / "robots")
-            return solvers.solve_folder(Path(folder) / "robots", pipeline, weighting=weighting)
+def own_files(
+    graph: PoseGraph, pipeline: solvers.Pipeline, weighting: Weighting, **options: Any
+) -> Answer:
+    unknown = set(options) - {"callback", "time_limit"}
+    if unknown:
+        raise pgo.PGOError(f"solve_folder has no option {unknown.pop()}")
+    with tempfile.TemporaryDirectory() as folder:
+        robots = np.arange(graph.num_poses) * 2 // graph.num_poses
+        if graph.world is not None:
+            robots[graph.world] = 0
+        write_g2o_folder(graph.with_robots(robots), Path(folder) / "robots")
+        return solvers.solve_folder(
+            Path(folder) / "robots", pipeline, weighting=weighting, **options
+        )
 
 
-PLACES = (Here(), Robots(), Alone(), OwnFiles())
+HERE = Place("here", here)
+PLACES = (
+    HERE,
+    Place("robots and a driver", partial(here, robots=2)),
+    Place("robots without a driver", without_driver),
+    Place("robots with own files", own_files),
+)
 
 
 def has_cost_of(place: Place, graph: PoseGraph, weighting: Weighting) -> bool:
     """Whether a place finds the cost that a solve here has."""
     answer = place.solve(graph, weighting=weighting)
-    best = Here().solve(graph, weighting=weighting).objective
+    best = HERE.solve(graph, weighting=weighting).certificate.objective
     return bool(answer.certificate.objective <= best * (1.0 + 1e-3))
 
 
