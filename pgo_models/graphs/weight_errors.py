@@ -30,11 +30,12 @@ _OUTWARD = 1.0 + 2.0**-30  # for the rounding of the bounds themselves
 _OF_DAMAGED_LINES = np.errstate(all="ignore")  # whose numbers overflow: nothing is known of them
 
 
+@_OF_DAMAGED_LINES
 def scaled_inverse(A: Array) -> Array:
     """Inverses of symmetric matrices, (m, k, k), as accurate as those with ones on the diagonals.
 
     So the units of rows do not matter. Matrices with other diagonals than positive ones, which are
-    refused later, are inverted as they are.
+    refused later, are inverted as they are. An inverse that overflows is inf, and refused, too.
     """
     diagonal = np.einsum("mkk->mk", A)
     is_positive = (diagonal > 0.0).all(axis=1, keepdims=True)

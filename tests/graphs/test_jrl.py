@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, assert_says, informed
-from hypothesis import given, strategies as st
+from hypothesis import example, given, strategies as st
 
 import pgo_models as pgo
 from pgo_models.errors import FileFormatError, GraphWarning, SettingError
@@ -356,6 +356,7 @@ WRONG_PARTS = NUMBERS | TYPES | st.sampled_from([None, True, [], {}, [1], [[]], 
 
 @pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
 @given(place=st.sampled_from(places_in(LOG)), wrong=WRONG_PARTS, skip_unknown=st.booleans())
+@example(("measurements", "a", 1, "measurements", 0, "covariance", 7), 5e-324, False)
 def test_a_damaged_log_is_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, place: tuple[Any, ...], wrong: Any, skip_unknown: bool
 ) -> None:
