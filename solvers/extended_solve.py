@@ -5,7 +5,9 @@ Priors are certified, and the note of the solution says which terms the bound le
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cvxpy as cp
 
@@ -21,24 +23,17 @@ from solvers.convex.extended_newton import ExtendedNewton, kinks
 from solvers.convex.extended_soc import ExtendedSOC, with_priors
 from solvers.loop import RunMonitor
 from solvers.place import Attempt
+from solvers.request import SolveRequest
 from solvers.result import Stage
-from solvers.riemannian.newton import Newton
-from solvers.robust_solves.attempts import SolveOnce
 from solvers.solution import Solution, joined_notes, note_of_absence, note_of_coupling
 
 
 def solve_extended(
-    problem: PGOProblem,
-    soc: ExtendedSOC,
-    newton: Newton,
-    start: Poses | None,
-    monitor: RunMonitor,
-    solve_once: SolveOnce,
-    asked: list[str],
+    request: SolveRequest, solution_for: Callable[[SolveRequest], Solution]
 ) -> Solution:
     """Solution of F with the terms and constraints that an ExtendedSOC adds.
 
-    Terms that are priors go into the graph, which `solve_once` solves. With priors alone that is
+    Terms that are priors go into the graph, which `solution_for` solves. With priors alone that is
     the solution, of the graph with them, whose last pose is the world.
 
     Else the poses are those of ExtendedSOC and, where that leaves all terms smooth and there are no
@@ -46,9 +41,14 @@ def solve_extended(
     says: terms that are never negative, and constraints, which can only raise the optimum. Where
     edges are replaced there is no bound.
 
-    A SettingError where a term may be negative, and where options of `solve_once` are `asked` for,
-    robots or robust, that go with priors alone.
+    A SettingError where a term may be negative, and where robots or a robust solve are asked for,
+    which go with priors alone.
     """
+    problem = request.problem
+    start = request.start
+    monitor = request.monitor
+    pipeline = request.pipeline
+    soc: Any = pipeline.soc  # an ExtendedSOC
     model = soc.model(problem)
     graph, other_terms = with_priors(model)
     left_out = _left_out(model.change, other_terms)
@@ -57,6 +57,8 @@ def solve_extended(
             "a term may be negative, so there is no bound; "
             "use solvers.run(ExtendedSOC(..), problem)"
         )
+    given = {"robots": request.robots, "robust": request.robust}
+    asked = [name for name, value in given.items() if value is not None]
     if left_out and asked:
         raise SettingError(
             f"{' and '.join(asked)} go with priors alone, and there are {left_out[0]}; "
@@ -64,7 +66,10 @@ def solve_extended(
         )
     with_known_priors = PGOProblem(graph, problem.backend, problem.weighting)
     known_start = None if start is None else graph.completed(start)
-    solution = solve_once(with_known_priors, start=known_start, time_limit=monitor.left)
+    without_terms = replace(pipeline, soc=soc.soc)
+    solution = solution_for(
+        replace(request, problem=with_known_priors, pipeline=without_terms, start=known_start)
+    )
     if not left_out:
         return solution
     stages = list(solution.stages)
@@ -78,6 +83,7 @@ def solve_extended(
             f"and there are {', '.join(rough)}"
         )
     elif not answer.is_out_of_time:
+        newton = pipeline.newton
         second = ExtendedNewton(soc.changer, newton.tolerance, newton.max_iterations)
         answer = _run_with_terms(problem, model, second, answer.poses, monitor, stages)
     certificate = _certificate_with_terms(

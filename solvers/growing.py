@@ -15,7 +15,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from pgo_models.errors import FAILURES, GraphError, SettingError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
@@ -30,13 +30,15 @@ from pgo_models.problem.weighting import Weighting
 from solvers.loop import run
 from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
-from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import OUT_OF_TIME
+from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
+from solvers.place import Attempt, Place, Step
+from solvers.places import solution_by
+from solvers.plan import solve_at, unless_it_fails
+from solvers.request import Pipeline, SolveRequest
 from solvers.riemannian.growing_map import GrowingMap
 from solvers.riemannian.newton import Newton
 from solvers.soc.subgraph import PartProblem
-from solvers.solution import Solution, joined_notes
+from solvers.solution import Solution
 
 # Share of the gap by which Newton may leave F above its minimum: the bound can be ten times as far
 # below it.
@@ -400,30 +402,34 @@ def _solve_from(
     robots: Partition | None = None,
     engine: Engine | None = None,
 ) -> Solution:
-    """Solution by Newton alone or, where its certificate is too wide, by the whole pipeline."""
+    """Solution from the poses before, as `update_at` finds it."""
+    request = SolveRequest(problem, pipeline, start, robots=robots, engine=engine)
+    warn_of_landmarks_seen_once(problem.graph)
     # Newton alone would leave added terms out, and needs a driver.
     if pipeline.has_added_terms or not pipeline.has_driver:
-        return solve(problem, pipeline, start, robots=robots, engine=engine)
-    tolerance = max(pipeline.newton.tolerance, _SHARE * pipeline.gap)
-    newton = replace(pipeline.newton, tolerance=tolerance)
-    # Terms are sought at the poses alone: the whole solve has the relaxation with hulls.
-    search = pipeline.handedness
+        return solution_for(request)
+    return solution_by(update_at, request)
+
+
+def update_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
+    """Solve a graph that has grown, at a place: by Newton alone or, if that fails, as any other.
+
+    Handedness terms are sought at the poses of Newton. The whole solve, which follows where the
+    certificate is still wider than asked for, has the relaxation with hulls, too.
+    """
+    tolerance = max(settings.newton.tolerance, _SHARE * settings.gap)
+    newton = replace(settings.newton, tolerance=tolerance)
+    search = settings.handedness
     terms = None if search is None else replace(search, hulls=None)
-    newton_alone = replace(pipeline.with_newton_alone(newton), handedness=terms)
-    update = solve(problem, newton_alone, start, robots=robots, engine=engine)
-    if update.status in OUT_OF_TIME or not update.certificate.can_improve:
+    newton_alone = replace(settings.with_newton_alone(newton), handedness=terms)
+    update = solve_at(place, newton_alone, start)
+    if not update.is_open:
         return update
-    try:
-        whole = solve(problem, pipeline, start, robots=robots, engine=engine)
-    except FAILURES as error:
-        failure = f"a whole solve failed ({error}); the update before it stands"
-        return replace(update, note=joined_notes(update.note, failure))
-    return replace(
-        whole,
-        stages=update.stages + whole.stages,
-        seconds=update.seconds + whole.seconds,
-        ledger=_joined(update.ledger, whole.ledger),
-    )
+
+    def solve_afresh(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+        return place.better(best, solve_at(place, settings, start))
+
+    return unless_it_fails(Step.WHOLE, solve_afresh, place, settings, update)
 
 
 def _joined(before: Ledger | None, after: Ledger | None) -> Ledger | None:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from solvers.riemannian.shrunk_bound import with_shrunk_information
 from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
 from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC, WARM_START
+
+if TYPE_CHECKING:  # what a plain solve does not need
+    from solvers.robust.gnc import GNC, Inliers
 
 # Poses from which SOC gives the memory of its factor up: a fifth of the most that a solve takes.
 MANY_POSES = 20_000
@@ -134,6 +137,15 @@ class Here(Place):
         with self.monitor.showing("certificate", self.problem.side):
             certificate = certify_at(self.problem, poses, self.gap, attempt.decrement)
         return replace(attempt, certificate=certificate)
+
+    def run_gnc(self, gnc: GNC, start: Poses | None) -> Inliers:
+        """Run graduated non-convexity."""
+        from solvers.robust.gnc import Inliers
+
+        finished = self.monitor.run(gnc, self.problem, start)
+        state = finished.state
+        stage = replace(Stage.of(finished), objective=state.objective)
+        return Inliers(finished.poses, state.inliers, state.schedule.scale, stage)
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the cheaper poses with the best bound: of either, or of the relaxation."""

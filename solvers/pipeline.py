@@ -1,6 +1,7 @@
 """solve(problem): from the start to the certificate, in one Solution.
 
-`solvers.plan` has the steps of a solve in their order; here it is decided where they are taken.
+`solvers.plan` has the steps of a solve in their order, `solvers.places` where they are taken; here
+it is decided which page a solve follows.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,20 +18,17 @@ from pgo_models.errors import GraphWarning
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem, as_problem
-from solvers.here import Here
-from solvers.local_solution import local_request, solution_of_whole
 from solvers.loop import RunMonitor
-from solvers.network.engine import Engine, InProcess
+from solvers.network.engine import Engine
+from solvers.places import in_local_world, solution_by
 from solvers.plan import solve_at
-from solvers.request import Pipeline, SolveRequest, solution_of
+from solvers.request import Pipeline, SolveRequest
 from solvers.result import Record
 from solvers.solution import Solution
 
 if TYPE_CHECKING:  # what a solve in one place does not need
     from solvers.distributed.checkpoint import Checkpoint
-    from solvers.distributed.robust import SharedEstimate
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
 
@@ -184,38 +181,24 @@ def solve(
         anchor=anchor,
         monitor=RunMonitor(time_limit, verbose, progress, callback),
     )
-    _warn_of_landmarks_seen_once(request.problem.graph)
+    warn_of_landmarks_seen_once(request.problem.graph)
+    return solution_for(request)
+
+
+def solution_for(request: SolveRequest) -> Solution:
+    """Solution of a request: with terms of one's own, without wrong edges, or by the plan alone."""
     if request.pipeline.has_added_terms:
-        return _solve_with_added_terms(request)
-    local = LocalWorld.of(request.problem)
-    if local is None:
-        return _solve_where_it_runs(request)
-    solution = _solve_where_it_runs(local_request(local, request))
-    return solution_of_whole(local, solution)
+        from solvers.extended_solve import solve_extended  # cvxpy is slow to import
 
-
-def _solve_where_it_runs(request: SolveRequest) -> Solution:
-    """Solution by a robust solve, by robots, or in one place, as was asked for."""
+        return solve_extended(request, solution_for)
     if request.robust is not None:
-        return _solve_without_wrong_edges(request, request.robust)
-    if request.robots is not None:
-        return _solve_by_robots(request, request.robots)
-    return _solve_in_one_place(request)
+        from solvers.robust_solves.robust_solve import solve_robustly
+
+        return in_local_world(partial(solve_robustly, request.robust), request)
+    return solution_by(solve_at, request)
 
 
-def _solve_once(request: SolveRequest) -> Callable[..., Solution]:
-    """`solve` with the anchor, callback and output of a request; the rest is to be given."""
-    monitor = request.monitor
-    return partial(
-        solve,
-        anchor=request.anchor,
-        callback=monitor.callback,
-        verbose=monitor.verbose,
-        progress=monitor.progress,
-    )
-
-
-def _warn_of_landmarks_seen_once(graph: PoseGraph) -> None:
+def warn_of_landmarks_seen_once(graph: PoseGraph) -> None:
     """Warn of landmarks with one edge, which tell nothing about the poses."""
     num_sights = np.bincount(graph.j, minlength=graph.num_poses)
     seen_once = graph.landmarks[num_sights[graph.landmarks] == 1]
@@ -229,76 +212,3 @@ def _warn_of_landmarks_seen_once(graph: PoseGraph) -> None:
         "look at them again"
     )
     warnings.warn(message, GraphWarning, stacklevel=3)
-
-
-def _solve_with_added_terms(request: SolveRequest) -> Solution:
-    """Solution of F with the terms and constraints of an ExtendedSOC."""
-    from solvers.extended_solve import solve_extended  # cvxpy is slow to import
-
-    pipeline = request.pipeline
-    soc: Any = pipeline.soc  # an ExtendedSOC
-    given = {"robots": request.robots, "robust": request.robust}
-    asked = [name for name, value in given.items() if value is not None]
-    solve_once = partial(
-        _solve_once(request),
-        pipeline=replace(pipeline, soc=soc.soc),
-        robust=request.robust,
-        robots=request.robots,
-        engine=request.engine,
-        checkpoint=request.checkpoint,
-    )
-    return solve_extended(
-        request.problem,
-        soc,
-        pipeline.newton,
-        request.start,
-        request.monitor,
-        solve_once,
-        asked,
-    )
-
-
-def _solve_without_wrong_edges(request: SolveRequest, robust: GNC | PCM) -> Solution:
-    """Solution of the edges that a robust solve keeps: Newton from the poses that it finds."""
-    from solvers.robust.gnc import GNC, LAST_STEPS
-    from solvers.robust_solves.robust_solve import solve_robustly
-
-    pipeline = request.pipeline
-    newton = pipeline.newton
-    if isinstance(robust, GNC):
-        newton = replace(newton, max_iterations=LAST_STEPS)
-    solve_once = partial(_solve_once(request), pipeline=pipeline.with_newton_alone(newton))
-    estimate: Callable[..., SharedEstimate] | None = None
-    if request.robots is not None:
-        from solvers.distributed.chosen_robots import robots_of_solve
-        from solvers.distributed.robust import estimate_by_robots
-
-        robots = robots_of_solve(pipeline.soc, request.robots, request.problem.graph)
-        engine = request.engine if request.engine is not None else InProcess()
-        solve_once = partial(solve_once, robots=robots, engine=engine)
-        estimate = partial(
-            estimate_by_robots, robots=robots, engine=engine, memory=pipeline.driver_memory
-        )
-    return solve_robustly(
-        request.problem,
-        robust,
-        pipeline.gap,
-        request.start,
-        request.monitor,
-        solve_once,
-        estimate,
-    )
-
-
-def _solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
-    """Solution by robots, with or without a driver."""
-    from solvers.shared_solve import solve_by_robots
-
-    return solve_by_robots(request, robots)
-
-
-def _solve_in_one_place(request: SolveRequest) -> Solution:
-    """Solution in this process."""
-    pipeline = request.pipeline
-    place = Here(request.monitor, [], request.problem, pipeline.gap)
-    return solution_of(request, place, solve_at(place, pipeline, request.start))

@@ -12,7 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import SettingError
@@ -21,12 +21,16 @@ from pgo_models.geometry.rotations import Array
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
+from solvers.network.ledger import Ledger
 from solvers.result import OUT_OF_TIME, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import DualBound, Staircase
 from solvers.soc.paper import PaperSOC
 from solvers.soc.soc import SOC
+
+if TYPE_CHECKING:  # what a plain solve does not need
+    from solvers.robust.gnc import GNC, Inliers
 
 BROKEN_OFF = (*OUT_OF_TIME, Status.STOPPED)
 Ending = Callable[[float], Stage]
@@ -46,6 +50,7 @@ FirstStage = AnySOC | Automatic | None
 class Step(enum.Enum):
     """Steps of a solve after its first attempt, each of which may improve the answer."""
 
+    WHOLE = "a whole solve"
     GROWING = "an attempt from a growing start"
     LAST_STEPS = "the last steps of Newton's method"
     SECOND = "a second attempt"
@@ -151,6 +156,11 @@ class Place(ABC):
         """Whether the graph has landmarks."""
 
     @property
+    def ledger(self) -> Ledger | None:
+        """What has crossed the network so far; None in one process."""
+        return None
+
+    @property
     def missing(self) -> frozenset[Step]:
         """Steps that cannot be taken here, though they might help."""
         return frozenset()
@@ -199,28 +209,36 @@ class Place(ABC):
         `ending` makes the stage that says why, from the cost of the poses.
         """
 
+    def finish(self, best: Attempt) -> None:
+        """Put away what would only serve to go on with a solve that was broken off."""
+        return  # nothing was put aside
+
+    def run_gnc(self, gnc: GNC, start: Poses | None) -> Inliers:
+        """Find wrong edges by graduated non-convexity, from a start or along known inliers."""
+        raise self._refusal("graduated non-convexity")
+
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the cheaper poses with the best bound that either has: after any other step."""
-        raise self._refusal(Step.SECOND)
+        raise self._refusal(Step.SECOND.value)
 
     def start_grown(self, growing: GrowingStart) -> Attempt | None:
         """Start at poses that prefixes of the graph lead to; None where it has no prefixes."""
-        raise self._refusal(Step.GROWING)
+        raise self._refusal(Step.GROWING.value)
 
     def start_again(self) -> Poses | None:
         """Return where a second attempt starts without SOC; None where it runs SOC once more."""
-        raise self._refusal(Step.SECOND)
+        raise self._refusal(Step.SECOND.value)
 
     def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
         """Solve the semidefinite relaxation from the best poses, and round its solution to poses.
 
         None where the cost is not convex and quadratic, and so has no such relaxation.
         """
-        raise self._refusal(Step.STAIRCASE)
+        raise self._refusal(Step.STAIRCASE.value)
 
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
-        raise self._refusal(Step.SMALLER_MATRICES)
+        raise self._refusal(Step.SMALLER_MATRICES.value)
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
@@ -229,11 +247,11 @@ class Place(ABC):
 
         The ascent begins with the terms of the multipliers Pi, (pairs, 4, 4), or with none.
         """
-        raise self._refusal(Step.TERMS)
+        raise self._refusal(Step.TERMS.value)
 
     def hulls(self, search: HandednessSearch) -> HullLagrangian | None:
         """Return the method for the relaxation with hulls of rotations, if it suits the graph."""
-        raise self._refusal(Step.HULLS)
+        raise self._refusal(Step.HULLS.value)
 
     def solve_hulls(
         self, best: Attempt, method: HullLagrangian, start: HullState | None
@@ -242,7 +260,7 @@ class Place(ABC):
 
         Returned are the better poses and the better bound, and the state that it ends at.
         """
-        raise self._refusal(Step.HULLS)
+        raise self._refusal(Step.HULLS.value)
 
-    def _refusal(self, step: Step) -> SettingError:
-        return SettingError(f"{step.value} cannot be taken here; {self.way_out}")
+    def _refusal(self, step: str) -> SettingError:
+        return SettingError(f"{step} cannot be taken here; {self.way_out}")

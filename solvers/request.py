@@ -22,7 +22,6 @@ from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
 from solvers.network.engine import DEFAULT_MEMORY, Engine
 from solvers.network.faults import Faults
-from solvers.network.ledger import Ledger
 from solvers.place import AUTO, Attempt, FirstStage, Place, Step
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
@@ -164,6 +163,7 @@ class Pipeline:
         """
         seeks_terms = self.handedness is not None and d == 3
         return {
+            Step.WHOLE: True,
             Step.GROWING: self.growing is not None,
             Step.LAST_STEPS: True,
             Step.SECOND: self.second_try,
@@ -195,13 +195,13 @@ class SolveRequest:
 
     problem: PGOProblem
     pipeline: Pipeline
-    start: Poses | None
-    robust: GNC | PCM | None
-    robots: Partition | int | None
-    engine: Engine | None
-    checkpoint: Checkpoint | None
-    anchor: int | None
-    monitor: RunMonitor
+    start: Poses | None = None
+    robust: GNC | PCM | None = None
+    robots: Partition | int | None = None
+    engine: Engine | None = None
+    checkpoint: Checkpoint | None = None
+    anchor: int | None = None
+    monitor: RunMonitor = field(default_factory=RunMonitor)
 
     def __post_init__(self) -> None:
         if self.anchor is not None:
@@ -263,13 +263,7 @@ class SolveRequest:
             )
 
 
-def solution_of(
-    request: SolveRequest,
-    place: Place,
-    best: Attempt,
-    ledger: Ledger | None = None,
-    robots: Partition | None = None,
-) -> Solution:
+def solution_of(request: SolveRequest, place: Place, best: Attempt) -> Solution:
     """Solution with the best attempt, in the frame that was asked for."""
     problem = request.problem
     current = problem.seen_poses(best.known_poses)
@@ -288,8 +282,8 @@ def solution_of(
         status=best.status,
         stages=tuple(place.stages),
         seconds=time.perf_counter() - request.monitor.began,
-        ledger=ledger,
-        robots=robots,
+        ledger=place.ledger,
+        robots=request.robots if isinstance(request.robots, Partition) else None,
         note=note_of(problem, certificate, place.note(best)),
         frame=frame,
         anchor=held,

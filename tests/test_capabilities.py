@@ -122,13 +122,13 @@ def solves_landmarks(place: Place) -> bool:
     return has_cost_of(place, graph, Weighting.ISOTROPIC)
 
 
-def finds_a_wrong_edge(place: Place) -> bool:
+def finds_a_wrong_edge(robust: solvers.GNC | solvers.PCM, place: Place) -> bool:
     graph = varied_graph(5, 30, 2, NoiseModel(0.01, 0.01))
     measured = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
     spoiled = graph.with_edges(np.array([2]), np.array([25]), measured, 1e4, 1e4)
-    answer = place.solve(spoiled, robust=solvers.GNC())
-    robust = getattr(answer, "robust", None)
-    return robust is not None and bool(robust.rejected[-1])
+    answer = place.solve(spoiled, robust=robust)
+    rejection = getattr(answer, "robust", None)
+    return rejection is not None and bool(rejection.rejected[-1])
 
 
 def has_covariances(place: Place) -> bool:
@@ -223,7 +223,8 @@ CAPABILITIES = (
         "rotations alone",
         lambda place: has_cost_of(place, graph_in_space(), Weighting.ROTATIONS),
     ),
-    Capability("robust (GNC)", finds_a_wrong_edge),
+    Capability("robust (GNC)", partial(finds_a_wrong_edge, solvers.GNC())),
+    Capability("robust (PCM)", partial(finds_a_wrong_edge, solvers.PCM())),
     Capability("covariances", has_covariances),
     Capability("handedness terms", certifies_by_terms),
     Capability("a start that grows", grows),

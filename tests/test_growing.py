@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -25,6 +24,8 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers import growing as growing_solves
 from solvers.growing import GrowingSolution, extend, extended_partition, extended_poses
+from solvers.place import Attempt, Place
+from solvers.plan import solve_at
 from solvers.result import Status
 
 
@@ -84,15 +85,15 @@ def test_an_update_that_is_interrupted_is_not_followed_by_another_solve(
 ) -> None:
     graph = grid(np.random.default_rng(0))
     before = solvers.solve(first_poses(graph, 20))
-    updates: list[solvers.Solution] = []
+    updates: list[Attempt] = []
 
-    def interrupted(*args: Any, **settings: Any) -> solvers.Solution:
-        found = solvers.solve(*args, **settings)
-        wide = replace(found.certificate, verdict=Verdict.NOT_CERTIFIED, gap=1.0)
+    def interrupted(place: Place, settings: solvers.Pipeline, start: Poses | None) -> Attempt:
+        found = solve_at(place, settings, start)
+        wide = replace(found.proof, verdict=Verdict.NOT_CERTIFIED, gap=1.0)
         updates.append(replace(found, status=Status.INTERRUPTED, certificate=wide))
         return updates[-1]
 
-    monkeypatch.setattr(growing_solves, "solve", interrupted)
+    monkeypatch.setattr(growing_solves, "solve_at", interrupted)
     found = extend(before, graph)
     assert len(updates) == 1
     assert found.status is Status.INTERRUPTED

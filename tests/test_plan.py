@@ -21,11 +21,11 @@ from solvers.handedness.ascent import HandednessAscent
 from solvers.handedness.hull_lagrangian import HullLagrangian
 from solvers.handedness.search import HandednessSearch
 from solvers.here import Here
-from solvers.place import Place, Step
+from solvers.place import Attempt, Place, Step
+from solvers.plan import solve_at
 from solvers.result import Status
-from solvers.robust_solves.attempts import Estimate, InOnePlace, Plan
+from solvers.robust_solves.attempts import Estimate, PlacesOfEdges, Plan
 from solvers.robust_solves.robust_solve import _RobustSolve
-from solvers.solution import Solution
 
 LOUD = NoiseModel(translation_std=1.0, rotation_std=1.0)
 FIRST_ALONE = solvers.Pipeline(growing=None, second_try=False, staircase=None, handedness=None)
@@ -185,22 +185,33 @@ def test_a_robust_solve_keeps_its_attempt_where_a_revision_fails(
     assert "the revision failed" in solution.note
 
 
+def test_a_robust_solve_that_rejects_nothing_proves_what_a_plain_one_does() -> None:
+    """A positioned graph in space whose relaxation is loose: handedness terms certify it."""
+    graph = pgo.read_g2o(Path(__file__).parent / "cases/utm_3d.g2o")
+    robust = solvers.solve(graph, robust=solvers.GNC())
+    assert robust.robust is not None
+    assert not robust.robust.rejected.any()
+    assert robust.is_certified
+    assert robust.certificate.bound.terms is not None
+    np.testing.assert_allclose(robust.objective, solvers.solve(graph).objective, rtol=1e-9, atol=0)
+
+
 def test_an_attempt_of_a_robust_solve_that_fails_is_passed_over(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     graph = varied_graph(5, 30, 2, NoiseModel(0.01, 0.01))
     measured = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
     spoiled = graph.with_edges(np.array([2]), np.array([25]), measured, 1e4, 1e4)
-    attempt = InOnePlace.attempt
+    attempt = PlacesOfEdges.attempt
     plans: list[str] = []
 
-    def first_fails(place: InOnePlace, plan: Plan, start: pgo.Poses | None) -> Estimate:
+    def first_fails(place: PlacesOfEdges, plan: Plan, start: pgo.Poses | None) -> Estimate:
         plans.append(plan.name)
         if len(plans) == 1:
             raise FAILURES[0]
         return attempt(place, plan, start)
 
-    monkeypatch.setattr(InOnePlace, "attempt", first_fails)
+    monkeypatch.setattr(PlacesOfEdges, "attempt", first_fails)
     solution = solvers.solve(spoiled, robust=solvers.GNC())
     assert len(plans) > 1
     assert f"the attempt {plans[0]} failed" in solution.note
@@ -215,13 +226,13 @@ def test_an_update_stands_where_the_whole_solve_after_it_fails(
     solution = solvers.solve(problem, FIRST_ALONE)
     calls: list[object] = []
 
-    def second_fails(*args: object, **options: object) -> Solution:
-        calls.append(args)
+    def second_fails(place: Place, settings: solvers.Pipeline, start: pgo.Poses | None) -> Attempt:
+        calls.append(place)
         if len(calls) == 2:
             raise FAILURES[0]
-        return solvers.solve(*args, **options)  # type: ignore[arg-type]
+        return solve_at(place, settings, start)
 
-    monkeypatch.setattr("solvers.growing.solve", second_fails)
+    monkeypatch.setattr("solvers.growing.solve_at", second_fails)
     pipeline = replace(PIPELINES[Step.STAIRCASE], handedness=None)
     grown = solvers.extend(solution, problem.graph, pipeline=pipeline)
     assert len(calls) == 2

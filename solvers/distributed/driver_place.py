@@ -19,6 +19,7 @@ from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.network.faults import Faults
+from solvers.network.ledger import Ledger
 from solvers.place import AUTO, Attempt, FirstStage, Place
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
@@ -60,6 +61,16 @@ class DriverPlace(Place):
     def d(self) -> int:
         """Dimension of the space, 2 or 3."""
         return self.driver.d
+
+    @property
+    def ledger(self) -> Ledger:
+        """What has crossed the network so far."""
+        return self.driver.network.ledger
+
+    def finish(self, best: Attempt) -> None:
+        """Remove the checkpoint of a solve that has ended well."""
+        if best.status.is_success:
+            self.journal.end()
 
     def chordal_start(self, soc: FirstStage) -> tuple[Attempt, SOC | None]:
         """Have the robots relax the rotations; with the start goes the SOC to run from there.

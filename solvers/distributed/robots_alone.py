@@ -36,7 +36,7 @@ from solvers.distributed.driver import Driver
 from solvers.here import Here
 from solvers.network.counted_pool import Count
 from solvers.network.faults import Faults
-from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
+from solvers.network.ledger import BYTES_PER_NUMBER, Ledger, Traffic
 from solvers.place import Attempt, Ending, FirstStage, Place, Step
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
@@ -90,6 +90,16 @@ class RobotsAlone(Place):
     def has_landmarks(self) -> bool:
         """Whether the graph has landmarks."""
         return self.here.has_landmarks
+
+    @property
+    def ledger(self) -> Ledger:
+        """What has crossed the network so far."""
+        return self.driver.network.ledger
+
+    def finish(self, best: Attempt) -> None:
+        """Remove the checkpoint of a solve that has ended well."""
+        if best.status.is_success:
+            self.journal.end()
 
     @property
     def missing(self) -> frozenset[Step]:

@@ -28,6 +28,8 @@ from solvers.distributed.handedness import (
 from solvers.distributed.lower_bound import best_bound_distributed, best_bound_with_terms
 from solvers.distributed.robots.agent import Agent
 from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots_alone import tree_traffic
+from solvers.distributed.robust import SharedGNC, inliers_of
 from solvers.handedness.ascent import AscentState
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search
@@ -38,6 +40,8 @@ from solvers.place import Attempt, Ending, FirstStage, after_search
 from solvers.result import Outcome, Stage
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
+from solvers.robust.gnc import GNC, Inliers
+from solvers.robust.weighted_edges import first_poses, known_inliers
 from solvers.soc.soc import SOC
 from solvers.soc.subgraph import middle_separator, split_graph
 
@@ -71,6 +75,7 @@ class RobotsOfGraph(DriverPlace):
     """
 
     here: Here
+    robots: Partition
 
     @property
     def has_landmarks(self) -> bool:
@@ -118,6 +123,21 @@ class RobotsOfGraph(DriverPlace):
             attempt.check_heard(self.faults, self.driver.network.ledger.rounds)
         self.journal.end_attempt((poses, certificate))
         return replace(attempt, poses=poses, certificate=certificate)
+
+    def run_gnc(self, gnc: GNC, start: Poses | None) -> Inliers:
+        """Run graduated non-convexity by the robots, which have the thresholds of their edges."""
+        driver = self.driver
+        problem = self.here.problem
+        if start is None:
+            known = known_inliers(problem.graph, gnc.known)
+            driver.hand_out(first_poses(problem.graph, known))
+            for traffic in tree_traffic(problem, self.robots):
+                driver.network.ledger = driver.network.ledger.after_round(traffic)
+        else:
+            driver.hand_out(start)
+        driver.choose_cost(final=True)
+        finished = self.monitor.run(SharedGNC.of(gnc, problem.graph), driver)
+        return inliers_of(problem, gnc, driver, finished)
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the cheaper poses with the best bound that either has."""

@@ -7,29 +7,22 @@ orders to the robots: residuals and weights stay with them, the control is sent,
 from __future__ import annotations
 
 import math
-from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import bridges
+from pgo_models.graphs.pose_graph import PoseGraph, bridges
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
 from solvers.distributed.robots.records import Reweigh
 from solvers.distributed.robots.reweighting import count_below, edges_within, sum_ratios
-from solvers.distributed.robots_alone import tree_traffic
-from solvers.distributed.robots_of_graph import open_driver
-from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
-from solvers.network.engine import Engine
-from solvers.network.ledger import Ledger
-from solvers.result import Measurement, Stage, Status
+from solvers.result import Measurement, Outcome, Stage, Status
 from solvers.robust.gnc import (
     GNC,
+    Inliers,
     ScheduleState,
     ending,
     first_schedule,
@@ -39,7 +32,6 @@ from solvers.robust.gnc import (
 from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import (
     RatioSums,
-    first_poses,
     known_inliers,
     negligible_weight,
 )
@@ -109,6 +101,11 @@ class SharedGNC:
     gnc: GNC
     least_weight: float
 
+    @classmethod
+    def of(cls, gnc: GNC, graph: PoseGraph) -> SharedGNC:
+        """The method for a graph, which says which weights are negligible."""
+        return cls(gnc, negligible_weight(graph, known_inliers(graph, gnc.known)))
+
     @property
     def max_iterations(self) -> int:
         """Most sets of weights."""
@@ -134,51 +131,27 @@ class SharedGNC:
         return ending(self.gnc, state.schedule)
 
 
-@dataclass(frozen=True, eq=False)
-class SharedEstimate:
-    """An estimate by robots: poses, the edges kept, (m,), and the scale of the thresholds.
+def inliers_of(
+    problem: PGOProblem, gnc: GNC, driver: Driver, finished: Outcome[SharedGNCState]
+) -> Inliers:
+    """Poses and edges that the robots keep at the end of a run.
 
-    `ledger` is the account of what was sent for it.
+    Edges that connect what those kept leave apart are kept, too. What is collected for this is not
+    on the ledger.
     """
-
-    poses: Poses
-    kept: BoolArray
-    scale: float
-    stage: Stage
-    ledger: Ledger
-
-
-def estimate_by_robots(
-    problem: PGOProblem,
-    gnc: GNC,
-    thresholds: Array,
-    start: Poses | None,
-    watch: RunMonitor,
-    robots: Partition,
-    engine: Engine,
-    memory: float,
-) -> SharedEstimate:
-    """Graduated non-convexity by robots, from `start` or along a tree of known inliers.
-
-    Edges that connect what those kept leave apart are kept, too. What is collected for the result
-    is not on the ledger.
-    """
-    graph = problem.graph
-    known = known_inliers(graph, gnc.known)
-    allowed = np.where(known, np.inf, thresholds)
-    with closing(open_driver(problem, robots, engine, memory, allowed)) as driver:
-        driver.hand_out(start if start is not None else first_poses(graph, known))
-        if start is None:
-            for traffic in tree_traffic(problem, robots):
-                driver.network.ledger = driver.network.ledger.after_round(traffic)
-        driver.choose_cost(final=True)
-        run = watch.run(SharedGNC(gnc, negligible_weight(graph, known)), driver)
-        scale = run.state.schedule.scale
-        kept = np.zeros(graph.num_edges, dtype=bool)
-        kept[np.concatenate(driver.ask(edges_within, scale, Count.OFF))] = True
-        poses = collect(driver)[0]
-        kept[bridges(graph, kept, problem.edge_costs(poses) / thresholds)] = True
-        stage = Stage(
-            "GNC", run.status, run.iterations, run.objective, run.seconds, run.history, gnc
-        )
-        return SharedEstimate(poses, kept, scale, stage, driver.network.ledger)
+    scale = finished.state.schedule.scale
+    kept = np.zeros(problem.graph.num_edges, dtype=bool)
+    kept[np.concatenate(driver.ask(edges_within, scale, Count.OFF))] = True
+    poses = collect(driver)[0]
+    ratio = problem.edge_costs(poses) / chi2_thresholds(problem, gnc.quantile)
+    kept[bridges(problem.graph, kept, ratio)] = True
+    stage = Stage(
+        "GNC",
+        finished.status,
+        finished.iterations,
+        finished.objective,
+        finished.seconds,
+        finished.history,
+        gnc,
+    )
+    return Inliers(poses, kept, scale, stage)

@@ -43,7 +43,8 @@ from pgo_models.errors import check_quantile, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.problem.problem import PGOProblem
-from solvers.result import Measurement, Status
+from pgo_models.problem.thresholds import chi2_thresholds
+from solvers.result import Measurement, Stage, Status
 from solvers.robust.losses import HARD_CONTROL, RobustLoss
 from solvers.robust.value_equality import ValueEquality
 from solvers.robust.weighted_edges import RatioSums, WeightedEdges, first_poses, known_inliers
@@ -140,6 +141,22 @@ class GNC(ValueEquality):
         )
         check_settings(self, above_one=["growth"], at_least_one=["inner_steps"])
         check_quantile(self.quantile)
+
+    def thresholds(self, problem: PGOProblem) -> Array:
+        """Compute the thresholds c_e^2 of all edges, before they are scaled.
+
+        Parameters
+        ----------
+        problem : PGOProblem
+            Problem with m edges.
+
+        Returns
+        -------
+        Array, shape (m,)
+            The quantile of the cost of a right edge; inf for known inliers.
+        """
+        is_known = known_inliers(problem.graph, self.known)
+        return np.where(is_known, np.inf, chi2_thresholds(problem, self.quantile))
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GNCState:
         """State 0: at `start`, or where known inliers lead along a tree."""
@@ -288,6 +305,19 @@ class GNCState(ScheduleState[WeightedEdges]):
     def inliers(self) -> BoolArray:
         """Known inliers and edges within their thresholds, (m,)."""
         return np.asarray(self.edges.known | (self.ratio <= 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Inliers:
+    """What a run ends with: its poses, the edges that it keeps, (m,), and the thresholds' scale.
+
+    `stage` says how the run ended, and has its robust cost.
+    """
+
+    poses: Poses
+    kept: BoolArray
+    scale: float
+    stage: Stage
 
 
 S = TypeVar("S", bound=ScheduleState[Any])

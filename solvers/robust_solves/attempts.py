@@ -1,38 +1,36 @@
 """Attempts of a robust solve: runs of graduated non-convexity, each certified.
 
-A `Plan` says what an attempt does differently, `plans_in_order` which ones there are. `InOnePlace`
-and `ByRobots` carry plans out; the result is an `Estimate`.
+A `Plan` says what an attempt does differently, `plans_in_order` which ones there are.
+`PlacesOfEdges` carries plans out, wherever the solve runs; the result is an `Estimate`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 
-from pgo_models.certificates.certificate import Certificate, certify_at
+from pgo_models.certificates.certificate import Certificate
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.robust import SharedEstimate
-from solvers.loop import RunMonitor
 from solvers.network.ledger import Ledger
-from solvers.result import Stage
-from solvers.riemannian.polish import polish
+from solvers.place import Place
+from solvers.places import open_place
+from solvers.plan import solve_at
+from solvers.request import Pipeline, SolveRequest, solution_of
+from solvers.result import OUT_OF_TIME, Stage, Status
 from solvers.robust.consistency import pairwise_consistent
 from solvers.robust.gnc import GNC, LAST_STEPS
 from solvers.robust.losses import RobustLoss
 from solvers.robust.rejection import Attempt
 from solvers.robust.revision import error_scale, inlier_problem, truncated_cost
 from solvers.solution import Solution
-
-# `solve` of the edges that are kept: called with a problem, start=poses, time_limit=seconds.
-SolveOnce = Callable[..., Solution]
 
 # Number of loop closures all pairs of which are compared within seconds.
 MAX_PAIRED = 4000
@@ -110,7 +108,7 @@ class Plan:
     starts_at_least_squares: bool = False
 
 
-def plans_in_order(settings: GNC, doubted: DoubtedProblem, is_central: bool) -> Iterator[Plan]:
+def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     """Plans of the attempts, the most promising first; each is made when it is asked for."""
     graph = doubted.problem.graph
     known = doubted.known
@@ -118,7 +116,7 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem, is_central: bool) -> 
     if settings.consistent:
         candidates = known | pairwise_consistent(graph, known)
     yield Plan("as set", settings, candidates)
-    if is_central and not settings.consistent and doubted.num_closures <= MAX_PAIRED:
+    if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
         consistent = known | pairwise_consistent(graph, known)
         if len(graph.components(consistent)) == 1:
             preselected = replace(settings, consistent=True)
@@ -162,25 +160,34 @@ def _with_other_loss(settings: GNC) -> tuple[str, GNC]:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Result of an attempt: the edges kept, (m,), and their certificate.
+    """Result of an attempt: the edges kept, (m,), and the solution with them.
 
     `scale` is the factor on the thresholds. `error_scale` is that of the edges kept, 1 where too
-    few cycles are left to estimate it. By robots there is a `solution`, too, with the account of
-    all that they sent.
+    few cycles are left to estimate it.
     """
 
     attempt: Attempt
     kept: BoolArray
     scale: float
     error_scale: float
-    certificate: Certificate
+    solution: Solution
     stage: Stage
-    solution: Solution | None = None
 
     @property
     def poses(self) -> Poses:
-        """Poses that the certificate is of."""
-        return self.certificate.poses
+        """Poses of the solution."""
+        return self.solution.poses
+
+    @property
+    def certificate(self) -> Certificate:
+        """Certificate of the solution."""
+        return self.solution.certificate
+
+    @property
+    def status(self) -> Status:
+        """How the attempt ended: what ended it early, or how graduated non-convexity did."""
+        is_out_of_time = self.solution.status in OUT_OF_TIME
+        return self.solution.status if is_out_of_time else self.stage.status
 
     @classmethod
     def of(
@@ -188,16 +195,17 @@ class Estimate:
         doubted: DoubtedProblem,
         kept: BoolArray,
         scale: float,
-        certificate: Certificate,
+        solution: Solution,
         stage: Stage,
         began: float,
     ) -> Estimate:
         """Estimate of an attempt that began at the time `began` and whose stage bears its name."""
-        poses = certificate.poses
+        poses = solution.poses
         num_cycles = int(kept.sum()) - (doubted.problem.num_poses - 1)
         errors = 1.0
         if num_cycles >= _MIN_CYCLES:
             errors = error_scale(doubted.with_edges(kept), poses)
+        certificate = solution.certificate
         attempt = Attempt(
             name=stage.name,
             cost=doubted.truncated_cost(poses),
@@ -207,74 +215,63 @@ class Estimate:
             seconds=time.perf_counter() - began,
         )
         stage = replace(stage, name=f"GNC, {stage.name}")
-        return cls(attempt, kept, scale, errors, certificate, stage)
+        return cls(attempt, kept, scale, errors, solution, stage)
 
 
 @dataclass(frozen=True, eq=False)
-class InOnePlace:
-    """Attempts, Newton steps and solutions of a robust solve, made in one place.
+class PlacesOfEdges:
+    """Where a robust solve runs: the place of its request, opened anew for the edges kept.
 
-    `ledgers` has what crossed the network so far, which is nothing here.
+    `ledgers` has what crossed the network at each of them so far, which is nothing in one process.
     """
 
     doubted: DoubtedProblem
-    gap: float
-    watch: RunMonitor
-    solve_once: SolveOnce
+    request: SolveRequest
     ledgers: list[Ledger] = field(default_factory=list)
-    is_central: ClassVar[bool] = True
 
     def attempt(self, plan: Plan, start: Poses | None) -> Estimate:
-        """Run graduated non-convexity on the plan's edges, and certify those kept."""
-        began = time.perf_counter()
-        kept = plan.candidates.copy()
-        settings = replace(plan.settings, known=self.doubted.known[kept])
-        run = self.watch.run(settings, self.doubted.with_edges(kept), start)
-        kept[kept] = run.state.inliers
-        inliers = self.doubted.with_edges(kept)
-        poses = polish(inliers, run.poses, max_steps=LAST_STEPS)
-        certificate = certify_at(inliers, poses, self.gap)
-        stage = replace(Stage.of(run), name=plan.name, objective=run.state.objective)
-        scale = run.state.schedule.scale
-        return Estimate.of(self.doubted, kept, scale, certificate, stage, began)
-
-    def solution(self, inliers: PGOProblem, start: Poses | None) -> Solution:
-        """Solution of some edges from poses nearby, in the time that is left."""
-        solution = self.solve_once(inliers, start=start, time_limit=self.watch.left)
-        if solution.ledger is not None:
-            self.ledgers.append(solution.ledger)
-        return solution
-
-    def polished(self, inliers: PGOProblem, poses: Poses, max_steps: int) -> Poses:
-        """Stationary poses near the given ones."""
-        return polish(inliers, poses, max_steps=max_steps)
-
-
-@dataclass(frozen=True, eq=False)
-class ByRobots(InOnePlace):
-    """The same by robots; `estimate` runs graduated non-convexity by them."""
-
-    estimate: Callable[..., SharedEstimate] = field(kw_only=True)
-    is_central: ClassVar[bool] = False
-
-    def attempt(self, plan: Plan, start: Poses | None) -> Estimate:
-        """Run graduated non-convexity on all edges, and solve with those kept."""
+        """Run graduated non-convexity on the plan's edges, and solve with those that it keeps."""
         began = time.perf_counter()
         doubted = self.doubted
-        shared = self.estimate(
-            doubted.problem, plan.settings, doubted.thresholds, start, self.watch
-        )
-        inliers = doubted.with_edges(shared.kept)
-        solution = self.solve_once(inliers, start=shared.poses, time_limit=self.watch.left)
-        assert solution.ledger is not None
-        ledger = shared.ledger.joined(solution.ledger)
-        self.ledgers.append(ledger)
-        stage = replace(shared.stage, name=plan.name)
-        estimate = Estimate.of(
-            doubted, shared.kept, shared.scale, solution.certificate, stage, began
-        )
-        return replace(estimate, solution=replace(solution, ledger=ledger))
+        kept = plan.candidates.copy()
+        gnc = replace(plan.settings, known=doubted.known[kept])
+        with self._opened(self._request_of(kept), gnc) as place:
+            inliers = place.run_gnc(gnc, start)
+        kept[kept] = inliers.kept
+        solution = self.solution_nearby(kept, inliers.poses)
+        stage = replace(inliers.stage, name=plan.name)
+        return Estimate.of(doubted, kept, inliers.scale, solution, stage, began)
 
-    def polished(self, inliers: PGOProblem, poses: Poses, max_steps: int) -> Poses:
-        """Poses of a solution from the given ones, with as many steps as it takes."""
-        return self.solution(inliers, poses).poses
+    def solution_nearby(self, kept: BoolArray, start: Poses | None) -> Solution:
+        """Solution with the kept edges, (m,), by Newton alone, from poses nearby or a start."""
+        pipeline = self.request.pipeline
+        newton = pipeline.newton
+        if start is not None:
+            newton = replace(newton, max_iterations=min(newton.max_iterations, LAST_STEPS))
+        return self._solved(kept, pipeline.with_newton_alone(newton), start)
+
+    def solution(self, kept: BoolArray, start: Poses | None) -> Solution:
+        """Solution with the kept edges, (m,), by all steps of the pipeline, from poses nearby."""
+        pipeline = self.request.pipeline
+        if start is not None:
+            pipeline = replace(pipeline, soc=None)
+        return self._solved(kept, pipeline, start)
+
+    def _solved(self, kept: BoolArray, pipeline: Pipeline, start: Poses | None) -> Solution:
+        request = replace(self._request_of(kept), pipeline=pipeline, start=start)
+        with self._opened(request) as place:
+            best = solve_at(place, pipeline, start)
+        return solution_of(request, place, best)
+
+    def _request_of(self, kept: BoolArray) -> SolveRequest:
+        """The request for the kept edges alone: a run of its own in the time that is left."""
+        monitor = replace(self.request.monitor, poses_found=[], plan=[])
+        return replace(self.request, problem=self.doubted.with_edges(kept), monitor=monitor)
+
+    @contextmanager
+    def _opened(self, request: SolveRequest, gnc: GNC | None = None) -> Iterator[Place]:
+        """Open the place of a request; what has crossed its network is accounted for at its end."""
+        with open_place(request, gnc) as place:
+            yield place
+        if place.ledger is not None:
+            self.ledgers.append(place.ledger)

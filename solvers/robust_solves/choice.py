@@ -74,11 +74,11 @@ class Choice:
         needs_several = self.doubted.is_cheap or not keeps_most
         return len(self.estimates) >= (_SEVERAL_ATTEMPTS if needs_several else 1)
 
-    def worth_revising(self, is_central: bool) -> list[Estimate]:
+    def worth_revising(self) -> list[Estimate]:
         """The cheapest attempt, and where revisions are cheap the next ones that differ from it."""
         cheapest, *others = self.by_cost
         chosen = [cheapest]
-        if not self.doubted.is_cheap or not is_central:
+        if not self.doubted.is_cheap:
             return chosen
         max_cost = _MAX_RELATIVE_COST * self.cost(cheapest.poses)
         num_tolerated = _DISPUTED_SHARE * self._num_closures_kept(cheapest)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 
@@ -14,10 +13,11 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
-from solvers.distributed.robust import SharedEstimate
-from solvers.loop import RunMonitor
 from solvers.network.ledger import Ledger
+from solvers.places import with_partition
+from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
+from solvers.riemannian.polish import polish
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
@@ -25,12 +25,10 @@ from solvers.robust.revision import drop_contradicted, readmit_clusters, readmit
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     MAX_PAIRED,
-    ByRobots,
     DoubtedProblem,
     Estimate,
-    InOnePlace,
+    PlacesOfEdges,
     Plan,
-    SolveOnce,
     plans_in_order,
 )
 from solvers.robust_solves.choice import Choice
@@ -41,16 +39,8 @@ _STEPS_AFTER_EDGE = 4
 _STEPS_AFTER_CLUSTER = 20
 
 
-def solve_robustly(
-    problem: PGOProblem,
-    robust: GNC | PCM,
-    gap: float,
-    start: Poses | None,
-    watch: RunMonitor,
-    solve_once: SolveOnce,
-    shared: Callable[..., SharedEstimate] | None = None,
-) -> Solution:
-    """Solution of the edges that are kept.
+def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
+    """Solution of the edges that are kept, at the place of the request.
 
     `Solution.robust` says which these are, what is proven of them, and what supports them.
 
@@ -69,24 +59,24 @@ def solve_robustly(
        rejected closures are readmitted (`readmit_clusters`), and, where it is cheap and attempts
        differ, single ones (`readmit_edges`). Readmitted edges stay if the truncated cost does not
        rise.
-    5. Verdict. The solution of the edges kept is put to the certificate, which may fail, and
-       `Rejection` says what supports these edges.
+    5. Solution and verdict. Newton and all further steps of the pipeline (`solvers.plan`) solve for
+       the edges kept. `Rejection` says what supports these edges.
 
-    With robots (`shared`, and a `solve_once` by them) the robots prove the certificates, and all
-    that crosses the network is on one ledger. With PCM, stages 2 to 4 are one solve with the
-    pairwise consistent edges. A SettingError when robust is neither GNC nor PCM, or not for robots
-    (PCM, or a GNC with `consistent`); a GraphError when known inliers and the edges kept do not
-    connect the poses.
+    Stages 1, 2 and 5 are solves at the place of the request, here or by robots, whose account is
+    one ledger. Choice, revision and pairwise consistency are found in this process, which has the
+    graph. With PCM, stages 2 to 4 are the pairwise consistent edges. A SettingError when robust is
+    neither GNC nor PCM; a GraphError when known inliers and the edges kept do not connect the
+    poses.
     """
-    _check_choice(robust, is_central=shared is None)
+    if not isinstance(robust, GNC | PCM):
+        raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
+    request = with_partition(request)
+    problem = request.problem
     known = known_inliers(problem.graph, robust.known)
     thresholds = chi2_thresholds(problem, robust.quantile)
     doubted = DoubtedProblem(problem, known, thresholds, robust.quantile)
-    place = InOnePlace(doubted, gap, watch, solve_once)
-    if shared is not None:
-        place = ByRobots(doubted, gap, watch, solve_once, estimate=shared)
-    job = _RobustSolve(doubted, place, start)
-    if doubted.is_cheap and start is None:
+    job = _RobustSolve(doubted, PlacesOfEdges(doubted, request), request.start)
+    if doubted.is_cheap and request.start is None:
         answer = job.answer_by_least_squares()
         if answer is not None:
             return answer
@@ -94,15 +84,6 @@ def solve_robustly(
         return job.answer_by_consistency(robust.quantile)
     ending = job.make_attempts(robust)
     return job.answer_by_attempts(ending)
-
-
-def _check_choice(robust: object, is_central: bool) -> None:
-    if not isinstance(robust, GNC | PCM):
-        raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
-    if not is_central and (isinstance(robust, PCM) or robust.consistent):
-        raise SettingError(
-            "pairwise consistency is found in one place; leave out the robots, or use GNC()"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +121,7 @@ class _RobustSolve:
     """
 
     doubted: DoubtedProblem
-    place: InOnePlace
+    places: PlacesOfEdges
     start: Poses | None
     least_squares: Poses | None = None
     estimates: list[Estimate] = field(default_factory=list)
@@ -157,7 +138,7 @@ class _RobustSolve:
     def answer_by_least_squares(self) -> Solution | None:
         """The solution with every edge, if nothing speaks against any or there is no time left."""
         every_edge = self.doubted.every_edge
-        solution = self.place.solution(self.doubted.problem, None)
+        solution = self.places.solution_nearby(every_edge, None)
         if solution.status in OUT_OF_TIME:
             name = "the plain solution: there was no time for others"
             return self._result(solution, every_edge, 1.0, name)
@@ -185,7 +166,7 @@ class _RobustSolve:
         """The solution of the known inliers and the pairwise consistent edges."""
         known = self.doubted.known
         kept = known | pairwise_consistent(self.doubted.problem.graph, known, quantile)
-        solution = self.place.solution(self.doubted.with_edges(kept), self.start)
+        solution = self.places.solution(kept, self.start)
         return self._result(solution, kept, 1.0, "pairwise consistency alone")
 
     # Stage 2: attempts
@@ -199,18 +180,18 @@ class _RobustSolve:
         ending = Status.CONVERGED
         last_failure: Exception = GraphError()
         try:
-            for plan in plans_in_order(settings, self.doubted, self.place.is_central):
+            for plan in plans_in_order(settings, self.doubted):
                 if plan.starts_at_least_squares and not self._has_least_squares():
                     continue
                 try:
-                    estimate = self.place.attempt(plan, self._start_of(plan))
+                    estimate = self.places.attempt(plan, self._start_of(plan))
                 except FAILURES as error:
                     last_failure = error
                     if not isinstance(error, GraphError):
                         self.failures.append(f"the attempt {plan.name} failed ({error})")
                     continue
                 self.estimates.append(estimate)
-                ending = estimate.stage.status
+                ending = estimate.status
                 if ending in OUT_OF_TIME or self.choice.is_enough:
                     break
         except KeyboardInterrupt:  # between the loops, which answer it themselves
@@ -230,7 +211,8 @@ class _RobustSolve:
         It is found where that is affordable and no start was given.
         """
         if self.least_squares is None and self.start is None and self.doubted.is_affordable:
-            self.least_squares = self.place.solution(self.doubted.problem, None).poses
+            every_edge = self.doubted.every_edge
+            self.least_squares = self.places.solution_nearby(every_edge, None).poses
         return self.least_squares is not None
 
     # Stages 3 and 4: choice and revision
@@ -253,19 +235,20 @@ class _RobustSolve:
         return self._result(solution, revision.kept, revision.estimate.scale, revision.name)
 
     def _solution_of(self, revision: _Revision) -> Solution:
-        """Solution of the edges kept.
+        """Solution of the edges kept, by all steps that may improve it.
 
         If the revision changed the edges and the solution is not certified, they are solved again
         without a given start, and the solution of lower cost is returned.
         """
-        if not revision.has_changed and revision.estimate.solution is not None:
-            return revision.estimate.solution
-        inliers = self.doubted.with_edges(revision.kept)
-        solution = self.place.solution(inliers, revision.poses)
+        of_attempt = revision.estimate.solution
+        is_final = of_attempt.status in OUT_OF_TIME or not of_attempt.certificate.can_improve
+        if not revision.has_changed and is_final:
+            return of_attempt
+        solution = self.places.solution(revision.kept, revision.poses)
         if not revision.has_changed or solution.is_certified:
             return solution
         try:
-            from_own_start = self.place.solution(solution.problem, None)
+            from_own_start = self.places.solution(revision.kept, None)
         except FAILURES as error:
             self.failures.append(f"another start failed ({error}); the solution before it stands")
             return solution
@@ -274,7 +257,7 @@ class _RobustSolve:
     def _cheapest_revision(self) -> _Revision:
         """The revision of the least truncated cost, of the attempts that are worth one."""
         choice = self.choice
-        attempts = choice.worth_revising(self.place.is_central)
+        attempts = choice.worth_revising()
         revisions = [self._revised(estimate, choice) for estimate in attempts]
         return min(revisions, key=lambda revision: choice.cost(revision.poses))
 
@@ -312,7 +295,7 @@ class _RobustSolve:
     def _polished(
         self, inliers: PGOProblem, poses: Poses, max_steps: int = _STEPS_AFTER_EDGE
     ) -> Poses:
-        return self.place.polished(inliers, poses, max_steps)
+        return polish(inliers, poses, max_steps=max_steps)
 
     # Stage 5: verdict
 
@@ -337,7 +320,7 @@ class _RobustSolve:
             is_misfit=solution.edge_residuals.is_overall_misfit,
             fit=solution.certificate.fit,
         )
-        ledgers = self.place.ledgers
+        ledgers = self.places.ledgers
         ledger = reduce(Ledger.joined, ledgers) if ledgers else None
         seconds = time.perf_counter() - self.began
         note = joined_notes(solution.note, *self.failures)

@@ -36,7 +36,6 @@ UNUSED_BY_SOLVE = EXTRAS | {
     "solvers.reporting.report",
     "solvers.robust_solves",
     "solvers.robust.gnc",
-    "solvers.shared_solve",
     "solvers.soc.consensus",
     "solvers.studies",
     "pgo_models.verification",

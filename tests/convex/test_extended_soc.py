@@ -324,7 +324,10 @@ def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refuse
     linear = ExtendedSOC(lambda unknown: ModelChange(terms=[cp.sum(unknown.t(0))]))
     with pytest.raises(SettingError, match="a term may be negative"):
         solve(problem(), Pipeline(soc=linear))
-    for begun in ("shared_solve.open_driver", "robust_solves.robust_solve.solve_robustly"):
+    for begun in (
+        "distributed.robots_of_graph.open_driver",
+        "robust_solves.robust_solve.solve_robustly",
+    ):
         monkeypatch.setattr(
             f"solvers.{begun}", lambda *_: pytest.fail("solved before it was refused")
         )

@@ -176,11 +176,18 @@ def test_the_plain_solve_before_the_attempts_is_on_the_ledger(wrong, by_two_robo
     assert whole.ledger.rounds >= plain.ledger.rounds + attempts.ledger.rounds
 
 
-def test_what_is_for_one_place_is_refused(wrong, tmp_path) -> None:
+def test_pairwise_consistency_keeps_by_robots_what_it_keeps_in_one_place(wrong) -> None:
     graph = wrong[0]
     for robust in (solvers.PCM(), GNC(consistent=True)):
-        with pytest.raises(SettingError, match="found in one place"):
-            solvers.solve(graph, robust=robust, robots=2)
+        central = solvers.solve(graph, robust=robust)
+        by_robots = solvers.solve(graph, robust=robust, robots=2)
+        assert by_robots.ledger.num_bytes > 0
+        np.testing.assert_array_equal(by_robots.robust.kept, central.robust.kept)
+        np.testing.assert_allclose(by_robots.objective, central.objective, rtol=1e-9, atol=0)
+
+
+def test_a_robust_solve_by_robots_writes_no_checkpoint(wrong, tmp_path) -> None:
+    graph = wrong[0]
     with pytest.raises(SettingError, match="writes no checkpoint"):
         solvers.solve(graph, robust=GNC(), robots=2, checkpoint=Checkpoint(tmp_path / "c.npz"))
 

@@ -95,23 +95,26 @@ def test_no_attempt_is_cheaper_than_the_answer(share: float, kind: str) -> None:
 def test_the_certificate_does_not_choose(monkeypatch: pytest.MonkeyPatch) -> None:
     """The cheapest attempt is the answer, be it the only one without a certificate."""
     graph, _ = spoiled(world(120, 0.05), 0.6, "aliased", 0)
-    attempt = robust_attempts.InOnePlace.attempt
+    attempt = robust_attempts.PlacesOfEdges.attempt
     estimates = []
 
     def recorded(self, plan, start):
         estimate = attempt(self, plan, start)
         verdict = Verdict.CERTIFIED if estimates else Verdict.NOT_CERTIFIED
-        certificate = replace(estimate.certificate, verdict=verdict)
+        solution = estimate.solution
+        certificate = replace(solution.certificate, verdict=verdict)
         # The first attempt keeps all right closures; each one after it is certified and dearer.
         worse = estimate.kept.copy()
         if estimates:
             worse[np.flatnonzero(worse & ~self.doubted.known)[: 5 * len(estimates)]] = False
-            poses = polish(self.doubted.with_edges(worse), certificate.poses)
-            certificate = replace(certificate, poses=poses)
-        estimates.append(replace(estimate, kept=worse, certificate=certificate))
+            solution = replace(
+                solution, poses=polish(self.doubted.with_edges(worse), solution.poses)
+            )
+        solution = replace(solution, certificate=certificate)
+        estimates.append(replace(estimate, kept=worse, solution=solution))
         return estimates[-1]
 
-    monkeypatch.setattr(robust_attempts.InOnePlace, "attempt", recorded)
+    monkeypatch.setattr(robust_attempts.PlacesOfEdges, "attempt", recorded)
     solution = solvers.solve(graph, robust=solvers.GNC())
     assert len(estimates) > 1
     np.testing.assert_array_equal(solution.robust.kept & estimates[0].kept, estimates[0].kept)

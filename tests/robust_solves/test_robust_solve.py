@@ -84,7 +84,7 @@ def test_right_closures_stay_where_noise_leaves_no_certificate(seed):
 
 def test_an_attempt_that_leaves_poses_apart_is_passed_over(clean, monkeypatch):
     graph, is_wrong = spoiled(clean, 0.3, "random", seed=0)
-    attempt = robust_attempts.InOnePlace.attempt
+    attempt = robust_attempts.PlacesOfEdges.attempt
 
     def without(names):
         def tried(self, plan, start):
@@ -92,7 +92,7 @@ def test_an_attempt_that_leaves_poses_apart_is_passed_over(clean, monkeypatch):
                 raise GraphError("apart")
             return attempt(self, plan, start)
 
-        monkeypatch.setattr(robust_attempts.InOnePlace, "attempt", tried)
+        monkeypatch.setattr(robust_attempts.PlacesOfEdges, "attempt", tried)
         return solvers.solve(graph, robust=solvers.GNC())
 
     solution = without(["as set", "smaller steps"])

@@ -1,0 +1,115 @@
+"""Where a request is solved: its place is opened here, a page is read at it, and it is closed.
+
+A page takes the steps of a solve at a place: `solvers.plan.solve_at` is the one of `solve`. The
+places of robots are imported when they are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.local_world import LocalWorld
+from solvers.here import Here
+from solvers.local_solution import local_request, solution_of_whole
+from solvers.place import Attempt, Place
+from solvers.request import Pipeline, SolveRequest, solution_of
+from solvers.result import Stage
+from solvers.solution import Solution
+
+if TYPE_CHECKING:  # what a solve in one place does not need
+    from solvers.robust.gnc import GNC
+
+Page = Callable[[Place, Pipeline, Poses | None], Attempt]
+
+
+def solution_by(page: Page, request: SolveRequest) -> Solution:
+    """Solution of a request by the steps of a page, at the place where it is to be solved.
+
+    A graph whose priors are far from zero is solved in its local world (`LocalWorld`).
+    """
+    return in_local_world(partial(_solution_at_place, page), request)
+
+
+def in_local_world(
+    solve_request: Callable[[SolveRequest], Solution], request: SolveRequest
+) -> Solution:
+    """Solution of a request, or of that of its local world where its priors are far from zero."""
+    local = LocalWorld.of(request.problem)
+    if local is None:
+        return solve_request(request)
+    return solution_of_whole(local, solve_request(local_request(local, request)))
+
+
+def with_partition(request: SolveRequest) -> SolveRequest:
+    """The request with the robots that a number of them stands for."""
+    if request.robots is None:
+        return request
+    from solvers.distributed.chosen_robots import robots_of_solve
+
+    graph = request.problem.graph
+    return replace(request, robots=robots_of_solve(request.pipeline.soc, request.robots, graph))
+
+
+def _solution_at_place(page: Page, request: SolveRequest) -> Solution:
+    request = with_partition(request)
+    with open_place(request) as place:
+        best = page(place, request.pipeline, request.start)
+        place.finish(best)
+    return solution_of(request, place, best)
+
+
+def open_place(request: SolveRequest, gnc: GNC | None = None) -> AbstractContextManager[Place]:
+    """Open the place of a request: robots if there are any, else this process.
+
+    With `gnc` the robots are given the thresholds of their edges, for a robust solve.
+    """
+    if request.robots is None:
+        return _open_here(request)
+    return _open_robots(request, gnc)
+
+
+@contextmanager
+def _open_here(request: SolveRequest) -> Iterator[Place]:
+    yield Here(request.monitor, [], request.problem, request.pipeline.gap)
+
+
+@contextmanager
+def _open_robots(request: SolveRequest, gnc: GNC | None) -> Iterator[Place]:
+    """The robots of one graph, with a driver or alone."""
+    from solvers.distributed.checkpoint import Journal, run_fingerprint
+    from solvers.distributed.robots_alone import RobotsAlone
+    from solvers.distributed.robots_of_graph import RobotsOfGraph, open_driver
+    from solvers.network.engine import InProcess
+
+    robots = request.robots
+    assert isinstance(robots, Partition)  # by `with_partition`
+    pipeline = request.pipeline
+    problem = request.problem
+    settings = (
+        pipeline.soc,
+        pipeline.newton,
+        pipeline.gap,
+        pipeline.growing,
+        pipeline.second_try,
+        pipeline.faults,
+        pipeline.has_driver,
+    )
+    mark = run_fingerprint(problem, robots, settings, request.start)
+    engine = request.engine if request.engine is not None else InProcess()
+    thresholds = None if gnc is None else gnc.thresholds(problem)
+    stages: list[Stage] = []
+    shown = request.monitor, stages
+    here = Here(*shown, problem, pipeline.gap, where=", in one place")
+    memory = pipeline.driver_memory
+    with (
+        closing(Journal(request.checkpoint, mark, stages)) as journal,
+        closing(open_driver(problem, robots, engine, memory, thresholds)) as driver,
+    ):
+        kind = RobotsOfGraph if pipeline.has_driver else RobotsAlone
+        yield kind(*shown, driver, journal, pipeline.faults, here, robots)
