@@ -361,7 +361,9 @@ faults = {
     "robot 2 silent for 20": solvers.Faults(silent_robot=2, silent_from=3, silent_rounds=20),
 }
 faulty = {
-    name: solvers.solve(graph, solvers.Pipeline(soc=consensus, faults=kind), robots=robots)
+    name: solvers.solve(
+        graph, solvers.Pipeline(soc=consensus), robots=solvers.Robots(robots, faults=kind)
+    )
     for name, kind in faults.items()
 }
 figure, axes = plt.subplots(figsize=(5.4, 2.8), layout="constrained")

@@ -13,7 +13,6 @@ from solvers.convex.orthogonal import (
     OrthogonalSolution as OrthogonalSolution,
     solve_orthogonal as solve_orthogonal,
 )
-from solvers.distributed.checkpoint import Checkpoint as Checkpoint
 from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
 from solvers.given_poses import certify as certify
 from solvers.growing import GrowingSolution as GrowingSolution, extend as extend
@@ -49,6 +48,7 @@ from solvers.riemannian.newton import Newton as Newton, gauss_newton as gauss_ne
 from solvers.riemannian.polish import polish as polish
 from solvers.riemannian.prefixes import GrowingStart as GrowingStart
 from solvers.riemannian.staircase import Staircase as Staircase
+from solvers.robots import Checkpoint as Checkpoint, Robots as Robots
 from solvers.robust.consistency import PCM as PCM, pairwise_consistent as pairwise_consistent
 from solvers.robust.gnc import GNC as GNC
 from solvers.robust.irls import IRLS as IRLS
@@ -116,6 +116,7 @@ __all__ += [
     "FolderSolution",
     "GrowingSolution",
     "Pipeline",
+    "Robots",
     "Solution",
     "certify",
     "extend",

@@ -36,6 +36,7 @@ from solvers.place import AUTO, FirstStage
 from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import Record, Stage, Status
+from solvers.robots import Robots
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
@@ -129,7 +130,7 @@ def solve_folder(
     pipeline: Pipeline | None = None,
     *,
     weighting: Weighting = Weighting.OWN,
-    engine: Engine | None = None,
+    robots: Robots | None = None,
     out: Path | str | None = None,
     callback: Callable[[Any, Record], bool | None] | None = None,
     time_limit: float = math.inf,
@@ -157,8 +158,8 @@ def solve_folder(
         The cost: INFORMATION is chi2 of the files' information matrices, ISOTROPIC F, and OWN chi2
         where it is another cost than F and no robot has an edge whose share of chi2 can be
         negative.
-    engine : Engine, optional
-        Where the robots run: in this process unless given, else as a `RayEngine` says.
+    robots : Robots, optional
+        Where the robots run, and the memory of their driver; who owns which poses is in the files.
     out : Path or str, optional
         Folder to which every robot, where it runs, writes its poses and edges: 0.g2o, 1.g2o, .., a
         file whole or not at all.
@@ -187,16 +188,18 @@ def solve_folder(
     """
     monitor = RunMonitor(time_limit, verbose, progress, callback)
     pipeline = pipeline if pipeline is not None else Pipeline()
+    robots = robots if robots is not None else Robots()
     folder = locate(folder).absolute()
     _check_first_stage(pipeline.soc)
+    _check_robots(robots)
     if weighting is Weighting.ROTATIONS:
         raise SettingError(f"robots with files of their own solve for poses; {READ_HERE}")
     files = list(enumerate(g2o_files(folder)))
     if out is not None:
         check_g2o_folder(out, len(files))
     stages: list[Stage] = []
-    engine = _engine_of_robots(engine, len(files))
-    opened = open_files(files, engine, pipeline.driver_memory, weighting, trust_folder)
+    engine = _engine_of_robots(robots.engine, len(files))
+    opened = open_files(files, engine, robots.driver_memory, weighting, trust_folder)
     name = f"{folder.name}, {FILES_HERE}" if opened.num_absent else folder.name
     driver = opened.driver
     with closing(driver), closing(Journal(None, {}, stages)) as journal:
@@ -242,6 +245,22 @@ def _check_first_stage(soc: FirstStage) -> None:
     if soc.robots is not None or soc.r_step is not RStep.FACTORIZED:
         raise SettingError(
             f"robots are those of the files, and factor their subproblems, got {soc}; {READ_HERE}"
+        )
+
+
+def _check_robots(robots: Robots) -> None:
+    """Raise a SettingError for what robots with own files do not have."""
+    options = {
+        "owners": robots.owners,
+        "faults": robots.faults,
+        "checkpoint": robots.checkpoint,
+    }
+    asked = [name for name, value in options.items() if value is not None]
+    if asked:
+        raise SettingError(f"robots with files of their own have no {asked[0]}; {READ_HERE}")
+    if not robots.has_driver:
+        raise SettingError(
+            f"robots with files of their own have a driver, got driver_memory=0; {READ_HERE}"
         )
 
 

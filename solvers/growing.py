@@ -28,7 +28,6 @@ from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.loop import run
-from solvers.network.engine import Engine
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
 from solvers.place import Attempt, Place, Step
@@ -37,6 +36,7 @@ from solvers.plan import solve_at, unless_it_fails
 from solvers.request import Pipeline, SolveRequest
 from solvers.riemannian.growing_map import GrowingMap
 from solvers.riemannian.newton import Newton
+from solvers.robots import Robots
 from solvers.soc.subgraph import PartProblem
 from solvers.solution import Solution
 
@@ -295,8 +295,7 @@ def extend(
     pipeline: Pipeline | None = None,
     *,
     certify: Literal[True] = True,
-    robots: Partition | None = None,
-    engine: Engine | None = None,
+    robots: Robots | Partition | None = None,
 ) -> Solution: ...
 
 
@@ -307,8 +306,7 @@ def extend(
     pipeline: Pipeline | None = None,
     *,
     certify: Literal[False],
-    robots: Partition | None = None,
-    engine: Engine | None = None,
+    robots: Robots | Partition | None = None,
 ) -> GrowingSolution: ...
 
 
@@ -318,8 +316,7 @@ def extend(
     pipeline: Pipeline | None = None,
     *,
     certify: bool = True,
-    robots: Partition | None = None,
-    engine: Engine | None = None,
+    robots: Robots | Partition | None = None,
 ) -> Solution | GrowingSolution:
     """Solve a graph that has grown out of another one, from the solution of that.
 
@@ -339,12 +336,10 @@ def extend(
         Whether the solution has a certificate. Without one, an update costs what the new edges
         change, if the poses and edges of the solution come first in the graph, in their order; the
         first update after a Solution factors the whole graph.
-    robots : Partition, optional
-        Robots that own the poses of the grown graph. Unless given, they are those of the solution.
-        A new pose goes to the robot that the graph names, or where these are not the robots of the
-        solution, to that of the pose that its first edge joins it with.
-    engine : Engine, optional
-        Where the robots run; in this process unless given.
+    robots : Robots or Partition, optional
+        Robots that own the poses of the grown graph. Unless their owners are given, they are those
+        of the solution. A new pose goes to the robot that the graph names, or where these are not
+        the robots of the solution, to that of the pose that its first edge joins it with.
 
     Returns
     -------
@@ -374,10 +369,13 @@ def extend(
     >>> grown.robots.num_robots, grown.ledger.rounds > shared.ledger.rounds
     (3, True)
     """
-    if robots is None and isinstance(solution, Solution) and solution.robots is not None:
-        robots = extended_partition(solution.robots, solution.problem.graph.pose_ids, graph)
+    shared = None if robots is None else Robots.of(robots)
+    has_owners = shared is not None and shared.owners is not None
+    if not has_owners and isinstance(solution, Solution) and solution.robots is not None:
+        owners = extended_partition(solution.robots, solution.problem.graph.pose_ids, graph)
+        shared = (shared or Robots()).with_owners(owners)
     if not certify:
-        if robots is not None:
+        if shared is not None:
             raise SettingError(
                 "certify=False is for updates in one place; robots go on with a certificate"
             )
@@ -390,7 +388,7 @@ def extend(
         weighting = Weighting.ISOTROPIC
     problem = PGOProblem(graph, solution.problem.backend, weighting)
     start = extended_poses(problem, solution.problem.graph.pose_ids, solution.poses)
-    grown = _solve_from(problem, pipeline, start, robots, engine)
+    grown = _solve_from(problem, pipeline, start, shared)
     before = solution.ledger if isinstance(solution, Solution) else None
     return replace(grown, ledger=_joined(before, grown.ledger))
 
@@ -399,14 +397,14 @@ def _solve_from(
     problem: PGOProblem,
     pipeline: Pipeline,
     start: Poses,
-    robots: Partition | None = None,
-    engine: Engine | None = None,
+    robots: Robots | None = None,
 ) -> Solution:
     """Solution from the poses before, as `update_at` finds it."""
-    request = SolveRequest(problem, pipeline, start, robots=robots, engine=engine)
+    request = SolveRequest(problem, pipeline, start, robots=robots)
     warn_of_landmarks_seen_once(problem.graph)
     # Newton alone would leave added terms out, and needs a driver.
-    if pipeline.has_added_terms or not pipeline.has_driver:
+    has_driver = robots is None or robots.has_driver
+    if pipeline.has_added_terms or not has_driver:
         return solution_for(request)
     return solution_by(update_at, request)
 

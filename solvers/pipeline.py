@@ -19,16 +19,16 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem, as_problem
+from pgo_models.problem.weighting import Weighting
 from solvers.loop import RunMonitor
-from solvers.network.engine import Engine
 from solvers.places import in_local_world, solution_by
 from solvers.plan import solve_at
 from solvers.request import Pipeline, SolveRequest
 from solvers.result import Record
+from solvers.robots import Robots
 from solvers.solution import Solution
 
 if TYPE_CHECKING:  # what a solve in one place does not need
-    from solvers.distributed.checkpoint import Checkpoint
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
 
@@ -41,9 +41,7 @@ def solve(
     start: Poses | None = None,
     *,
     robust: GNC | PCM | None = None,
-    robots: Partition | int | None = None,
-    engine: Engine | None = None,
-    checkpoint: Checkpoint | None = None,
+    robots: Robots | Partition | int | None = None,
     anchor: int | None = None,
     callback: Callable[[Any, Record], bool | None] | None = None,
     time_limit: float = math.inf,
@@ -88,16 +86,11 @@ def solve(
         How to find wrong edges, which are left out (`solvers.robust_solves.robust_solve`). The
         solution is then of the edges kept alone, by Newton from where these were found: the other
         stages of the pipeline are not run.
-    robots : Partition or int, optional
-        Robots that share the poses. Start, SOC, Newton and certificate are run by them and a
-        driver, with the same result as in one place, and `Solution.ledger` says what crosses the
-        network. A number stands for the robots of the pipeline's SOC if they are so many, else for
-        the default partition. Without robots everything is run in one place.
-    engine : Engine, optional
-        Where the robots run; in this process unless given.
-    checkpoint : Checkpoint, optional
-        File to which a solve by robots writes what it needs to go on after it was broken off, and
-        from which it goes on.
+    robots : Robots, Partition or int, optional
+        Robots that share the poses; `Robots` also says where they run, and more. Start, SOC, Newton
+        and certificate are run by them and a driver, with the same result as in one place, and
+        `Solution.ledger` says what crosses the network. Without robots everything is run in one
+        place.
     anchor : int, optional
         Pose that stays where the graph's estimate has it, or at the identity if it has none. Unless
         given, the first of `graph.fixed`; without one the poses are aligned with the estimate, or
@@ -169,15 +162,16 @@ def solve(
     """
     pipeline = Pipeline() if pipeline is None else pipeline
     if isinstance(problem, PoseGraph) and isinstance(pipeline, Pipeline):
-        problem = PGOProblem(problem, weighting=pipeline.default_weighting)
+        has_driver = robots is None or Robots.of(robots).has_driver
+        is_own = has_driver and not pipeline.has_added_terms
+        weighting = Weighting.OWN if is_own else Weighting.ISOTROPIC
+        problem = PGOProblem(problem, weighting=weighting)
     request = SolveRequest(
         problem=as_problem(problem),
         pipeline=pipeline,
         start=start,
         robust=robust,
-        robots=robots,
-        engine=engine,
-        checkpoint=checkpoint,
+        robots=None if robots is None else Robots.of(robots),
         anchor=anchor,
         monitor=RunMonitor(time_limit, verbose, progress, callback),
     )

@@ -13,7 +13,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.local_world import LocalWorld
 from solvers.here import Here
 from solvers.local_solution import local_request, solution_of_whole
@@ -53,7 +52,8 @@ def with_partition(request: SolveRequest) -> SolveRequest:
     from solvers.distributed.chosen_robots import robots_of_solve
 
     graph = request.problem.graph
-    return replace(request, robots=robots_of_solve(request.pipeline.soc, request.robots, graph))
+    owners = robots_of_solve(request.pipeline.soc, request.robots.owners, graph)
+    return replace(request, robots=request.robots.with_owners(owners))
 
 
 def _solution_at_place(page: Page, request: SolveRequest) -> Solution:
@@ -88,7 +88,7 @@ def _open_robots(request: SolveRequest, gnc: GNC | None) -> Iterator[Place]:
     from solvers.network.engine import InProcess
 
     robots = request.robots
-    assert isinstance(robots, Partition)  # by `with_partition`
+    assert robots is not None
     pipeline = request.pipeline
     problem = request.problem
     settings = (
@@ -97,19 +97,20 @@ def _open_robots(request: SolveRequest, gnc: GNC | None) -> Iterator[Place]:
         pipeline.gap,
         pipeline.growing,
         pipeline.second_try,
-        pipeline.faults,
-        pipeline.has_driver,
+        robots.faults,
+        robots.has_driver,
     )
-    mark = run_fingerprint(problem, robots, settings, request.start)
-    engine = request.engine if request.engine is not None else InProcess()
+    mark = run_fingerprint(problem, robots.partition, settings, request.start)
+    engine = robots.engine if robots.engine is not None else InProcess()
     thresholds = None if gnc is None else gnc.thresholds(problem)
     stages: list[Stage] = []
     shown = request.monitor, stages
     here = Here(*shown, problem, pipeline.gap, where=", in one place")
-    memory = pipeline.driver_memory
     with (
-        closing(Journal(request.checkpoint, mark, stages)) as journal,
-        closing(open_driver(problem, robots, engine, memory, thresholds)) as driver,
+        closing(Journal(robots.checkpoint, mark, stages)) as journal,
+        closing(
+            open_driver(problem, robots.partition, engine, robots.driver_memory, thresholds)
+        ) as driver,
     ):
-        kind = RobotsOfGraph if pipeline.has_driver else RobotsAlone
-        yield kind(*shown, driver, journal, pipeline.faults, here, robots)
+        kind = RobotsOfGraph if robots.has_driver else RobotsAlone
+        yield kind(*shown, driver, journal, robots.faults, here, robots.partition)

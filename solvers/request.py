@@ -15,23 +15,19 @@ from pgo_models.certificates.certificate import (
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
-from solvers.network.engine import DEFAULT_MEMORY, Engine
-from solvers.network.faults import Faults
 from solvers.place import AUTO, Attempt, FirstStage, Place, Step
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
+from solvers.robots import Robots
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 from solvers.solution import Solution, choose_gauge, note_of
 
 if TYPE_CHECKING:  # what a solve in one place does not need
-    from solvers.distributed.checkpoint import Checkpoint
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
 
@@ -65,19 +61,11 @@ class Pipeline:
         The next stage, where the certificate is still wider; None leaves it out.
     handedness : HandednessSearch or None
         The last stage, where the relaxation is not tight; None leaves it out.
-    faults : Faults, optional
-        What goes wrong between the robots of a CONSENSUS stage, which then does not wait
-        (`solvers.distributed.asynchronous`).
-    driver_memory : float
-        Bytes that the driver of a solve by robots may take with its fronts. A solve that needs more
-        is refused before it begins. 0 stands for no driver: CONSENSUS alone
-        (`solvers.distributed.robots_alone`), which finds poses and no certificate.
 
     Raises
     ------
     SettingError
-        When a setting is out of its range, or faults or no driver are asked for without a CONSENSUS
-        stage.
+        When a setting is out of its range.
 
     Examples
     --------
@@ -95,31 +83,16 @@ class Pipeline:
     second_try: bool = True
     staircase: Staircase | None = field(default_factory=Staircase)
     handedness: HandednessSearch | None = field(default_factory=HandednessSearch)
-    faults: Faults | None = None
-    driver_memory: float = DEFAULT_MEMORY
 
     def __post_init__(self) -> None:
         # soc may also be an ExtendedSOC, which this module does not import.
-        check_settings(self, finite=["gap"], not_negative=["driver_memory"], of_any_type=["soc"])
-        is_consensus = (
-            isinstance(self.soc, SOC) and self.soc.effective_coupling is Coupling.CONSENSUS
-        )
-        if self.faults is not None and not is_consensus:
-            raise SettingError(
-                "faults are of messages between robots; "
-                "use SOC(robots=.., coupling=Coupling.CONSENSUS)"
-            )
-        if not self.has_driver and not is_consensus:
-            raise SettingError(
-                "without a driver robots run CONSENSUS alone; give the pipeline "
-                "SOC(robots=.., coupling=Coupling.CONSENSUS) and solve() the robots, "
-                "or leave out driver_memory=0"
-            )
+        check_settings(self, finite=["gap"], of_any_type=["soc"])
 
     @property
-    def has_driver(self) -> bool:
-        """Whether a solve by robots has a driver."""
-        return self.driver_memory > 0
+    def has_consensus(self) -> bool:
+        """Whether the first stage is CONSENSUS."""
+        soc = self.soc
+        return isinstance(soc, SOC) and soc.effective_coupling is Coupling.CONSENSUS
 
     def with_newton_alone(self, newton: Newton) -> Pipeline:
         """The pipeline without all stages but a start, Newton and its certificate.
@@ -132,7 +105,7 @@ class Pipeline:
         Returns
         -------
         Pipeline
-            Gap, faults and memory of the driver are those of this one.
+            The gap is that of this one.
         """
         return replace(
             self,
@@ -174,16 +147,6 @@ class Pipeline:
         }[step]
 
     @property
-    def default_weighting(self) -> Weighting:
-        """Which cost of a graph is minimised unless another is given: its own, where it can be.
-
-        Robots without a driver run SOC alone, and an ExtendedSOC adds terms to F.
-        """
-        return (
-            Weighting.OWN if self.has_driver and not self.has_added_terms else Weighting.ISOTROPIC
-        )
-
-    @property
     def has_added_terms(self) -> bool:
         """Whether the first stage is an ExtendedSOC, which adds terms and constraints to F."""
         return getattr(self.soc, "changer", None) is not None
@@ -197,9 +160,7 @@ class SolveRequest:
     pipeline: Pipeline
     start: Poses | None = None
     robust: GNC | PCM | None = None
-    robots: Partition | int | None = None
-    engine: Engine | None = None
-    checkpoint: Checkpoint | None = None
+    robots: Robots | None = None
     anchor: int | None = None
     monitor: RunMonitor = field(default_factory=RunMonitor)
 
@@ -211,9 +172,8 @@ class SolveRequest:
                 f"the pipeline is a {type(self.pipeline).__name__}; "
                 "give Pipeline(soc=SOC(..)), or run(SOC(..))"
             )
-        if self.robots is None:
-            self._check_in_one_place()
-        self._check_driver()
+        if self.robots is not None:
+            self._check_robots(self.robots)
 
     def _check_anchor(self, anchor: int) -> None:
         """Raise a SettingError unless the anchor is a pose with a rotation.
@@ -231,31 +191,24 @@ class SolveRequest:
         if graph.world is not None:
             raise SettingError("an anchor cannot be combined with priors; leave out the anchor")
 
-    def _check_in_one_place(self) -> None:
-        """Raise a SettingError for what only a solve by robots has."""
-        if self.engine is not None or self.checkpoint is not None:
+    def _check_robots(self, robots: Robots) -> None:
+        """Raise a SettingError for what these robots cannot do with this cost and pipeline."""
+        if robots.faults is not None and not self.pipeline.has_consensus:
             raise SettingError(
-                "engine and checkpoint are for solves by robots; "
-                "give robots, a number or a Partition"
+                "faults are of messages between robots; "
+                "use SOC(robots=.., coupling=Coupling.CONSENSUS)"
             )
-        if self.pipeline.faults is not None:
+        if not robots.has_driver and not self.pipeline.has_consensus:
             raise SettingError(
-                "faults are of messages between robots; give solve() the robots of SOC, too"
+                "without a driver robots run CONSENSUS alone; give the pipeline "
+                "SOC(robots=.., coupling=Coupling.CONSENSUS), or leave out driver_memory=0"
             )
-        if self.pipeline.driver_memory != DEFAULT_MEMORY:
-            raise SettingError(
-                "driver_memory is for solves by robots; give solve() the robots, too"
-            )
-
-    def _check_driver(self) -> None:
-        """Raise a SettingError where the cost or a robust solve needs a driver, and has none."""
-        pipeline = self.pipeline
-        if not pipeline.has_driver and self.problem.convex_part is not self.problem:
+        if not robots.has_driver and self.problem.convex_part is not self.problem:
             raise SettingError(
                 "without a driver robots run SOC alone, "
                 "which needs a convex quadratic cost: F, not chi2"
             )
-        is_plain = self.checkpoint is None and pipeline.has_driver and pipeline.faults is None
+        is_plain = robots.checkpoint is None and robots.has_driver and robots.faults is None
         if self.robust is not None and not is_plain:
             raise SettingError(
                 "a robust solve needs a driver without faults, "
@@ -283,7 +236,7 @@ def solution_of(request: SolveRequest, place: Place, best: Attempt) -> Solution:
         stages=tuple(place.stages),
         seconds=time.perf_counter() - request.monitor.began,
         ledger=place.ledger,
-        robots=request.robots if isinstance(request.robots, Partition) else None,
+        robots=None if request.robots is None else request.robots.partition,
         note=note_of(problem, certificate, place.note(best)),
         frame=frame,
         anchor=held,

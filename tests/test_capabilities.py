@@ -62,19 +62,26 @@ def here(
     return solvers.solve(pgo.PGOProblem(graph, weighting=weighting), pipeline, **options)
 
 
+def with_driver(
+    graph: PoseGraph, pipeline: solvers.Pipeline, weighting: Weighting, **options: Any
+) -> Answer:
+    robots = replace(options.pop("robots", solvers.Robots()), owners=2)
+    return here(graph, pipeline, weighting, robots=robots, **options)
+
+
 def without_driver(
     graph: PoseGraph, pipeline: solvers.Pipeline, weighting: Weighting, **options: Any
 ) -> Answer:
     if pipeline.soc is solvers.Automatic.AUTO:
         pipeline = replace(pipeline, soc=consensus(graph))
-    pipeline = replace(pipeline, driver_memory=0.0)
-    return here(graph, pipeline, weighting, robots=2, **options)
+    robots = replace(options.pop("robots", solvers.Robots()), owners=2, driver_memory=0.0)
+    return here(graph, pipeline, weighting, robots=robots, **options)
 
 
 def own_files(
     graph: PoseGraph, pipeline: solvers.Pipeline, weighting: Weighting, **options: Any
 ) -> Answer:
-    unknown = set(options) - {"callback", "time_limit"}
+    unknown = set(options) - {"callback", "time_limit", "robots"}
     if unknown:
         raise pgo.PGOError(f"solve_folder has no option {unknown.pop()}")
     with tempfile.TemporaryDirectory() as folder:
@@ -90,7 +97,7 @@ def own_files(
 HERE = Place("here", here)
 PLACES = (
     HERE,
-    Place("robots and a driver", partial(here, robots=2)),
+    Place("robots and a driver", with_driver),
     Place("robots without a driver", without_driver),
     Place("robots with own files", own_files),
 )
@@ -171,7 +178,7 @@ def writes_checkpoints(place: Place) -> bool:
         path = Path(folder) / "run.checkpoint"
         place.solve(
             graph_in_space(),
-            checkpoint=solvers.Checkpoint(path),
+            robots=solvers.Robots(checkpoint=solvers.Checkpoint(path)),
             callback=lambda *_: True,
             weighting=Weighting.ISOTROPIC,
         )
@@ -189,8 +196,10 @@ def extends(place: Place) -> bool:
 
 
 def bears_faults(place: Place) -> bool:
-    pipeline = solvers.Pipeline(soc=consensus(graph_in_space()), faults=solvers.Faults())
-    return place.solve(graph_in_space(), pipeline, Weighting.ISOTROPIC).status.is_success
+    pipeline = solvers.Pipeline(soc=consensus(graph_in_space()))
+    robots = solvers.Robots(faults=solvers.Faults())
+    answer = place.solve(graph_in_space(), pipeline, Weighting.ISOTROPIC, robots=robots)
+    return answer.status.is_success
 
 
 def runs_soc(soc: Callable[[], Any]) -> Callable[[Place], bool]:

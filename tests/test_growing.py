@@ -465,13 +465,12 @@ def test_robots_without_a_driver_go_on_without_one() -> None:
     whole = Partition(owner, PartitionMethod.GIVEN)
     parts = [Partition(owner[:18], PartitionMethod.GIVEN), whole]
     pipelines = [
-        solvers.Pipeline(
-            soc=solvers.SOC(robots=robots, coupling=solvers.Coupling.CONSENSUS), driver_memory=0
-        )
+        solvers.Pipeline(soc=solvers.SOC(robots=robots, coupling=solvers.Coupling.CONSENSUS))
         for robots in parts
     ]
-    before = solvers.solve(first_poses(graph, 18), pipelines[0], robots=parts[0])
-    grown = extend(before, graph, pipelines[1], robots=whole)
+    alone = solvers.Robots(parts[0], driver_memory=0)
+    before = solvers.solve(first_poses(graph, 18), pipelines[0], robots=alone)
+    grown = extend(before, graph, pipelines[1], robots=replace(alone, owners=whole))
     assert [stage.name for stage in grown.stages] == ["given start", "SOC"]
     assert grown.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-3)
     assert grown.ledger is not None

@@ -44,6 +44,7 @@ ORDER = {
         "given_poses",
         "convex",
         "baselines",
+        "robots",
         "place",
         "here",
         "distributed.robots",

@@ -31,7 +31,6 @@ from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.baselines.sweep_order import Sweep
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.distributed.asynchronous import AsynchronousSOC
-from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
 from solvers.distributed.handedness import RobotsPoint, begin_without_terms
@@ -50,6 +49,7 @@ from solvers.riemannian.newton import Newton, gauss_newton
 from solvers.riemannian.newton_step import ModelOrder
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
+from solvers.robots import Checkpoint
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC, GNCState
 from solvers.robust.losses import RobustLoss
@@ -375,7 +375,7 @@ def fields_of_settings() -> list[Any]:
         kind for kind in kinds if dataclasses.is_dataclass(kind) and hasattr(kind, "__post_init__")
     ]
     every = [(kind, field) for kind in kinds for field in dataclasses.fields(kind)]
-    open_ones = ("r_step", "known", "idle", "soc", "changer", "only", "contenders")
+    open_ones = ("engine", "r_step", "known", "idle", "soc", "changer", "only", "contenders")
     return [
         pytest.param(k, f.name, id=f"{k.__name__}-{f.name}")
         for k, f in every

@@ -51,23 +51,18 @@ def chosen_pipeline(
     gap: float,
     max_iterations: int | None,
     tolerance: float | None,
-    driver_memory: float | None = None,
+    has_driver: bool = True,
     is_asked_for: bool = True,
 ) -> Pipeline:
     """Pipeline of the options of `pgo solve`.
 
-    The `robots` are those of CONSENSUS and PAPER; `driver_memory` is in GB. Where the method was
+    The `robots` are those of CONSENSUS and PAPER. Where the method was
     not asked for, and no option is about SOC, the place of the solve chooses whether it runs SOC. A
     SettingError when the options do not go together.
     """
-    if driver_memory is not None and method not in ON_ROBOTS:
-        raise SettingError(
-            f"--driver-memory is for methods that run on robots, got --method {method.value}"
-        )
-    memory = DEFAULT_MEMORY if driver_memory is None else 1e9 * driver_memory
     if method is FirstStage.NEWTON:
         _check_without_soc(r_step, max_iterations, tolerance)
-        return Pipeline(soc=None, gap=gap, driver_memory=memory)
+        return Pipeline(soc=None, gap=gap)
     if method is FirstStage.SUBSTRUCTURED and r_step not in (None, BackEndName.FACTORIZED):
         raise SettingError(
             f"--method substructured factors, got --r-step {r_step.value}; "
@@ -75,8 +70,8 @@ def chosen_pipeline(
         )
     options_of_soc = (r_step, max_iterations, tolerance)
     if not is_asked_for and all(option is None for option in options_of_soc):
-        return Pipeline(gap=gap, driver_memory=memory)
-    soc = _default_soc(method, has_driver=memory > 0)
+        return Pipeline(gap=gap)
+    soc = _default_soc(method, has_driver)
     soc = replace(
         soc,
         robots=robots if method in (FirstStage.CONSENSUS, FirstStage.PAPER) else None,
@@ -85,10 +80,21 @@ def chosen_pipeline(
         max_iterations=soc.max_iterations if max_iterations is None else max_iterations,
     )
     if isinstance(soc, PaperSOC):
-        return Pipeline(soc=soc, newton=gauss_newton(), gap=gap, driver_memory=memory)
+        return Pipeline(soc=soc, newton=gauss_newton(), gap=gap)
     if method is FirstStage.CONSENSUS:
         soc = replace(soc, coupling=Coupling.CONSENSUS)
-    return Pipeline(soc=soc, gap=gap, driver_memory=memory)
+    return Pipeline(soc=soc, gap=gap)
+
+
+def chosen_memory(method: FirstStage, driver_memory: float | None) -> float:
+    """Bytes of the driver, from --driver-memory in GB; a SettingError for a method without one."""
+    if driver_memory is None:
+        return DEFAULT_MEMORY
+    if method not in ON_ROBOTS:
+        raise SettingError(
+            f"--driver-memory is for methods that run on robots, got --method {method.value}"
+        )
+    return 1e9 * driver_memory
 
 
 def _check_without_soc(

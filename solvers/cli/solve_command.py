@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -74,11 +74,9 @@ from solvers.pipeline import solve
 from solvers.progress_bars import JobBar
 from solvers.request import Pipeline
 from solvers.result import Status
+from solvers.robots import Checkpoint, Robots
 from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution, check_format, check_target
-
-if TYPE_CHECKING:
-    from solvers.distributed.checkpoint import Checkpoint
 
 _INDENT = 13  # columns of the labels of a solution
 
@@ -244,12 +242,10 @@ def solve_command(
     place = network.chosen_for(problem.graph, stages)
     solution = solve(
         problem,
-        stages.pipeline(place.method, place.partition, driver_memory),
+        stages.pipeline(place.method, place.partition, not network.has_no_driver),
         choices.chosen_start(problem, start),
         robust=choices.chosen_robust(robust),
-        robots=place.partition if place.engine is not None else None,
-        engine=place.engine,
-        checkpoint=network.checkpoint,
+        robots=network.robots_at(place),
         anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
         verbose=verbose,
@@ -284,7 +280,7 @@ class StageOptions:
         )
 
     def pipeline(
-        self, method: FirstStage, robots: Partition | None, driver_memory: float | None
+        self, method: FirstStage, robots: Partition | None, has_driver: bool = True
     ) -> Pipeline:
         """Pipeline of these options with the method that was chosen."""
         return choices.chosen_pipeline(
@@ -294,7 +290,7 @@ class StageOptions:
             self.gap,
             self.max_iterations,
             self.tolerance,
-            driver_memory,
+            has_driver,
             is_asked_for=self.method is not None,
         )
 
@@ -338,13 +334,18 @@ class RobotOptions:
         """Whether robots do without a driver."""
         return self.driver_memory == 0
 
+    def robots_at(self, place: Place) -> Robots | None:
+        """Robots of a solve, or None where it is run in one place."""
+        memory = choices.chosen_memory(place.method, self.driver_memory)
+        if place.engine is None:
+            return None
+        return Robots(place.partition, place.engine, memory, checkpoint=self.checkpoint)
+
     @property
-    def checkpoint(self) -> "Checkpoint | None":
+    def checkpoint(self) -> Checkpoint | None:
         """The checkpoint of --resume."""
         if self.resume is None:
             return None
-        from solvers.distributed.checkpoint import Checkpoint
-
         return Checkpoint(self.resume)
 
     def reads_own_files(self, graph: str) -> bool:
@@ -515,12 +516,14 @@ def _solve_own_files(
         Cost.ISOTROPIC: Weighting.ISOTROPIC,
     }
     method = choices.chosen_method(stages.method, None, True)
-    pipeline = stages.pipeline(method, None, network.driver_memory)
+    pipeline = stages.pipeline(method, None)
+    engine = choices.chosen_engine(method, network.engine, network.address, False)
+    memory = choices.chosen_memory(method, network.driver_memory)
     solution = solve_folder(
         source.graph,
         pipeline,
         weighting=weightings[source.chosen_cost],
-        engine=choices.chosen_engine(method, network.engine, network.address, False),
+        robots=Robots(engine=engine, driver_memory=memory),
         out=outputs.out[0] if outputs.out else None,
         time_limit=stages.time_limit,
         verbose=display.verbose,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.lower_bound import LowerBound
-from pgo_models.errors import FileFormatError, PGOError, SettingError, check_settings
+from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
@@ -40,6 +40,7 @@ from solvers.network.serialization import deserialize, serialize
 from solvers.result import History, Measurement, Outcome, Record, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
+from solvers.robots import Checkpoint
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.copies import SeparatorPenalty
@@ -56,50 +57,6 @@ _FORMAT = b"pgo-splitting checkpoint 6\n"
 _DIGEST_SIZE = 65
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Where and how often a solve by robots writes what it needs to go on.
-
-    If the file exists when a solve begins, the solve goes on from it. The file is removed when the
-    solve has converged, and stays when the solve was stopped, interrupted or out of time. While a
-    solve runs it is locked for others. Where a checkpoint cannot be written, say on a full disk,
-    there is one warning, and the last one that could be written stays.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file.
-    rounds : int
-        Rounds of communication after which one is written; at least 1. There is also one when SOC
-        and when Newton begins.
-
-    Raises
-    ------
-    SettingError
-        When `rounds` is below 1.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from pgo_models import load
-    >>> from solvers import solve
-    >>> path = Path(tempfile.mkdtemp()) / "solve.checkpoint"
-    >>> checkpoint = Checkpoint(path)
-    >>> stopped = solve(load("grid"), robots=2, checkpoint=checkpoint, callback=lambda *_: True)
-    >>> stopped.status.name, path.exists()
-    ('STOPPED', True)
-    >>> solution = solve(load("grid"), robots=2, checkpoint=checkpoint)
-    >>> solution.status.name, path.exists()
-    ('CONVERGED', False)
-    """
-
-    path: Path | str
-    rounds: int = 10
-
-    def __post_init__(self) -> None:
-        check_settings(self, at_least_one=["rounds"])
 
 
 @dataclass(frozen=True, eq=False)

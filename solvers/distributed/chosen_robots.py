@@ -11,12 +11,14 @@ from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 
 
-def robots_of_solve(soc: FirstStage, robots: Partition | int, graph: PoseGraph) -> Partition:
+def robots_of_solve(soc: FirstStage, robots: Partition | int | None, graph: PoseGraph) -> Partition:
     """Robots of a solve, which are also those of its SOC.
 
     A number stands for the robots of SOC if they are so many, else for the default partition. A
-    SettingError when SOC has other robots, or cannot be run by robots.
+    SettingError when neither is given, SOC has other robots, or cannot be run by robots.
     """
+    if robots is None:
+        raise SettingError("nobody owns the poses; give Robots(3, ..) or Robots(partition, ..)")
     soc = None if isinstance(soc, Automatic) else soc
     of_soc = soc.robots if soc is not None else None
     if not isinstance(robots, Partition):

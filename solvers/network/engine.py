@@ -72,7 +72,7 @@ class InProcess:
     --------
     >>> import pgo_models as pgo, solvers
     >>> graph = pgo.load("circle")
-    >>> solvers.solve(graph, robots=2, engine=solvers.InProcess(threads=2)).is_certified
+    >>> solvers.solve(graph, robots=solvers.Robots(2, solvers.InProcess(threads=2))).is_certified
     True
     """
 

@@ -21,10 +21,10 @@ class RobotSilentError(EngineError):
 class Faults:
     """Faults between robots, for study; the same seed gives the same faults.
 
-    `Pipeline(faults=..)` runs its CONSENSUS stage with them: robots then do not wait for each
-    other. Of a later stage a driver waits for a robot that is silent, for as many rounds as the
-    CONSENSUS stage may take. A robot that is silent for longer has no part in Newton's method or a
-    certificate, and then there are none.
+    `Robots(faults=..)` runs the CONSENSUS stage of a solve with them: robots then do not wait for
+    each other. Of a later stage a driver waits for a robot that is silent, for as many rounds as
+    the CONSENSUS stage may take. A robot that is silent for longer has no part in Newton's method
+    or a certificate, and then there are none.
 
     Parameters
     ----------

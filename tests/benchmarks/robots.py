@@ -147,7 +147,7 @@ def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
         for _ in range(5):
             began = time.perf_counter()
             cpu = time.process_time()
-            solution = solvers.solve(graph, pipeline, robots=shared, engine=engine)
+            solution = solvers.solve(graph, pipeline, robots=solvers.Robots(shared, engine=engine))
             whole = time.perf_counter() - began
             driver = time.process_time() - cpu
             (stage,) = (stage for stage in solution.stages if stage.name == "SOC")
@@ -205,7 +205,7 @@ def interleaved_job(poses: str) -> dict[str, object]:
         run_cli(["generate", "grid-world", *shape, "--out", str(world)])
         began = time.perf_counter()
         with RayEngine(num_cpus=16, actors=16).kept() as engine:
-            solution = solvers.solve_folder(world, engine=engine)
+            solution = solvers.solve_folder(world, robots=solvers.Robots(engine=engine))
             actors = processes_of("ray::")
         seconds = time.perf_counter() - began
     usage = resource.getrusage(resource.RUSAGE_SELF)
@@ -285,7 +285,7 @@ def driver_job(robots: str, poses: str) -> dict[str, object]:
     shared = pgo.partition(graph, int(robots), METIS)
     timed = TimedRobots()
     began = time.process_time()
-    solution = solvers.solve(graph, robots=shared, engine=timed)
+    solution = solvers.solve(graph, robots=solvers.Robots(shared, engine=timed))
     total = time.process_time() - began
     assert solution.ledger is not None
     return {

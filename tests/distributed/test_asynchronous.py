@@ -28,6 +28,7 @@ from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import Record, Status
 from solvers.riemannian.polish import polish
+from solvers.robots import Robots
 from solvers.soc.consensus import LocalConsensus, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.paper import PaperSOC
@@ -181,8 +182,8 @@ def test_a_solve_with_faults_is_certified_with_the_central_gap(d: int, fault: st
     graph = varied_graph(3, 20, d)
     parts = metis(graph, 3)
     engine = Recording()
-    pipeline = Pipeline(soc=SOC(robots=parts, tolerance=2e-3), faults=FAULTS[fault])
-    solution = solve(graph, pipeline, robots=parts, engine=engine)
+    pipeline = Pipeline(soc=SOC(robots=parts, tolerance=2e-3))
+    solution = solve(graph, pipeline, robots=Robots(parts, engine=engine, faults=FAULTS[fault]))
     central = solve(graph, Pipeline())
     assert solution.is_certified
     assert solution.status is Status.CONVERGED
@@ -190,7 +191,7 @@ def test_a_solve_with_faults_is_certified_with_the_central_gap(d: int, fault: st
     assert solution.gap == pytest.approx(central.gap, abs=1e-9)
     assert engine.times(ConsensusRobot.turn) == solution.stages[1].iterations > 0
     assert engine.times(ConsensusRobot.step, ConsensusRobot.solve) == 0
-    again = solve(graph, pipeline, robots=parts)
+    again = solve(graph, pipeline, robots=Robots(parts, faults=FAULTS[fault]))
     np.testing.assert_array_equal(again.poses.R, solution.poses.R)  # the same seed, the same faults
 
 
@@ -200,21 +201,22 @@ def test_nothing_is_certified_for_a_robot_that_is_silent_for_ever(silent_from: i
     graph = varied_graph(3, 20, 2)
     parts = metis(graph, 3)
     soc = SOC(robots=parts, tolerance=2e-3, max_iterations=60)
-    heard = solve(graph, Pipeline(soc=soc, faults=Faults()), robots=parts)
+    pipeline = Pipeline(soc=soc)
+    heard = solve(graph, pipeline, robots=Robots(parts, faults=Faults()))
     assert heard.is_certified
     if silent_from == "after SOC":
         silent_from = heard.stages[1].iterations + 2
     assert isinstance(silent_from, int)
     for rounds in (10**9, 1000):
         silence = Faults(silent_robot=1, silent_from=silent_from, silent_rounds=rounds)
-        solution = solve(graph, Pipeline(soc=soc, faults=silence), robots=parts)
+        solution = solve(graph, pipeline, robots=Robots(parts, faults=silence))
         assert not solution.is_certified
         assert solution.lower_bound == 0.0
         assert solution.status is Status.SILENT
         assert f"robot 1 is silent from round {silent_from} on" in solution.note
         assert solution.objective == pytest.approx(solution.problem.objective(solution.poses))
     waits = Faults(silent_robot=1, silent_from=silent_from, silent_rounds=60)
-    assert solve(graph, Pipeline(soc=soc, faults=waits), robots=parts).is_certified
+    assert solve(graph, pipeline, robots=Robots(parts, faults=waits)).is_certified
 
 
 def test_a_round_is_one_message_a_link_and_no_all_reduce() -> None:
@@ -269,9 +271,7 @@ def test_faults_are_for_consensus_by_robots() -> None:
     parts = partition(graph, 3)
     for soc in (None, SOC(), SOC(coupling=Coupling.SUBSTRUCTURED), PaperSOC(robots=parts)):
         with pytest.raises(SettingError, match="faults are of messages between robots"):
-            Pipeline(soc=soc, faults=Faults())
-    with pytest.raises(SettingError, match="faults are of messages between robots"):
-        solve(graph, Pipeline(soc=SOC(robots=parts), faults=Faults()))
-    nobody = Pipeline(soc=SOC(robots=parts), faults=Faults(silent_robot=3, silent_rounds=5))
+            solve(graph, Pipeline(soc=soc), robots=Robots(parts, faults=Faults()))
+    nobody = Robots(parts, faults=Faults(silent_robot=3, silent_rounds=5))
     with pytest.raises(SettingError, match="silent_robot is 3; give 0 to 2"):
-        solve(graph, nobody, robots=parts)
+        solve(graph, Pipeline(soc=SOC(robots=parts)), robots=nobody)

@@ -20,8 +20,9 @@ from solvers.cli.choices import chosen_pipeline
 from solvers.cli.inputs import chosen_partition
 from solvers.cli.options import BackEndName, FirstStage
 from solvers.distributed import checkpoint
-from solvers.distributed.checkpoint import Checkpoint, Journal
+from solvers.distributed.checkpoint import Journal
 from solvers.network.engine import InProcess
+from solvers.robots import Checkpoint
 from solvers.soc.soc import WARM_START
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
@@ -77,15 +78,16 @@ def test_a_run_that_was_broken_off_goes_on_to_the_same_numbers(coupling, part, t
     after = round(part * (steps - 1))
     with pytest.raises(Killed):
         solvers.solve(
-            graph, settings, robots=robots, checkpoint=checkpoint, callback=killed_after(after)
+            graph,
+            settings,
+            robots=solvers.Robots(robots, checkpoint=checkpoint),
+            callback=killed_after(after),
         )
     seen = []
     found = solvers.solve(
         graph,
         settings,
-        robots=robots,
-        checkpoint=checkpoint,
-        engine=InProcess(threads=2),
+        robots=solvers.Robots(robots, engine=InProcess(threads=2), checkpoint=checkpoint),
         callback=lambda state, record: seen.append(record.k),
     )
     assert_same(found, expected)
@@ -121,14 +123,16 @@ def test_a_second_attempt_goes_on_too(part, growing, tmp_path):
     after = first + round(part * (second - 1))
     with pytest.raises(Killed):
         solvers.solve(
-            graph, settings, robots=3, checkpoint=checkpoint, callback=killed_after(after)
+            graph,
+            settings,
+            robots=solvers.Robots(3, checkpoint=checkpoint),
+            callback=killed_after(after),
         )
     seen = []
     found = solvers.solve(
         graph,
         settings,
-        robots=3,
-        checkpoint=checkpoint,
+        robots=solvers.Robots(3, checkpoint=checkpoint),
         callback=lambda state, record: seen.append(record.k),
     )
     assert_same(found, expected)
@@ -143,17 +147,26 @@ def test_without_soc_newton_goes_on(tmp_path):
     expected = solvers.solve(graph, settings, robots=3)
     checkpoint = Checkpoint(tmp_path / "run.ckpt", rounds=1)
     with pytest.raises(Killed):
-        solvers.solve(graph, settings, robots=3, checkpoint=checkpoint, callback=killed_after(1))
-    assert_same(solvers.solve(graph, settings, robots=3, checkpoint=checkpoint), expected)
+        solvers.solve(
+            graph,
+            settings,
+            robots=solvers.Robots(3, checkpoint=checkpoint),
+            callback=killed_after(1),
+        )
+    assert_same(
+        solvers.solve(graph, settings, robots=solvers.Robots(3, checkpoint=checkpoint)), expected
+    )
 
 
 def test_the_file_stays_when_the_run_was_stopped_and_goes_when_it_converged(tmp_path):
     graph = varied_graph(8, 40, 2)
     path = tmp_path / "run.ckpt"
-    stopped = solvers.solve(graph, robots=2, checkpoint=Checkpoint(path), time_limit=1e-9)
+    stopped = solvers.solve(
+        graph, robots=solvers.Robots(2, checkpoint=Checkpoint(path)), time_limit=1e-9
+    )
     assert stopped.status is solvers.Status.TIME_LIMIT
     assert path.exists()
-    found = solvers.solve(graph, robots=2, checkpoint=Checkpoint(path))
+    found = solvers.solve(graph, robots=solvers.Robots(2, checkpoint=Checkpoint(path)))
     assert_same(found, solvers.solve(graph, robots=2))
     assert not path.exists()
 
@@ -170,7 +183,11 @@ def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
     def writes(rounds):
         written.clear()
         finer = solvers.Pipeline(soc=solvers.SOC(tolerance=2e-3))
-        solvers.solve(graph, finer, robots=2, checkpoint=Checkpoint(tmp_path / "run.ckpt", rounds))
+        solvers.solve(
+            graph,
+            finer,
+            robots=solvers.Robots(2, checkpoint=Checkpoint(tmp_path / "run.ckpt", rounds)),
+        )
         return [rounds for method, rounds in written if method == "SubstructuredSOC"]
 
     monkeypatch.setattr(checkpoint, "_write", recording)
@@ -187,7 +204,9 @@ def broken_off(tmp_path):
     graph = varied_graph(9, 30, 3)
     path = tmp_path / "run.ckpt"
     with pytest.raises(Killed):
-        solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
+        solvers.solve(
+            graph, robots=solvers.Robots(3, checkpoint=Checkpoint(path)), callback=killed_after(2)
+        )
     return graph, path
 
 
@@ -235,8 +254,7 @@ def test_all_that_is_another_is_named(broken_off):
         solvers.solve(
             changed_graph(graph, "t_ij"),
             solvers.Pipeline(gap=1e-5),
-            robots=3,
-            checkpoint=Checkpoint(path),
+            robots=solvers.Robots(3, checkpoint=Checkpoint(path)),
         )
 
 
@@ -263,7 +281,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_left_alone(damage, broken_o
         damage, "no checkpoint"
     )
     with pytest.raises(FileFormatError, match=rf"run\.ckpt: {wrong}"):
-        solvers.solve(graph, robots=3, checkpoint=Checkpoint(path))
+        solvers.solve(graph, robots=solvers.Robots(3, checkpoint=Checkpoint(path)))
     assert [one.name for one in path.parent.iterdir()] == ["run.ckpt"]  # and no lock
 
 
@@ -328,7 +346,7 @@ def test_room_on_the_disk_again_means_checkpoints_again(tmp_path, monkeypatch, c
         write(*arguments)
 
     monkeypatch.setattr(checkpoint, "_write", failing)
-    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path, rounds=1))
+    found = solvers.solve(graph, robots=solvers.Robots(3, checkpoint=Checkpoint(path, rounds=1)))
     assert len(written) > 6
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert_same(found, solvers.solve(graph, robots=3))
@@ -344,7 +362,9 @@ def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path
             path.unlink()
             path.mkdir()
 
-    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path, rounds=1), callback=block)
+    found = solvers.solve(
+        graph, robots=solvers.Robots(3, checkpoint=Checkpoint(path, rounds=1)), callback=block
+    )
     assert_same(found, solvers.solve(graph, robots=3))
     first, last = caplog.messages
     assert first.startswith(
@@ -359,7 +379,11 @@ def test_a_second_run_on_a_checkpoint_is_refused(is_there, tmp_path):
     path = tmp_path / "run.ckpt"
     if is_there:
         with pytest.raises(Killed):
-            solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=killed_after(2))
+            solvers.solve(
+                graph,
+                robots=solvers.Robots(3, checkpoint=Checkpoint(path)),
+                callback=killed_after(2),
+            )
     link = tmp_path / "link.ckpt"
     link.symlink_to(path)
     refusals = []
@@ -369,10 +393,12 @@ def test_a_second_run_on_a_checkpoint_is_refused(is_there, tmp_path):
             with pytest.raises(
                 SettingError, match=r"run\.ckpt is in use by another run; wait until"
             ) as refused:
-                solvers.solve(graph, robots=3, checkpoint=Checkpoint(name))
+                solvers.solve(graph, robots=solvers.Robots(3, checkpoint=Checkpoint(name)))
             refusals.append(str(refused.value))
 
-    found = solvers.solve(graph, robots=3, checkpoint=Checkpoint(path), callback=second)
+    found = solvers.solve(
+        graph, robots=solvers.Robots(3, checkpoint=Checkpoint(path)), callback=second
+    )
     assert refusals
     assert_same(found, solvers.solve(graph, robots=3))
     assert list(tmp_path.iterdir()) == [link]
@@ -396,7 +422,8 @@ def wait_in_the_middle(state, record):
 
 graph, settings, robots = long_run()
 checkpoint = solvers.Checkpoint(sys.argv[1])
-solvers.solve(graph, settings, robots=robots, checkpoint=checkpoint, callback=wait_in_the_middle)
+robots = solvers.Robots(robots, checkpoint=checkpoint)
+solvers.solve(graph, settings, robots=robots, callback=wait_in_the_middle)
 """
 
 
@@ -440,8 +467,7 @@ def test_a_killed_process_goes_on_where_it_was(tmp_path):
     found = solvers.solve(
         graph,
         settings,
-        robots=robots,
-        checkpoint=Checkpoint(path),
+        robots=solvers.Robots(robots, checkpoint=Checkpoint(path)),
         callback=lambda state, record: seen.append(record.k),
     )
     np.testing.assert_allclose(found.objective, expected.objective, rtol=1e-8, atol=0)

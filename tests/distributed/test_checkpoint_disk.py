@@ -10,7 +10,7 @@ from robots import Killed
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import EngineError, FileFormatError
-from solvers.distributed.checkpoint import Checkpoint
+from solvers.robots import Checkpoint
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 
@@ -49,7 +49,10 @@ def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after
 
     with full_disk_later() as fill_disk, pytest.raises(Killed):
         solvers.solve(
-            graph, SUBSTRUCTURED, robots=3, checkpoint=Checkpoint(path, rounds=3), callback=fill
+            graph,
+            SUBSTRUCTURED,
+            robots=solvers.Robots(3, checkpoint=Checkpoint(path, rounds=3)),
+            callback=fill,
         )
     assert caplog.messages == [
         f"the solve goes on without a new checkpoint: cannot write {path}: File too large;"
@@ -62,7 +65,9 @@ def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after
         seen.append(record.k)
         return True
 
-    solvers.solve(graph, SUBSTRUCTURED, robots=3, checkpoint=Checkpoint(path), callback=look)
+    solvers.solve(
+        graph, SUBSTRUCTURED, robots=solvers.Robots(3, checkpoint=Checkpoint(path)), callback=look
+    )
     # it goes on from the last one before the disk was full
     assert full_after - 4 <= seen[0] < full_after
 
@@ -73,8 +78,7 @@ def test_where_nothing_can_be_written_is_told_before_the_solve(tmp_path):
     ):
         solvers.solve(
             varied_graph(9, 30, 2),
-            robots=3,
-            checkpoint=Checkpoint(tmp_path / "missing" / "run.ckpt"),
+            robots=solvers.Robots(3, checkpoint=Checkpoint(tmp_path / "missing" / "run.ckpt")),
         )
 
 
@@ -86,8 +90,8 @@ def test_the_lock_is_let_go_when_the_robots_cannot_start(tmp_path):
     with pytest.raises(EngineError, match="nowhere"):
         solvers.solve(
             varied_graph(9, 30, 2),
-            robots=3,
-            engine=Nowhere(),
-            checkpoint=Checkpoint(tmp_path / "run.ckpt"),
+            robots=solvers.Robots(
+                3, engine=Nowhere(), checkpoint=Checkpoint(tmp_path / "run.ckpt")
+            ),
         )
     assert list(tmp_path.iterdir()) == []

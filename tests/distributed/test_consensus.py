@@ -39,6 +39,7 @@ from solvers.loop import iterate, run
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import Status
+from solvers.robots import Robots
 from solvers.soc import safeguard, separator_stiffness as stiffness
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus import ConsensusState, LocalConsensus
@@ -297,7 +298,7 @@ def test_solve_and_soc_have_the_same_robots() -> None:
     four = partition(graph, 4)
     pipeline = Pipeline(soc=SOC(robots=three, tolerance=2e-3))
     engine = Recording()
-    solution = solve(graph, pipeline, robots=3, engine=engine)  # so many are SOC's
+    solution = solve(graph, pipeline, robots=Robots(3, engine=engine))  # so many are SOC's
     assert solution.robots is three
     assert engine.times(ConsensusRobot.turn, Interior.penalize) == 0
     assert engine.times(ConsensusRobot.step) == solution.stages[1].iterations > 0

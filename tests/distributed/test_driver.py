@@ -45,6 +45,7 @@ from solvers.network.engine import InProcess
 from solvers.pipeline import solve
 from solvers.place import AUTO, FirstStage
 from solvers.request import Pipeline
+from solvers.robots import Robots
 from solvers.soc.soc import WARM_START
 from solvers.soc.subgraph import split_graph
 from solvers.solution import Solution
@@ -176,7 +177,7 @@ def solved(
     graph = varied_graph(seed, n, d, noise)
     engine = Recording()
     pipeline = Pipeline(soc=soc, staircase=None)
-    solution = solve(graph, pipeline, robots=partitioner(graph, seed), engine=engine)
+    solution = solve(graph, pipeline, robots=Robots(partitioner(graph, seed), engine=engine))
     assert engine.is_closed
     return solution, engine
 
@@ -234,7 +235,7 @@ def test_the_ledger_counts_what_was_sent(
 def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     graph = grid(np.random.default_rng(0))
     engine = Recording()
-    solution = solve(graph, robots=partition(graph, 3), engine=engine)
+    solution = solve(graph, robots=Robots(partition(graph, 3), engine=engine))
     assert solution.ledger is not None
     start, soc, newton = solution.stages
     moves = engine.times(Interior.move)
@@ -355,7 +356,8 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
 def test_threads_change_no_bit(d: int) -> None:
     graph = varied_graph(3, 30, d)
     first, second = (
-        solve(graph, robots=partition(graph, 4), engine=InProcess(threads)) for threads in (1, 3)
+        solve(graph, robots=Robots(partition(graph, 4), engine=InProcess(threads)))
+        for threads in (1, 3)
     )
     np.testing.assert_array_equal(first.poses.R, second.poses.R)
     np.testing.assert_array_equal(first.poses.t, second.poses.t)

@@ -15,7 +15,6 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import multifrontal
-from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.multifrontal import FrontOwners
 from solvers.distributed.robots.elimination import HeldFront
 from solvers.distributed.robots.records import ALONG_TREE
@@ -24,6 +23,7 @@ from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve
 from solvers.request import Pipeline
+from solvers.robots import Checkpoint, Robots
 from solvers.solution import Solution
 
 OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result", "take_front")
@@ -43,9 +43,14 @@ def world(seed: int, d: int, robots: int) -> tuple[PoseGraph, Partition]:
 
 
 def solved(
-    graph: PoseGraph, robots: Partition, engine: Engine | None = None, **settings: Any
+    graph: PoseGraph,
+    owners: Partition,
+    engine: Engine | None = None,
+    checkpoint: Checkpoint | None = None,
+    **settings: Any,
 ) -> Solution:
-    return solve(graph, Pipeline(staircase=None), robots=robots, engine=engine, **settings)
+    robots = Robots(owners, engine, checkpoint=checkpoint)
+    return solve(graph, Pipeline(staircase=None), robots=robots, **settings)
 
 
 @pytest.mark.parametrize(("seed", "d", "robots"), [(0, 2, 2), (1, 3, 4), (2, 2, 9), (3, 3, 6)])

@@ -25,11 +25,11 @@ from pgo_models.problem.excess import Tangent
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import prove_with_eta
 from solvers.network.counted_pool import Count
 from solvers.riemannian.polish import polish
+from solvers.robots import Checkpoint
 from solvers.soc.settings import Coupling
 
 QUIET = NoiseModel(0.02, 0.02)
@@ -109,8 +109,10 @@ def test_a_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
         return len(seen) >= 4
 
     checkpoint = Checkpoint(tmp_path / "run.ckpt", rounds=1)
-    solvers.solve(problem, robots=3, progress=False, checkpoint=checkpoint, callback=stop)
-    again = solvers.solve(problem, robots=3, progress=False, checkpoint=checkpoint)
+    solvers.solve(
+        problem, robots=solvers.Robots(3, checkpoint=checkpoint), progress=False, callback=stop
+    )
+    again = solvers.solve(problem, robots=solvers.Robots(3, checkpoint=checkpoint), progress=False)
     assert again.objective == pytest.approx(whole.objective, rel=1e-12)
     assert again.certificate.verdict is whole.certificate.verdict
 
@@ -192,7 +194,10 @@ def test_without_a_driver_chi2_is_refused() -> None:
     soc = solvers.SOC(coupling=Coupling.CONSENSUS, robots=partition(problem.graph, 2))
     with pytest.raises(SettingError, match="without a driver"):
         solvers.solve(
-            problem, solvers.Pipeline(soc=soc, driver_memory=0), robots=soc.robots, progress=False
+            problem,
+            solvers.Pipeline(soc=soc),
+            robots=solvers.Robots(soc.robots, driver_memory=0),
+            progress=False,
         )
 
 

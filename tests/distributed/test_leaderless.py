@@ -24,11 +24,11 @@ from pgo_models.certificates.certificate import Verdict
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_alone import (
     NO_CERTIFICATE,
@@ -46,6 +46,7 @@ from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import Record, Status
 from solvers.riemannian.polish import polish
+from solvers.robots import Checkpoint, Robots
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import MultiplierPenalty
@@ -58,8 +59,9 @@ OFF = ("Interior.describe", "Interior.set_poses")
 ALONE = ("in_cover", "force", "schur", "b")  # fields that are sent to a driver only
 
 
-def alone(soc: SOC, faults: Faults | None = None) -> Pipeline:
-    return Pipeline(soc=soc, faults=faults, driver_memory=0)
+def alone(parts: Partition, **settings: Any) -> Robots:
+    """Robots without a driver."""
+    return Robots(parts, driver_memory=0, **settings)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +84,10 @@ def test_a_start_that_is_cut_short_is_the_end(
     monkeypatch.setattr(ConsensusSOC, "step", counted)
     limit = math.inf if interrupted_step is not None else 1e-6
     solution = solve(
-        graph, alone(SOC(coupling=Coupling.CONSENSUS, robots=parts)), robots=parts, time_limit=limit
+        graph,
+        Pipeline(soc=SOC(coupling=Coupling.CONSENSUS, robots=parts)),
+        robots=alone(parts),
+        time_limit=limit,
     )
     assert [stage.name for stage in solution.stages] == ["spanning tree"]
     assert solution.status is status
@@ -101,7 +106,7 @@ def test_robots_alone_find_an_optimum_or_stay_at_their_start_and_claim_nothing(
     parts = partitioner(graph, seed)
     engine = Recording()
     soc = SOC(coupling=Coupling.CONSENSUS, robots=parts, tolerance=TOLERANCE, max_iterations=5000)
-    solution = solve(graph, alone(soc), robots=parts, engine=engine)
+    solution = solve(graph, Pipeline(soc=soc), robots=alone(parts, engine=engine))
     problem = solution.problem
     best = problem.objective(polish(problem, solution.poses))
     begun = solution.stages[0].objective
@@ -150,7 +155,9 @@ def test_rounds_of_the_relaxation_end_at_the_joint_minimiser(
 def test_sums_go_along_a_tree_of_robots_and_nothing_to_a_driver() -> None:
     problem = varied_problem(4, 24, 3)
     parts = scattered(problem.graph, 4)
-    solution = solve(problem, alone(SOC(robots=parts, max_iterations=0)), robots=parts)
+    solution = solve(
+        problem, Pipeline(soc=SOC(robots=parts, max_iterations=0)), robots=alone(parts)
+    )
     ledger = solution.ledger
     order, parents = robot_tree(problem, parts)
     assert ledger is not None
@@ -189,7 +196,7 @@ def test_the_penalties_are_taken_anew_at_the_poses_agreed_on() -> None:
         penalty=MultiplierPenalty(stall_window=2, stall_ratio=1e-9),
         tolerance=TOLERANCE,
     )
-    solution = solve(problem, alone(soc), robots=parts, engine=engine)
+    solution = solve(problem, Pipeline(soc=soc), robots=alone(parts, engine=engine))
     assert engine.times(ConsensusRobot.begin_here) == 2 + engine.times(ConsensusRobot.travel) == 3
     assert solution.status is Status.CONVERGED
     best = problem.objective(polish(problem, chordal_start(problem)))
@@ -200,15 +207,17 @@ def test_given_poses_are_the_start_and_stay_where_nothing_is_better() -> None:
     problem = varied_problem(1, 20, 2)
     parts = metis(problem.graph, 3)
     best = polish(problem, chordal_start(problem))
-    solution = solve(problem, alone(SOC(robots=parts, max_iterations=2)), best, robots=parts)
+    solution = solve(
+        problem, Pipeline(soc=SOC(robots=parts, max_iterations=2)), best, robots=alone(parts)
+    )
     assert solution.stages[0].name == "given start"
     assert solution.objective <= problem.objective(best) * (1 + 1e-12)
     with pytest.raises(GraphError, match="give one pose for every pose"):
         solve(
             problem,
-            alone(SOC(robots=parts)),
+            Pipeline(soc=SOC(robots=parts)),
             Poses(np.eye(2)[None], np.zeros((1, 2))),
-            robots=parts,
+            robots=alone(parts),
         )
 
 
@@ -216,7 +225,8 @@ def test_lost_messages_need_no_driver_either() -> None:
     problem = varied_problem(3, 20, 3)
     parts = metis(problem.graph, 4)
     soc = SOC(robots=parts, tolerance=TOLERANCE)
-    solution = solve(problem, alone(soc, Faults(loss=0.2, seed=1)), robots=parts)
+    robots = alone(parts, faults=Faults(loss=0.2, seed=1))
+    solution = solve(problem, Pipeline(soc=soc), robots=robots)
     assert solution.status is Status.CONVERGED
     assert solution.objective == pytest.approx(
         problem.objective(polish(problem, chordal_start(problem))), rel=1e-4
@@ -228,15 +238,15 @@ def test_a_run_without_a_driver_goes_on_from_its_checkpoint(tmp_path: Path) -> N
     problem = varied_problem(3, 20, 3)
     parts = metis(problem.graph, 4)
     file = Checkpoint(tmp_path / "run.ckpt", rounds=3)
-    pipeline = alone(SOC(robots=parts, tolerance=TOLERANCE))
+    pipeline = Pipeline(soc=SOC(robots=parts, tolerance=TOLERANCE))
 
     def stop(state: object, record: Record) -> bool:
         return record.k == 8
 
-    whole = solve(problem, pipeline, robots=parts)
-    broken = solve(problem, pipeline, robots=parts, checkpoint=file, callback=stop)
+    whole = solve(problem, pipeline, robots=alone(parts))
+    broken = solve(problem, pipeline, robots=alone(parts, checkpoint=file), callback=stop)
     assert broken.status is Status.STOPPED
-    resumed = solve(problem, pipeline, robots=parts, checkpoint=file)
+    resumed = solve(problem, pipeline, robots=alone(parts, checkpoint=file))
     assert resumed.stages[1].iterations == whole.stages[1].iterations
     assert resumed.ledger is not None
     assert whole.ledger is not None
@@ -253,22 +263,27 @@ def test_the_memory_of_the_driver_is_a_setting_and_the_refusal_says_the_way_out(
         r".* set it to 0: CONSENSUS without a driver"
     )
     with pytest.raises(SettingError, match=too_little):
-        solve(graph, Pipeline(soc=soc, driver_memory=1e3), robots=parts)
-    assert solve(graph, Pipeline(soc=soc, driver_memory=1e9), robots=parts).is_certified
+        solve(graph, Pipeline(soc=soc), robots=Robots(parts, driver_memory=1e3))
+    assert solve(graph, Pipeline(soc=soc), robots=Robots(parts, driver_memory=1e9)).is_certified
     for other in (None, SOC(), SOC(coupling=Coupling.SUBSTRUCTURED), PaperSOC(robots=parts)):
         with pytest.raises(SettingError, match="without a driver robots run CONSENSUS alone"):
-            Pipeline(soc=other, driver_memory=0)
+            solve(graph, Pipeline(soc=other), robots=alone(parts))
     for value in (-1.0, np.nan):
         with pytest.raises(SettingError, match="driver_memory must not be negative"):
-            Pipeline(soc=soc, driver_memory=value)
-    with pytest.raises(SettingError, match="driver_memory is for solves by robots"):
-        solve(graph, Pipeline(soc=soc, driver_memory=0))
+            Robots(parts, driver_memory=value)
+
+
+def test_robots_without_owners_are_answered() -> None:
+    with pytest.raises(SettingError, match="nobody owns the poses"):
+        solve(grid(np.random.default_rng(0)), robots=Robots(engine=InProcess()))
+    with pytest.raises(SettingError, match="faults must be"):
+        Robots(3, faults=0.2)  # type: ignore[arg-type]
 
 
 def test_without_a_driver_there_is_no_proof_to_write(tmp_path: Path) -> None:
     graph = grid(np.random.default_rng(0))
     parts = metis(graph, 3)
-    solution = solve(graph, Pipeline(soc=SOC(robots=parts), driver_memory=0), robots=parts)
+    solution = solve(graph, Pipeline(soc=SOC(robots=parts)), robots=alone(parts))
     with pytest.raises(SettingError, match="no proof to write: no bound was sought, and that F is"):
         solution.save_proof(tmp_path / "proof.json")
     assert not list(tmp_path.iterdir())
@@ -277,6 +292,6 @@ def test_without_a_driver_there_is_no_proof_to_write(tmp_path: Path) -> None:
 def test_rotations_alone_are_solved_without_a_driver() -> None:
     problem = PGOProblem(grid(np.random.default_rng(0)), weighting=Weighting.ROTATIONS)
     parts = metis(problem.graph, 3)
-    solution = solve(problem, Pipeline(soc=SOC(robots=parts), driver_memory=0), robots=parts)
+    solution = solve(problem, Pipeline(soc=SOC(robots=parts)), robots=alone(parts))
     assert solution.objective == pytest.approx(solve(problem).objective, rel=1e-6)
     assert solution.note == NO_CERTIFICATE

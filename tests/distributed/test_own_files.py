@@ -40,6 +40,7 @@ from solvers.distributed.robots.interior import Interior
 from solvers.folder_solve import FolderSolution, solve_folder
 from solvers.place import Attempt
 from solvers.result import Status
+from solvers.robots import Robots
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import WARM_START
 
@@ -332,7 +333,7 @@ def test_robots_leave_poses_where_their_areas_interleave(
     graph = graph.with_robots(robots)
     write_g2o_folder(graph, tmp_path / "in")
     engine = Recording()
-    solution = solve_folder(tmp_path / "in", engine=engine, out=tmp_path / "out")
+    solution = solve_folder(tmp_path / "in", robots=Robots(engine=engine), out=tmp_path / "out")
     check_same(solution, graph, tmp_path / "out")
     assert engine.times(own_files.propose_poses) == 1
     assert engine.times(own_files.take_larger_cover) == int(is_interleaved)
@@ -359,7 +360,7 @@ def test_messages_do_not_grow_with_the_interiors(
         engine = Recording()
         folder = tmp_path / str(poses_each)
         write_g2o_folder(graph, folder)
-        solution = solve_folder(folder, pipeline, engine=engine, out=folder / "out")
+        solution = solve_folder(folder, pipeline, robots=Robots(engine=engine), out=folder / "out")
         assert solution.certificate.is_certified
         assert (engine.times(climbing.climb) > 0) == climbs
         assert max(agent.subgraph.graph.num_edges for agent in engine.agents) >= 2 * poses_each - 10
@@ -398,7 +399,7 @@ def read_size(folder: Path) -> int:
 
 
 def solve_limited(folder: Path, out: Path) -> FolderSolution:
-    solution = solve_folder(folder, engine=LimitedProcesses(LIMIT), out=out)
+    solution = solve_folder(folder, robots=Robots(engine=LimitedProcesses(LIMIT)), out=out)
     return replace(solution, stages=solution.stages[-1:])
 
 

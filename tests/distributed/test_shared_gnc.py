@@ -16,7 +16,6 @@ from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.thresholds import chi2_thresholds
-from solvers.distributed.checkpoint import Checkpoint
 from solvers.distributed.robots.agent import CLASSES, Agent, order_interior
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Reweigh
@@ -27,6 +26,7 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import InProcess
 from solvers.network.messages import count_numbers
 from solvers.network.serialization import deserialize, serialize
+from solvers.robots import Checkpoint
 from solvers.robust.gnc import GNC
 from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import first_poses, known_inliers
@@ -189,7 +189,9 @@ def test_pairwise_consistency_keeps_by_robots_what_it_keeps_in_one_place(wrong) 
 def test_a_robust_solve_by_robots_writes_no_checkpoint(wrong, tmp_path) -> None:
     graph = wrong[0]
     with pytest.raises(SettingError, match="writes no checkpoint"):
-        solvers.solve(graph, robust=GNC(), robots=2, checkpoint=Checkpoint(tmp_path / "c.npz"))
+        solvers.solve(
+            graph, robust=GNC(), robots=solvers.Robots(2, checkpoint=Checkpoint(tmp_path / "c.npz"))
+        )
 
 
 def test_the_driver_counts_the_orders(wrong) -> None:

@@ -19,6 +19,7 @@ from solvers.distributed.sparse_interface import SparseInterface
 from solvers.network.engine import InProcess
 from solvers.pipeline import solve
 from solvers.request import Pipeline
+from solvers.robots import Robots
 from solvers.soc.subgraph import split_graph
 
 pytest.importorskip("cvxopt")
@@ -60,7 +61,7 @@ def test_the_ledger_counts_the_entries_that_are_sent() -> None:
     graph = grid_world(4, 60, np.random.default_rng(0), d=2)
     engine = Recording()
     with sparse_elimination(8):
-        ledger = solve(graph, Pipeline(staircase=None), robots=4, engine=engine).ledger
+        ledger = solve(graph, Pipeline(staircase=None), robots=Robots(4, engine=engine)).ledger
     assert ledger is not None
     off = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")
     counted = [said for said in engine.log if said[0] not in off]

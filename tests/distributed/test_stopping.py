@@ -31,6 +31,7 @@ from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import History, Measurement, Outcome, Record, Status
 from solvers.riemannian.polish import polish
+from solvers.robots import Robots
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
@@ -62,7 +63,8 @@ def with_driver(problem: PGOProblem, soc: SOC) -> Ended:
 
 
 def alone(problem: PGOProblem, soc: SOC, faults: Faults | None = None) -> Ended:
-    solution = solve(problem, Pipeline(soc=soc, faults=faults, driver_memory=0), robots=soc.robots)
+    robots = Robots(soc.robots, driver_memory=0, faults=faults)
+    solution = solve(problem, Pipeline(soc=soc), robots=robots)
     return Ended(
         solution.status, solution.poses, solution.stages[-1].history.records[-1].measurement
     )

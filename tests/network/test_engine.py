@@ -20,7 +20,8 @@ from solvers.soc.subgraph import split_graph
 def test_threads_give_the_same_numbers(seed):
     graph = varied_graph(seed, 40, 2 + seed % 2)
     in_order, in_threads = (
-        solvers.solve(graph, robots=4, engine=InProcess(threads)) for threads in (1, 3)
+        solvers.solve(graph, robots=solvers.Robots(4, engine=InProcess(threads)))
+        for threads in (1, 3)
     )
     np.testing.assert_array_equal(in_order.poses.R, in_threads.poses.R)
     np.testing.assert_array_equal(in_order.poses.t, in_threads.poses.t)
@@ -72,7 +73,7 @@ class Refusing:
 def test_a_solve_that_is_broken_off_while_robots_are_set_up_lets_them_go():
     engine = Refusing()
     with pytest.raises(KeyboardInterrupt):
-        solvers.solve(varied_graph(1, 20, 2), robots=3, engine=engine)
+        solvers.solve(varied_graph(1, 20, 2), robots=solvers.Robots(3, engine=engine))
     assert engine.is_closed
 
 
@@ -108,8 +109,3 @@ def test_robots_restored_from_snapshots_answer_as_those_that_were_asked():
             ):
                 assert name == other_name
                 np.testing.assert_array_equal(value, other)
-
-
-def test_engine_and_checkpoint_need_robots():
-    with pytest.raises(SettingError, match="give robots"):
-        solvers.solve(varied_graph(0, 8, 2), engine=InProcess())

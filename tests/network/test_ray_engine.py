@@ -153,7 +153,9 @@ def test_killed_actors_change_nothing_and_no_process_receives_anothers_private_e
             ray.kill(place.actors[0])
 
     engine = RayEngine(actors=processes, recovery=Recovery(orders_between_snapshots=20))
-    solution = solvers.solve(graph, settings, robots=robots, engine=engine, callback=kill)
+    solution = solvers.solve(
+        graph, settings, robots=solvers.Robots(robots, engine=engine), callback=kill
+    )
     assert len(steps) > 12
     assert_same(solution, expected)
     assert solution.ledger.snapshot_bytes > 0
@@ -197,7 +199,7 @@ def test_a_robot_that_is_lost_too_often_ends_the_run(graph, actors):
     with pytest.raises(
         EngineError, match=r"the process of robots 1 was lost 1 times \(the actor is gone"
     ):
-        solvers.solve(graph, robots=2, engine=engine, callback=kill)
+        solvers.solve(graph, robots=solvers.Robots(2, engine=engine), callback=kill)
     assert actors[0].actors == {}
 
 
@@ -267,13 +269,21 @@ def test_actors_are_started_once_for_many_solves(graph, robots, sent):
     other = varied_graph(1, 40, 2)
     with RayEngine().kept() as engine:
         with pytest.raises(SettingError, match="give both the same robots"):
-            solvers.solve(other, settings, robots=2, engine=engine)
+            solvers.solve(other, settings, robots=solvers.Robots(2, engine=engine))
         for _ in range(2):
-            assert_same(solvers.solve(graph, settings, robots=robots, engine=engine), expected)
-        assert_same(solvers.solve(other, robots=5, engine=engine), solvers.solve(other, robots=5))
+            assert_same(
+                solvers.solve(graph, settings, robots=solvers.Robots(robots, engine=engine)),
+                expected,
+            )
+        assert_same(
+            solvers.solve(other, robots=solvers.Robots(5, engine=engine)),
+            solvers.solve(other, robots=5),
+        )
         assert len(sent) == 2
         ray.kill(engine.idle[0])  # one that is lost between two solves is started anew
-        assert_same(solvers.solve(graph, settings, robots=robots, engine=engine), expected)
+        assert_same(
+            solvers.solve(graph, settings, robots=solvers.Robots(robots, engine=engine)), expected
+        )
         assert len(sent) == 3
         pids = [pid_of(actor) for actor in engine.idle]
         assert len(pids) == 2
@@ -303,7 +313,7 @@ def test_cpus_that_others_use_are_told_in_time(graph):
             EngineError,
             match=r"too few CPUs: 2 of 2 actors have not started in 0\.5 s, 0 CPUs are free",
         ):
-            solvers.solve(graph, robots=2, engine=RayEngine(patience=0.5))
+            solvers.solve(graph, robots=solvers.Robots(2, engine=RayEngine(patience=0.5)))
     finally:
         ray.kill(held)
 
@@ -436,7 +446,9 @@ def test_robots_of_a_folder_read_and_write_files_of_their_own(tmp_path, actors, 
         if record.k == 1 and type(state).__name__ == "SubstructuredState":
             ray.kill(actors[-1].actors[2])
 
-    solution = solvers.solve_folder(folder, engine=RayEngine(), callback=lose)
+    solution = solvers.solve_folder(
+        folder, robots=solvers.Robots(engine=RayEngine()), callback=lose
+    )
     assert solution.certificate.objective == expected.certificate.objective
     assert solution.certificate.lower_bound == expected.certificate.lower_bound
 

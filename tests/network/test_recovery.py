@@ -141,7 +141,9 @@ def test_lost_robots_change_nothing(coupling, orders, is_before, least, groups, 
     expected = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
     losses = frozenset(np.random.default_rng(orders).integers(1, 300, 12).tolist())
     engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000), is_before, groups)
-    solution = solvers.solve(graph, pipeline(coupling, robots), robots=robots, engine=engine)
+    solution = solvers.solve(
+        graph, pipeline(coupling, robots), robots=solvers.Robots(robots, engine=engine)
+    )
     (pool,) = engine.opened
     assert pool.place.lost > 3
     assert sum(pool.restarts) == pool.place.lost
@@ -167,8 +169,15 @@ def test_a_run_that_goes_on_from_a_checkpoint_can_lose_robots(orders, tmp_path):
     losses = frozenset(np.random.default_rng(orders).integers(5, 100, 8).tolist())
     first, second = (LeakyEngine(losses, Recovery(orders, max_restarts=1000)) for _ in range(2))
     with pytest.raises(KilledError):
-        solvers.solve(graph, settings, robots=4, engine=first, checkpoint=checkpoint, callback=kill)
-    solution = solvers.solve(graph, settings, robots=4, engine=second, checkpoint=checkpoint)
+        solvers.solve(
+            graph,
+            settings,
+            robots=solvers.Robots(4, engine=first, checkpoint=checkpoint),
+            callback=kill,
+        )
+    solution = solvers.solve(
+        graph, settings, robots=solvers.Robots(4, engine=second, checkpoint=checkpoint)
+    )
     assert second.opened[0].place.lost > 3
     np.testing.assert_array_equal(solution.poses.t, expected.poses.t)
     assert solution.lower_bound == expected.lower_bound
@@ -214,7 +223,7 @@ def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatc
 def test_what_is_kept_for_a_robot_is_bounded():
     graph = varied_graph(3, 30, 2)
     engine = LeakyEngine(recovery=Recovery(orders_between_snapshots=5))
-    solvers.solve(graph, robots=3, engine=engine)
+    solvers.solve(graph, robots=solvers.Robots(3, engine=engine))
     assert len(engine.opened[0]._log) < 5
 
 
@@ -261,7 +270,9 @@ def test_the_ledger_has_the_bytes_of_all_snapshots(coupling, monkeypatch):
     here = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
     assert here.ledger.snapshot_bytes == sum(taken) == 0
     solution = solvers.solve(
-        graph, pipeline(coupling, robots), robots=robots, engine=LeakyEngine(recovery=Recovery(7))
+        graph,
+        pipeline(coupling, robots),
+        robots=solvers.Robots(robots, engine=LeakyEngine(recovery=Recovery(7))),
     )
     assert solution.ledger.snapshot_bytes == sum(taken) > 0
     assert solution.ledger.num_bytes == here.ledger.num_bytes
@@ -289,8 +300,10 @@ def test_a_checkpoint_counts_the_snapshots_in_it(tmp_path, monkeypatch):
     monkeypatch.setattr(Agent, "snapshot", counted)
     settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
     with pytest.raises(KilledError):
-        solvers.solve(graph, settings, robots=4, checkpoint=checkpoint, callback=kill)
-    resumed = solvers.solve(graph, settings, robots=4, checkpoint=checkpoint)
+        solvers.solve(
+            graph, settings, robots=solvers.Robots(4, checkpoint=checkpoint), callback=kill
+        )
+    resumed = solvers.solve(graph, settings, robots=solvers.Robots(4, checkpoint=checkpoint))
     assert resumed.ledger.snapshot_bytes == sum(taken) > 0  # the first run's, too
 
 
@@ -300,7 +313,7 @@ def test_a_robot_that_is_lost_again_and_again_ends_the_run():
     with pytest.raises(
         EngineError, match=r"the process of robots \d was lost 3 times \(gone\); look at the memory"
     ):
-        solvers.solve(graph, robots=3, engine=engine)
+        solvers.solve(graph, robots=solvers.Robots(3, engine=engine))
 
 
 def test_a_robots_own_error_is_told_after_all_have_obeyed_and_is_passed_over_in_the_replay():

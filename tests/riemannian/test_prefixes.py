@@ -162,7 +162,7 @@ def test_robots_go_on_from_a_start_that_grows_in_one_place(
 ) -> None:
     problem = PGOProblem(trees(3, 200, 0.12, 3.0))
     checkpoint = solvers.Checkpoint(tmp_path / "state.ckpt") if has_checkpoint else None
-    shared = solvers.solve(problem, GROWING, robots=3, checkpoint=checkpoint)
+    shared = solvers.solve(problem, GROWING, robots=solvers.Robots(3, checkpoint=checkpoint))
     assert shared.certificate.verdict is Verdict.CERTIFIED
     assert shared.objective == pytest.approx(solvers.solve(problem, GROWING).objective, rel=1e-9)
     assert [stage.name for stage in shared.stages] == [

@@ -30,6 +30,7 @@ from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve
 from solvers.request import Pipeline
+from solvers.robots import Robots
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.penalty import MultiplierPenalty
@@ -156,7 +157,7 @@ def solved_graph(
         soc if soc is not None else SOC(tolerance=1e-4), coupling=Coupling.CONSENSUS, robots=parts
     )
     pipeline = Pipeline(soc=soc, second_try=False, staircase=None)
-    return solve(graph, pipeline, robots=parts, engine=engine), engine
+    return solve(graph, pipeline, robots=Robots(parts, engine=engine)), engine
 
 
 @settings(max_examples=examples(12))
@@ -201,7 +202,7 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     engine = Recording()
     parts = partition(graph, 3)
     soc = SOC(robots=parts, tolerance=2e-3)
-    solution = solve(graph, Pipeline(soc=soc), robots=parts, engine=engine)
+    solution = solve(graph, Pipeline(soc=soc), robots=Robots(parts, engine=engine))
     _, stage, _ = solution.stages
     assert solution.ledger is not None
     assert engine.times(begin_copies, Copies.back_at_best) == 1  # no refresh, no raise

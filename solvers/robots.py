@@ -1,0 +1,142 @@
+"""Robots that solve together, as `solve`, `extend` and `solve_folder` are given them.
+
+A solve by robots may be broken off and go on later, from the file of a `Checkpoint`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pgo_models.errors import check_settings
+from pgo_models.graphs.partitioning import Partition
+from solvers.network.engine import DEFAULT_MEMORY, Engine
+from solvers.network.faults import Faults
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Where and how often a solve by robots writes what it needs to go on.
+
+    If the file exists when a solve begins, the solve goes on from it. The file is removed when the
+    solve has converged, and stays when the solve was stopped, interrupted or out of time. While a
+    solve runs it is locked for others. Where a checkpoint cannot be written, say on a full disk,
+    there is one warning, and the last one that could be written stays.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file.
+    rounds : int
+        Rounds of communication after which one is written; at least 1. There is also one when SOC
+        and when Newton begins.
+
+    Raises
+    ------
+    SettingError
+        When `rounds` is below 1.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pgo_models import load
+    >>> from solvers import Robots, solve
+    >>> path = Path(tempfile.mkdtemp()) / "solve.checkpoint"
+    >>> robots = Robots(2, checkpoint=Checkpoint(path))
+    >>> stopped = solve(load("grid"), robots=robots, callback=lambda *_: True)
+    >>> stopped.status.name, path.exists()
+    ('STOPPED', True)
+    >>> solution = solve(load("grid"), robots=robots)
+    >>> solution.status.name, path.exists()
+    ('CONVERGED', False)
+    """
+
+    path: Path | str
+    rounds: int = 10
+
+    def __post_init__(self) -> None:
+        check_settings(self, at_least_one=["rounds"])
+
+
+@dataclass(frozen=True)
+class Robots:
+    """Robots that share a solve: who owns which poses, where they run, and what goes wrong.
+
+    Parameters
+    ----------
+    owners : Partition or int, optional
+        Owners of the poses. A number stands for the robots of the pipeline's SOC if they are so
+        many, else for the default partition. `extend` takes those of the solution unless they are
+        given, and `solve_folder` those of the files.
+    engine : Engine, optional
+        Where the robots run; in this process unless given.
+    driver_memory : float
+        Bytes that the driver may take with its fronts. A solve that needs more is refused before it
+        begins. 0 stands for no driver: CONSENSUS alone (`solvers.distributed.robots_alone`), which
+        finds poses and no certificate.
+    faults : Faults, optional
+        What goes wrong between the robots of a CONSENSUS stage, which then does not wait
+        (`solvers.distributed.asynchronous`).
+    checkpoint : Checkpoint, optional
+        File to which the solve writes what it needs to go on after it was broken off, and from
+        which it goes on.
+
+    Raises
+    ------
+    SettingError
+        When a setting is of another type or out of its range.
+
+    Examples
+    --------
+    >>> from pgo_models import load
+    >>> from solvers import InProcess, solve
+    >>> robots = Robots(3, engine=InProcess(threads=2))
+    >>> solve(load("grid"), robots=robots).robots.num_robots
+    3
+    """
+
+    owners: Partition | int | None = None
+    engine: Engine | None = None
+    driver_memory: float = DEFAULT_MEMORY
+    faults: Faults | None = None
+    checkpoint: Checkpoint | None = None
+
+    def __post_init__(self) -> None:
+        check_settings(self, not_negative=["driver_memory"])
+
+    @classmethod
+    def of(cls, robots: Robots | Partition | int) -> Robots:
+        """Robots as they are given to `solve`, where owners alone will do.
+
+        Parameters
+        ----------
+        robots : Robots, Partition or int
+            Robots, or owners of the poses.
+        """
+        return robots if isinstance(robots, Robots) else cls(robots)
+
+    def with_owners(self, owners: Partition) -> Robots:
+        """The robots with the owners that a number of them stands for.
+
+        Parameters
+        ----------
+        owners : Partition
+            Owners of the poses.
+
+        Returns
+        -------
+        Robots
+            All else is as it was.
+        """
+        return replace(self, owners=owners)
+
+    @property
+    def partition(self) -> Partition:
+        """Owners of the poses, once they are known one by one."""
+        assert isinstance(self.owners, Partition)
+        return self.owners
+
+    @property
+    def has_driver(self) -> bool:
+        """Whether they have a driver."""
+        return self.driver_memory > 0
