@@ -71,6 +71,7 @@ from pgo_models.graphs.trajectories import (
     read_tum as read_tum,
     write_tum as write_tum,
 )
+from pgo_models.plots.films import animate as animate, animate_poses as animate_poses
 from pgo_models.plots.graph_plots import compare_poses as compare_poses, plot_graph as plot_graph
 from pgo_models.plots.interactive_plots import explore_graph as explore_graph
 from pgo_models.problem.cholesky import CholeskyBackend as CholeskyBackend
@@ -121,7 +122,7 @@ __all__ += ["multipliers", "prove_bound"]
 __all__ += ["Verification", "save_proof", "verify_proof"]
 __all__ += ["BregmanProblem", "ConvexSolver", "ModelChange", "OrthogonalProblem"]
 __all__ += ["graph_qp", "rotation_qp", "solve_relaxation"]
-__all__ += ["compare_poses", "explore_graph", "plot_graph"]
+__all__ += ["animate", "animate_poses", "compare_poses", "explore_graph", "plot_graph"]
 # Types in the signatures of the names above.
 __all__ += ["EdgeResiduals", "NoiseModel", "Registry"]
 __all__ += ["BoundSource", "Fit", "HandednessTerms", "LowerBound"]

@@ -33,6 +33,7 @@ from solvers.network.recovery import Recovery as Recovery
 from solvers.pipeline import solve as solve
 from solvers.place import Automatic as Automatic
 from solvers.reporting.edge_fit import EdgeFit as EdgeFit
+from solvers.reporting.film import film as film
 from solvers.reporting.report import write_report as write_report
 from solvers.request import Pipeline as Pipeline
 from solvers.result import (
@@ -120,6 +121,7 @@ __all__ += [
     "Solution",
     "certify",
     "extend",
+    "film",
     "solve",
     "solve_folder",
     "write_report",

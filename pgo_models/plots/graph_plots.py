@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # Kinds of edges, in the order in which they are drawn: a landmark that is seen, one robot's own
 # edges, those between robots, and the two kinds of marked edges.
 SIGHTING, OWN, BETWEEN, UNCERTAIN, MISFIT = range(5)
-_NOT_DRAWN = -1
+NOT_DRAWN = -1
 _WIDTHS = np.array([0.15, 0.6, 0.5, 0.5, 1.8])  # points, of every kind
 KIND_LABELS = {
     SIGHTING: "a landmark seen",
@@ -60,7 +60,7 @@ def edge_kinds(
             residuals = edge_residuals(graph, poses)
         kind[uncertain_edges(graph)] = UNCERTAIN
         kind[residuals.is_misfit] = MISFIT
-    kind[graph.is_prior] = _NOT_DRAWN
+    kind[graph.is_prior] = NOT_DRAWN
     return kind
 
 
@@ -81,7 +81,7 @@ def lines_to_draw(
         is_on_path = (kind == OWN) & is_consecutive
         paths = _thinned_paths(graph, is_on_path, step)
         is_misfit = kind == MISFIT
-        is_other = (kind != _NOT_DRAWN) & ~is_misfit & ~is_on_path
+        is_other = (kind != NOT_DRAWN) & ~is_misfit & ~is_on_path
         misfits = np.flatnonzero(is_misfit)
         others = np.flatnonzero(is_other)
         drawn_misfits = misfits[:: thinning_step(len(misfits), most)]
@@ -90,7 +90,7 @@ def lines_to_draw(
         ends = np.concatenate([paths, ends[drawn]])
         kind = np.append(kind_of_paths, kind[drawn])
     order = np.argsort(kind, kind="stable")
-    num_not_drawn = int(np.sum(kind == _NOT_DRAWN))  # their kind is the lowest
+    num_not_drawn = int(np.sum(kind == NOT_DRAWN))  # their kind is the lowest
     order = order[num_not_drawn:]
     return ends[order], kind[order]
 

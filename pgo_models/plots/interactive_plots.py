@@ -1,22 +1,17 @@
-"""Figures to explore with plotly (extra `plot`): a graph to turn, and a film of iterates."""
+"""A graph to turn and to explore, by plotly (extra `plot`)."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pgo_models.errors import GraphError
-from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.residuals import check_poses
 from pgo_models.plots import graph_plots
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
@@ -29,16 +24,6 @@ Trace = dict[str, object]  # a plotly trace is plain data
 _MOST_NAMED_ROBOTS = 12
 MOST_DOTS = 20_000  # poses that show their names
 _MOST_LINES_BEFORE = 10_000  # lines between the poses before
-_FILM_BYTES = 8_000_000
-_BYTES_PER_NUMBER = 7.5  # a float32 in base64, of which plotly writes every / as six characters
-_FRAME_MILLISECONDS = 150
-# A page sends nothing away: plotly's button to share a chart would upload it.
-PAGE_CONFIG: dict[str, object] = {
-    "displaylogo": False,
-    "showSendToCloud": False,
-    "responsive": True,
-    "modeBarButtonsToRemove": ["sendChartToCloud"],
-}
 
 
 class _Line(NamedTuple):
@@ -192,78 +177,6 @@ def _ellipses(poses: Poses, covariances: Array) -> Trace:
     }
 
 
-def animate_poses(
-    graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[str] | None = None
-) -> Figure:
-    """Film of iterates with a slider and a play button, by plotly.
-
-    Edges are drawn straight between the positions of every iterate; the colours are the robots'. A
-    film of a large graph is subsampled evenly to about 8 MB, with the first and the last iterate.
-
-    Iterates, for example `[soc.poses(problem, state) for state in itertools.islice(iterate(soc,
-    problem), 30)]`, are aligned with the last one, so that only what changes moves. The slider
-    shows `labels`; `k = 0`, `k = 1`, .. unless given. A GraphError when there are no iterates,
-    their labels are not as many, or they are not poses of the graph.
-    """
-    go = plotly("graph_objects")
-    if not iterates:
-        raise GraphError("there are no iterates; give at least one set of poses")
-    if labels is None:
-        labels = [f"k = {k}" for k in range(len(iterates))]
-    if len(labels) != len(iterates):
-        raise GraphError(f"{len(labels)} labels for {len(iterates)} iterates; give one each")
-    for poses in iterates:
-        check_poses(graph, poses)
-    shown = _frames_to_keep(graph, len(iterates))
-    last = iterates[-1]
-    names = []
-    positions = []
-    frames = []
-    for k in shown:
-        t = iterates[k].aligned_to(last).t
-        traces = _frame_traces(graph, t)
-        frames.append(go.Frame(data=traces, name=labels[k]))
-        names.append(labels[k])
-        positions.append(t)
-    figure = go.Figure(data=_frame_traces(graph, positions[0]), frames=frames)
-    _arrange(figure, np.concatenate(positions), f"{graph.name}: {len(iterates)} iterates")
-    _add_controls(figure, names)
-    return figure
-
-
-def _frames_to_keep(graph: PoseGraph, num_iterates: int) -> list[int]:
-    """Iterates of a film that is not too large, evenly chosen."""
-    numbers_per_frame = 3 * graph.d * graph.num_edges  # start, end and gap of every line
-    most = max(2, int(_FILM_BYTES / (numbers_per_frame * _BYTES_PER_NUMBER)))
-    count = min(num_iterates, most)
-    evenly = np.linspace(0, num_iterates - 1, count)
-    numbers = evenly.round().astype(int)
-    return [int(k) for k in np.unique(numbers)]
-
-
-def _frame_traces(graph: PoseGraph, t: Array) -> list[Trace]:
-    """Lines of one iterate, robot by robot, then those between robots; priors are not drawn."""
-    ends = np.stack([graph.i, graph.j], axis=1)
-    robot_i = graph.robots[graph.i]
-    robot_j = graph.robots[graph.j]
-    is_drawn = ~graph.is_prior
-    is_own = (robot_i == robot_j) & is_drawn
-    traces = []
-    for robot in range(graph.num_robots):
-        own_ends = ends[is_own & (robot_i == robot)]
-        if len(own_ends):
-            colour = COLOURS[robot % len(COLOURS)]
-            line = _Line(colour, 1.0)
-            in_legend = graph.num_robots > 1 and robot < _MOST_NAMED_ROBOTS
-            traces.append(_lines(t, own_ends, f"robot {robot}", line, in_legend))
-    ends_between = ends[~is_own & is_drawn]
-    if len(ends_between):
-        in_legend = graph.num_robots > 1
-        line = _Line(QUIET_COLOUR, 1.0)
-        traces.append(_lines(t, ends_between, "between robots", line, in_legend))
-    return traces
-
-
 def lay_out(figure: Figure, title: str, legend_y: float) -> None:
     """Set a white ground and narrow margins, and put the legend in a row at a height.
 
@@ -276,18 +189,6 @@ def lay_out(figure: Figure, title: str, legend_y: float) -> None:
         legend={"itemsizing": "constant", "orientation": "h", "y": legend_y},
         hovermode="closest",
     )
-
-
-def save_page(figure: Figure, path: Path | str) -> None:
-    """Write a plotly figure as an HTML page that opens offline.
-
-    The script of plotly adds about 5 MB to the page. Errors are those of `replace_when_done`.
-    """
-    page = figure.to_html(
-        include_plotlyjs=True, config=PAGE_CONFIG, auto_play=False, default_height="96vh"
-    )
-    with replace_when_done(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
 
 
 def _parts(graph: PoseGraph, names: NDArray[np.str_]) -> tuple[IntArray, list[str]]:
@@ -409,47 +310,3 @@ def _arrange(figure: Figure, points: Array, title: str) -> None:
         axis = {"title": title_of_axis, "range": [centre - half, centre + half]}
         figure.update_scenes({f"{letter}axis": axis})
     figure.update_scenes(aspectmode="cube")
-
-
-def _frame_options(milliseconds: int) -> dict[str, object]:
-    """Options of plotly's `animate`: how long a frame is shown."""
-    return {
-        "frame": {"duration": milliseconds, "redraw": True},
-        "mode": "immediate",
-        "transition": {"duration": 0},
-    }
-
-
-def _button(label: str, args: list[object]) -> dict[str, object]:
-    """Button that calls plotly's `animate`."""
-    return {"label": label, "method": "animate", "args": args}
-
-
-def _add_controls(figure: Figure, names: list[str]) -> None:
-    """Add a slider over the frames, and buttons to play and to pause."""
-    at_once = _frame_options(0)
-    steps = [_button(name, [[name], at_once]) for name in names]
-    play_options = {**_frame_options(_FRAME_MILLISECONDS), "fromcurrent": True}
-    play_button = _button("play", [None, play_options])
-    pause_button = _button("pause", [[None], at_once])
-    slider = {
-        "steps": steps,
-        "x": 0.16,
-        "len": 0.84,
-        "pad": {"t": 45},
-        "currentvalue": {"prefix": ""},
-    }
-    menu = {
-        "type": "buttons",
-        "direction": "left",
-        "buttons": [play_button, pause_button],
-        "x": 0.13,
-        "y": 0,
-        "pad": {"t": 60},
-    }
-    figure.update_layout(
-        margin={"b": 20},
-        legend={"orientation": "v", "x": 0.0, "y": 1.0, "yanchor": "top"},
-        sliders=[slider],
-        updatemenus=[menu],
-    )

@@ -18,7 +18,7 @@ from pgo_models.geometry.poses import absolute_rotation_error, absolute_trajecto
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.plots.style import is_picture
+from pgo_models.plots.style import is_picture, plotly
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.cli import choices
@@ -185,6 +185,13 @@ def solve_command(
             "advice."
         ),
     ] = None,
+    film: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write a film as .html: SOC and Newton on the graph from a spanning tree, with "
+            "the cost and the proven bound of every iterate."
+        ),
+    ] = None,
     covariances: Annotated[
         Path | None,
         typer.Option(
@@ -224,7 +231,7 @@ def solve_command(
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
     display = Display(verbose, quiet, as_json)
-    outputs = Outputs(out or [], report, covariances, proof, resume)
+    outputs = Outputs(out or [], report, film, covariances, proof, resume)
     network.check_without_driver(stages, outputs.proof, graph)
     if network.reads_own_files(graph):
         _refuse_what_needs_the_graph(given, outputs, source.chosen_cost, method)
@@ -429,6 +436,7 @@ class Outputs:
 
     out: list[Path]
     report: Path | None
+    film: Path | None
     covariances: Path | None
     proof: Path | None
     resume: Path | None
@@ -439,6 +447,7 @@ class Outputs:
                 "--out": self.out,
                 "--resume": self.resume,
                 "--report": self.report,
+                "--film": self.film,
                 "--covariances": self.covariances,
                 "--proof": self.proof,
             }
@@ -447,25 +456,29 @@ class Outputs:
             check_format(path)
 
     def check_pages(self) -> None:
-        """Raise an error where report or covariances have a name of another format."""
+        """Raise an error where report, film or covariances have a name of another format."""
         if self.report is not None:
             from solvers.reporting.report import check_report
 
             check_report(self.report)
+        if self.film is not None:
+            plotly("graph_objects")  # or the line that names the extra
+            if self.film.suffix.lower() != ".html":
+                raise SettingError(f"cannot write {self.film}: films are written as .html")
         if self.covariances is not None and self.covariances.suffix.lower() != ".csv":
             raise SettingError(f"cannot write {self.covariances}: covariances are written as .csv")
 
     def check_drawable(self, problem: PGOProblem) -> None:
-        """Raise an error for a picture or report of rotations alone."""
-        for path in (*self.out, self.report):
-            if path is not None and (path is self.report or is_picture(path)):
+        """Raise an error for a picture, report or film of rotations alone."""
+        for path in (*self.out, self.report, self.film):
+            if path is not None and (path in (self.report, self.film) or is_picture(path)):
                 problem.check_positions(str(path))
 
     def check_writable(self, num_robots: int) -> None:
         """Raise an error for the first file or folder that cannot be written."""
         for path in self.out:
             check_target(path, num_robots)
-        for other in (self.report, self.resume, self.covariances, self.proof):
+        for other in (self.report, self.film, self.resume, self.covariances, self.proof):
             if other is not None:
                 check_writable(other)
 
@@ -579,6 +592,15 @@ def _files_of_solution(
         targets.append((path, solution.save))
     if outputs.proof is not None:
         targets.append((outputs.proof, solution.save_proof))
+    if outputs.film is not None:
+
+        def save_film(path: Path) -> None:
+            from pgo_models.plots.pages import save_page
+            from solvers.reporting.film import film
+
+            save_page(film(solution.problem), path)
+
+        targets.append((outputs.film, save_film))
     if outputs.covariances is not None:
         graph = solution.problem.graph
         named = graph.in_files

@@ -22,7 +22,8 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.published_results import published_run
 from pgo_models.plots.graph_plots import MOST_LINES, thinning_step
-from pgo_models.plots.interactive_plots import MOST_DOTS, PAGE_CONFIG, explore_graph
+from pgo_models.plots.interactive_plots import MOST_DOTS, explore_graph
+from pgo_models.plots.pages import PAGE_CONFIG
 from pgo_models.plots.style import plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.network.ledger import Ledger

@@ -17,7 +17,7 @@ from pgo_models.errors import SettingError, check_settings
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.plots.interactive_plots import save_page
+from pgo_models.plots.pages import save_page
 from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting

@@ -18,7 +18,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedRow, published_rows, published_run
 from pgo_models.plots.graph_plots import plot_panels
-from pgo_models.plots.interactive_plots import explore_graph, save_page
+from pgo_models.plots.interactive_plots import explore_graph
+from pgo_models.plots.pages import save_page
 from pgo_models.plots.style import column_figure, plotly, save_figure
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting

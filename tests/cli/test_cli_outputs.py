@@ -79,6 +79,18 @@ def test_info_without_a_graph_says_what_is_installed(pgo_command, monkeypatch):
         assert re.search(rf"^extra {extra} .*{name} ([\d.]+|missing)", out, re.M)
 
 
+def test_a_film_is_written_beside_the_answer(pgo_command, tmp_path):
+    pytest.importorskip("plotly")
+    code, out, _ = pgo_command("solve", "grid", "--film", tmp_path / "film.html")
+    assert code == 0
+    assert f"written: {tmp_path / 'film.html'}" in out
+    text = (tmp_path / "film.html").read_text(encoding="utf-8")
+    assert re.search(r"<p>grid from start to Newton \d\. F falls from .* to 97\.014, and", text)
+    code, out, err = pgo_command("solve", "grid", "--film", tmp_path / "film.gif")
+    assert (code, out) == (1, "")
+    assert "films are written as .html" in err
+
+
 def test_edges_are_left_out_by_their_lines(pgo_command, tmp_path):
     path = tmp_path / "sphere.g2o"
     graph = pgo.load("sphere")

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
-from pgo_models.errors import GraphError, MissingExtraError
-from pgo_models.plots.interactive_plots import animate_poses, save_page
+from pgo_models.errors import MissingExtraError
+from pgo_models.plots.pages import save_page
 
 pytest.importorskip("plotly")
 
@@ -58,36 +58,6 @@ def test_a_misfit_says_how_bad_it_is():
     assert len(misfit.text) == residuals.is_misfit.sum()
     (text,) = [text for text in misfit.text if text.startswith("edge 5:")]
     assert f"{np.rad2deg(residuals.rotation[5]):.3g} deg" in text
-
-
-def test_a_film_has_a_frame_and_a_step_of_the_slider_for_every_iterate():
-    graph = pgo.circle(np.random.default_rng(0))
-    iterates = [pgo.spanning_tree_start(graph, root) for root in range(4)]
-    film = animate_poses(graph, iterates)
-    assert [frame.name for frame in film.frames] == ["k = 0", "k = 1", "k = 2", "k = 3"]
-    (slider,) = film.layout.sliders
-    assert [list(step.args[0]) for step in slider.steps] == [[frame.name] for frame in film.frames]
-    np.testing.assert_allclose(
-        ends(film.frames[-1].data[0], 3)[:, 0], iterates[-1].t[graph.i], rtol=1e-6, atol=1e-6
-    )
-
-
-def test_long_films_of_large_graphs_are_thinned_but_keep_their_ends():
-    graph = pgo.random_geometric(2000, np.random.default_rng(0), mean_degree=20.0)
-    film = animate_poses(graph, [graph.truth] * 60)
-    assert (film.frames[0].name, film.frames[-1].name) == ("k = 0", "k = 59")
-    assert 2 < len(film.frames) < 60
-    assert len(film.to_json()) < 9e6
-
-
-@pytest.mark.parametrize(
-    ("iterates", "labels", "message"),
-    [(0, None, "no iterates"), (2, ["one"], "1 labels for 2 iterates")],
-)
-def test_films_of_nothing_are_refused(iterates, labels, message):
-    graph = pgo.circle(np.random.default_rng(0))
-    with pytest.raises(GraphError, match=message):
-        animate_poses(graph, [graph.truth] * iterates, labels)
 
 
 def test_a_page_escapes_its_title_and_has_no_button_that_uploads(tmp_path):

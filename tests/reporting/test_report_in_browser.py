@@ -7,7 +7,7 @@ from pages import Page, own_part
 
 import pgo_models as pgo
 import solvers
-from pgo_models.plots.interactive_plots import animate_poses, save_page
+from pgo_models.plots.pages import save_page
 
 pytestmark = pytest.mark.slow  # clicks in a browser
 
@@ -129,16 +129,46 @@ def test_a_large_graph_is_thinned_and_its_page_can_be_opened(browser, solution, 
     assert browser.errors == []
 
 
-def test_a_film_steps_through_its_iterates_in_a_browser(browser, tmp_path):
+def test_a_film_goes_by_slider_and_keys_in_a_browser(browser, tmp_path):
     graph = pgo.circle(np.random.default_rng(0))
-    film = animate_poses(graph, [pgo.spanning_tree_start(graph), graph.truth], ["tree", "truth"])
+    film = pgo.animate_poses(
+        graph, [pgo.spanning_tree_start(graph), graph.truth, graph.truth], ["tree", "truth", "end"]
+    )
     save_page(film, tmp_path / "film.html")
     browser.open(tmp_path / "film.html")
     browser.wait_for("document.querySelectorAll('.slider-group').length > 0")
     plot = "document.querySelector('.plotly-graph-div')"
     assert browser.value(f"{plot}._fullLayout.sliders[0].active") == 0
+    assert "from tree to end" in browser.value(f"{plot}.getAttribute('aria-label')")
+
     browser.value(f"Plotly.animate({plot}, ['truth'], {{mode: 'immediate'}}).then(() => true)")
     browser.wait_for(f"{plot}._fullLayout.sliders[0].active === 1")
     shown = browser.value(f"Array.from({plot}._fullData[0].x).slice(0, 1)")[0]
-    np.testing.assert_allclose(shown, graph.truth.t[graph.i[0], 0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(shown, graph.truth.t[0, 0], rtol=0, atol=1e-2)
+
+    for key, place, label in (
+        ("ArrowRight", 2, "end"),
+        ("Home", 0, "tree"),
+        ("ArrowLeft", 0, "tree"),
+        ("End", 2, "end"),
+    ):
+        event = f"new KeyboardEvent('keydown', {{key: '{key}'}})"
+        browser.value(f"{plot}.dispatchEvent({event})")
+        browser.wait_for(f"{plot}._fullLayout.sliders[0].active === {place}")
+        browser.wait_for(f"document.querySelector('.film-status').textContent === '{label}'")
+    browser.value(f"{plot}.dispatchEvent(new KeyboardEvent('keydown', {{key: 'Home'}}))")
+    browser.wait_for(f"{plot}._fullLayout.sliders[0].active === 0")
+    browser.value(f"{plot}.dispatchEvent(new KeyboardEvent('keydown', {{key: ' '}}))")
+    browser.wait_for(f"{plot}._fullLayout.sliders[0].active === 2")  # it plays to the end
+    assert browser.errors == []
+
+
+def test_a_film_fits_a_telephone(browser, tmp_path):
+    save_page(solvers.film(pgo.load("grid")), tmp_path / "film.html")
+    telephone = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser.call("Emulation.setDeviceMetricsOverride", telephone)
+    browser.open(tmp_path / "film.html")
+    browser.wait_for("document.querySelectorAll('.slider-group').length > 0")
+    assert browser.value("document.documentElement.scrollWidth") <= 390
+    browser.call("Emulation.clearDeviceMetricsOverride", {})
     assert browser.errors == []
