@@ -46,7 +46,7 @@ _FACTORS = {
 # Values and the dimension of their space; others are no poses and no points.
 _DIMENSIONS = {"Pose2": 2, "Point2": 2, "Pose3": 3, "Point3": 3}
 # GTSAM's order of a pose in space is rotation, translation; here it is translation, rotation.
-_TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
+TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 class _WrongValueError(Exception):
@@ -54,7 +54,7 @@ class _WrongValueError(Exception):
 
 
 @dataclass
-class _Measurements:
+class Measurements:
     """Measurements of one type in the log of one robot."""
 
     kind: Tag
@@ -184,19 +184,19 @@ def _logs(path: Path, log: Mapping[str, Any]) -> Iterator[tuple[str, Sequence[An
 
 def _files_of_robots(path: Path, log: Mapping[str, Any], skip_unknown: bool) -> list[G2OLines]:
     """The measurements of each robot, as if it had a g2o file of its own, without vertices."""
-    by_robot: list[dict[str, _Measurements]] = []
+    by_robot: list[dict[str, Measurements]] = []
     unknown: dict[str, list[int]] = {}
     problems: list[Problem] = []
     place = 0
     for _, measurements in _logs(path, log):
-        by_type: dict[str, _Measurements] = {}
+        by_type: dict[str, Measurements] = {}
         for measurement in measurements:
             place += 1
             name = str(measurement.get("type")) if isinstance(measurement, dict) else ""
             if name not in _FACTORS:
                 unknown.setdefault(name[:_SHOWN], []).append(place)
                 continue
-            of_type = by_type.setdefault(name, _Measurements(_FACTORS[name]))
+            of_type = by_type.setdefault(name, Measurements(_FACTORS[name]))
             try:
                 _take(of_type, measurement)
             except _WrongValueError as error:
@@ -208,8 +208,8 @@ def _files_of_robots(path: Path, log: Mapping[str, Any], skip_unknown: bool) -> 
         warnings.warn(_text_of_unknown(path, unknown), GraphWarning, stacklevel=3)
     elif unknown:
         problems += _problems_of_unknown(unknown)
-    d = _dimension(path, by_robot, problems)
-    files = [_file(path, d, by_type, problems) for by_type in by_robot]
+    d = common_dimension(path, by_robot, problems)
+    files = [lines_of_measurements(path, d, by_type, problems) for by_type in by_robot]
     for file in files:
         problems += problems_of(file)
     check_lines(path, problems, "measurements")
@@ -235,8 +235,8 @@ def _text_of_unknown(path: Path, unknown: Mapping[str, list[int]]) -> str:
     return f"{printable(str(path))}: measurements of other types were skipped: {', '.join(counts)}"
 
 
-def _dimension(
-    path: Path, by_robot: Sequence[Mapping[str, _Measurements]], problems: list[Problem]
+def common_dimension(
+    path: Path, by_robot: Sequence[Mapping[str, Measurements]], problems: list[Problem]
 ) -> int:
     """Dimension of all measurements; a FileFormatError unless they have one."""
     first_place: dict[int, int] = {}
@@ -257,8 +257,8 @@ def _dimension(
     return d
 
 
-def _file(
-    path: Path, d: int, by_type: Mapping[str, _Measurements], problems: list[Problem]
+def lines_of_measurements(
+    path: Path, d: int, by_type: Mapping[str, Measurements], problems: list[Problem]
 ) -> G2OLines:
     """The measurements of a robot as edges, in the order of the file."""
     width = 9 if d == 2 else 28
@@ -313,7 +313,7 @@ def _file(
     )
 
 
-def _take(of_type: _Measurements, measurement: Mapping[str, Any]) -> None:
+def _take(of_type: Measurements, measurement: Mapping[str, Any]) -> None:
     """Add a measurement, all of it or, with a _WrongValueError, nothing."""
     kind = of_type.kind
     name = measurement["type"]
@@ -375,7 +375,7 @@ def _covariance(measurement: Mapping[str, Any], kind: Tag) -> Array:
     if not (np.abs(covariance - covariance.T) <= _SYMMETRY * largest).all():
         raise _WrongValueError("covariance is not symmetric")
     if side == 6:
-        covariance = covariance[np.ix_(_TRANSLATION_FIRST, _TRANSLATION_FIRST)]
+        covariance = covariance[np.ix_(TRANSLATION_FIRST, TRANSLATION_FIRST)]
     return covariance
 
 

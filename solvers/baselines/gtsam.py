@@ -28,7 +28,8 @@ import numpy as np
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError, check_settings, extra_module
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, exp_map, log_map, project_to_rotations
+from pgo_models.geometry.rotations import Array, exp_map, project_to_rotations
+from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
 from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.precisions import LEAST_SCALED, are_definite, proper_information
 from pgo_models.problem.problem import PGOProblem
@@ -145,7 +146,7 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
     full_noise = gtsam.noiseModel.Gaussian.Information
     factors = gtsam.NonlinearFactorGraph()
-    measured = gtsam_poses(gtsam, Poses(graph.R_ij, graph.t_ij))
+    measured = poses_in_gtsam(gtsam, Poses(graph.R_ij, graph.t_ij))
     edges = zip(graph.i.tolist(), graph.j.tolist(), measured, information, strict=True)
     definite = are_definite(information, LEAST_SCALED).tolist()
     for (i, j, pose, weight), is_definite in zip(edges, definite, strict=True):
@@ -154,7 +155,7 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
     pose_0 = Poses.identity(1, d) if start is None else start[:1]
     largest_information = np.einsum("mkk->mk", information).max(axis=0)
     noise = full_noise(np.diag(largest_information))
-    factors.add(prior(0, gtsam_poses(gtsam, pose_0)[0], noise))
+    factors.add(prior(0, poses_in_gtsam(gtsam, pose_0)[0], noise))
     return factors
 
 
@@ -202,18 +203,9 @@ def _singular_named() -> Iterator[None]:
         raise NotPositiveDefiniteError(message) from error
 
 
-def gtsam_poses(gtsam: ModuleType, poses: Poses) -> list[Any]:
-    """Poses as GTSAM's Pose2 or Pose3."""
-    if poses.d == 3:
-        return [gtsam.Pose3(gtsam.Rot3(R), t) for R, t in zip(poses.R, poses.t, strict=True)]
-    angles: Array = log_map(poses.R)[:, 0]
-    t_and_angles = zip(poses.t.tolist(), angles.tolist(), strict=True)
-    return [gtsam.Pose2(t[0], t[1], angle) for t, angle in t_and_angles]
-
-
 def _values(gtsam: ModuleType, poses: Poses) -> Any:  # noqa: ANN401
     values = gtsam.Values()
-    for key, pose in enumerate(gtsam_poses(gtsam, poses)):
+    for key, pose in enumerate(poses_in_gtsam(gtsam, poses)):
         values.insert(key, pose)
     return values
 

@@ -31,7 +31,8 @@ import numpy as np
 import pgo_models as pgo
 import solvers
 from pgo_models.figures import rounded_up
-from solvers.baselines.gtsam import factor_graph, gtsam_poses, poses_of_values
+from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
+from solvers.baselines.gtsam import factor_graph, poses_of_values
 
 NAMES = ("M3500", "sphere2500", "city10000", "intel", "manhattan", "parking-garage", "kitti_00")
 UPDATES = 200
@@ -69,7 +70,7 @@ class Isam:
             batch.add(self.factors.at(e))
         batch.add(self.factors.at(graph.num_edges))  # the prior of pose 0
         values = self.gtsam.Values()
-        for key, pose in enumerate(gtsam_poses(self.gtsam, start)):
+        for key, pose in enumerate(poses_in_gtsam(self.gtsam, start)):
             values.insert(key, pose)
         self.isam.update(batch, values)
         self.estimate = self.isam.calculateEstimate()

@@ -1,0 +1,294 @@
+"""Graphs of GTSAM in memory: to certify what its optimisers return, and to give it ours.
+
+GTSAM's cost has the factor one half and the logarithm in SE(d) for a residual; chi2 here has
+neither. To second order in the residuals, chi2 is twice GTSAM's error. The extra `peers` brings it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pgo_models.errors import GraphError, GraphWarning, extra_module, printable
+from pgo_models.files import Problem, check_lines
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, log_map, project_to_rotations
+from pgo_models.graphs.g2o import graph_of_files
+from pgo_models.graphs.g2o_parser import problems_of
+from pgo_models.graphs.g2o_tags import Noise, Tag
+from pgo_models.graphs.jrl import (
+    TRANSLATION_FIRST,
+    Measurements,
+    common_dimension,
+    lines_of_measurements,
+)
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
+from pgo_models.graphs.precisions import (
+    LEAST_SCALED,
+    RotationWeight,
+    are_definite,
+    proper_information,
+)
+from pgo_models.graphs.residuals import check_poses
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+# Factors that become edges, and what stands on a line with such an edge. GPS measures the position
+# of a pose, a prior on a point that of a landmark.
+_FACTORS = {
+    "BetweenFactorPose2": Tag(2, 2),
+    "BetweenFactorPose3": Tag(3, 2),
+    "PriorFactorPose2": Tag(2, 1),
+    "PriorFactorPose3": Tag(3, 1),
+    "GPSFactor": Tag(3, 1, is_point=True),
+    "PoseTranslationPrior2D": Tag(2, 1, is_point=True),
+    "PoseTranslationPrior3D": Tag(3, 1, is_point=True),
+    "PriorFactorPoint2": Tag(2, 1, is_point=True, to_landmark=True),
+    "PriorFactorPoint3": Tag(3, 1, is_point=True, to_landmark=True),
+    "BearingRangeFactor2D": Tag(2, 2, is_point=True, to_landmark=True, noise=Noise.DEVIATIONS),
+}
+_SOURCE = Path("factors of GTSAM")  # in messages, in place of a file
+
+
+class _UnreadableFactorError(Exception):
+    """A factor that is no edge; the text says why."""
+
+
+def from_gtsam(
+    factors: Any,  # noqa: ANN401 - GTSAM has no types
+    values: Any = None,  # noqa: ANN401
+    *,
+    weights: RotationWeight = RotationWeight.SE_SYNC,
+    skip_unknown: bool = False,
+) -> PoseGraph:
+    """Make a PoseGraph of a factor graph of GTSAM, to solve it or to certify GTSAM's answer.
+
+    Read are between factors and priors of poses, GPS and other positions of poses, positions of
+    points, and bearing and range in the plane. Their noise models are Gaussian; a factor with a
+    constrained or robust one is no edge with an information matrix. Keys become the ids of the
+    poses, and a letter in a key names the robot.
+
+    Parameters
+    ----------
+    factors : gtsam.NonlinearFactorGraph
+        Factors, whose noise models give the information matrices.
+    values : gtsam.Values, optional
+        Values of all keys, which become `PoseGraph.initial`.
+    weights : RotationWeight
+        As for `read_g2o`.
+    skip_unknown : bool
+        Whether other factors are left out, with a warning that names and counts them.
+
+    Returns
+    -------
+    PoseGraph
+        Graph with the information matrices of the noise models.
+
+    Raises
+    ------
+    GraphError
+        For factors of other kinds, named and counted, unless they are to be skipped; for values
+        that lack a key.
+    FileFormatError
+        For factors that measure nothing, with their numbers in the graph, from 1.
+    MissingExtraError
+        Without the extra `peers`.
+
+    Examples
+    --------
+    To certify what an optimiser of GTSAM has returned:
+
+    >>> import pgo_models as pgo, solvers  # doctest: +SKIP
+    >>> graph = pgo.from_gtsam(factors, optimizer.optimize())  # doctest: +SKIP
+    >>> solvers.certify(pgo.PGOProblem(graph), graph.initial)  # doctest: +SKIP
+    """
+    gtsam = extra_module("gtsam", "peers")
+    by_type: dict[str, Measurements] = {}
+    unreadable: dict[str, list[int]] = {}
+    for place in range(factors.size()):
+        factor = factors.at(place)
+        try:
+            name, ids, numbers = _measurement(gtsam, factor)
+        except _UnreadableFactorError as error:
+            unreadable.setdefault(str(error), []).append(place + 1)
+            continue
+        of_type = by_type.setdefault(name, Measurements(_FACTORS[name]))
+        of_type.places.append(place + 1)
+        of_type.ids.append(ids)
+        of_type.numbers.append(numbers)
+    if unreadable:
+        _report_unreadable(unreadable, skip_unknown)
+    problems: list[Problem] = []
+    d = common_dimension(_SOURCE, [by_type], problems)
+    lines = lines_of_measurements(_SOURCE, d, by_type, problems)
+    check_lines(_SOURCE, problems + problems_of(lines), "factors")
+    graph = graph_of_files(_SOURCE, [lines], weights, _letters(lines.edge_ids))
+    graph = replace(graph, name="gtsam")
+    if values is None:
+        return graph
+    return replace(graph, initial=_poses_of_values(gtsam, values, graph))
+
+
+def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
+    """Make a factor graph of GTSAM of a PoseGraph: between factors, priors and positions of poses.
+
+    Twice its error is chi2 of the graph to second order in the residuals. A graph without
+    information matrices has those of its kappa and tau, as `write_g2o` writes them. Without priors
+    GTSAM leaves the frame open: add a prior on one pose.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Graph without landmarks, all of whose edges between poses have definite matrices.
+    poses : Poses, optional
+        Values of the poses; `graph.initial` unless given.
+
+    Returns
+    -------
+    gtsam.NonlinearFactorGraph, gtsam.Values
+        Factors, and the values, which are empty if there are none. Keys are the ids of the poses.
+
+    Raises
+    ------
+    GraphError
+        When the graph has landmarks or an edge that GTSAM's noise models cannot have, or the poses
+        do not fit it.
+    MissingExtraError
+        Without the extra `peers`.
+    """
+    gtsam = extra_module("gtsam", "peers")
+    if len(graph.landmarks):
+        raise GraphError(f"{graph.name} has landmarks, which are not written for GTSAM; leave out")
+    if poses is None:
+        poses = graph.initial
+    else:
+        check_poses(graph, poses)
+    information = proper_information(graph)
+    is_position = graph.is_prior & ~(graph.kappa > 0.0)
+    d = graph.d
+    definite = are_definite(information, LEAST_SCALED)
+    definite[is_position] = are_definite(information[is_position, :d, :d], LEAST_SCALED)
+    if not definite.all():
+        edge = graph.edge_label(int(np.argmin(definite)))
+        raise GraphError(f"{edge}: its information matrix is singular; GTSAM needs definite ones")
+    factors = gtsam.NonlinearFactorGraph()
+    ids = graph.pose_ids
+    measured = poses_in_gtsam(gtsam, Poses(graph.R_ij, graph.t_ij))
+    in_order = np.roll(information, 3, axis=(1, 2)) if d == 3 else information
+    full_noise = gtsam.noiseModel.Gaussian.Information
+    between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
+    prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
+    position = gtsam.GPSFactor if d == 3 else gtsam.PoseTranslationPrior2D
+    for e in range(graph.num_edges):
+        j = int(ids[graph.j[e]])
+        if is_position[e]:
+            noise = full_noise(information[e, :d, :d])
+            factors.add(position(j, graph.t_ij[e], noise))
+        elif graph.is_prior[e]:
+            factors.add(prior(j, measured[e], full_noise(in_order[e])))
+        else:
+            factors.add(between(int(ids[graph.i[e]]), j, measured[e], full_noise(in_order[e])))
+    values = gtsam.Values()
+    if poses is not None:
+        shown = graph.in_files
+        for pose_id, pose in zip(
+            ids[shown].tolist(), poses_in_gtsam(gtsam, poses[shown]), strict=True
+        ):
+            values.insert(pose_id, pose)
+    return factors, values
+
+
+def poses_in_gtsam(gtsam: ModuleType, poses: Poses) -> list[Any]:
+    """Poses as GTSAM's Pose2 or Pose3."""
+    if poses.d == 3:
+        return [gtsam.Pose3(gtsam.Rot3(R), t) for R, t in zip(poses.R, poses.t, strict=True)]
+    angles: Array = log_map(poses.R)[:, 0]
+    t_and_angles = zip(poses.t.tolist(), angles.tolist(), strict=True)
+    return [gtsam.Pose2(t[0], t[1], angle) for t, angle in t_and_angles]
+
+
+def _measurement(
+    gtsam: ModuleType,
+    factor: Any,  # noqa: ANN401
+) -> tuple[str, list[int], list[float]]:
+    """Type of a factor, its ids, and the numbers of its measurement and its noise."""
+    name = type(factor).__name__
+    if name not in _FACTORS:
+        raise _UnreadableFactorError(name)
+    kind = _FACTORS[name]
+    noise = factor.noiseModel()
+    is_gaussian = isinstance(noise, gtsam.noiseModel.Gaussian)
+    if not is_gaussian or noise.isConstrained():
+        raise _UnreadableFactorError(f"{name} with {type(noise).__name__} noise")
+    keys = [int(key) for key in list(factor.keys())]
+    ids = [WORLD_ID, *keys] if kind.num_ids == 1 else keys
+    if kind.noise is Noise.DEVIATIONS:
+        information = noise.information()
+        if information[0, 1] != 0.0:
+            raise _UnreadableFactorError(f"{name} with correlated noise")
+        value = factor.measured()
+        deviations = np.diag(information) ** -0.5
+        return name, ids, [value.bearing().theta(), value.range(), *deviations.tolist()]
+    if name == "GPSFactor":
+        value = factor.measurementIn()
+    else:
+        value = factor.prior() if name.startswith("PriorFactor") else factor.measured()
+    information = noise.information()
+    if len(information) == 6:
+        information = information[np.ix_(TRANSLATION_FIRST, TRANSLATION_FIRST)]
+    triangle = information[np.triu_indices(len(information))]
+    return name, ids, [*_numbers_of(value), *triangle.tolist()]
+
+
+def _numbers_of(value: Any) -> list[float]:  # noqa: ANN401
+    """Numbers of a pose or point, as on a line of a g2o file."""
+    if isinstance(value, np.ndarray):
+        return [float(number) for number in value]
+    if hasattr(value, "theta"):
+        return [value.x(), value.y(), value.theta()]
+    quaternion = value.rotation().toQuaternion()
+    xyz = [quaternion.x(), quaternion.y(), quaternion.z()]
+    return [value.x(), value.y(), value.z(), *xyz, quaternion.w()]
+
+
+def _report_unreadable(unreadable: dict[str, list[int]], skip_unknown: bool) -> None:
+    """Raise a GraphError that names and counts the factors that are no edges, or warn of them."""
+    counts = [
+        f"{len(places)} {printable(name)} (first: factor {places[0]})"
+        for name, places in unreadable.items()
+    ]
+    text = f"factors that no edge of a pose graph stands for: {', '.join(counts)}"
+    if not skip_unknown:
+        raise GraphError(f"{text}; leave them out, or give skip_unknown=True")
+    warnings.warn(f"left out: {text}", GraphWarning, stacklevel=3)
+
+
+def _letters(ids: IntArray) -> list[int]:
+    """Codes of the letters of the keys that are symbols, each of which names a robot."""
+    named = ids[ids != WORLD_ID]
+    codes = np.unique(named >> 56).tolist()
+    return [int(code) for code in codes if code > 0]
+
+
+def _poses_of_values(gtsam: ModuleType, values: Any, graph: PoseGraph) -> Poses:  # noqa: ANN401
+    """Poses of all keys of a graph; the world is at the origin, and landmarks are not turned."""
+    d = graph.d
+    R = np.tile(np.eye(d), (graph.num_poses, 1, 1))
+    t = np.zeros((graph.num_poses, d))
+    for place in graph.in_files.tolist():
+        key = int(graph.pose_ids[place])
+        if not values.exists(key):
+            name = gtsam.DefaultKeyFormatter(key)
+            raise GraphError(f"the values have no pose {name}; give one for every key")
+        if place in graph.landmarks:
+            t[place] = values.atPoint2(key) if d == 2 else values.atPoint3(key)
+            continue
+        pose = values.atPose2(key) if d == 2 else values.atPose3(key)
+        R[place] = pose.rotation().matrix()
+        t[place] = np.asarray(pose.translation())
+    return Poses(project_to_rotations(R), t)
