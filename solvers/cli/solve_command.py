@@ -303,7 +303,7 @@ class StageOptions:
 
 
 @dataclass(frozen=True)
-class Place:
+class ChosenPlace:
     """Where a solve is run: the method, the robots if it has any, and where these run.
 
     Without an engine everything is run in one place, also a method that has robots.
@@ -341,7 +341,7 @@ class RobotOptions:
         """Whether robots do without a driver."""
         return self.driver_memory == 0
 
-    def robots_at(self, place: Place) -> Robots | None:
+    def robots_at(self, place: ChosenPlace) -> Robots | None:
         """Robots of a solve, or None where it is run in one place."""
         memory = choices.chosen_memory(place.method, self.driver_memory)
         if place.engine is None:
@@ -384,7 +384,7 @@ class RobotOptions:
                 "or leave out --driver-memory 0"
             )
 
-    def chosen_for(self, graph: PoseGraph, stages: StageOptions) -> Place:
+    def chosen_for(self, graph: PoseGraph, stages: StageOptions) -> ChosenPlace:
         """Where the solve is run; a SettingError when the options do not go together."""
         method = choices.chosen_method(stages.method, self.robots, self.is_given)
         if method is FirstStage.JOINT and self.split is not None:
@@ -400,13 +400,13 @@ class RobotOptions:
         # Robots factor; the other back ends of CONSENSUS have all robots in one place.
         is_factorized = stages.r_step in (None, BackEndName.FACTORIZED)
         if partition is not None and engine is not None and is_factorized:
-            return Place(method, partition, engine)
+            return ChosenPlace(method, partition, engine)
         if stages.r_step is not None and self.is_about_network:
             raise SettingError(
                 f"robots of an engine factor, got --r-step {stages.r_step.value}; "
                 "leave out --engine, --resume and --driver-memory"
             )
-        return Place(method, partition, None)
+        return ChosenPlace(method, partition, None)
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,7 @@ def _check_loopback(ray: ModuleType) -> None:
 
 @dataclass(eq=False)
 class _RayPlace:
-    """Groups of robots, each in an actor; see `solvers.network.recovery.Place`."""
+    """Groups of robots, each in an actor; see `solvers.network.recovery.RobotGroups`."""
 
     ray: ModuleType
     make: Callable[[Any], Worker]

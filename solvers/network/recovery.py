@@ -32,7 +32,7 @@ class RobotLostError(EngineError):
     """A robot is lost, and with it all that it held."""
 
 
-class Place(Protocol[T]):
+class RobotGroups(Protocol[T]):
     """A place where groups of robots run, each of which can be lost as a whole.
 
     T is the type of a ticket, which stands for an order under way.
@@ -87,7 +87,7 @@ class Recovery:
 class RecoveringPool(Generic[T]):
     """Robots in a place where they can be lost; answers are the same as if they never were."""
 
-    place: Place[T]  # with all robots started
+    place: RobotGroups[T]  # with all robots started
     recovery: Recovery
     restarts: list[int] = field(init=False)  # how often every group was started again
     # Payload in bytes of the snapshots that the pool took of its own accord.

@@ -55,7 +55,7 @@ _PENALTY_OF_RELAXED = 1e-6  # rho_i / m_i of rotations that need not be rotation
 Order = Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]]
 
 
-class Robots(Protocol):
+class AskedRobots(Protocol):
     """All robots, in one process or on a network."""
 
     @property
@@ -72,7 +72,7 @@ class Robots(Protocol):
         """Deliver what every robot sent, by receiver; return what every robot gets, by sender."""
 
 
-def ask_all(robots: Robots, order: Order[Q, A], request: Q, count: Count) -> list[A]:
+def ask_all(robots: AskedRobots, order: Order[Q, A], request: Q, count: Count) -> list[A]:
     """Return the answers of all robots to an order with the same request."""
     return robots.ask(order, [request] * robots.num_robots, count)
 
@@ -145,7 +145,7 @@ class Consensus:
     soc: SOCSettings  # its coupling and robots are not used
     rotations: Rotations = Rotations.PROJECTED
 
-    def init(self, robots: Robots, before: ConsensusState | None = None) -> ConsensusState:
+    def init(self, robots: AskedRobots, before: ConsensusState | None = None) -> ConsensusState:
         """State 0: omega at the robots' poses, B in balance, separator penalties as in `before`.
 
         It takes two rounds, for poses and for penalties and forces.
@@ -167,7 +167,7 @@ class Consensus:
         replies = ask_all(robots, ConsensusRobot.start, separators, Count.GATHER)
         return _first_state(separators, replies)
 
-    def step(self, robots: Robots, state: ConsensusState) -> ConsensusState:
+    def step(self, robots: AskedRobots, state: ConsensusState) -> ConsensusState:
         """Make one iteration, with one exchange; (a) was done at the end of the last one."""
         with_penalty = self._with_due_penalty(robots, state)
         if with_penalty is not state or state.ahead is None:
@@ -211,7 +211,7 @@ class Consensus:
         acceleration = self.soc.acceleration
         return None if acceleration is None or acceleration.per_robot else acceleration
 
-    def _with_due_penalty(self, robots: Robots, state: ConsensusState) -> ConsensusState:
+    def _with_due_penalty(self, robots: AskedRobots, state: ConsensusState) -> ConsensusState:
         """State with the penalty that the rule or the safeguard asks for; usually unchanged.
 
         The relaxations of the start keep their penalties.
@@ -253,7 +253,7 @@ class Consensus:
             return SeparatorPenalty(translation, self.soc.separator_penalty_for(translation))
         return SeparatorPenalty(translation, 0.0)
 
-    def _adapted(self, robots: Robots, state: ConsensusState) -> ConsensusState:
+    def _adapted(self, robots: AskedRobots, state: ConsensusState) -> ConsensusState:
         """State with separator penalties adapted to how far their translations have gone."""
         if self.soc.translation_penalty is not None or robots.num_robots == 1:
             return state
@@ -262,7 +262,7 @@ class Consensus:
         return replace(state, separators=self._separators(translation))
 
     def _rescaled(
-        self, robots: Robots, state: ConsensusState, factor: float, from_best: bool
+        self, robots: AskedRobots, state: ConsensusState, factor: float, from_best: bool
     ) -> ConsensusState:
         """State with factor * rho and the same unscaled multiplier rho B."""
         order = RescaleCopies(factor, state.separators.translation, None)
@@ -298,7 +298,7 @@ def _first_state(separators: SeparatorPenalty, replies: Sequence[InitReply]) -> 
 
 
 def _with_solution(
-    robots: Robots, state: ConsensusState, answers: Sequence[SolveReply]
+    robots: AskedRobots, state: ConsensusState, answers: Sequence[SolveReply]
 ) -> ConsensusState:
     """State with the result of step (a), whose rows are delivered to the neighbours."""
     rows = robots.exchange([answer.rows for answer in answers])
