@@ -3,7 +3,7 @@
 import numpy as np
 
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import BoolArray, random_rotations
+from pgo_models.geometry.rotations import BoolArray, exp_map, random_rotations
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers.robust.consistency import odometry
@@ -63,3 +63,23 @@ def noisy_sphere(num_poses: int, per_turn: int, noise: NoiseModel, seed: int) ->
     i, j = np.concatenate(pairs).T
     truth = Poses(random_rotations(num_poses, 3, rng), t)
     return observe("noisy_sphere", truth, i, j, noise, noise.kappa(3), noise.tau, rng)
+
+
+def ring_road(seed: int, num_poses: int = 500, per_turn: int = 320) -> PoseGraph:
+    """A road once and a half around: where it comes along again, closures come in runs.
+
+    Odometry has drifted by metres then, and closures measure centimetres.
+    """
+    rng = np.random.default_rng(seed)
+    angle = 2.0 * np.pi * np.arange(num_poses) / per_turn
+    radius = 50.0 * (1.0 + 0.15 * np.sin(3.0 * angle))
+    t = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    along = np.gradient(t, axis=0)
+    heading = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+    later = np.arange(per_turn, num_poses)
+    later = later[(later - per_turn) % 60 < 35]
+    i = np.concatenate([np.arange(num_poses - 1), later - per_turn])
+    j = np.concatenate([np.arange(1, num_poses), later])
+    truth = Poses(exp_map(heading[:, None]), t)
+    noise = NoiseModel(0.03, 0.01)
+    return observe("ring_road", truth, i, j, noise, noise.kappa(2), noise.tau, rng)

@@ -5,6 +5,7 @@ They are made for either weighting, F or chi2.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ import scipy  # and scipy.special when it is used
 from pgo_models.errors import check_quantile
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import LEAST_SCALED, gaussian_information, scaled_blocks
 from pgo_models.graphs.residuals import edge_errors
 from pgo_models.problem.edge_cost import isotropic_cost
@@ -206,9 +207,47 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     return _quantiles(_chi2_weights(problem), quantile)
 
 
+@dataclass(frozen=True, eq=False)
+class RightCosts:
+    """Distribution of what right edges cost together: sums of the w of `chi2_thresholds`.
+
+    Parameters
+    ----------
+    sums : Array, (m, 3)
+        sum w, sum w^2 and sum w^3 of every edge.
+    """
+
+    sums: Array
+
+    @classmethod
+    def of(cls, problem: PGOProblem) -> RightCosts:
+        """Distribution of the costs of a problem's edges, which are taken for independent."""
+        return cls(_power_sums(_chi2_weights(problem)))
+
+    def thresholds(self, groups: Sequence[IntArray], quantile: float) -> Array:
+        """Quantiles of the costs that groups of right edges have together, (k,).
+
+        For k edges with matrices of full rank it is that of chi^2 with k d (d + 1) / 2 degrees of
+        freedom. Adding the edges of a group to the right map raises the least cost by no more with
+        this probability, however far the map moves.
+        """
+        sums = np.array([self.sums[group].sum(axis=0) for group in groups]).reshape(-1, 3)
+        return _quantiles_of_sums(sums, quantile)
+
+
 def _quantiles(w: Array, quantile: float) -> Array:
     """Quantiles of sums of w chi^2_1, (m,)."""
-    c_1, c_2, c_3 = (np.sum(w**k, axis=1) for k in (1, 2, 3))
+    return _quantiles_of_sums(_power_sums(w), quantile)
+
+
+def _power_sums(w: Array) -> Array:
+    """Sums of w, w^2 and w^3, (m, 3)."""
+    return np.stack([np.sum(w**k, axis=1) for k in (1, 2, 3)], axis=1)
+
+
+def _quantiles_of_sums(sums: Array, quantile: float) -> Array:
+    """Quantiles of sums of w chi^2_1, (m,), of which the power sums are known, (m, 3)."""
+    c_1, c_2, c_3 = sums.T
     # An edge without weight has c_1 = c_2 = c_3 = 0.
     ratio = c_3 / np.where(c_2 > 0.0, c_2, 1.0)
     divisor = np.where(ratio > 0.0, ratio, 1.0)

@@ -1,4 +1,6 @@
-"""Attempts of a robust solve: runs of graduated non-convexity, each certified.
+"""Attempts of a robust solve: edges to begin with, each set of them certified.
+
+Graduated non-convexity finds them, or they are the known inliers alone, to which revision adds.
 
 A `Plan` says what an attempt does differently, `plans_in_order` which ones there are.
 `PlacesOfEdges` carries plans out, wherever the solve runs; the result is an `Estimate`.
@@ -16,6 +18,7 @@ import numpy as np
 from pgo_models.certificates.certificate import Certificate
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import bridges
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order
 from pgo_models.problem.problem import PGOProblem
@@ -30,6 +33,7 @@ from solvers.robust.gnc import GNC, LAST_STEPS
 from solvers.robust.losses import RobustLoss
 from solvers.robust.rejection import Attempt
 from solvers.robust.revision import error_scale, inlier_problem, truncated_cost
+from solvers.robust.weighted_edges import first_poses
 from solvers.solution import Solution
 
 # Number of loop closures all pairs of which are compared within seconds.
@@ -47,6 +51,8 @@ _TIGHT_SPREAD = 0.3
 # Settings of the attempt with smaller steps.
 _SLOW_GROWTH = 1.4
 _SLOW_INNER_STEPS = 5
+# What the names of the stages of graduated non-convexity begin with.
+_OF_GNC = "GNC, "
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +106,13 @@ class DoubtedProblem:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What an attempt does: settings, the edges that it begins with, (m,), and where it starts."""
+    """What an attempt does: settings, the edges that it begins with, (m,), and where it starts.
+
+    Without settings it keeps the edges that it begins with.
+    """
 
     name: str
-    settings: GNC
+    settings: GNC | None
     candidates: BoolArray
     starts_at_least_squares: bool = False
 
@@ -116,6 +125,9 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     if settings.consistent:
         candidates = known | pairwise_consistent(graph, known)
     yield Plan("as set", settings, candidates)
+    tree = known.copy()
+    tree[bridges(graph, known, np.zeros(graph.num_edges))] = True
+    yield Plan("known inliers", None, tree)
     if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
         consistent = known | pairwise_consistent(graph, known)
         if len(graph.components(consistent)) == 1:
@@ -162,11 +174,12 @@ def _with_other_loss(settings: GNC) -> tuple[str, GNC]:
 class Estimate:
     """Result of an attempt: the edges kept, (m,), and the solution with them.
 
-    `scale` is the factor on the thresholds. `error_scale` is that of the edges kept, 1 where too
-    few cycles are left to estimate it.
+    `found` (m,) are those kept before their revision. `scale` is the factor on the thresholds.
+    `error_scale` is that of the edges kept, 1 where too few cycles are left to estimate it.
     """
 
     attempt: Attempt
+    found: BoolArray
     kept: BoolArray
     scale: float
     error_scale: float
@@ -199,7 +212,7 @@ class Estimate:
         stage: Stage,
         began: float,
     ) -> Estimate:
-        """Estimate of an attempt that began at the time `began` and whose stage bears its name."""
+        """Estimate of an attempt that began at the time `began`, and whose stage bears its name."""
         poses = solution.poses
         num_cycles = int(kept.sum()) - (doubted.problem.num_poses - 1)
         errors = 1.0
@@ -207,15 +220,14 @@ class Estimate:
             errors = error_scale(doubted.with_edges(kept), poses)
         certificate = solution.certificate
         attempt = Attempt(
-            name=stage.name,
+            name=stage.name.removeprefix(_OF_GNC),
             cost=doubted.truncated_cost(poses),
             rejected=int((~kept).sum()),
             gap=certificate.printed_gap,
             is_certified=certificate.is_certified,
             seconds=time.perf_counter() - began,
         )
-        stage = replace(stage, name=f"GNC, {stage.name}")
-        return cls(attempt, kept, scale, errors, solution, stage)
+        return cls(attempt, kept, kept, scale, errors, solution, stage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,13 +246,33 @@ class PlacesOfEdges:
         began = time.perf_counter()
         doubted = self.doubted
         kept = plan.candidates.copy()
+        if plan.settings is None:
+            start = first_poses(doubted.problem.graph, doubted.known) if start is None else start
+            solution = self.solution_nearby(kept, start)
+            stage = replace(solution.stages[-1], name=plan.name)
+            return Estimate.of(doubted, kept, 1.0, solution, stage, began)
         gnc = replace(plan.settings, known=doubted.known[kept])
         with self._opened(self._request_of(kept), gnc) as place:
             inliers = place.run_gnc(gnc, start)
         kept[kept] = inliers.kept
         solution = self.solution_nearby(kept, inliers.poses)
-        stage = replace(inliers.stage, name=plan.name)
+        stage = replace(inliers.stage, name=_OF_GNC + plan.name)
         return Estimate.of(doubted, kept, inliers.scale, solution, stage, began)
+
+    def revised(self, estimate: Estimate, kept: BoolArray, poses: Poses) -> Estimate:
+        """The estimate with the edges `kept`, (m,), in place of those found, from poses nearby."""
+        began = time.perf_counter()
+        num_removed = int((estimate.found & ~kept).sum())
+        num_added = int((kept & ~estimate.found).sum())
+        name = estimate.stage.name
+        name += f", less {num_removed} that others contradict" if num_removed else ""
+        name += f", with {num_added} that they can follow" if num_added else ""
+        solution = self.solution_nearby(kept, poses)
+        stage = replace(estimate.stage, name=name)
+        revised = Estimate.of(self.doubted, kept, estimate.scale, solution, stage, began)
+        seconds = estimate.attempt.seconds + revised.attempt.seconds
+        attempt = replace(revised.attempt, seconds=seconds)
+        return replace(revised, attempt=attempt, found=estimate.found)
 
     def solution_nearby(self, kept: BoolArray, start: Poses | None) -> Solution:
         """Solution with the kept edges, (m,), by Newton alone, from poses nearby or a start."""

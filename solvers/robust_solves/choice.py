@@ -9,17 +9,14 @@ from pgo_models.geometry.rotations import BoolArray
 from solvers.robust.rejection import Attempt
 from solvers.robust_solves.attempts import DoubtedProblem, Estimate
 
-# Attempts where they are cheap, or where most closures were rejected.
-_SEVERAL_ATTEMPTS = 3
+# Attempts at most, where they are cheap or most closures were rejected, and no two agree.
+_SEVERAL_ATTEMPTS = 4
 # Factor on the error scale of the edges kept: real errors have heavier tails than Gaussian ones,
 # and an attempt that keeps the best edges alone has smaller ones. In cubicle no right edge costs
 # ten times its threshold so scaled.
 _TAIL_FACTOR = 10.0
-# Attempts that are revised where that is cheap, at most; their truncated cost over the least; and
-# the share of the closures kept on which any two of them differ.
-_MAX_REVISED = 3
-_MAX_RELATIVE_COST = 1.25
-_DISPUTED_SHARE = 0.05
+# Share of the closures kept on which two attempts that agree may differ.
+_AGREEING_SHARE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,36 +59,24 @@ class Choice:
     def is_enough(self) -> bool:
         """Whether no further attempt is needed.
 
-        The cheapest attempt has to be certified, the edges that it keeps may not form a tree, and
-        where attempts are cheap, or it rejects more than half of the closures, three have to be
-        made.
+        The cheapest attempt has to be certified, and the edges that it keeps may not form a tree.
+        Where attempts are cheap, or it rejects more than half of the closures, another one has to
+        agree with it, or four have to be made.
         """
         cheapest = self.cheapest
         is_tree = int(cheapest.kept.sum()) < self.doubted.problem.num_poses
         if is_tree or not cheapest.certificate.is_certified:
             return False
         keeps_most = 2 * self._num_closures_kept(cheapest) >= self.doubted.num_closures
-        needs_several = self.doubted.is_cheap or not keeps_most
-        return len(self.estimates) >= (_SEVERAL_ATTEMPTS if needs_several else 1)
+        if keeps_most and not self.doubted.is_cheap:
+            return True
+        return self._is_agreed(cheapest) or len(self.estimates) >= _SEVERAL_ATTEMPTS
 
-    def worth_revising(self) -> list[Estimate]:
-        """The cheapest attempt, and where revisions are cheap the next ones that differ from it."""
-        cheapest, *others = self.by_cost
-        chosen = [cheapest]
-        if not self.doubted.is_cheap:
-            return chosen
-        max_cost = _MAX_RELATIVE_COST * self.cost(cheapest.poses)
-        num_tolerated = _DISPUTED_SHARE * self._num_closures_kept(cheapest)
-        for estimate in others:
-            if self.cost(estimate.poses) > max_cost:
-                break
-            if all((estimate.kept != other.kept).sum() > num_tolerated for other in chosen):
-                chosen.append(estimate)
-        return chosen[:_MAX_REVISED]
-
-    def is_disputed(self, estimate: Estimate) -> bool:
-        """Whether another attempt keeps other edges."""
-        return any((other.kept != estimate.kept).any() for other in self.estimates)
+    def _is_agreed(self, estimate: Estimate) -> bool:
+        """Whether another attempt keeps nearly the same edges."""
+        num_tolerated = _AGREEING_SHARE * self._num_closures_kept(estimate)
+        others = [other for other in self.estimates if other is not estimate]
+        return any((other.kept != estimate.kept).sum() <= num_tolerated for other in others)
 
     def attempts_beside(self, kept: BoolArray) -> tuple[Attempt, ...]:
         """Records of the attempts, each with the number of its edges that the answer rejects."""

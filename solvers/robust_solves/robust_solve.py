@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from functools import partial, reduce
+from functools import reduce
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from solvers.places import with_partition
 from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
 from solvers.riemannian.polish import polish
+from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
-from solvers.robust.revision import drop_contradicted, readmit_clusters, readmit_edges
+from solvers.robust.revision import drop_contradicted
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
-    MAX_PAIRED,
     DoubtedProblem,
     Estimate,
     PlacesOfEdges,
@@ -34,9 +34,10 @@ from solvers.robust_solves.attempts import (
 from solvers.robust_solves.choice import Choice
 from solvers.solution import Solution, joined_notes
 
-# Newton steps after one edge was dropped or added, and after a cluster of them was.
+# Newton steps after one edge was dropped.
 _STEPS_AFTER_EDGE = 4
-_STEPS_AFTER_CLUSTER = 20
+# Seconds that have to be left for another step of a revision.
+_LEAST_SECONDS = 1e-6
 
 
 def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
@@ -48,23 +49,20 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        solution with every edge comes first. It is the answer if time has run out, or if nothing
        speaks against any edge: it is certified, no edge but known inliers is beyond its threshold
        or contradicted, and all together cost no more than they may.
-    2. Attempts. Graduated non-convexity is run with several settings and starts
-       (`plans_in_order`): as set; on the pairwise consistent edges; with more and smaller steps;
+    2. Attempts (`plans_in_order`). Graduated non-convexity is run as set; then there are the known
+       inliers alone; then it is run on the pairwise consistent edges; with more and smaller steps;
        with tight thresholds, which the edges kept then widen; from the least-squares solution; with
-       the other loss. It ends early when no further attempt is needed (`Choice.is_enough`).
-    3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is chosen, whether
-       it is certified or not. Where revising is cheap, up to three attempts that differ in more
-       than a few closures are chosen. The cheapest after revision is the answer.
-    4. Revision. Edges are dropped that all others contradict (`drop_contradicted`). Clusters of
-       rejected closures are readmitted (`readmit_clusters`), and, where it is cheap and attempts
-       differ, single ones (`readmit_edges`). Readmitted edges stay if the truncated cost does not
-       rise.
-    5. Solution and verdict. Newton and all further steps of the pipeline (`solvers.plan`) solve for
-       the edges kept. `Rejection` says what supports these edges.
+       the other loss. Each attempt is revised: clusters of closures are added, removed and
+       exchanged (`ClusterSearch`), then edges are dropped that all others contradict
+       (`drop_contradicted`). It ends early when no further attempt is needed (`Choice.is_enough`).
+    3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
+       whether it is certified or not. Newton and all further steps of the pipeline
+       (`solvers.plan`) solve for the edges kept.
+    4. Verdict. `Rejection` says what supports these edges.
 
-    Stages 1, 2 and 5 are solves at the place of the request, here or by robots, whose account is
-    one ledger. Choice, revision and pairwise consistency are found in this process, which has the
-    graph. With PCM, stages 2 to 4 are the pairwise consistent edges. A SettingError when robust is
+    Stages 1 to 3 are solves at the place of the request, here or by robots, whose account is
+    one ledger. Revision and pairwise consistency are found in this process, which has the
+    graph. With PCM, stages 2 and 3 are the pairwise consistent edges. A SettingError when robust is
     neither GNC nor PCM; a GraphError when known inliers and the edges kept do not connect the
     poses.
     """
@@ -84,32 +82,6 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
         return job.answer_by_consistency(robust.quantile)
     ending = job.make_attempts(robust)
     return job.answer_by_attempts(ending)
-
-
-@dataclass(frozen=True, eq=False)
-class _Revision:
-    """An attempt, the edges kept after its revision, (m,), and stationary poses of these."""
-
-    estimate: Estimate
-    kept: BoolArray
-    poses: Poses
-
-    @property
-    def has_changed(self) -> bool:
-        """Whether other edges are kept than by the attempt."""
-        return not np.array_equal(self.kept, self.estimate.kept)
-
-    @property
-    def name(self) -> str:
-        """Name of the attempt, with the numbers of edges dropped and readmitted."""
-        name = self.estimate.attempt.name
-        num_dropped = int((self.estimate.kept & ~self.kept).sum())
-        num_readmitted = int((self.kept & ~self.estimate.kept).sum())
-        if num_dropped:
-            name += f", less {num_dropped} that all others contradict"
-        if num_readmitted:
-            name += f", with {num_readmitted} that they can follow"
-        return name
 
 
 @dataclass(eq=False)
@@ -158,7 +130,7 @@ class _RobustSolve:
             return False
         every_edge = self.doubted.every_edge
         remaining = drop_contradicted(
-            self.doubted.problem, known, every_edge, solution.poses, self._polished
+            self.doubted.problem, known, every_edge, solution.poses, _settled
         )
         return bool(remaining.all())
 
@@ -181,7 +153,7 @@ class _RobustSolve:
         last_failure: Exception = GraphError()
         try:
             for plan in plans_in_order(settings, self.doubted):
-                if plan.starts_at_least_squares and not self._has_least_squares():
+                if self._is_known(plan):
                     continue
                 try:
                     estimate = self.places.attempt(plan, self._start_of(plan))
@@ -192,6 +164,8 @@ class _RobustSolve:
                     continue
                 self.estimates.append(estimate)
                 ending = estimate.status
+                if ending not in OUT_OF_TIME:
+                    self._revise_last()
                 if ending in OUT_OF_TIME or self.choice.is_enough:
                     break
         except KeyboardInterrupt:  # between the loops, which answer it themselves
@@ -201,6 +175,19 @@ class _RobustSolve:
         if not self.estimates:
             raise last_failure
         return ending
+
+    def _revise_last(self) -> None:
+        """Revise the last estimate; it stands where that fails."""
+        try:
+            self.estimates[-1] = self._improved(self.estimates[-1])
+        except FAILURES as error:
+            self.failures.append(f"a revision failed ({error}); what it began with stands")
+
+    def _is_known(self, plan: Plan) -> bool:
+        """Whether an attempt has begun its revision where the plan's would, or has no start."""
+        if plan.settings is None:
+            return any(np.array_equal(plan.candidates, other.found) for other in self.estimates)
+        return plan.starts_at_least_squares and not self._has_least_squares()
 
     def _start_of(self, plan: Plan) -> Poses | None:
         return self.least_squares if plan.starts_at_least_squares else self.start
@@ -215,89 +202,62 @@ class _RobustSolve:
             self.least_squares = self.places.solution_nearby(every_edge, None).poses
         return self.least_squares is not None
 
-    # Stages 3 and 4: choice and revision
+    def _improved(self, estimate: Estimate) -> Estimate:
+        """The estimate revised, if this lowers its truncated cost.
+
+        Clusters of closures are added, removed and exchanged (`ClusterSearch`); then edges are
+        dropped that all others contradict.
+        """
+        choice = self.choice
+        doubted = self.doubted
+        scale = choice.threshold_scale
+        search = ClusterSearch(
+            doubted.problem, doubted.known, scale * doubted.thresholds, scale, self._has_time
+        )
+        fit = search.improved(estimate.kept, estimate.poses)
+        kept = drop_contradicted(doubted.problem, doubted.known, fit.kept, fit.poses, _settled)
+        if np.array_equal(kept, estimate.kept):
+            return estimate
+        revised = self.places.revised(estimate, kept, fit.poses)
+        is_no_dearer = choice.cost(revised.poses) <= choice.cost(estimate.poses)
+        only_drops = not (kept & ~estimate.kept).any()
+        return revised if is_no_dearer or only_drops else estimate
+
+    def _has_time(self) -> bool:
+        return self.places.request.monitor.left > _LEAST_SECONDS
+
+    # Stage 3: choice
 
     def answer_by_attempts(self, ending: Status) -> Solution:
-        """The solution of the edges kept by the attempt that is cheapest once revised."""
+        """The solution of the edges kept by the cheapest attempt."""
         cheapest = self.choice.cheapest
-        revision = _Revision(cheapest, cheapest.kept, cheapest.poses)
-        if ending not in OUT_OF_TIME:
-            try:
-                revision = self._cheapest_revision()
-            except KeyboardInterrupt:
-                ending = Status.INTERRUPTED
-            except FAILURES as error:
-                self.failures.append(f"the revision failed ({error}); what it began with stands")
-        solution = self._solution_of(revision)
+        solution = self._solution_of(cheapest)
         stages = [estimate.stage for estimate in self.estimates]
         status = ending if ending in OUT_OF_TIME else solution.status
         solution = replace(solution, stages=(*stages, *solution.stages), status=status)
-        return self._result(solution, revision.kept, revision.estimate.scale, revision.name)
+        return self._result(solution, cheapest.kept, cheapest.scale, cheapest.attempt.name)
 
-    def _solution_of(self, revision: _Revision) -> Solution:
+    def _solution_of(self, estimate: Estimate) -> Solution:
         """Solution of the edges kept, by all steps that may improve it.
 
         If the revision changed the edges and the solution is not certified, they are solved again
         without a given start, and the solution of lower cost is returned.
         """
-        of_attempt = revision.estimate.solution
-        is_final = of_attempt.status in OUT_OF_TIME or not of_attempt.certificate.can_improve
-        if not revision.has_changed and is_final:
+        of_attempt = estimate.solution
+        if of_attempt.status in OUT_OF_TIME or not of_attempt.certificate.can_improve:
             return of_attempt
-        solution = self.places.solution(revision.kept, revision.poses)
-        if not revision.has_changed or solution.is_certified:
+        solution = self.places.solution(estimate.kept, estimate.poses)
+        has_changed = not np.array_equal(estimate.kept, estimate.found)
+        if not has_changed or solution.is_certified:
             return solution
         try:
-            from_own_start = self.places.solution(revision.kept, None)
+            from_own_start = self.places.solution(estimate.kept, None)
         except FAILURES as error:
             self.failures.append(f"another start failed ({error}); the solution before it stands")
             return solution
         return min(solution, from_own_start, key=lambda other: other.objective)
 
-    def _cheapest_revision(self) -> _Revision:
-        """The revision of the least truncated cost, of the attempts that are worth one."""
-        choice = self.choice
-        attempts = choice.worth_revising()
-        revisions = [self._revised(estimate, choice) for estimate in attempts]
-        return min(revisions, key=lambda revision: choice.cost(revision.poses))
-
-    def _revised(self, estimate: Estimate, choice: Choice) -> _Revision:
-        """Drop the edges of an attempt that others contradict, and readmit those that fit."""
-        doubted = self.doubted
-        kept = drop_contradicted(
-            doubted.problem, doubted.known, estimate.kept, estimate.poses, self._polished
-        )
-        poses = self._polished(doubted.with_edges(kept), estimate.poses)
-        dropped = _Revision(estimate, kept, poses)
-        readmitted = self._readmitted(dropped, choice)
-        if np.array_equal(readmitted.kept, dropped.kept):
-            return dropped
-        poses = self._polished(doubted.with_edges(readmitted.kept), readmitted.poses)
-        if choice.cost(poses) > choice.cost(dropped.poses):
-            return dropped
-        return replace(readmitted, poses=poses)
-
-    def _readmitted(self, revision: _Revision, choice: Choice) -> _Revision:
-        """The revision with the rejected edges that fit: clusters of them, then single ones."""
-        doubted = self.doubted
-        problem = doubted.problem
-        kept = revision.kept
-        poses = revision.poses
-        num_rejected = int((~kept).sum())
-        if 0 < num_rejected <= MAX_PAIRED:
-            allowed = choice.threshold_scale * doubted.thresholds
-            settle = partial(self._polished, max_steps=_STEPS_AFTER_CLUSTER)
-            kept, poses = readmit_clusters(problem, doubted.known, allowed, kept, poses, settle)
-        if doubted.is_cheap and choice.is_disputed(revision.estimate):
-            kept = readmit_edges(problem, kept, poses, self._polished)
-        return replace(revision, kept=kept, poses=poses)
-
-    def _polished(
-        self, inliers: PGOProblem, poses: Poses, max_steps: int = _STEPS_AFTER_EDGE
-    ) -> Poses:
-        return polish(inliers, poses, max_steps=max_steps)
-
-    # Stage 5: verdict
+    # Stage 4: verdict
 
     def _result(self, solution: Solution, kept: BoolArray, scale: float, name: str) -> Solution:
         """The solution with the decision on every edge, and the account of all that was sent.
@@ -325,3 +285,8 @@ class _RobustSolve:
         seconds = time.perf_counter() - self.began
         note = joined_notes(solution.note, *self.failures)
         return replace(solution, robust=rejection, ledger=ledger, seconds=seconds, note=note)
+
+
+def _settled(inliers: PGOProblem, poses: Poses) -> Poses:
+    """Stationary poses near the given ones."""
+    return polish(inliers, poses, max_steps=_STEPS_AFTER_EDGE)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +18,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
 from solvers.robust.rejection import Attempt, Support
-from solvers.robust.revision import (
-    readmit_clusters,
-    readmit_edges,
-    truncated_cost,
-)
+from solvers.robust.revision import truncated_cost
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves import attempts as robust_attempts, robust_solve
 from solvers.robust_solves.attempts import Plan
@@ -235,23 +230,6 @@ def test_what_speaks_against_the_edges_kept() -> None:
     assert uncertified.headline.startswith("NOT_CERTIFIED for the ")
     assert uncertified.headline.endswith("; the edges kept do not fit together")
     assert uncertified.standing is Verdict.NOT_CERTIFIED
-
-
-def test_closures_that_fit_only_together_come_back_together() -> None:
-    """A long way round a square ends far from its beginning: each closure alone costs too much."""
-    right = world(1500, 0.02)
-    problem = pgo.PGOProblem(right)
-    known = known_inliers(right, None)
-    poses = pgo.odometry_start(right)
-    settled = partial(polish, max_steps=4)
-    alone = readmit_edges(problem, known, poses, settled)
-    assert alone.sum() == known.sum()  # nothing comes back into a tree one by one
-    allowed = pgo.chi2_thresholds(problem)
-    far = partial(polish, max_steps=20)
-    kept, moved = readmit_clusters(problem, known, allowed, known, poses, far)
-    assert (kept & ~known).sum() > 0.9 * (~known).sum()
-    cost = truncated_cost(problem, known, allowed, moved)
-    assert cost < 0.5 * truncated_cost(problem, known, allowed, poses)
 
 
 @pytest.mark.parametrize("start", ["odometry", None])

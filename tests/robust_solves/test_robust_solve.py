@@ -12,7 +12,8 @@ from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
-from solvers.robust.revision import drop_contradicted, inlier_problem, readmit_edges
+from solvers.robust.cluster_search import ClusterSearch
+from solvers.robust.revision import drop_contradicted, inlier_problem
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves import attempts as robust_attempts, robust_solve
 from solvers.robust_solves.attempts import Plan
@@ -110,7 +111,7 @@ def test_an_attempt_that_leaves_poses_apart_is_passed_over(clean, monkeypatch):
         without(["as set"])
 
 
-@pytest.mark.parametrize("where", ["drop_contradicted", "readmit_edges", "pairwise_consistent"])
+@pytest.mark.parametrize("where", ["drop_contradicted", "ClusterSearch", "pairwise_consistent"])
 def test_ctrl_c_between_the_loops_keeps_the_best_attempt(clean, where, monkeypatch):
     graph, is_wrong = spoiled(clean, 0.3, "random", seed=0)
 
@@ -202,7 +203,7 @@ def test_on_large_graphs_smaller_steps_come_last(clean, is_large, monkeypatch):
     tight = ["thresholds times 0.1 at first", "thresholds times 0.01 at first"]
     middle = tight + slow if is_large else slow + tight
     last = ["from least squares with every edge", "geman-mcclure loss"]
-    assert tried == ["as set", "pairwise consistent edges", *middle, *last]
+    assert tried == ["as set", "known inliers", "pairwise consistent edges", *middle, *last]
 
 
 def test_doubtful_edges_are_within_a_factor_of_two_of_their_threshold(clean):
@@ -393,15 +394,10 @@ def test_closures_that_the_map_can_follow_come_back(seed, claim):
     poses = solvers.solve(inlier_problem(problem, kept)).poses
     far = problem.edge_costs(poses) > 5.0 * pgo.chi2_thresholds(problem) * claim
     assert (far & ~kept & ~wrong).any()
-    np.testing.assert_array_equal(readmit_edges(problem, kept, poses, POLISHED), ~wrong)
-
-
-def test_nothing_comes_back_into_a_map_without_redundancy():
-    graph, _ = spoiled(few_closures(0, 60), 0.5, "random", 0)
-    problem = pgo.PGOProblem(graph)
-    known = known_inliers(graph, None)
-    poses = solvers.solve(inlier_problem(problem, known)).poses
-    np.testing.assert_array_equal(readmit_edges(problem, known, poses, POLISHED), known)
+    search = ClusterSearch(
+        problem, known, claim * pgo.chi2_thresholds(problem), claim, lambda: True
+    )
+    np.testing.assert_array_equal(search.improved(kept, poses).kept, ~wrong)
 
 
 def test_what_pairwise_consistency_left_out_comes_back():

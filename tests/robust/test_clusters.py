@@ -1,0 +1,147 @@
+"""Clusters of closures, their first-order distances, and the search that moves them as units."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.special
+from wrong_edges import ring_road, spoiled
+
+import pgo_models as pgo
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.thresholds import RightCosts
+from solvers.riemannian.polish import polish
+from solvers.robust.chains import Chains
+from solvers.robust.cluster_search import ClusterSearch
+from solvers.robust.clusters import closure_clusters
+from solvers.robust.consistency import odometry
+from solvers.robust.distances import least_distances
+from solvers.robust.revision import inlier_problem, truncated_cost
+
+
+def search_of(problem: pgo.PGOProblem, has_time: bool = True) -> ClusterSearch:
+    known = odometry(problem.graph)
+    return ClusterSearch(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: has_time)
+
+
+def street(seed: int, share: float = 0.5, kind: str = "random") -> tuple[pgo.PoseGraph, BoolArray]:
+    return spoiled(ring_road(seed), share, kind, seed)
+
+
+@pytest.mark.parametrize("kind", ["random", "aliased"])
+def test_a_cluster_is_right_or_wrong_as_a_whole(kind: str) -> None:
+    graph, is_wrong = street(0, 0.8, kind)
+    known = odometry(graph)
+    clusters = closure_clusters(graph, known)
+    np.testing.assert_array_equal(np.sort(np.concatenate(clusters)), np.flatnonzero(~known))
+    right = [cluster for cluster in clusters if not is_wrong[cluster].any()]
+    assert all(is_wrong[cluster].all() for cluster in clusters if is_wrong[cluster].any())
+    assert max(map(len, right)) >= 10
+
+
+def test_closures_of_a_road_driven_back_are_one_cluster_whichever_way_they_are_written() -> None:
+    graph = ring_road(0)
+    turned = np.flatnonzero(~odometry(graph))[::2]
+    R = graph.R_ij.copy()
+    t = graph.t_ij.copy()
+    i = graph.i.copy()
+    j = graph.j.copy()
+    R[turned] = np.swapaxes(R[turned], 1, 2)
+    t[turned] = -np.einsum("mab,mb->ma", R[turned], t[turned])
+    i[turned], j[turned] = j[turned], i[turned].copy()
+    reversed_graph = pgo.PoseGraph(graph.num_poses, i, j, R, t, graph.kappa, graph.tau)
+    of_both = [
+        sorted(map(tuple, closure_clusters(each, odometry(each))))
+        for each in (graph, reversed_graph)
+    ]
+    assert of_both[0] == of_both[1]
+
+
+def test_the_rise_by_right_closures_has_its_quantile() -> None:
+    """T of k right closures is chi^2 with k d (d + 1) / 2 degrees of freedom."""
+    cluster_size = 4
+    ratios = []
+    for seed in range(40):
+        noise = NoiseModel(0.02, 0.005)
+        graph = pgo.grid_world(
+            1, 60, np.random.default_rng(seed), d=2, loop_closure_probability=0.2, noise=noise
+        )
+        problem = pgo.PGOProblem(graph)
+        cluster = np.flatnonzero(~odometry(graph))[:cluster_size]
+        kept = np.ones(graph.num_edges, dtype=bool)
+        kept[cluster] = False
+        costs = []
+        for edges in (kept, np.ones_like(kept)):
+            inliers = inlier_problem(problem, edges)
+            costs.append(inliers.objective(polish(inliers, graph.truth)))
+        median = RightCosts.of(problem).thresholds([cluster], 0.5)[0]
+        ratios.append((costs[1] - costs[0]) / median)
+    # 40 draws above the median or below: within three deviations of half of them
+    assert abs(np.mean(np.array(ratios) > 1.0) - 0.5) < 3 * 0.5 / np.sqrt(40)
+
+
+def test_the_joint_threshold_of_full_matrices_is_that_of_chi2() -> None:
+    graph = pgo.grid_world(1, 40, np.random.default_rng(0), d=3, loop_closure_probability=0.2)
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+    groups = [np.arange(1), np.arange(5)]
+    expected = scipy.special.chdtri([6, 30], 0.01)
+    np.testing.assert_allclose(RightCosts.of(problem).thresholds(groups, 0.99), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_no_map_follows_a_closure_for_less_than_its_distance(d: int) -> None:
+    """To first order, which small errors make exact."""
+    noise = NoiseModel(1e-3, 1e-3)
+    graph = pgo.grid_world(
+        1, 60, np.random.default_rng(1), d=d, loop_closure_probability=0.3, noise=noise
+    )
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+    known = odometry(graph)
+    closures = np.flatnonzero(~known)
+    kept = known.copy()
+    kept[closures[::2]] = True
+    inliers = inlier_problem(problem, kept)
+    poses = polish(inliers, graph.truth)
+    edges = closures[1::2][:10]
+    distances = least_distances(Chains.of(graph, known), inliers, poses, edges)
+    assert (distances > 0.0).all()
+    for edge, distance in zip(edges, distances, strict=True):
+        larger = kept.copy()
+        larger[edge] = True
+        with_edge = inlier_problem(problem, larger)
+        rise = with_edge.objective(polish(with_edge, poses)) - inliers.objective(poses)
+        assert distance <= 1.05 * rise
+
+
+@pytest.mark.parametrize("kind", ["random", "aliased"])
+def test_runs_come_back_into_a_map_that_has_drifted_away_from_them(kind: str) -> None:
+    graph, is_wrong = street(0, 0.5, kind)
+    problem = pgo.PGOProblem(graph)
+    search = search_of(problem)
+    poses = pgo.odometry_start(graph)
+    thresholds = pgo.chi2_thresholds(problem)
+    fits = problem.edge_costs(poses) <= thresholds
+    assert fits[~search.known & ~is_wrong].mean() < 0.2  # one at a time almost nothing would
+    fit = search.improved(search.known, poses)
+    np.testing.assert_array_equal(fit.kept, ~is_wrong)
+    cost = truncated_cost(problem, search.known, thresholds, fit.poses)
+    assert search.cost(fit) == cost
+    assert cost < truncated_cost(problem, search.known, thresholds, poses)
+
+
+def test_a_wrong_run_that_is_kept_goes_as_a_whole_and_right_ones_take_its_place() -> None:
+    graph, is_wrong = street(0, 0.3, "aliased")
+    problem = pgo.PGOProblem(graph)
+    search = search_of(problem)
+    kept = search.known.copy()
+    kept[np.flatnonzero(is_wrong)[:5]] = True
+    poses = polish(inlier_problem(problem, kept), pgo.odometry_start(graph))
+    np.testing.assert_array_equal(search.improved(kept, poses).kept, ~is_wrong)
+
+
+def test_without_time_the_search_returns_what_it_was_given() -> None:
+    graph, _ = street(0)
+    search = search_of(pgo.PGOProblem(graph), has_time=False)
+    fit = search.improved(search.known, pgo.odometry_start(graph))
+    np.testing.assert_array_equal(fit.kept, search.known)
