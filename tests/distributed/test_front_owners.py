@@ -26,7 +26,7 @@ from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.solution import Solution
 
-OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result", "take_front")
+OFF = ("describe", "set_poses", "cost", "result", "take_front")
 
 
 @pytest.fixture
