@@ -200,7 +200,8 @@ def solve_folder(
     opened = open_files(files, engine, pipeline.driver_memory, weighting, trust_folder)
     name = f"{folder.name}, {FILES_HERE}" if opened.num_absent else folder.name
     driver = opened.driver
-    with closing(driver), closing(Journal(None, {}, stages)) as journal:
+    journal = Journal(None, {}, stages)
+    with closing(driver):
         place = RobotsWithFiles(
             monitor, stages, driver, journal, None, name, pipeline.gap, opened.weighting
         )

@@ -37,10 +37,8 @@ def solve_by_robots(request: SolveRequest, robots: Partition | int) -> Solution:
     stages: list[Stage] = []
     shown = request.monitor, stages
     here = Here(*shown, problem, pipeline.gap, where=", in one place")
-    with (
-        closing(Journal(request.checkpoint, mark, stages)) as journal,
-        closing(open_driver(problem, partition, engine, pipeline.driver_memory)) as driver,
-    ):
+    journal = Journal(request.checkpoint, mark, stages)
+    with closing(open_driver(problem, partition, engine, pipeline.driver_memory)) as driver:
         place: Place = RobotsAlone(*shown, driver, journal, pipeline.faults, here, partition)
         if pipeline.has_driver:
             place = RobotsOfGraph(*shown, driver, journal, pipeline.faults, here)

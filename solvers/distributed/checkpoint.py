@@ -24,7 +24,7 @@ from pgo_models.certificates.certificate import BoundSource, Certificate, Verdic
 from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.errors import FileFormatError, PGOError, SettingError, check_settings
-from pgo_models.files import replace_when_done
+from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.problem.problem import PGOProblem
@@ -32,7 +32,6 @@ from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import CoverPoses, Driver, DriverState
 from solvers.distributed.newton import SubstructuredNewtonState
 from solvers.distributed.robots.records import RightHandSide
-from solvers.distributed.run_lock import RunLock
 from solvers.distributed.substructured import SubstructuredState
 from solvers.loop import Method, RunMonitor
 from solvers.network.ledger import Ledger, Traffic
@@ -63,9 +62,10 @@ class Checkpoint:
     """Where and how often a solve by robots writes what it needs to go on.
 
     If the file exists when a solve begins, the solve goes on from it. The file is removed when the
-    solve has converged, and stays when the solve was stopped, interrupted or out of time. While a
-    solve runs it is locked for others. Where a checkpoint cannot be written, say on a full disk,
-    there is one warning, and the last one that could be written stays.
+    solve has converged, and stays when the solve was stopped, interrupted or out of time. Where a
+    checkpoint cannot be written, say on a full disk, there is one warning, and the last one that
+    could be written stays. Two runs of the same solve may use one file: every file is a whole
+    checkpoint, from which either goes on.
 
     Parameters
     ----------
@@ -170,8 +170,8 @@ _CLASSES = (
 class Journal:
     """Writes the checkpoints of one solve, and returns the one that it goes on from.
 
-    It is to be closed after the solve. Without a checkpoint it only runs methods. `stages` are the
-    finished ones of the solve; those of the checkpoint are put there to begin with.
+    Without a checkpoint it only runs methods. `stages` are the finished ones of the solve; those of
+    the checkpoint are put there to begin with.
     """
 
     def __init__(
@@ -179,9 +179,8 @@ class Journal:
     ) -> None:
         """Read the checkpoint, if there is one.
 
-        A FileFormatError when the file is no checkpoint, is damaged, or is where none can be
-        written; a SettingError when it is that of another graph, partition or settings, or another
-        run uses it.
+        A FileFormatError when the file is no checkpoint, or is damaged; a SettingError when it is
+        that of another graph, partition or settings; a PGOError where none can be written.
         """
         self.stages = stages
         self._checkpoint = checkpoint
@@ -191,24 +190,13 @@ class Journal:
         self._snapshots: list[dict[str, NDArray[Any]]] = []  # the robots', of the same
         self._has_warned = False
         self._writes = checkpoint is not None
-        self._lock: RunLock | None = None
         if checkpoint is None:
             return
         path = Path(checkpoint.path)
-        self._lock = RunLock(path)
-        try:
-            if path.exists():
-                self._saved, self._snapshots = _read(path, mark)
-                stages[:] = self._saved.stages
-        except PGOError:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Leave the checkpoint to other runs."""
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+        if path.exists():
+            self._saved, self._snapshots = _read(path, mark)
+            stages[:] = self._saved.stages
+        check_writable(path)
 
     def take_outcome(self) -> JudgedPoses | None:
         """Outcome of the attempt that begins, if the checkpoint is of a later one.
