@@ -5,6 +5,8 @@ import math
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
@@ -15,10 +17,17 @@ from solvers.result import Measurement, Record, Status
 # Both headers together are 80 columns wide.
 _HEADER = f"{'k':>5}  {'F':>15}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"
 _HEADER_OF_ROBOTS = f"  {'rounds':>6}  {'reduces':>7}  {'MB sent':>7}"
-_LINE_AFTER_SECONDS = 1.0
-_SECONDS_BETWEEN_UPDATES = 0.1
-# Side of a matrix whose factorisation may take seconds: 10,000 poses in space.
-_LARGE_SIDE = 40_000
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When a line appears, and how often it is drawn."""
+
+    first_after: float = 1.0  # seconds of the solve
+    between: float = 0.1  # seconds
+    # Side of a matrix whose factorisation may take seconds: 10,000 poses in space.
+    large_side: int = 40_000
+    clock: Callable[[], float] = field(default_factory=lambda: time.perf_counter)
 
 
 def is_shown(progress: bool | None) -> bool:
@@ -33,11 +42,11 @@ def _is_in_notebook() -> bool:
 class StageLine:
     """A line on one stage of a solve: its iterations, if it has any, and what is done just now.
 
-    It appears on stderr, or in the notebook, where the solve has taken `_LINE_AFTER_SECONDS` and
-    the stage is no matter of a moment, or before work that may take seconds. It is removed at the
-    end of the stage. It is drawn when an activity begins: the library that factors lets no other
-    thread draw meanwhile. `began` is the time at which the solve did, and `side` that of a matrix
-    which the stage factors.
+    It appears on stderr, or in the notebook, where the solve has taken `Pace.first_after` seconds
+    and the stage is no matter of a moment, or before work that may take seconds. It is removed at
+    the end of the stage. It is drawn when an activity begins: the library that factors lets no
+    other thread draw meanwhile. `began` is the time at which the solve did, and `side` that of a
+    matrix which the stage factors.
     """
 
     def __init__(
@@ -46,12 +55,14 @@ class StageLine:
         max_iterations: int | None,
         began: float,
         side: int = 0,
+        pace: Pace = Pace(),
     ) -> None:
         self._name = name
-        self._is_large = side >= _LARGE_SIDE
+        self._pace = pace
+        self._is_large = side >= pace.large_side
         self._max_iterations = max_iterations
         self._solve_began = began
-        self._began = time.perf_counter()
+        self._began = pace.clock()
         self._drawn = -math.inf
         self._bar: Any = None  # a _NotebookBar, or a JobBar
         self._watching = watched_by(self)
@@ -62,7 +73,7 @@ class StageLine:
 
     def __enter__(self) -> "StageLine":
         self._watching.__enter__()
-        self._draw(_LINE_AFTER_SECONDS if self._is_large else 0.0)
+        self._draw(self._pace.first_after if self._is_large else 0.0)
         return self
 
     def __exit__(self, *error: Any) -> None:  # noqa: ANN401 - as of any context
@@ -80,8 +91,8 @@ class StageLine:
         """Show what begins (`pgo_models.activity.Watcher`)."""
         self._activities.append(activity)
         self._num_begun[activity.name] += 1
-        is_large = activity.side >= _LARGE_SIDE
-        self._draw(_LINE_AFTER_SECONDS if is_large else _SECONDS_BETWEEN_UPDATES)
+        is_large = activity.side >= self._pace.large_side
+        self._draw(self._pace.first_after if is_large else self._pace.between)
 
     def end(self, activity: Activity) -> None:
         """Show the activity no longer."""
@@ -90,15 +101,16 @@ class StageLine:
 
     def _draw(self, expected: float) -> None:
         """Draw the line, if it is time for it or what follows may take so many seconds."""
-        now = time.perf_counter()
+        pace = self._pace
+        now = pace.clock()
         if self._bar is None:
             elapsed = now - self._began
-            is_due = now - self._solve_began >= _LINE_AFTER_SECONDS
-            is_short = max(elapsed, expected) < _SECONDS_BETWEEN_UPDATES
-            if expected < _LINE_AFTER_SECONDS and (is_short or not is_due):
+            is_due = now - self._solve_began >= pace.first_after
+            is_short = max(elapsed, expected) < pace.between
+            if expected < pace.first_after and (is_short or not is_due):
                 return
             self._bar = self._new_bar(elapsed)
-        at_once = max(now - self._drawn, expected) >= _SECONDS_BETWEEN_UPDATES
+        at_once = max(now - self._drawn, expected) >= pace.between
         if at_once:
             self._drawn = now
         self._bar.show(self._k, self._text(), at_once)
@@ -115,7 +127,7 @@ class StageLine:
 
     def _new_bar(self, elapsed: float) -> Any:  # noqa: ANN401 - one of two classes
         if _is_in_notebook():
-            return _NotebookBar(self._name, self._max_iterations, elapsed)
+            return _NotebookBar(self._name, self._max_iterations, elapsed, self._pace.clock)
         # rich is imported only if a line is shown
         progress_bars = import_module("solvers.progress_bars")
         bar = progress_bars.JobBar(self._max_iterations, True, self._name, elapsed)
@@ -183,13 +195,16 @@ class _NotebookBar:
     It has a bar if iterations are counted. The bar of rich needs ipywidgets in a notebook.
     """
 
-    def __init__(self, name: str, max_iterations: int | None, elapsed: float) -> None:
+    def __init__(
+        self, name: str, max_iterations: int | None, elapsed: float, clock: Callable[[], float]
+    ) -> None:
         from IPython.display import HTML, DisplayHandle
 
         self._name = html.escape(name)
         self._max_iterations = max_iterations
         self._html = HTML
-        self._began = time.perf_counter() - elapsed
+        self._clock = clock
+        self._began = clock() - elapsed
         self._handle = DisplayHandle()
         self._handle.display(HTML(self._page(0, "")))
 
@@ -201,7 +216,7 @@ class _NotebookBar:
         self._handle.update(self._html(""))
 
     def _page(self, k: int, text: str) -> str:
-        seconds = time.perf_counter() - self._began
+        seconds = self._clock() - self._began
         bar = ""
         if self._max_iterations is not None:
             most = self._max_iterations

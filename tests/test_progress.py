@@ -1,7 +1,7 @@
 import sys
-import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from types import ModuleType, TracebackType
 
 import numpy as np
@@ -9,10 +9,10 @@ import pytest
 from rich.progress import Progress
 
 import solvers
-import solvers.progress as table_module
 from pgo_models.activity import Activity, doing
 from pgo_models.graphs import scenes
-from solvers.progress import StageLine, Table, is_shown
+from solvers import loop
+from solvers.progress import Pace, StageLine, Table, is_shown
 from solvers.result import Measurement, Record, Status
 from solvers.riemannian.newton import Newton
 
@@ -21,10 +21,24 @@ RECORDS = [
 ]
 
 
-def line_of(name: str, elapsed: float = 0.0, most: int | None = 100) -> StageLine:
+class Clock:
+    """Stands for `time.perf_counter`."""
+
+    def __init__(self, now: float = 0.0) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        return self.now
+
+
+EVERY_TIME = Pace(between=0.0)  # a line is drawn whenever something is said
+
+
+def line_of(name: str, elapsed: float = 0.0, pace: Pace = EVERY_TIME) -> StageLine:
     """Line on the only stage of a solve, which began so many seconds ago."""
-    line = StageLine(name, most, time.perf_counter() - elapsed)
-    line._began -= elapsed
+    clock = Clock()
+    line = StageLine(name, 100, 0.0, pace=replace(pace, clock=clock))
+    clock.now = elapsed
     return line
 
 
@@ -137,7 +151,7 @@ def test_the_table_takes_the_place_of_the_bar(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graph = scenes.grid(np.random.default_rng(0))
-    monkeypatch.setattr(table_module, "_LARGE_SIDE", 1)
+    monkeypatch.setattr(loop, "StageLine", partial(StageLine, pace=Pace(large_side=1)))
     solvers.run(Newton(), graph, verbose=True, progress=True)
     out, err = capsys.readouterr()
     assert out.startswith("Newton\n")
@@ -165,7 +179,6 @@ class Notebook:
         monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
         monkeypatch.setitem(sys.modules, "IPython.display", display)
         monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
-        monkeypatch.setattr(table_module, "_SECONDS_BETWEEN_UPDATES", 0.0)
 
 
 @pytest.mark.parametrize("progress", [None, True])
@@ -250,7 +263,7 @@ def test_stages_without_iterations_are_shown_on_large_graphs_with_what_is_still_
     graph = scenes.grid(np.random.default_rng(0))
     solvers.solve(graph, progress=True)
     assert "chordal start" not in capsys.readouterr().err
-    monkeypatch.setattr(table_module, "_LARGE_SIDE", 1)
+    monkeypatch.setattr(loop, "StageLine", partial(StageLine, pace=Pace(large_side=1)))
     solvers.solve(graph, progress=True)
     err = capsys.readouterr().err
     start, _, others = err.partition("Newton, then certificate")
@@ -261,22 +274,12 @@ def test_stages_without_iterations_are_shown_on_large_graphs_with_what_is_still_
     assert "certificate  " in certificate
 
 
-class Clock:
-    """Stands for `time.perf_counter`."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 0.0
-        monkeypatch.setattr(table_module.time, "perf_counter", lambda: self.now)
-
-
 OF_M = Activity("factorisation", 4 * 1000)
 
 
 def test_activities_of_one_name_are_counted(monkeypatch) -> None:
     notebook = Notebook(monkeypatch)
-    clock = Clock(monkeypatch)
-    clock.now = 5.0
-    with StageLine("certificate", None, 0.0):
+    with StageLine("certificate", None, -5.0, pace=replace(EVERY_TIME, clock=Clock())):
         for activity in (OF_M, replace(OF_M, name="analysis"), OF_M):
             with doing(activity):
                 pass
@@ -290,9 +293,8 @@ def test_activities_of_one_name_are_counted(monkeypatch) -> None:
 
 def test_activities_within_others_are_shown_together_and_none_after_an_error(monkeypatch) -> None:
     notebook = Notebook(monkeypatch)
-    clock = Clock(monkeypatch)
-    clock.now = 5.0
-    with StageLine("certificate", None, 0.0) as line:
+    pace = replace(EVERY_TIME, clock=Clock())
+    with StageLine("certificate", None, -5.0, pace=pace) as line:
         with suppress(ValueError), doing(Activity("shift 1 of at most 9")), doing(OF_M):
             raise ValueError
         line.show(0, "F 1")
@@ -311,10 +313,8 @@ def test_a_line_waits_for_a_second_of_the_solve_and_a_moment_of_the_stage(
     of_solve, of_stage, is_shown, monkeypatch
 ) -> None:
     notebook = Notebook(monkeypatch)
-    clock = Clock(monkeypatch)
-    monkeypatch.setattr(table_module, "_SECONDS_BETWEEN_UPDATES", 0.1)
-    clock.now = of_solve - of_stage
-    with StageLine("SOC", 100, 0.0) as line:
+    clock = Clock(of_solve - of_stage)
+    with StageLine("SOC", 100, 0.0, pace=Pace(clock=clock)) as line:
         line.show(0, "F 1")
         assert notebook.outputs == []
         clock.now += of_stage
@@ -326,7 +326,7 @@ def test_a_large_matrix_is_shown_before_a_second_has_passed(monkeypatch) -> None
     notebook = Notebook(monkeypatch)
     with line_of("SOC", 0.0), doing(OF_M):
         assert notebook.outputs == []
-    with line_of("SOC", 0.0), doing(replace(OF_M, side=table_module._LARGE_SIDE)):
+    with line_of("SOC", 0.0), doing(replace(OF_M, side=Pace.large_side)):
         assert "factorisation" in notebook.outputs[0][-1]
 
 
