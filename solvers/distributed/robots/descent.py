@@ -40,6 +40,9 @@ def model(robot: Interior, order: ModelOrder) -> tuple[Interior, Reduced | None]
     diagonal = H.diagonal()
     grounded = diagonal.copy()
     if robot.factored.grounds:
+        # A motion of all poses together changes no cost, so that H is singular, and the gradient
+        # orthogonal to it: with pose 0 stiffer the solution leaves that pose where it is, and,
+        # without damping, solves the system without the stiffness, too.
         zero = np.zeros(1, dtype=np.int64)
         v = layout.translations(zero)[0]
         w = layout.rotations(zero)[0]

@@ -30,6 +30,8 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     cut = factored.cut(robot.widths)
     fixed = cut.boundary[order.fixed > 0]
     if not order.is_grounded and factored.grounds:
+        # Without a pose that is left out S is singular, as a shift of all translations costs
+        # nothing: one translation is left out in its place.
         fixed = np.append(fixed, 0)
     if not problem.has_translations:
         fixed = np.union1d(np.arange(problem.num_poses), fixed)

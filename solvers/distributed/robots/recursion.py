@@ -107,7 +107,7 @@ def _factorized(
     positions = problem.diagonal_positions[robot.interior_rows]
     data[positions] += 0.5 * block.rho
     if robot.factored.grounds:
-        # A shift of all translations costs nothing: without the larger entry K would be singular.
+        # As in `Driver.grounding_block`: a shift of all translations costs nothing.
         data[problem.diagonal_positions[0]] *= 2.0
     K = problem.with_pattern_of_M(data)
     eliminated, system = robot.eliminate(K, robot.widths, _pull(robot, block))

@@ -126,6 +126,7 @@ class FactoredPart:
         p = problem.num_poses
         M_tt = problem.M[:p, :p].tocsc()
         if self.grounds:
+            # As in `Driver.grounding_block`: M_tt alone is singular, a shift of all costs nothing.
             M_tt[0, 0] *= 2.0
         following, elimination = self.eliminate(M_tt, (1,))
         return replace(following, known_laplacian=elimination)
