@@ -14,13 +14,11 @@ from typing import Protocol
 class Activity:
     """Something that may take seconds.
 
-    A matrix has its side and its number of entries, zero for other work: activities that are equal
-    take about the same time.
+    `side` is that of the matrix that is worked on, zero for other work.
     """
 
     name: str
     side: int = 0
-    num_entries: int = 0
 
 
 class Watcher(Protocol):

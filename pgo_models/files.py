@@ -20,7 +20,7 @@ LONGEST = 10_000  # characters of a line of numbers; an edge in space with all i
 LONGEST_OF_ALL = 2**16  # bytes of any line, comments included
 _NAMED_LINES = 20  # wrong lines of a file that an error names
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
-_BLOCK = 2**24  # bytes of a file that are split into lines at a time
+BLOCK = 2**24  # bytes of a file that are split into lines at a time
 _SHOWN = 40  # characters of a wrong word that a message shows
 _LF, _CR = b"\n\r"
 
@@ -28,16 +28,16 @@ Problem = tuple[int, str]  # a line of a file, from 1, and what is wrong with it
 Lines = Sequence[int] | NDArray[np.integer[Any]]
 
 
-def read_text(path: Path | str) -> str:
+def read_text(path: Path | str, block: int = BLOCK) -> str:
     """Text of a UTF-8 file, a pipe or a device, with lines that end with LF.
 
     Lines of the file may end with CR LF or CR, too. A FileFormatError when the file is missing,
     cannot be opened, or is not text.
     """
-    return "".join(read_blocks(path))
+    return "".join(read_blocks(path, block))
 
 
-def read_blocks(path: Path | str) -> Iterator[str]:
+def read_blocks(path: Path | str, block: int = BLOCK) -> Iterator[str]:
     """Yield what `read_text` reads in blocks of whole lines, so that no large file is held as text.
 
     Errors are those of `read_text`. A FileFormatError, too, where a line is longer than
@@ -48,7 +48,7 @@ def read_blocks(path: Path | str) -> Iterator[str]:
     num_lines = 0  # lines of the blocks so far
     try:
         with path.open("rb") as file:
-            for data in _whole_lines(file, path):
+            for data in _whole_lines(file, path, block):
                 _check_lines(path, num_lines, data)
                 try:
                     text = data.decode(encoding)
@@ -67,14 +67,14 @@ def read_blocks(path: Path | str) -> Iterator[str]:
         ) from error
 
 
-def _whole_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
+def _whole_lines(file: BinaryIO, path: Path, block: int) -> Iterator[bytes]:
     """Yield blocks of a file that end where a line ends, except perhaps the last one.
 
     Little more than one block is held at a time.
     """
     begun_line = b""
     num_lines = 0  # lines of the blocks so far
-    while chunk := file.read(_BLOCK):
+    while chunk := file.read(block):
         data = begun_line + chunk
         # A CR at the very end may be the first half of CR LF.
         end = max(data.rfind(b"\n"), data.rfind(b"\r", 0, len(data) - 1)) + 1

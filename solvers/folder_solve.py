@@ -25,7 +25,8 @@ from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.checkpoint import Journal
-from solvers.distributed.own_files import READ_HERE, OpenedFiles, open_files, write_answer
+from solvers.distributed.own_files import OpenedFiles, open_files
+from solvers.distributed.robots.own_file import READ_HERE, write_answer
 from solvers.distributed.robots_with_files import RobotsWithFiles
 from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
@@ -202,7 +203,8 @@ def solve_folder(
     opened = open_files(files, engine, robots.driver_memory, weighting, trust_folder)
     name = f"{folder.name}, {FILES_HERE}" if opened.num_absent else folder.name
     driver = opened.driver
-    with closing(driver), closing(Journal(None, {}, stages)) as journal:
+    journal = Journal(None, {}, stages)
+    with closing(driver):
         place = RobotsWithFiles(
             monitor, stages, driver, journal, None, name, pipeline.gap, opened.weighting
         )

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
-from pgo_models.activity import Activity
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -229,8 +228,7 @@ class RunMonitor:
     """For how long several runs may go on together, and what is shown of them; see `run`.
 
     The seconds count from `began`. `poses_found` are those that the runs have ended at. `plan` has
-    the names of all stages in order, so that bars show which are still to come. `seconds_taken` are
-    those of activities, from which bars estimate how long equal ones will take.
+    the names of all stages in order, so that bars show which are still to come.
     """
 
     time_limit: float = math.inf
@@ -240,7 +238,6 @@ class RunMonitor:
     began: float = field(default_factory=lambda: time.perf_counter())
     poses_found: list[Poses] = field(default_factory=list)
     plan: list[str] = field(default_factory=list)
-    seconds_taken: dict[Activity, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.time_limit > 0:
@@ -268,7 +265,7 @@ class RunMonitor:
 
     def _line(self, name: str, max_iterations: int | None, side: int = 0) -> StageLine:
         """A line on a stage, for which it may still be too early."""
-        return StageLine(self._titled(name), max_iterations, self.began, self.seconds_taken, side)
+        return StageLine(self._titled(name), max_iterations, self.began, side)
 
     def _titled(self, name: str) -> str:
         """Name of a stage, and of those that follow it."""
@@ -293,11 +290,10 @@ class RunMonitor:
         if solver is not None:
             problem = as_problem(problem)
         name = type(method).__name__
-        tolerance = getattr(method, "tolerance", 0.0)
         line = None
         if not self.verbose and is_shown(self.progress):
             line = self._line(name, method.max_iterations)
-        with Table(name, self.verbose, line, tolerance) as table:
+        with Table(name, self.verbose, line) as table:
             course = _Course[S](lambda: method.init(problem, start), earlier)
             try:
                 status = self._iterate(method, problem, course, table)
@@ -328,7 +324,7 @@ class RunMonitor:
         """Take steps until the method, the callback or a limit ends the run, and return why."""
         while True:
             record = course.add(method.measure(problem, course.state))
-            table.row(record, course.elapsed)
+            table.row(record)
             status = self._ending(method, course.state, record)
             if status is not None:
                 return status

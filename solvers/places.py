@@ -106,11 +106,8 @@ def _open_robots(request: SolveRequest, gnc: GNC | None) -> Iterator[Place]:
     stages: list[Stage] = []
     shown = request.monitor, stages
     here = Here(*shown, problem, pipeline.gap, where=", in one place")
-    with (
-        closing(Journal(robots.checkpoint, mark, stages)) as journal,
-        closing(
-            open_driver(problem, robots.partition, engine, robots.driver_memory, thresholds)
-        ) as driver,
-    ):
+    journal = Journal(robots.checkpoint, mark, stages)
+    opened = open_driver(problem, robots.partition, engine, robots.driver_memory, thresholds)
+    with closing(opened) as driver:
         kind = RobotsOfGraph if robots.has_driver else RobotsAlone
         yield kind(*shown, driver, journal, robots.faults, here, robots.partition)

@@ -5,6 +5,8 @@ import math
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
@@ -15,11 +17,17 @@ from solvers.result import Measurement, Record, Status
 # Both headers together are 80 columns wide.
 _HEADER = f"{'k':>5}  {'F':>15}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"
 _HEADER_OF_ROBOTS = f"  {'rounds':>6}  {'reduces':>7}  {'MB sent':>7}"
-_LINE_AFTER_SECONDS = 1.0
-_SECONDS_BETWEEN_UPDATES = 0.1
-_SAME_GRAPH = 1.5  # factor within which matrices of one graph have the entries that are expected
-# Side of a matrix whose factorisation may take seconds: 10,000 poses in space.
-_LARGE_SIDE = 40_000
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When a line appears, and how often it is drawn."""
+
+    first_after: float = 1.0  # seconds of the solve
+    between: float = 0.1  # seconds
+    # Side of a matrix whose factorisation may take seconds: 10,000 poses in space.
+    large_side: int = 40_000
+    clock: Callable[[], float] = field(default_factory=lambda: time.perf_counter)
 
 
 def is_shown(progress: bool | None) -> bool:
@@ -34,12 +42,11 @@ def _is_in_notebook() -> bool:
 class StageLine:
     """A line on one stage of a solve: its iterations, if it has any, and what is done just now.
 
-    It appears on stderr, or in the notebook, where the solve has taken `_LINE_AFTER_SECONDS` and
-    the stage is no matter of a moment, or before work that may take seconds. It is removed at the
-    end of the stage. It is drawn when an activity begins: the library that factors lets no other
-    thread draw meanwhile. `seconds_taken` are the seconds that activities of all stages took, from
-    which those of the next are estimated.
-    `began` is the time at which the solve did, and `side` that of a matrix which the stage factors.
+    It appears on stderr, or in the notebook, where the solve has taken `Pace.first_after` seconds
+    and the stage is no matter of a moment, or before work that may take seconds. It is removed at
+    the end of the stage. It is drawn when an activity begins: the library that factors lets no
+    other thread draw meanwhile. `began` is the time at which the solve did, and `side` that of a
+    matrix which the stage factors.
     """
 
     def __init__(
@@ -47,26 +54,26 @@ class StageLine:
         name: str,
         max_iterations: int | None,
         began: float,
-        seconds_taken: dict[Activity, float],
         side: int = 0,
+        pace: Pace = Pace(),
     ) -> None:
         self._name = name
-        self._is_large = side >= _LARGE_SIDE
+        self._pace = pace
+        self._is_large = side >= pace.large_side
         self._max_iterations = max_iterations
         self._solve_began = began
-        self._seconds_taken = seconds_taken
-        self._began = time.perf_counter()
+        self._began = pace.clock()
         self._drawn = -math.inf
         self._bar: Any = None  # a _NotebookBar, or a JobBar
         self._watching = watched_by(self)
         self._k = 0
         self._figures = ""
-        self._activities: list[tuple[Activity, float]] = []  # one within the other, with their time
+        self._activities: list[Activity] = []  # one within the other
         self._num_begun: Counter[str] = Counter()
 
     def __enter__(self) -> "StageLine":
         self._watching.__enter__()
-        self._draw(_LINE_AFTER_SECONDS if self._is_large else 0.0)
+        self._draw(self._pace.first_after if self._is_large else 0.0)
         return self
 
     def __exit__(self, *error: Any) -> None:  # noqa: ANN401 - as of any context
@@ -82,72 +89,45 @@ class StageLine:
 
     def begin(self, activity: Activity) -> None:
         """Show what begins (`pgo_models.activity.Watcher`)."""
-        self._activities.append((activity, time.perf_counter()))
+        self._activities.append(activity)
         self._num_begun[activity.name] += 1
-        expected = self._expected_seconds(activity)
-        if expected is None:
-            is_large = activity.side >= _LARGE_SIDE
-            expected = _LINE_AFTER_SECONDS if is_large else _SECONDS_BETWEEN_UPDATES
-        self._draw(expected)
+        is_large = activity.side >= self._pace.large_side
+        self._draw(self._pace.first_after if is_large else self._pace.between)
 
     def end(self, activity: Activity) -> None:
-        """Remember how long an activity took, and show it no longer."""
-        _, began = self._activities.pop()
-        self._seconds_taken[activity] = time.perf_counter() - began
+        """Show the activity no longer."""
+        self._activities.pop()
         self._draw(0.0)
 
     def _draw(self, expected: float) -> None:
         """Draw the line, if it is time for it or what follows may take so many seconds."""
-        now = time.perf_counter()
+        pace = self._pace
+        now = pace.clock()
         if self._bar is None:
             elapsed = now - self._began
-            is_due = now - self._solve_began >= _LINE_AFTER_SECONDS
-            is_short = max(elapsed, expected) < _SECONDS_BETWEEN_UPDATES
-            if expected < _LINE_AFTER_SECONDS and (is_short or not is_due):
+            is_due = now - self._solve_began >= pace.first_after
+            is_short = max(elapsed, expected) < pace.between
+            if expected < pace.first_after and (is_short or not is_due):
                 return
             self._bar = self._new_bar(elapsed)
-        at_once = max(now - self._drawn, expected) >= _SECONDS_BETWEEN_UPDATES
+        at_once = max(now - self._drawn, expected) >= pace.between
         if at_once:
             self._drawn = now
         self._bar.show(self._k, self._text(), at_once)
 
     def _text(self) -> str:
         """What is done, and the figures of the last iteration."""
-        activities = [self._text_of(activity) for activity, _ in self._activities]
+        activities = [self._text_of(activity) for activity in self._activities]
         return "  ".join([", ".join(activities), self._figures]).strip()
 
     def _text_of(self, activity: Activity) -> str:
-        """An activity, which one it is of its name, and its seconds if they are worth a word."""
+        """An activity, and which one it is of its name."""
         count = self._num_begun[activity.name]
-        text = f"{activity.name} {count}" if count > 1 else activity.name
-        seconds = self._expected_seconds(activity) or 0.0
-        return f"{text} (about {seconds:.0f} s)" if seconds >= _LINE_AFTER_SECONDS else text
-
-    def _expected_seconds(self, activity: Activity) -> float | None:
-        """Seconds that an activity is expected to take; None if nothing is known of them.
-
-        They are those of an equal one, or those of the largest matrix of the same graph times the
-        cube of the ratio of their rows for each pose. Of one graph are matrices whose entries are
-        as many as the square of that ratio says.
-        """
-        if activity in self._seconds_taken:
-            return self._seconds_taken[activity]
-        expected = None
-        largest_side = 0
-        for measured, seconds in self._seconds_taken.items():
-            is_larger = measured.name == activity.name and measured.side > largest_side
-            if not is_larger or seconds < _SECONDS_BETWEEN_UPDATES:
-                continue
-            ratio = activity.side / measured.side
-            entries = activity.num_entries / (ratio**2 * measured.num_entries)
-            if 1.0 / _SAME_GRAPH <= entries <= _SAME_GRAPH:
-                largest_side = measured.side
-                expected = ratio**3 * seconds
-        return expected
+        return f"{activity.name} {count}" if count > 1 else activity.name
 
     def _new_bar(self, elapsed: float) -> Any:  # noqa: ANN401 - one of two classes
         if _is_in_notebook():
-            return _NotebookBar(self._name, self._max_iterations, elapsed)
+            return _NotebookBar(self._name, self._max_iterations, elapsed, self._pace.clock)
         # rich is imported only if a line is shown
         progress_bars = import_module("solvers.progress_bars")
         bar = progress_bars.JobBar(self._max_iterations, True, self._name, elapsed)
@@ -155,19 +135,10 @@ class StageLine:
 
 
 class Table:
-    """Prints one line for every iterate if `verbose`, or else shows figures of it in a `line`.
+    """Prints one line for every iterate if `verbose`, or else shows figures of it in a `line`."""
 
-    If the run ends when residuals fall below a `tolerance`, the line has the seconds that are left,
-    provided that the logarithm of the residual keeps falling at its mean rate so far.
-    """
-
-    def __init__(
-        self, name: str, verbose: bool, line: StageLine | None = None, tolerance: float = 0.0
-    ) -> None:
+    def __init__(self, name: str, verbose: bool, line: StageLine | None = None) -> None:
         self._name = name
-        self._tolerance = tolerance
-        self._first_residual = math.inf  # the first one that is known, and when it was
-        self._first_elapsed = 0.0
         self._has_header = False
         self._verbose = verbose
         self._line = line
@@ -181,23 +152,20 @@ class Table:
         if self._line is not None:
             self._line.__exit__(*error)
 
-    def row(self, record: Record, elapsed: float) -> None:
-        """Show one record after `elapsed` seconds of wall time."""
+    def row(self, record: Record) -> None:
+        """Show one record."""
         figures = record.measurement
-        residual = max(figures.primal_residual, figures.dual_residual)
-        if math.isinf(self._first_residual):
-            self._first_residual = residual
-            self._first_elapsed = elapsed
         if self._verbose:
             self._print_row(record)
         if self._line is not None:
-            texts = [self._time_left(residual, elapsed)]
+            residual = max(figures.primal_residual, figures.dual_residual)
+            texts = []
             if math.isfinite(residual):
                 texts.append(f"residual {residual:.1e}")
             texts.append(f"F {rounded_up(figures.objective, 8)}")
             if figures.num_bytes is not None:
                 texts.append(f"{1e-6 * figures.num_bytes:.2f} MB")
-            self._line.show(record.k, "  ".join(filter(None, texts)))
+            self._line.show(record.k, "  ".join(texts))
 
     def _print_row(self, record: Record) -> None:
         """Print a line of the table, and before the first one its header."""
@@ -220,15 +188,6 @@ class Table:
         if self._verbose:
             print(f"{status.name} after {iterations} iterations: {status.value}", flush=True)
 
-    def _time_left(self, residual: float, elapsed: float) -> str:
-        """Text on the seconds left; empty if nothing is known of them."""
-        if not 0.0 < self._tolerance < residual < self._first_residual < math.inf:
-            return ""
-        past_decades = math.log10(self._first_residual / residual)
-        decades_left = math.log10(residual / self._tolerance)
-        seconds = (elapsed - self._first_elapsed) * decades_left / past_decades
-        return f"about {seconds:.0f} s left" if seconds >= 1.0 else ""
-
 
 class _NotebookBar:
     """A line in the output of a notebook's cell, made of HTML.
@@ -236,13 +195,16 @@ class _NotebookBar:
     It has a bar if iterations are counted. The bar of rich needs ipywidgets in a notebook.
     """
 
-    def __init__(self, name: str, max_iterations: int | None, elapsed: float) -> None:
+    def __init__(
+        self, name: str, max_iterations: int | None, elapsed: float, clock: Callable[[], float]
+    ) -> None:
         from IPython.display import HTML, DisplayHandle
 
         self._name = html.escape(name)
         self._max_iterations = max_iterations
         self._html = HTML
-        self._began = time.perf_counter() - elapsed
+        self._clock = clock
+        self._began = clock() - elapsed
         self._handle = DisplayHandle()
         self._handle.display(HTML(self._page(0, "")))
 
@@ -254,7 +216,7 @@ class _NotebookBar:
         self._handle.update(self._html(""))
 
     def _page(self, k: int, text: str) -> str:
-        seconds = time.perf_counter() - self._began
+        seconds = self._clock() - self._began
         bar = ""
         if self._max_iterations is not None:
             most = self._max_iterations

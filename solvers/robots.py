@@ -19,9 +19,10 @@ class Checkpoint:
     """Where and how often a solve by robots writes what it needs to go on.
 
     If the file exists when a solve begins, the solve goes on from it. The file is removed when the
-    solve has converged, and stays when the solve was stopped, interrupted or out of time. While a
-    solve runs it is locked for others. Where a checkpoint cannot be written, say on a full disk,
-    there is one warning, and the last one that could be written stays.
+    solve has converged, and stays when the solve was stopped, interrupted or out of time. Where a
+    checkpoint cannot be written, say on a full disk, there is one warning, and the last one that
+    could be written stays. Two runs of the same solve may use one file: every file is a whole
+    checkpoint, from which either goes on.
 
     Parameters
     ----------

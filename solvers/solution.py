@@ -1,50 +1,58 @@
 """Solution: poses, cost, certificate and what each stage did; it prints and saves itself."""
 
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.proof_file import save_proof
-from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
-from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.g2o import check_g2o_folder, write_g2o, write_g2o_folder
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import extreme_weight, indefinite_edges, proper_information
-from pgo_models.graphs.residuals import chi2
-from pgo_models.graphs.trajectories import write_kitti, write_tum
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
-from pgo_models.plots.style import check_installed, is_picture, save_figure
-from pgo_models.problem.floating_point import UNIT_ROUNDOFF
+from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.hessian import riemannian_hessian, unknowns_of
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
-from pgo_models.problem.weighting import Weighting, name_of_cost
+from solvers.gauge import choose_gauge as choose_gauge
 from solvers.network.ledger import Ledger
-from solvers.reporting.result_table import finite_or_none
+from solvers.reporting.json_records import (
+    certificate_json as certificate_json,
+    network_json,
+    stage_json,
+    write_json as write_json,
+)
+from solvers.reporting.notes import (
+    joined_notes as joined_notes,
+    note_of as note_of,
+    note_of_absence as note_of_absence,
+    note_of_coupling as note_of_coupling,
+    note_of_weights as note_of_weights,
+    verdict_suffix as verdict_suffix,
+)
+from solvers.reporting.result_files import (
+    check_format as check_format,
+    check_target as check_target,
+    write_poses,
+)
+from solvers.reporting.two_costs import (
+    Facts,
+    both_costs as both_costs,
+    facts_of_unknowns as facts_of_unknowns,
+    other_cost as other_cost,
+)
 from solvers.reporting.versions import installed_versions
 from solvers.result import Stage, Status
 from solvers.robust.rejection import Rejection, Support
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Facts = list[tuple[str, str]]  # labels and texts, as they are printed
-_SAME_COST = 1e-9  # relative difference below which two costs are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,21 +231,12 @@ class Solution:
         """
         path = Path(path)
         check_format(path)
-        graph = self.problem.graph
-        bodies = graph.bodies
-        suffix = path.suffix.lower()
-        if suffix == ".g2o":
-            write_g2o(graph, path, self.poses)
-        elif suffix == "":
-            write_g2o_folder(graph, path, self.poses)
-        elif suffix in (".tum", ".txt"):
-            write_tum(self.poses[bodies], path, graph.times)
-        elif suffix == ".kitti":
-            write_kitti(self.poses[bodies], path)
-        elif suffix == ".json":
+        if is_picture(path):
+            save_figure(self.plot(), path)
+        elif path.suffix.lower() == ".json":
             write_json(self.as_json(), path)
         else:
-            save_figure(self.plot(), path)
+            write_poses(self.problem.graph, self.poses, path)
 
     def save_proof(self, path: Path | str) -> None:
         """Write what proves the lower bound, for `pgo verify` and `verify_proof`.
@@ -320,6 +319,9 @@ class Solution:
         """
         graph = self.problem.graph
         named = graph.in_files
+        network = {}
+        if self.ledger is not None and self.robots is not None:
+            network = network_json(self.ledger, self.robots)
         translations = {}
         if self.problem.has_translations:
             translations["t"] = self.poses.t[named].tolist()
@@ -340,8 +342,8 @@ class Solution:
             "frame": self.frame,
             "status": self.status.name,
             "seconds": self.seconds,
-            "stages": [_stage_json(stage) for stage in self.stages],
-            **self._network_json(),
+            "stages": [stage_json(stage) for stage in self.stages],
+            **network,
             "versions": installed_versions(self.problem.backend),
             "ids": graph.pose_ids[named].tolist(),
             "R": self.poses.R[named].tolist(),
@@ -415,249 +417,3 @@ class Solution:
         range_of_sizes = f"{sizes.min()} to {sizes.max()} poses each"
         robots = f"{len(sizes)}, {range_of_sizes}, {self.robots.method.value}"
         return [("robots", robots), *self.ledger.facts()]
-
-    def _network_json(self) -> dict[str, object]:
-        """What `.json` files hold of robots and of what they sent."""
-        ledger = self.ledger
-        if ledger is None or self.robots is None:
-            return {}
-        network = {
-            "rounds": ledger.rounds,
-            "all_reduces": ledger.all_reduces,
-            "messages": ledger.messages,
-            "bytes": ledger.num_bytes,
-            "snapshot_bytes": ledger.snapshot_bytes,
-            "bytes_sent": ledger.bytes_sent.tolist(),
-            "bytes_received": ledger.bytes_received.tolist(),
-        }
-        return {"robots": self.robots.robot.tolist(), "network": network}
-
-
-def _stage_json(stage: Stage) -> dict[str, object]:
-    """What `.json` files hold of a stage."""
-    return {
-        "name": stage.name,
-        "status": stage.status.name,
-        "iterations": stage.iterations,
-        "objective": stage.objective,
-        "seconds": stage.seconds,
-    }
-
-
-def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | None]:
-    """What `.json` files hold of the costs of poses: F, chi2 (chordal), which of them is the cost.
-
-    chi2 is None without a file's matrices, or where these are indefinite; `edges_without_coupling`
-    counts those whose coupling blocks it leaves out, and `note` says so if it is the cost. Both are
-    None of rotations alone in a graph with translations, which would be part of them.
-    """
-    graph = problem.graph
-    weighting = problem.weighting
-    isotropic = problem
-    if weighting is not Weighting.ISOTROPIC:
-        isotropic = PGOProblem(graph, problem.backend, Weighting.ISOTROPIC)
-    is_complete = problem.has_translations == graph.has_translations
-    has_chi2 = graph.information is not None and not indefinite_edges(graph).any()
-    num_uncoupled = 0 if graph.uncoupled is None else int(graph.uncoupled.sum())
-    return {
-        "unknowns": "poses" if problem.has_translations else "rotations",
-        "weighting": weighting.name if isinstance(weighting, Weighting) else "GIVEN",
-        "F": isotropic.objective(poses) if is_complete else None,
-        "chi2": chi2(graph, poses) if is_complete and has_chi2 else None,
-        "edges_without_coupling": num_uncoupled,
-        "note": joined_notes(note_of_absence(len(graph.absent)), note_of_coupling(problem)),
-    }
-
-
-def other_cost(problem: PGOProblem, poses: Poses) -> Facts:
-    """What a summary says of the cost that is not bounded, where it is another."""
-    costs = both_costs(problem, poses)
-    other = costs["chi2"]
-    other_weighting = Weighting.INFORMATION
-    weights = "the file's information matrices"
-    if costs["edges_without_coupling"]:
-        weights += f", without the coupling blocks of {costs['edges_without_coupling']} edges"
-    if costs["weighting"] == "INFORMATION":
-        other = costs["F"]
-        other_weighting = Weighting.ISOTROPIC
-        num_precisions = "two precisions" if problem.has_translations else "one precision"
-        weights = f"{num_precisions} an edge"
-    objective = problem.objective(poses)
-    if not isinstance(other, float) or abs(other - objective) <= _SAME_COST * objective:
-        return []
-    name = name_of_cost(other_weighting, problem.has_translations)
-    bounded = problem.cost_name
-    return [(name, f"{rounded_up(other)} with {weights}; the bound is on {bounded} alone")]
-
-
-def facts_of_unknowns(problem: PGOProblem, of_poses: str) -> Facts:
-    """What a summary says where the unknowns are rotations alone, and why they are.
-
-    `of_poses` says what becomes of the translations of the poses.
-    """
-    if problem.has_translations:
-        return []
-    why = "no edge measures a translation"
-    if problem.graph.has_translations:
-        why = "measured translations are left out"
-    return [("unknowns", f"rotations alone: {why}, and those of the poses are {of_poses}")]
-
-
-def check_format(path: Path) -> None:
-    """Raise what `Solution.save` would for the suffix of a path.
-
-    That is a SettingError for an unknown one, or an error where matplotlib is missing.
-    """
-    suffix = path.suffix.lower()
-    if is_picture(path):
-        check_installed(path)
-    elif suffix not in ("", ".g2o", ".tum", ".txt", ".kitti", ".json"):
-        known = ".g2o, .tum, .kitti, .json, .png, .svg or .pdf"
-        raise SettingError(f"cannot write {path}: no format has suffix {suffix!r}; use {known}")
-
-
-def check_target(path: Path, num_robots: int) -> None:
-    """Raise what `Solution.save` would for a path, before there is a solution of these robots."""
-    check_format(path)
-    if path.suffix == "":
-        check_g2o_folder(path, num_robots)
-    else:
-        check_writable(path)
-
-
-def write_json(record: dict[str, object], path: Path) -> None:
-    """Write a record, whole or not at all."""
-    with replace_when_done(path) as temporary:
-        temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def certificate_json(certificate: Certificate) -> dict[str, object]:
-    """What `.json` files hold of a certificate; None stands for what is not known.
-
-    That is eta where none was proved, the error of the objective where no bound on it is known, and
-    the stationarity where it was not measured. `exact_to` is ROUNDING, COORDINATES or DIGITS where
-    the verdict is EXACT.
-    """
-    return {
-        "lower_bound": certificate.lower_bound,
-        "gap": certificate.gap,
-        "proven_gap": certificate.proven_gap,
-        "wanted_gap": certificate.wanted_gap,
-        "eta": finite_or_none(certificate.eta),
-        "grounded": certificate.bound.is_grounded,
-        "rounding": certificate.bound.rounding,
-        "objective_error": finite_or_none(certificate.objective_error),
-        "weights_error": certificate.weights_error,
-        "digits": certificate.digits,
-        "stationarity": finite_or_none(certificate.stationarity),
-        "verdict": certificate.verdict.name,
-        "exact_to": None if certificate.fit is Fit.NONE else certificate.fit.name,
-    }
-
-
-def note_of(problem: PGOProblem, certificate: Certificate, lacks: str = "") -> str:
-    """Note of a solution: absent robots, coupling left out, and what the certificate lacks.
-
-    The last is `lacks`, or unless given what `note_of_weights` and `note_of_tangent` say.
-    """
-    found = note_of_weights(problem.graph, certificate) or note_of_tangent(problem, certificate)
-    absence = note_of_absence(len(problem.graph.absent))
-    return joined_notes(absence, note_of_coupling(problem), lacks or found)
-
-
-def joined_notes(*notes: str) -> str:
-    """Notes that say something, as one."""
-    return "; ".join(note for note in notes if note)
-
-
-def note_of_absence(num_absent: int) -> str:
-    """Sentence on what a solution holds for where edges name poses of absent robots, or ""."""
-    if num_absent == 0:
-        return ""
-    return (
-        f"edges name {num_absent} poses of robots without a file here: cost, bound and verdict "
-        "are of the files here alone, not of the graph of all robots"
-    )
-
-
-def verdict_suffix(num_absent: int) -> str:
-    """What a verdict says where edges name poses of absent robots, or ""."""
-    return "; this is of the files here alone, without absent robots" if num_absent else ""
-
-
-def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
-    """Sentence on a weight that is too far from the others for a bound, or "".
-
-    That is so where no bound was found, and beside this weight rounding hides more than the gap
-    that was asked for.
-    """
-    if certificate.verdict is not Verdict.TRIVIAL:
-        return ""
-    spread, _, text = extreme_weight(graph, certificate.has_translations)
-    if spread * UNIT_ROUNDOFF <= certificate.wanted_gap:
-        return ""
-    return f"{text}, too far from others for a proof; correct it, or solve graph.unit_weights()"
-
-
-def note_of_tangent(problem: PGOProblem, certificate: Certificate) -> str:
-    """Sentence on translations whose information the bound on chi2 cannot keep, or "".
-
-    That is so where the bound is one of smaller information matrices: the tangent keeps of every
-    I_tt its smallest eigenvalue, and the largest of them is beyond what could be proven.
-    """
-    if certificate.is_certified or certificate.bound.cap == math.inf:
-        return ""
-    d = problem.d
-    information = proper_information(problem.graph)[:, :d, :d]
-    values = np.linalg.eigvalsh(information)
-    is_known = values[:, 0] > 0.0
-    condition = values[is_known, -1] / values[is_known, 0]
-    num_beyond = int((condition > certificate.bound.cap).sum())
-    if num_beyond == 0:
-        return ""
-    return (
-        f"chi2 is open because of its translations: the information of {num_beyond} edges has a "
-        f"condition of up to {condition.max():.2g}, and the bound could keep "
-        f"{certificate.bound.cap:.2g}; F has no such loss"
-    )
-
-
-def note_of_coupling(problem: PGOProblem) -> str:
-    """Sentence on the coupling blocks that chi2 leaves out, or ""."""
-    graph = problem.graph
-    if problem.weighting is not Weighting.INFORMATION or graph.uncoupled is None:
-        return ""
-    if not graph.uncoupled.any():
-        return ""
-    count = f"coupling blocks of {graph.uncoupled.sum()} of {graph.num_edges} edges left out"
-    return f"{count}, as their information matrices are indefinite"
-
-
-def choose_gauge(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:
-    """Poses in the frame of priors, anchor, first FIX line, estimate or pose 0.
-
-    Returned are the moved poses, a sentence on their frame, and the pose that it is held by, 0
-    where there is none.
-    """
-    reference = graph.initial
-    if graph.world is not None:
-        ignored = "; FIX lines are ignored beside them" if len(graph.fixed) else ""
-        return poses.with_gauge_at(graph.world), f"that of the priors{ignored}", graph.world
-    held = anchor
-    why = "as asked for"
-    if anchor is None and len(graph.fixed):
-        held = int(graph.fixed[0])
-        why = "by its FIX line"
-        num_others = len(graph.fixed) - 1
-        if num_others:
-            why += f"; those of {num_others} other poses are ignored, F leaves one frame open"
-    if held is None:
-        if reference is not None:
-            frame = "aligned with the estimate that came with the graph"
-            return poses.aligned_to(reference), frame, 0
-        return poses.with_gauge_at(0), f"pose {graph.pose_ids[0]} at the identity", 0
-    name = f"pose {graph.pose_ids[held]}"
-    if reference is not None:
-        moved = poses.anchored_to(reference, held)
-        return moved, f"{name} where the estimate has it, {why}", held
-    return poses.with_gauge_at(held), f"{name} at the identity, {why}", held

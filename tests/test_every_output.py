@@ -19,8 +19,8 @@ from pgo_models.errors import NotPositiveDefiniteError, PGOError
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.trajectories import read_kitti, read_tum
-from solvers import solution as solution_file
 from solvers.cli.shell import save_then_show
+from solvers.reporting import result_files
 
 PICTURES = ["x.png", "x.svg", "x.pdf"]
 TRAJECTORIES = ["x.g2o", "x.tum", "x.txt", "x.kitti"]
@@ -147,7 +147,7 @@ def test_a_writer_that_fails_is_named_and_keeps_none_of_the_others(
     def fails(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(solution_file, "write_tum", fails)
+    monkeypatch.setattr(result_files, "write_tum", fails)
     outs = repeated("-o", tmp_path, ["x.g2o", "x.tum", "x.json"])
     code, out, err = pgo_command("solve", "grid", *outs, "--report", tmp_path / "x.html")
     assert (code, err.count("\n")) == (1, 1)

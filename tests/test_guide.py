@@ -190,6 +190,7 @@ ROOMS_OF_AN_ITERATION = (
     "solvers.distributed.robots.agent",
     "solvers.distributed.robots.interior",
     "solvers.distributed.robots.records",
+    "solvers.distributed.robots.system",
     "solvers.distributed.robots_of_graph",
     "solvers.distributed.substructured",
     "solvers.network.counted_pool",

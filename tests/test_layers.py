@@ -33,6 +33,7 @@ ORDER = {
     "solvers": (
         "distribution",
         "result",
+        "gauge",
         "progress_bars",
         "progress",
         "network",

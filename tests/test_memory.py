@@ -185,21 +185,19 @@ def test_a_line_without_end_is_refused_before_it_is_held(read, tmp_path):
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r", b"\r\n"], ids=["lf", "cr", "crlf"])
-def test_lines_are_whole_wherever_blocks_end_and_errors_count_them(end, tmp_path, monkeypatch):
+def test_lines_are_whole_wherever_blocks_end_and_errors_count_them(end, tmp_path):
     lines = [f"line {k} \u00e9".encode() for k in range(200)]
     path = tmp_path / "x"
     path.write_bytes(end.join(lines) + end)
     whole = "".join(line.decode() + "\n" for line in lines)
     for size in (*range(1, 40), 1000):
-        monkeypatch.setattr("pgo_models.files._BLOCK", size)
-        blocks = list(read_blocks(path))
-        assert "".join(blocks) == read_text(path) == whole
+        blocks = list(read_blocks(path, size))
+        assert "".join(blocks) == read_text(path, size) == whole
         assert all(block.endswith("\n") for block in blocks)
     for wrong in (b"\xff", b"\0", b"x" * (LONGEST_OF_ALL + 1)):
         path.write_bytes(end.join([*lines[:120], wrong, *lines]))
         for size in (13, 1000, 2**24):
-            monkeypatch.setattr("pgo_models.files._BLOCK", size)
             with pytest.raises(FileFormatError, match=r"x:121: "):
-                read_text(path)
+                read_text(path, size)
     path.write_bytes(end.join([b"#" * LONGEST_OF_ALL, b"1", b"2"]))
     np.testing.assert_array_equal(read_times(path), [1.0, 2.0])

@@ -1,7 +1,7 @@
 import sys
-import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from types import ModuleType, TracebackType
 
 import numpy as np
@@ -9,10 +9,10 @@ import pytest
 from rich.progress import Progress
 
 import solvers
-import solvers.progress as table_module
 from pgo_models.activity import Activity, doing
 from pgo_models.graphs import scenes
-from solvers.progress import StageLine, Table, is_shown
+from solvers import loop
+from solvers.progress import Pace, StageLine, Table, is_shown
 from solvers.result import Measurement, Record, Status
 from solvers.riemannian.newton import Newton
 
@@ -21,10 +21,24 @@ RECORDS = [
 ]
 
 
-def line_of(name: str, elapsed: float = 0.0, most: int | None = 100) -> StageLine:
+class Clock:
+    """Stands for `time.perf_counter`."""
+
+    def __init__(self, now: float = 0.0) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        return self.now
+
+
+EVERY_TIME = Pace(between=0.0)  # a line is drawn whenever something is said
+
+
+def line_of(name: str, elapsed: float = 0.0, pace: Pace = EVERY_TIME) -> StageLine:
     """Line on the only stage of a solve, which began so many seconds ago."""
-    line = StageLine(name, most, time.perf_counter() - elapsed, {})
-    line._began -= elapsed
+    clock = Clock()
+    line = StageLine(name, 100, 0.0, pace=replace(pace, clock=clock))
+    clock.now = elapsed
     return line
 
 
@@ -32,7 +46,7 @@ def shown(verbose: bool, progress: bool | None, elapsed: float = 0.0) -> None:
     line = line_of("SOC", elapsed) if is_shown(progress) and not verbose else None
     with Table("SOC", verbose, line) as table:
         for record in RECORDS:
-            table.row(record, elapsed)
+            table.row(record)
         table.end(Status.CONVERGED, 2)
 
 
@@ -65,7 +79,7 @@ def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[s
     )
     with Table("SOC", verbose=True) as table:
         for k in (0, 99_999):
-            table.row(Record(k, 9999.999, measured), 0.0)
+            table.row(Record(k, 9999.999, measured))
     lines = capsys.readouterr().out.splitlines()[1:]
     assert {len(line) for line in lines} == {80}
     assert lines[-1].split() == [
@@ -84,16 +98,16 @@ def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[s
 
 def test_a_run_that_goes_on_has_a_head_too(capsys: pytest.CaptureFixture[str]) -> None:
     with Table("SOC", verbose=True) as table:
-        table.row(Record(7, 0.0, Measurement(1.0, 1e-3, 1e-3)), 0.0)
-        table.row(Record(8, 0.0, Measurement(1.0, 1e-4, 1e-4)), 0.0)
+        table.row(Record(7, 0.0, Measurement(1.0, 1e-3, 1e-3)))
+        table.row(Record(8, 0.0, Measurement(1.0, 1e-4, 1e-4)))
     name, head, *rows = capsys.readouterr().out.splitlines()
     assert (name, "primal" in head, len(rows)) == ("SOC", True, 2)
 
 
 def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
     with Table("SOC", verbose=True) as table:
-        table.row(Record(0, 0.0, Measurement(1.0, float("inf"), float("inf"))), 0.0)
-        table.row(Record(1, 0.0, Measurement(float("nan"), float("nan"), float("nan"))), 0.0)
+        table.row(Record(0, 0.0, Measurement(1.0, float("inf"), float("inf"))))
+        table.row(Record(1, 0.0, Measurement(float("nan"), float("nan"), float("nan"))))
     rows = capsys.readouterr().out.splitlines()[2:]
     assert rows[0].split() == ["0", "1", "-", "-", "0.000"]
     assert rows[1].split() == ["1", "nan", "nan", "nan", "0.000"]
@@ -101,7 +115,7 @@ def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixtur
 
 def test_names_with_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
     with Table("SOC[bold]", verbose=True) as table:
-        table.row(RECORDS[0], 0.0)
+        table.row(RECORDS[0])
     assert capsys.readouterr().out.splitlines()[0] == "SOC[bold]"
 
 
@@ -116,17 +130,6 @@ def test_a_long_run_shows_a_bar_on_stderr_alone(
     assert out == ""
     assert "SOC" in err
     assert "2/100" in err
-
-
-@pytest.mark.parametrize(("tolerance", "left"), [(2e-2, True), (0.0, False), (2.0, False)])
-def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(
-    tolerance, left, monkeypatch
-) -> None:
-    notebook = Notebook(monkeypatch)
-    with Table("SOC", False, line_of("SOC", 10.0), tolerance) as table:
-        table.row(RECORDS[0], 0.5)
-        table.row(RECORDS[1], 10.0)  # one decade of two in ten seconds
-    assert ("about 10 s left" in notebook.outputs[0][-2]) == left
 
 
 @pytest.mark.parametrize("status", Status)
@@ -148,7 +151,7 @@ def test_the_table_takes_the_place_of_the_bar(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graph = scenes.grid(np.random.default_rng(0))
-    monkeypatch.setattr(table_module, "_LARGE_SIDE", 1)
+    monkeypatch.setattr(loop, "StageLine", partial(StageLine, pace=Pace(large_side=1)))
     solvers.run(Newton(), graph, verbose=True, progress=True)
     out, err = capsys.readouterr()
     assert out.startswith("Newton\n")
@@ -176,7 +179,6 @@ class Notebook:
         monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
         monkeypatch.setitem(sys.modules, "IPython.display", display)
         monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
-        monkeypatch.setattr(table_module, "_SECONDS_BETWEEN_UPDATES", 0.0)
 
 
 @pytest.mark.parametrize("progress", [None, True])
@@ -228,7 +230,7 @@ def test_the_bar_is_stopped_whatever_happens(
 
     def interrupted() -> None:
         with Table("SOC", False, line_of("SOC", 10.0)) as table:
-            table.row(RECORDS[1], 10.0)
+            table.row(RECORDS[1])
             assert not stopped
             if error is not None:
                 raise error
@@ -261,7 +263,7 @@ def test_stages_without_iterations_are_shown_on_large_graphs_with_what_is_still_
     graph = scenes.grid(np.random.default_rng(0))
     solvers.solve(graph, progress=True)
     assert "chordal start" not in capsys.readouterr().err
-    monkeypatch.setattr(table_module, "_LARGE_SIDE", 1)
+    monkeypatch.setattr(loop, "StageLine", partial(StageLine, pace=Pace(large_side=1)))
     solvers.solve(graph, progress=True)
     err = capsys.readouterr().err
     start, _, others = err.partition("Newton, then certificate")
@@ -272,46 +274,27 @@ def test_stages_without_iterations_are_shown_on_large_graphs_with_what_is_still_
     assert "certificate  " in certificate
 
 
-class Clock:
-    """Stands for `time.perf_counter`."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 0.0
-        monkeypatch.setattr(table_module.time, "perf_counter", lambda: self.now)
+OF_M = Activity("factorisation", 4 * 1000)
 
 
-HESSIAN = Activity("factorisation", 6 * 1000, 36 * 5000)
-OF_M = Activity("factorisation", 4 * 1000, 16 * 5000)
-OTHER_GRAPH = Activity("factorisation", 6 * 1000, 36 * 15000)
-
-
-@pytest.mark.parametrize(
-    ("activity", "text"),
-    [
-        (OF_M, "factorisation 2 (about 8 s)"),  # as measured
-        (HESSIAN, "factorisation 2 (about 27 s)"),  # 1.5^3 times that
-        (OTHER_GRAPH, "factorisation 2"),  # nothing is known of it
-        (replace(HESSIAN, name="analysis"), "analysis"),
-    ],
-)
-def test_the_seconds_of_a_factorisation_are_estimated_from_what_is_measured(
-    activity, text, monkeypatch
-) -> None:
+def test_activities_of_one_name_are_counted(monkeypatch) -> None:
     notebook = Notebook(monkeypatch)
-    clock = Clock(monkeypatch)
-    with StageLine("certificate", None, 0.0, {}):
-        with doing(OF_M):
-            clock.now += 8.0
-        with doing(activity):
-            pass
-    assert f"certificate {text} 8 s" in notebook.outputs[0]
+    with StageLine("certificate", None, -5.0, pace=replace(EVERY_TIME, clock=Clock())):
+        for activity in (OF_M, replace(OF_M, name="analysis"), OF_M):
+            with doing(activity):
+                pass
+    shown_texts = [text for text in notebook.outputs[0] if text.removeprefix("certificate").strip()]
+    assert [text.split()[1:-2] for text in shown_texts if len(text.split()) > 3] == [
+        ["factorisation"],
+        ["analysis"],
+        ["factorisation", "2"],
+    ]
 
 
 def test_activities_within_others_are_shown_together_and_none_after_an_error(monkeypatch) -> None:
     notebook = Notebook(monkeypatch)
-    clock = Clock(monkeypatch)
-    clock.now = 5.0
-    with StageLine("certificate", None, 0.0, {}) as line:
+    pace = replace(EVERY_TIME, clock=Clock())
+    with StageLine("certificate", None, -5.0, pace=pace) as line:
         with suppress(ValueError), doing(Activity("shift 1 of at most 9")), doing(OF_M):
             raise ValueError
         line.show(0, "F 1")
@@ -330,10 +313,8 @@ def test_a_line_waits_for_a_second_of_the_solve_and_a_moment_of_the_stage(
     of_solve, of_stage, is_shown, monkeypatch
 ) -> None:
     notebook = Notebook(monkeypatch)
-    clock = Clock(monkeypatch)
-    monkeypatch.setattr(table_module, "_SECONDS_BETWEEN_UPDATES", 0.1)
-    clock.now = of_solve - of_stage
-    with StageLine("SOC", 100, 0.0, {}) as line:
+    clock = Clock(of_solve - of_stage)
+    with StageLine("SOC", 100, 0.0, pace=Pace(clock=clock)) as line:
         line.show(0, "F 1")
         assert notebook.outputs == []
         clock.now += of_stage
@@ -345,14 +326,17 @@ def test_a_large_matrix_is_shown_before_a_second_has_passed(monkeypatch) -> None
     notebook = Notebook(monkeypatch)
     with line_of("SOC", 0.0), doing(OF_M):
         assert notebook.outputs == []
-    with line_of("SOC", 0.0), doing(replace(OF_M, side=table_module._LARGE_SIDE)):
+    with line_of("SOC", 0.0), doing(replace(OF_M, side=Pace.large_side)):
         assert "factorisation" in notebook.outputs[0][-1]
 
 
-def test_nobody_is_told_of_activities_after_a_line() -> None:
-    taken: dict[Activity, float] = {}
-    with StageLine("SOC", 100, time.perf_counter(), taken):
+def test_nobody_is_told_of_activities_after_a_line(monkeypatch) -> None:
+    notebook = Notebook(monkeypatch)
+    with line_of("SOC", 10.0):
         pass
     with doing(OF_M):
         pass
-    assert taken == {}
+    assert all("factorisation" not in text for output in notebook.outputs for text in output)
+    with line_of("SOC", 10.0), doing(OF_M):
+        pass
+    assert any("factorisation" in text for output in notebook.outputs for text in output)

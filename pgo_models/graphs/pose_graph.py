@@ -691,17 +691,9 @@ class PoseGraph(ReadOnly):
     # Other graphs made of this one
 
     def subgraph(self, poses: IntArray) -> PoseGraph:
-        """Return the graph of some poses and of the edges among them.
+        """Return the graph of some poses, (k,), and of the edges among them.
 
-        Parameters
-        ----------
-        poses : IntArray, (k,)
-            Poses to keep. They keep their ids, and are numbered anew in ascending order.
-
-        Returns
-        -------
-        PoseGraph
-            Graph of these poses.
+        The poses keep their ids, and are numbered anew in ascending order.
 
         Raises
         ------

@@ -129,7 +129,7 @@ class SymbolicCholesky(ABC):
         self._indptr = pattern.indptr
         self._indices = pattern.indices
         self._shape = pattern.shape
-        self._factorisation = Activity("factorisation", pattern.shape[0], pattern.nnz)
+        self._factorisation = Activity("factorisation", pattern.shape[0])
 
     @abstractmethod
     def factorize(

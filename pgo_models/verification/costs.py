@@ -1,9 +1,9 @@
 """The cost of a graph as a quadratic form: F, which is one, or a tangent of chi2, nowhere above it.
 
-The rows of pose i are X_i = (t_i^T; R_i^T). An edge has the residual rho = X_j - T X_i, where
+The rows of pose i are X_i = (t_i^T; R_i^T). An edge has the residual delta = X_j - T X_i, where
 T = (1, t_ij^T; 0, R_ij^T); that of a position is the first row alone.
 
-**F** is the sum of tr(rho^T W rho) with W = diag(tau, kappa I), tau = d / tr(I_tt^-1), and
+**F** is the sum of tr(delta^T W delta) with W = diag(tau, kappa I), tau = d / tr(I_tt^-1), and
 kappa = 3 / (2 tr(I_rr^-1)) in space, I_theta in the plane (SE-Sync). **F(R)**, of rotations alone,
 has tau = 0.
 
@@ -11,20 +11,20 @@ has tau = 0.
 turn by theta about a. Both s = a sin theta and H = (1 - cos theta) a a^T are linear in E. With the
 blocks of the information matrix turned into that frame, the cost of an edge is
 
-    r^T I_tt r + 2 r^T I_tr s + 2 tr(I_rr H) = tr(rho^T W rho) + u^T J u + tr(H K H),
-    u = (r, s),   J = (I_tt - tau I, I_tr; I_tr^T, K),   W = blockdiag(tau, V),
+    r^T I_tt r + 2 r^T I_tr s + 2 tr(I_rr H) = tr(delta^T W delta) + u^T J u + tr(H J_ss H),
+    u = (r, s),   J = (I_tt - tau I, I_tr; I_tr^T, J_ss),   W = blockdiag(tau, W_R),
 
-for any tau and K, where V = tr(I_rr - K) / 2 I - (I_rr - K), in the plane (I_theta - K) / 2 I:
-tr(V (2 I - E - E^T)) = 2 (1 - cos theta) a^T (I_rr - K) a by Rodrigues' formula, and
-2 (1 - cos theta) a^T K a = s^T K s + tr(H K H). For K = I_tr^T (I_tt - tau I)^-1 I_tr and a tau
-below the smallest eigenvalue of I_tt both J and K are positive semidefinite, so that the last two
-terms are a convex function of Z = rho R_i, in which u and H are linear. Let 2 C be its gradient at
-some Z'. The function is quadratic, so that its value at Z' is <C, Z'>, and being convex it is at
-least its tangent 2 <C, Z> - <C, Z'>. There <C, rho R_i> = <C R_i^T, rho> is bilinear in the rows of
-X.
+for any tau and J_ss, where W_R = tr(I_rr - J_ss) / 2 I - (I_rr - J_ss), and in the plane
+W_R = (I_theta - J_ss) / 2 I. For tr(W_R (2 I - E - E^T)) = 2 (1 - cos theta) a^T (I_rr - J_ss) a by
+Rodrigues' formula, and 2 (1 - cos theta) a^T J_ss a = s^T J_ss s + tr(H J_ss H). With
+J_ss = I_tr^T (I_tt - tau I)^-1 I_tr and a tau below the smallest eigenvalue of I_tt both J and J_ss
+are positive semidefinite, so that the last two terms are a convex function of Z = delta R_i, in
+which u and H are linear. Let 2 C be its gradient at some Z'. The function is quadratic, so that its
+value at Z' is <C, Z'>, and being convex it is at least its tangent 2 <C, Z> - <C, Z'>. There
+<C, delta R_i> = <C R_i^T, delta> is bilinear in the rows of X.
 
-Any tau and K will do that make J positive semidefinite, of which K is a block. A proof may say
-which: its multipliers and its handedness terms belong to the form that follows from them.
+Any tau and J_ss will do that make J positive semidefinite, of which J_ss is a block. A proof may
+say which: its multipliers and its handedness terms belong to the form that follows from them.
 
 **A matrix that is semidefinite but for rounding**, as a file of so many digits has it, would make
 chi2 negative somewhere. As everywhere in this project, chi2 is then that of the matrix with 2^-45
@@ -58,7 +58,7 @@ from pgo_models.verification.proof import ROTATION_COSTS, UNIT_COSTS, Split
 
 RESOLUTION = 2.0**-26  # of a bisection, relative
 BELOW = 1.0 - 2.0**-24  # of the largest tau: what is left of the matrix is well above rounding
-COUPLED_SHARE = 0.5  # of the largest tau, so that K stays moderate
+COUPLED_SHARE = 0.5  # of the largest tau, so that J_ss stays moderate
 SINGULAR_SHARE = 2.0**-20  # of it where the coupling leaves nothing of a matrix
 ROUNDED_ENTRIES = fmpq(1, 2**45)  # share of the diagonal that the rounding of entries can hide
 KEPT = 2**16  # information matrices whose weights are remembered
@@ -125,7 +125,7 @@ def add_edge(
     form.add(edge.i, edge.j, -(weighted_begin * end))
     form.add(edge.j, edge.j, weighted_end * end)
     if tangent is not None:
-        # 2 <C, rho R_i> = 2 <(0, C) X_i, rho>: S gets half of each product and of its transpose.
+        # 2 <C, delta R_i> = 2 <(0, C) X_i, delta>: S gets half of every product, and its transpose.
         no_translation = arb_mat(tangent.C.nrows(), 1)
         pull = beside(no_translation, tangent.C).transpose()
         pull_begin = pull * begin
@@ -136,7 +136,7 @@ def add_edge(
 
 
 def residual_matrices(edge: Edge, rows_j: int) -> tuple[arb_mat, arb_mat]:
-    """T and the matrix before X_j in rho, the identity; of a position their first rows."""
+    """T and the matrix before X_j in delta, the identity; of a position their first rows."""
     d = edge.tag.d
     top = beside(identity(1), edge.t.transpose())
     if edge.tag.is_point:
@@ -147,7 +147,7 @@ def residual_matrices(edge: Edge, rows_j: int) -> tuple[arb_mat, arb_mat]:
     return T, identity(d + 1)
 
 
-def isotropic_cost(edge: Edge, cost: str, rho: arb_mat) -> tuple[arb, arb_mat]:
+def isotropic_cost(edge: Edge, cost: str, delta: arb_mat) -> tuple[arb, arb_mat]:
     """Share of an edge in F, and W."""
     kappa, tau = precisions(edge.triangle, edge.tag.d, edge.tag.is_point)
     if cost in UNIT_COSTS:
@@ -155,9 +155,9 @@ def isotropic_cost(edge: Edge, cost: str, rho: arb_mat) -> tuple[arb, arb_mat]:
         tau = fmpq(tau != 0)
     if cost in ROTATION_COSTS:
         tau = fmpq(0)
-    kappas = [kappa] * (rho.nrows() - 1)
+    kappas = [kappa] * (delta.nrows() - 1)
     W = diagonal([tau, *kappas])
-    share = (rho.transpose() * W * rho).trace()
+    share = (delta.transpose() * W * delta).trace()
     return share, W
 
 
@@ -219,7 +219,7 @@ def information_cost(
     axes = range(d, edge.tag.side)
     I_tt = edge.block(translation, translation)
     I_tr = edge.block(translation, axes)
-    tau, K = translation_weight(edge, I_tr, splits)
+    tau, J_ss = translation_weight(edge, I_tr, splits)
     I_tt_less_tau = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
     # Translations: the residual r and I_tt - tau I, both in the frame of pose i.
     r = translation_residual(edge, X_i, X_j)
@@ -231,24 +231,24 @@ def information_cost(
         return share, diagonal([tau]), tangent
     # Rotations: s = a sin theta and H = (1 - cos theta) a a^T of E.
     I_rr = edge.block(axes, axes)
-    V = rotation_weight(arb_mat(I_rr - K), d)
-    W = blocks_on_diagonal(diagonal([tau]), V)
+    W_R = rotation_weight(arb_mat(I_rr - J_ss), d)
+    W = blocks_on_diagonal(diagonal([tau]), W_R)
     turn = R if d == 3 else identity(1)  # of axes of rotations
     E = rotation_residual(R, X_i, X_j)
     s = axis_times_sine(E)
     H = axis_times_versine(E)
-    B = R * arb_mat(I_tr) * turn.transpose()
+    turned_I_tr = R * arb_mat(I_tr) * turn.transpose()
     turned_I_rr = turn * arb_mat(I_rr) * turn.transpose()
-    share += 2 * inner(r, B * s) + 2 * inner(H, turned_I_rr)
-    if not any([*I_tt_less_tau.entries(), *I_tr.entries(), *K.entries()]):
+    share += 2 * inner(r, turned_I_tr * s) + 2 * inner(H, turned_I_rr)
+    if not any([*I_tt_less_tau.entries(), *I_tr.entries(), *J_ss.entries()]):
         return share, W, None
-    # The tangent of u^T J u + tr(H K H): half its gradients in r, s and H are y_r, y_s and
+    # The tangent of u^T J u + tr(H J_ss H): half its gradients in r, s and H are y_r, y_s and
     # (N + N^T) / 2.
-    turned_K = turn * arb_mat(K) * turn.transpose()
-    y_r = Dr + B * s
-    y_s = B.transpose() * r + turned_K * s
-    N = turned_K * H
-    # From E to the rotation rows of Z = rho R_i, in which E - I is linear: E - I = (R Z_R)^T.
+    turned_J_ss = turn * arb_mat(J_ss) * turn.transpose()
+    y_r = Dr + turned_I_tr * s
+    y_s = turned_I_tr.transpose() * r + turned_J_ss * s
+    N = turned_J_ss * H
+    # From E to the rotation rows Z_R of Z = delta R_i, in which E - I is linear: E - I = (R Z_R)^T.
     gradient_in_E = skew(y_s) + versine_adjoint(N + N.transpose(), d)
     half_gradient_in_E = gradient_in_E * arb(0.5)
     C = above(y_r.transpose(), (half_gradient_in_E * R).transpose())
@@ -301,14 +301,14 @@ def proper_triangle(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> tuple
 def translation_weight(
     edge: Edge, I_tr: fmpq_mat, splits: Sequence[Split]
 ) -> tuple[fmpq, fmpq_mat]:
-    """The tau and K of an edge: of the first split that fits it, else of the verifier's choice."""
+    """The tau and J_ss of an edge, of the first split that fits it, else of its own choice."""
     d = edge.tag.d
     num_axes = edge.tag.side - d
     for split in splits:
         tau = exact(split.tau)
-        K = tuple(map(exact, split.K)) or (fmpq(0),) * (num_axes * (num_axes + 1) // 2)
-        if fits(edge.triangle, d, edge.tag.is_point, tau, K):
-            return tau, fmpq_mat(symmetric(K, num_axes)) if K else fmpq_mat(0, 0)
+        J_ss = tuple(map(exact, split.J_ss)) or (fmpq(0),) * (num_axes * (num_axes + 1) // 2)
+        if fits(edge.triangle, d, edge.tag.is_point, tau, J_ss):
+            return tau, fmpq_mat(symmetric(J_ss, num_axes)) if J_ss else fmpq_mat(0, 0)
     tau = own_translation_weight(edge.triangle, d, edge.tag.is_point)
     if not any(I_tr.entries()):
         return tau, fmpq_mat(num_axes, num_axes)
@@ -320,15 +320,15 @@ def translation_weight(
 
 @lru_cache(maxsize=KEPT)
 def fits(
-    triangle: tuple[fmpq, ...], d: int, is_point: bool, tau: fmpq, K: tuple[fmpq, ...]
+    triangle: tuple[fmpq, ...], d: int, is_point: bool, tau: fmpq, J_ss: tuple[fmpq, ...]
 ) -> bool:
-    """Whether tau and K, an upper triangle, make J positive semidefinite, exactly."""
+    """Whether tau and J_ss, an upper triangle, make J positive semidefinite, exactly."""
     side = information_side(d, is_point)
-    if len(K) != (side - d) * (side - d + 1) // 2:
+    if len(J_ss) != (side - d) * (side - d + 1) // 2:
         return False
     J = less_tau(symmetric(triangle, side), tau, d)
-    if K:
-        for a, row in enumerate(symmetric(K, side - d), d):
+    if J_ss:
+        for a, row in enumerate(symmetric(J_ss, side - d), d):
             J[a][d:] = row
     return is_semidefinite(J)
 
@@ -338,9 +338,9 @@ def own_translation_weight(triangle: tuple[fmpq, ...], d: int, is_point: bool) -
     """A tau for any edge: I_tt where that is isotropic and not coupled, else as large as it may be.
 
     What it may be is below the largest tau with I - blockdiag(tau I, 0) positive definite, which
-    keeps the term with V convex. A coupled I that is only semidefinite leaves no such tau: there it
-    is a small share of the smallest eigenvalue of I_tt, and V a little indefinite, of which the
-    proof asks nothing.
+    keeps the term with W_R convex. A coupled I that is only semidefinite leaves no such tau: there
+    it is a small share of the smallest eigenvalue of I_tt, and W_R a little indefinite, of which
+    the proof asks nothing.
     """
     rows = symmetric(triangle, information_side(d, is_point))
     I_tt = [row[:d] for row in rows[:d]]
@@ -396,7 +396,7 @@ def inner(A: arb_mat, B: arb_mat) -> arb:
 
 
 def rotation_weight(I_rr: arb_mat, d: int) -> arb_mat:
-    """V with tr(V (2 I - E - E^T)) = 2 (1 - cos theta) a^T I_rr a."""
+    """W_R with tr(W_R (2 I - E - E^T)) = 2 (1 - cos theta) a^T I_rr a."""
     half_trace = I_rr.trace() / 2
     if d == 2:
         return identity(2) * half_trace

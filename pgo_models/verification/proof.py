@@ -35,10 +35,10 @@ class HandednessTerm:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """How the proof splits chi2 of an edge into a quadratic form and a convex rest: tau and K."""
+    """The tau and J_ss by which chi2 of an edge is split into a quadratic and a convex part."""
 
     tau: float
-    K: tuple[float, ...]  # upper triangle, row by row; empty for a K of zeros
+    J_ss: tuple[float, ...]  # upper triangle, row by row; empty for a J_ss of zeros
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Proof:
     Lambda: dict[int, list[float]]
     terms: list[HandednessTerm]
     # Of the edges from a pose to another, in the order of the file of the graph. The verifier
-    # chooses tau and K itself where they are missing or do not fit.
+    # chooses tau and J_ss itself where they are missing or do not fit.
     splits: dict[tuple[int, int], list[Split]] = field(default_factory=dict)
 
 
@@ -128,10 +128,10 @@ def read_splits(path: Path, record: dict[str, Any], d: int) -> dict[tuple[int, i
     for row in rows:
         i = name_of(path, entry(path, row, "i"))
         j = name_of(path, entry(path, row, "j"))
-        K = row.get("J_ss", [])
-        if K:
-            K = numbers(path, K, "J_ss of a split", size_of_triangle)
-        split = Split(number_entry(path, row, "tau"), tuple(K))
+        J_ss = row.get("J_ss", [])
+        if J_ss:
+            J_ss = numbers(path, J_ss, "J_ss of a split", size_of_triangle)
+        split = Split(number_entry(path, row, "tau"), tuple(J_ss))
         splits.setdefault((i, j), []).append(split)
     return splits
 

@@ -26,20 +26,20 @@ definite, then for all poses X
 
     (A)   cost(X) >= q(X') - tr(G_r^T H^-1 G_r) - 8 eta (number of rotations - 1).
 
-Proof. Shift X so that its pose r is at the origin, which does not change q(X). Let the rotation Q
-be the transpose of its R there; then X and X' Q have the same rows of pose r, so that Z = X - X' Q
-is zero there. As Q Q^T = I, q(X' Q) = q(X'), and
+Proof. Shift X so that its pose r is at the origin, which does not change q(X). Let the rotation V
+be the transpose of its R there; then X and X' V have the same rows of pose r, so that Z = X - X' V
+is zero there. As V V^T = I, q(X' V) = q(X'), and
 
-    q(X) = q(X') + 2 tr((G_r Q)^T Z_r) + tr(Z_r^T S_r Z_r)
-         = q(X') + 2 tr((G_r Q)^T Z_r) + tr(Z_r^T H Z_r) - eta sum_i ||R_i^T - P_i Q||_F^2,
+    q(X) = q(X') + 2 tr((G_r V)^T Z_r) + tr(Z_r^T S_r Z_r)
+         = q(X') + 2 tr((G_r V)^T Z_r) + tr(Z_r^T H Z_r) - eta sum_i ||R_i^T - P_i V||_F^2,
 
 where P_i is the rotation block of X'_i, and the sum is over all rotations but that of pose r. Two
 rotations are at most sqrt(8) apart, so that the sum is at most 8 (number of rotations - 1). The
 terms before it complete the square
 
-    tr((Z_r + H^-1 G_r Q)^T H (Z_r + H^-1 G_r Q)) - tr((G_r Q)^T H^-1 G_r Q),
+    tr((Z_r + H^-1 G_r V)^T H (Z_r + H^-1 G_r V)) - tr((G_r V)^T H^-1 G_r V),
 
-whose first term is not negative; the second is tr(G_r^T H^-1 G_r), as Q cancels in the trace.
+whose first term is not negative; the second is tr(G_r^T H^-1 G_r), as V cancels in the trace.
 
 With Lambda_i - eta I in place of Lambda_i, S becomes S + eta blockdiag(0, I), and G becomes G' =
 G + eta blockdiag(0, I) X', while q(X') stays, for the P_i are rotations. The matrix without pose r
@@ -63,9 +63,9 @@ the multiplier of a stationary point then has no lever of their length.
 
 **Handedness terms.** In three dimensions a proof may take terms off q that are never negative on
 rotations, so that the smaller form bounds the cost as well. For poses i and j, a rotation T and a
-positive semidefinite P, let rho = R_j^T - T^T R_i^T and W = (tr(P) / 2 I - P) / 4. Where the
+positive semidefinite P, let delta = R_j^T - T^T R_i^T and W = (tr(P) / 2 I - P) / 4. Where the
 rotation E = T^T R_i^T R_j has the unit quaternion (w, v), Rodrigues' formula gives
-tr(rho^T W rho) = tr(W (2 I - E - E^T)) = v^T P v >= 0. A reflection is no such E: that is what
+tr(delta^T W delta) = tr(W (2 I - E - E^T)) = v^T P v >= 0. A reflection is no such E: that is what
 these terms know, and S does not.
 
 **The arithmetic.** Numbers of the file are rational numbers. What is computed from them is a ball:
@@ -439,13 +439,13 @@ def subtract_terms(
         T = exact_rotation(term.T, f"T of {pose_name(term.i)} and {pose_name(term.j)}")
         W = blocks_on_diagonal(zero, weight_of_term(term))
         begin = blocks_on_diagonal(zero, T.transpose())
-        rho = blocks_on_diagonal(zero, identity(3)) * X[term.j] - begin * X[term.i]
+        delta = blocks_on_diagonal(zero, identity(3)) * X[term.j] - begin * X[term.i]
         form.add(term.i, term.i, -(begin.transpose() * W * begin))
         form.add(term.i, term.j, begin.transpose() * W)
         form.add(term.j, term.j, -W)
-        G[term.i] += begin.transpose() * W * rho
-        G[term.j] -= W * rho
-        terms_at_X += (rho.transpose() * W * rho).trace()
+        G[term.i] += begin.transpose() * W * delta
+        G[term.j] -= W * delta
+        terms_at_X += (delta.transpose() * W * delta).trace()
     return terms_at_X
 
 
@@ -595,10 +595,10 @@ def eliminate(H: dict[int, dict[int, arb_mat]], G: dict[int, arb_mat]) -> arb_ma
     Minus its trace is the minimum of tr(Z^T H Z) + 2 tr(G^T Z), which is taken over the rows Z_k of
     one pose at a time. The terms with Z_k are
 
-        tr(Z_k^T P Z_k) + 2 tr(Z_k^T V),   P = H_kk,   V = G_k + sum_{i != k} H_ki Z_i.
+        tr(Z_k^T P Z_k) + 2 tr(Z_k^T U),   P = H_kk,   U = G_k + sum_{i != k} H_ki Z_i.
 
-    If the pivot P is positive definite, their minimum over Z_k, at Z_k = -P^-1 V, is -tr(V^T P^-1
-    V). Multiplied out, that is the constant -tr(G_k^T P^-1 G_k), and terms in the other Z_i, which
+    If the pivot P is positive definite, their minimum over Z_k, at Z_k = -P^-1 U, is -tr(U^T P^-1
+    U). Multiplied out, that is the constant -tr(G_k^T P^-1 G_k), and terms in the other Z_i, which
     change their form to
 
         H_ij <- H_ij - H_ik P^-1 H_kj,   G_i <- G_i - H_ik P^-1 G_k.

@@ -48,7 +48,7 @@ class ExtendedStep:
             raise SettingError(
                 "a changed subproblem is that of the whole graph; use Coupling.JOINT"
             )
-        rho = subproblem.penalty[n::d]
+        rho = subproblem.rho[n::d]
         return graph_qp(self.graph, rho, changer=self.changer, solver=self.solver)
 
 

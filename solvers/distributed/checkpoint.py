@@ -24,7 +24,7 @@ from pgo_models.certificates.certificate import BoundSource, Certificate, Verdic
 from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.errors import FileFormatError, PGOError, SettingError
-from pgo_models.files import replace_when_done
+from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.problem.problem import PGOProblem
@@ -32,7 +32,6 @@ from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import CoverPoses, Driver, DriverState
 from solvers.distributed.newton import SubstructuredNewtonState
 from solvers.distributed.robots.records import RightHandSide
-from solvers.distributed.run_lock import RunLock
 from solvers.distributed.substructured import SubstructuredState
 from solvers.loop import Method, RunMonitor
 from solvers.network.ledger import Ledger, Traffic
@@ -53,7 +52,7 @@ from solvers.soc.soc import SOC
 S = TypeVar("S")
 JudgedPoses = tuple[Poses, Certificate]
 # First line of a file; the second is the SHA-256 of all that follows.
-_FORMAT = b"pgo-splitting checkpoint 6\n"
+_FORMAT = b"pgo-splitting checkpoint 7\n"
 _DIGEST_SIZE = 65
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")
@@ -127,8 +126,8 @@ _CLASSES = (
 class Journal:
     """Writes the checkpoints of one solve, and returns the one that it goes on from.
 
-    It is to be closed after the solve. Without a checkpoint it only runs methods. `stages` are the
-    finished ones of the solve; those of the checkpoint are put there to begin with.
+    Without a checkpoint it only runs methods. `stages` are the finished ones of the solve; those of
+    the checkpoint are put there to begin with.
     """
 
     def __init__(
@@ -136,9 +135,8 @@ class Journal:
     ) -> None:
         """Read the checkpoint, if there is one.
 
-        A FileFormatError when the file is no checkpoint, is damaged, or is where none can be
-        written; a SettingError when it is that of another graph, partition or settings, or another
-        run uses it.
+        A FileFormatError when the file is no checkpoint, or is damaged; a SettingError when it is
+        that of another graph, partition or settings; a PGOError where none can be written.
         """
         self.stages = stages
         self._checkpoint = checkpoint
@@ -148,24 +146,13 @@ class Journal:
         self._snapshots: list[dict[str, NDArray[Any]]] = []  # the robots', of the same
         self._has_warned = False
         self._writes = checkpoint is not None
-        self._lock: RunLock | None = None
         if checkpoint is None:
             return
         path = Path(checkpoint.path)
-        self._lock = RunLock(path)
-        try:
-            if path.exists():
-                self._saved, self._snapshots = _read(path, mark)
-                stages[:] = self._saved.stages
-        except PGOError:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Leave the checkpoint to other runs."""
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+        if path.exists():
+            self._saved, self._snapshots = _read(path, mark)
+            stages[:] = self._saved.stages
+        check_writable(path)
 
     def take_outcome(self) -> JudgedPoses | None:
         """Outcome of the attempt that begins, if the checkpoint is of a later one.

@@ -68,6 +68,7 @@ from pgo_models.relaxations.low_rank import poses_from, tangent_widths
 from solvers.distributed.elimination_choice import CoverSystem
 from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.multifrontal import FrontOwners
+from solvers.distributed.robots import current_poses, start, translations
 from solvers.distributed.robots.agent import order_interior
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import (
@@ -287,7 +288,7 @@ class Driver:
 
     def describe(self, count: Count) -> None:
         """Ask for the diagonal of M at the current poses."""
-        self.diagonal = self.gather_diagonal(self.ask(Interior.describe, None, count))
+        self.diagonal = self.gather_diagonal(self.ask(current_poses.describe, None, count))
 
     def choose_cost(self, final: bool) -> None:
         """Make one of two costs the current one, see `is_final`.
@@ -296,7 +297,7 @@ class Driver:
         """
         if self.has_two_costs and final != self.is_final:
             self.is_final = final
-            answers = self.ask(Interior.choose_cost, final, Count.PIGGYBACKED)
+            answers = self.ask(current_poses.choose_cost, final, Count.PIGGYBACKED)
             self.current = self.with_cost(self.current, answers)
 
     def reweigh(self, order: Reweigh) -> None:
@@ -421,7 +422,7 @@ class Driver:
         self.saved = state.saved
         self.network.ledger = state.ledger
         self.is_final = state.is_final
-        answers = self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)
+        answers = self.ask(translations.send_matrix_again, None, Count.PIGGYBACKED)
         matrices = [answer.schur for answer in answers if answer.schur is not None]
         # Robots that had not sent their part yet have none. Without all parts the matrix is
         # factored when it is needed (`best_translations`).
@@ -437,20 +438,20 @@ class Driver:
         gathers those of the translations and scatters the best ones. An `averaged` start, where
         `can_average`, takes a round more, for a step of rotation averaging (`chordal_start`).
         """
-        answers = self.ask(Interior.chordal, None, Count.PIGGYBACKED)
+        answers = self.ask(start.chordal, None, Count.PIGGYBACKED)
         # Unknowns of these widths are solved for at the start alone: the factor is not kept.
         interface = replace(self._any_widths, widths=(self.d,))
         factor = interface.factorize([answer.schur for answer in answers])
         Y, parts, _ = factor.solve([answer.right.b for answer in answers])
         self.current = replace(self.current, R=project_to_rotations(unstack_transposes(Y)))
-        self.ask_each(Interior.project, parts, is_along=True)
+        self.ask_each(start.project, parts, is_along=True)
         if averaged:
             assert self._stiffness is not None
-            pulls = self.ask(Interior.average, self._stiffness, Count.PIGGYBACKED)
+            pulls = self.ask(start.average, self._stiffness, Count.PIGGYBACKED)
             angles, parts = self.best_translations(pulls)  # the same matrix
             self.current = replace(self.current, R=self.current.R @ exp_map(angles))
-            self.ask_each(Interior.turn_by, parts, is_along=True)
-        self.set_translations(self.ask(Interior.translations, None, Count.PIGGYBACKED))
+            self.ask_each(start.turn_by, parts, is_along=True)
+        self.set_translations(self.ask(translations.reduce_translations, None, Count.PIGGYBACKED))
 
     def set_poses(self, poses: Poses) -> None:
         """Take all poses as they are, with F and M X on the cover, gathered with the next round.
@@ -459,7 +460,7 @@ class Driver:
         """
         self.hand_out(poses)
         self.current = self.with_cost(
-            self.current, self.ask(Interior.evaluate, None, Count.PIGGYBACKED)
+            self.current, self.ask(current_poses.evaluate, None, Count.PIGGYBACKED)
         )
 
     def hand_out(self, poses: Poses) -> None:
@@ -472,7 +473,7 @@ class Driver:
             raise GraphError(f"{poses} for {expected}; give one pose for every pose of the graph")
         self.current = replace(self.current, R=poses.R[self.cover], t=poses.t[self.cover])
         poses_of_parts = [poses[part] for part in self._parts if part is not None]
-        self.ask_each(Interior.set_poses, poses_of_parts, Count.OFF)
+        self.ask_each(current_poses.set_poses, poses_of_parts, Count.OFF)
 
     def poses_of_cover(self) -> list[Poses]:
         """Poses of the cover for every robot that holds some of them."""
@@ -481,12 +482,12 @@ class Driver:
     def save_poses(self) -> None:
         """Save the current poses, here and on the robots."""
         self.saved = self.current
-        self.ask(Interior.save_poses, None, Count.PIGGYBACKED)
+        self.ask(current_poses.save_poses, None, Count.PIGGYBACKED)
 
     def restore_poses(self) -> None:
         """Return to the saved poses, here and on the robots."""
         self.current = self.saved
-        self.ask(Interior.restore_poses, None, Count.PIGGYBACKED)
+        self.ask(current_poses.restore_poses, None, Count.PIGGYBACKED)
 
     def accept(self, trial: CoverPoses) -> None:
         """Go to the trial, here and on all robots, even if Ctrl-C arrives meanwhile.
@@ -495,9 +496,9 @@ class Driver:
         twice is at the trial, as after once.
         """
         try:
-            self.ask(Interior.accept, None, Count.PIGGYBACKED)
+            self.ask(current_poses.accept, None, Count.PIGGYBACKED)
         except KeyboardInterrupt:
-            self.ask(Interior.accept, None, Count.OFF)
+            self.ask(current_poses.accept, None, Count.OFF)
             self.current = trial
             raise
         self.current = trial
@@ -509,7 +510,7 @@ class Driver:
         """
         self.current = replace(self.current, R=R)
         parts = self.scattered_rotations(stack_transposes(R))
-        self.set_translations(self.ask_each(Interior.adopt, parts))
+        self.set_translations(self.ask_each(translations.adopt, parts))
 
     def set_translations(self, answers: Sequence[ReducedTranslations]) -> None:
         """Go to the best translations for the current rotations: one round.
@@ -517,7 +518,7 @@ class Driver:
         `answers` are the robots' reduced right-hand sides, which were gathered by the ask before.
         """
         t, parts = self.best_translations(answers)
-        costs = self.ask_each(Interior.set_translations, parts, is_along=True)
+        costs = self.ask_each(translations.set_translations, parts, is_along=True)
         self.current = self.with_cost(replace(self.current, t=t), costs)
 
     def best_translations(
@@ -529,7 +530,7 @@ class Driver:
             # that were sent has failed, and they are needed again.
             eliminated: Sequence[ReducedTranslations] = answers
             if any(answer.schur is None for answer in answers):
-                eliminated = self.ask(Interior.eliminated_translations, None, Count.PIGGYBACKED)
+                eliminated = self.ask(translations.send_matrix_again, None, Count.PIGGYBACKED)
             matrices = [answer.schur for answer in eliminated if answer.schur is not None]
             self._factorize_laplacian(matrices)
         assert self._laplacian is not None
@@ -567,7 +568,7 @@ def collect(driver: Driver) -> tuple[Poses, Array]:
     R[driver.cover] = driver.current.R
     t[driver.cover] = driver.current.t
     Lambda[driver.cover] = driver.current.multipliers
-    for own in driver.ask(Interior.result, None, Count.OFF):
+    for own in driver.ask(current_poses.result, None, Count.OFF):
         R[own.poses] = own.R
         t[own.poses] = own.t
         Lambda[own.poses] = own.Lambda

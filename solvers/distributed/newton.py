@@ -17,7 +17,7 @@ from pgo_models.problem.hessian import TangentLayout
 from pgo_models.relaxations.low_rank import LiftedPoses, poses_from
 from solvers.distributed.driver import CoverPoses, Driver
 from solvers.distributed.interface import InterfaceFactor
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots import descent
 from solvers.distributed.robots.records import Move, Reduced, RightHandSide, TrialEvaluation
 from solvers.network.counted_pool import Count
 from solvers.network.moments import Moment
@@ -136,9 +136,9 @@ class EliminatedAlgebra:
         driver = self.driver
         if length == 1.0:
             moves = [Move(part, length) for part in model.parts]
-            answers = driver.ask_each(Interior.move_straight, moves)
+            answers = driver.ask_each(descent.move_straight, moves)
         else:
-            answers = driver.ask(Interior.go_straight, length, Count.PIGGYBACKED)
+            answers = driver.ask(descent.go_straight, length, Count.PIGGYBACKED)
         R, t = self._moved(model, length)
         return self._trial(R, t, answers)
 
@@ -147,11 +147,11 @@ class EliminatedAlgebra:
         driver = self.driver
         if length == 1.0:
             moves = [Move(part, length) for part in model.parts]
-            turned = driver.ask_each(Interior.move, moves)
+            turned = driver.ask_each(descent.move, moves)
         else:
-            turned = driver.ask(Interior.turn, length, Count.PIGGYBACKED)
+            turned = driver.ask(descent.turn, length, Count.PIGGYBACKED)
         t, parts = driver.best_translations(turned)
-        answers = driver.ask_each(Interior.evaluate_trial, parts, is_along=True)
+        answers = driver.ask_each(descent.evaluate_trial, parts, is_along=True)
         return self._trial(self._moved(model, length)[0], t, answers)
 
     def _moved(self, model: Model, length: float) -> tuple[Array, Array]:
@@ -235,7 +235,7 @@ def model_at(driver: Driver, order: ModelOrder) -> Model | None:
 
     None when a robot's interior, or the sum of what they reduce to, is not positive definite.
     """
-    answers = driver.ask(Interior.model, order, Count.PIGGYBACKED)
+    answers = driver.ask(descent.model, order, Count.PIGGYBACKED)
     reduced = [answer for answer in answers if answer is not None]
     if len(reduced) < len(answers):
         return None

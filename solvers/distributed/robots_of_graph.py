@@ -27,7 +27,7 @@ from solvers.distributed.handedness import (
 )
 from solvers.distributed.lower_bound import best_bound_distributed, best_bound_with_terms
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots.translations import reduce_translations
 from solvers.distributed.robots_alone import tree_traffic
 from solvers.distributed.robust import SharedGNC, inliers_of
 from solvers.handedness.ascent import AscentState
@@ -182,7 +182,7 @@ class RobotsOfGraph(DriverPlace):
         poses = best.known_poses
         driver.choose_cost(final=True)
         driver.set_poses(poses)
-        driver.set_translations(driver.ask(Interior.translations, None, Count.PIGGYBACKED))
+        driver.set_translations(driver.ask(reduce_translations, None, Count.PIGGYBACKED))
         driver.describe(Count.PIGGYBACKED)
         if Pi is None:
             begin_without_terms(driver)

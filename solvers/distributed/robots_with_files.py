@@ -25,7 +25,7 @@ from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import CoverPoses
 from solvers.distributed.driver_place import DriverPlace
 from solvers.distributed.lower_bound import best_bound_distributed
-from solvers.distributed.own_files import (
+from solvers.distributed.robots.own_file import (
     READ_HERE,
     Answer,
     keep_answer,

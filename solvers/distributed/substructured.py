@@ -14,7 +14,7 @@ from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.rotations import Array, unstack_transposes
 from solvers.distributed.driver import Driver
 from solvers.distributed.interface import InterfaceFactor
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots import recursion
 from solvers.distributed.robots.records import Agree, Reduced, RescaleInterior, RightHandSide
 from solvers.network.counted_pool import Count
 from solvers.network.moments import Moment
@@ -94,7 +94,7 @@ class SubstructuredSOC:
         if start is None:
             state = self._penalized(driver, is_stationary=False)
         else:
-            reduced = driver.ask(Interior.eliminated, None, Count.PIGGYBACKED)
+            reduced = driver.ask(recursion.reduce_again, None, Count.PIGGYBACKED)
             state = replace(start, factor=_factorize(driver, start.block, reduced))
         return replace(state, moment=driver.moment())
 
@@ -111,7 +111,7 @@ class SubstructuredSOC:
         block = block.extrapolated(agreement)  # s = x_ahead + B
         block, own_squares = block.projected()  # (b) omega, (c) B = s - omega; as the robots do
         orders = [Agree(agreement, part) for part in driver.scattered_rotations(block.omega)]
-        answers = driver.ask_each(Interior.agree, orders, Count.ALL_REDUCE)
+        answers = driver.ask_each(recursion.agree, orders, Count.ALL_REDUCE)
         squares = own_squares + np.sum([answer.sums for answer in answers], axis=0)
         return replace(
             state.after(merit, squares, state.size, anderson),
@@ -129,7 +129,7 @@ class SubstructuredSOC:
         if math.isnan(objective):
             driver.return_to(state.moment)
             parts = driver.scattered_rotations(state.block.omega)
-            objective = math.fsum(driver.ask_each(Interior.cost, parts, Count.OFF))
+            objective = math.fsum(driver.ask_each(recursion.cost, parts, Count.OFF))
         return driver.measured(state.measurement(objective))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
@@ -154,14 +154,14 @@ class SubstructuredSOC:
         if not driver.has_whole and driver.num_poses >= ENOUGH_NORMS:
             step = driver.num_poses // ENOUGH_NORMS
         Lambda = driver.current.multipliers
-        answers = [*driver.ask(Interior.multiplier_norms, step, Count.PIGGYBACKED)]
+        answers = [*driver.ask(recursion.report_norms, step, Count.PIGGYBACKED)]
         answers.append(subsampled(Norms(multiplier_norms(Lambda), driver.scale), step))
         norms = np.concatenate([answer.norms for answer in answers])
         scales = np.concatenate([answer.scale for answer in answers])
         order = self.soc.penalty_order(norms / scales, is_stationary)
         ratio = order.rho(norms, scales) / scales
         block = order.block(driver.current.R, Lambda, driver.diagonal[driver.rotation_rows])
-        reduced = driver.ask(Interior.penalize, order)
+        reduced = driver.ask(recursion.penalize, order)
         # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
         squared_size = driver.d * (step or 1) * float(ratio @ scales)
         return SubstructuredState(
@@ -194,7 +194,7 @@ class SubstructuredSOC:
         block = state.block.back_at_best() if from_best else state.block
         block = block.rescaled(factor * block.rho)
         order = RescaleInterior(factor, from_best)
-        reduced = driver.ask(Interior.rescale, order)
+        reduced = driver.ask(recursion.rescale, order)
         return replace(
             state.rescaled(factor),
             block=block,
@@ -207,7 +207,7 @@ def _finish(driver: Driver, state: SubstructuredState) -> None:
     """Go from an iterate, which driver and robots hold, to its poses."""
     driver.current = replace(driver.current, R=state.omega)
     parts = driver.scattered_rotations(state.block.omega)
-    driver.set_translations(driver.ask_each(Interior.finish, parts))
+    driver.set_translations(driver.ask_each(recursion.finish, parts))
 
 
 def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock, Array]:
@@ -219,7 +219,7 @@ def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock,
     b[rows] = (0.5 * block.rho)[:, None] * block.shift
     x, parts, _ = state.factor.solve([right.b for right in state.right], b)
     block, own_sums = block.after_solve(x[rows])
-    sums_of_robots = driver.ask_each(Interior.solve, parts, is_along=True)
+    sums_of_robots = driver.ask_each(recursion.solve, parts, is_along=True)
     return block, own_sums + np.sum(sums_of_robots, axis=0)
 
 

@@ -121,7 +121,7 @@ class ConsensusRobot:
         penalty = np.concatenate([np.zeros(n), np.repeat(rho / num_copies, d)])
         penalty[separators] = 2.0 * GROUND * half_scale
         components = connected_components(layout.subgraph.graph.adjacency, directed=False)[1]
-        factor = layout.problem.analysis.factorize(layout.subproblem(penalty).K)
+        factor = layout.problem.analysis.factorize(layout.subproblem(penalty).matrix)
         stiffness = stiffness_of_separators(
             factor, (d + 1) * n, separators, half_scale, components[separators]
         )

@@ -55,9 +55,9 @@ class RSubproblem:
     num_translations : int
         Number of the first rows of X, which are translations; 0 for rotations only. The others are
         rows of R_i^T.
-    penalty : (N,) array
-        Diagonal of D. When no translation has a penalty, row 0 is grounded: the minimiser with
-        t_0 = 0 is taken.
+    rho : (N,) array
+        Diagonal of D: the penalty of every row of X. When no translation has a penalty, row 0 is
+        grounded: the minimiser with t_0 = 0 is taken.
     analysis : SymbolicCholesky
         Ordering and pattern of the factor.
     backend : CholeskyBackend or None
@@ -69,27 +69,29 @@ class RSubproblem:
     M: csc_array
     d: int
     num_translations: int
-    penalty: Array
+    rho: Array
     analysis: SymbolicCholesky
     backend: CholeskyBackend | None
 
     @cached_property
     def needs_ground(self) -> bool:
         """Whether a common shift of all translations costs nothing."""
-        return self.num_translations > 0 and not (self.penalty[: self.num_translations] > 0).any()
+        return self.num_translations > 0 and not (self.rho[: self.num_translations] > 0).any()
 
     @cached_property
-    def K(self) -> csc_array:
-        """K = M + D/2, grounded where needed, positive definite; the pattern of M."""
+    def matrix(self) -> csc_array:
+        """M + D/2, grounded where needed, positive definite; the pattern of M."""
         rows = np.arange(self.M.shape[0])
         diagonal = entry_positions(self.M, rows, rows)
         data = self.M.data.copy()
-        data[diagonal] += 0.5 * self.penalty
+        data[diagonal] += 0.5 * self.rho
         if self.needs_ground:
+            # The right-hand sides of all translations sum to zero, so that the solution with the
+            # larger entry has t_0 = 0 and solves the system without it, too.
             data[diagonal[0]] *= 2.0
-        K = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
-        K.has_canonical_format = True
-        return K
+        matrix = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
+        matrix.has_canonical_format = True  # as M: scipy need not look
+        return matrix
 
 
 class RotationStep(Protocol):
@@ -114,17 +116,9 @@ class CustomRStep(Protocol):
     """A back end that a user writes, in place of an RStep."""
 
     def prepare(self, subproblem: RSubproblem) -> RotationStep:
-        """Make the subproblem, or a changed one with the same rows, ready for many shifts.
+        """Factor or compile a subproblem once; what is returned solves it for many shifts.
 
-        Parameters
-        ----------
-        subproblem : RSubproblem
-            The subproblem.
-
-        Returns
-        -------
-        RotationStep
-            What solves it for one shift after the other.
+        It is called again, with the same rows of X, where the penalties change.
         """
 
 
@@ -136,8 +130,8 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
     if not isinstance(back_end, RStep):
         return back_end.prepare(subproblem)
     if back_end is RStep.FACTORIZED:
-        factor = subproblem.analysis.factorize(subproblem.K)
-        return _Factorized(factor, 0.5 * subproblem.penalty[:, None])
+        factor = subproblem.analysis.factorize(subproblem.matrix)
+        return _Factorized(factor, 0.5 * subproblem.rho[:, None])
     if back_end is RStep.FISTA:
         return _Fista(subproblem)
     if back_end is RStep.NESTEROV:
@@ -178,11 +172,11 @@ def prepare_joint(problem: PGOProblem, rho: Array, back_end: BackEnd) -> JointSt
     n = problem.num_poses
     d = problem.d
     A, w = problem.residual_matrix
-    rho_of_rows = np.repeat(rho, d)
-    penalty = np.concatenate([np.zeros(n), rho_of_rows])
-    subproblem = RSubproblem(A, w, problem.M, d, n, penalty, problem.analysis, problem.backend)
+    of_rotations = np.repeat(rho, d)
+    of_rows = np.concatenate([np.zeros(n), of_rotations])
+    subproblem = RSubproblem(A, w, problem.M, d, n, of_rows, problem.analysis, problem.backend)
     diagonal = problem.M.data[problem.diagonal_positions[n:]]
-    stiffness = np.maximum(1.0, rho_of_rows / diagonal)
+    stiffness = np.maximum(1.0, of_rotations / diagonal)
     return JointStep(prepare(subproblem, back_end), n, stiffness.reshape(n, 1, d))
 
 
@@ -207,22 +201,11 @@ class CvxpyStep:
     solver: "ConvexSolver | str" = "CLARABEL"
 
     def prepare(self, subproblem: RSubproblem) -> RotationStep:
-        """Compile the cvxpy quadratic program.
-
-        Parameters
-        ----------
-        subproblem : RSubproblem
-            The R-subproblem with its penalties.
-
-        Returns
-        -------
-        RotationStep
-            The compiled program, which is solved for every shift.
-        """
+        """Compile the cvxpy quadratic program once, for many shifts."""
         from pgo_models.convex.rotation_subproblem import rotation_qp
 
         qp = rotation_qp(
-            subproblem.A, subproblem.w, subproblem.penalty, subproblem.d, solver=self.solver
+            subproblem.A, subproblem.w, subproblem.rho, subproblem.d, solver=self.solver
         )
         return _Cvxpy(qp, subproblem.num_translations if subproblem.needs_ground else 0)
 
@@ -239,41 +222,43 @@ class _Factorized:
 class _Gradients(ABC):
     """Accelerated gradients on the rotations alone.
 
-    The best translations of an iterate come from one factorised Laplacian. The variable is
-    D^(1/2) R, with H = D^(-1/2) (K_RR - K_Rt K_tt^-1 K_tR) D^(-1/2). The Lipschitz constant is a
-    bound on the largest eigenvalue.
+    With P = M + D/2 in blocks, the best translations of rotations R are P_tt^-1 (b_t - P_tR R), by
+    one factor of P_tt. What is left is a system in Y = D^(1/2) R,
+    H Y = D^(-1/2) (b_R - P_Rt P_tt^-1 b_t) with H = D^(-1/2) (P_RR - P_Rt P_tt^-1 P_tR) D^(-1/2):
+    the scaling brings its eigenvalues close together. The Lipschitz constant is a bound on the
+    largest of them.
     """
 
     def __init__(self, subproblem: RSubproblem) -> None:
-        K = subproblem.K
+        P = subproblem.matrix
         count = subproblem.num_translations
         self._subproblem = subproblem
         self._factor_tt = (
-            factorize(K[:count, :count].tocsc(), subproblem.backend) if count else None
+            factorize(P[:count, :count].tocsc(), subproblem.backend) if count else None
         )
-        self._K_tR = K[:count, count:].tocsr()
-        scale = 1.0 / np.sqrt(subproblem.penalty[count:])
+        self._P_tR = P[:count, count:].tocsr()
+        scale = 1.0 / np.sqrt(subproblem.rho[count:])
         self._scale = scale[:, None]
-        self._H_RR = (diags_array(scale) @ K[count:, count:] @ diags_array(scale)).tocsr()
-        # The correction K_Rt K_tt^-1 K_tR only lowers the eigenvalues of H.
+        self._H_RR = (diags_array(scale) @ P[count:, count:] @ diags_array(scale)).tocsr()
+        # The correction P_Rt P_tt^-1 P_tR only lowers the eigenvalues of H.
         self._lipschitz = _largest_eigenvalue_bound(self._H_RR)
 
     def solve(self, V: Array) -> Array:
         count = self._subproblem.num_translations
-        b = 0.5 * self._subproblem.penalty[:, None] * V
+        b = 0.5 * self._subproblem.rho[:, None] * V
         b_t = b[:count]
-        reduced = self._scale * (b[count:] - self._K_tR.T @ self._solve_tt(b_t))
+        reduced = self._scale * (b[count:] - self._P_tR.T @ self._solve_tt(b_t))
         start = V[count:] / self._scale
         R = self._scale * self._minimize(reduced, start)
-        return np.concatenate([self._solve_tt(b_t - self._K_tR @ R), R])
+        return np.concatenate([self._solve_tt(b_t - self._P_tR @ R), R])
 
     @abstractmethod
     def _minimize(self, b: Array, start: Array) -> Array:
         """Y with H Y = b."""
 
     def _apply(self, Y: Array) -> Array:
-        t = self._solve_tt(self._K_tR @ (self._scale * Y))
-        return np.asarray(self._H_RR @ Y - self._scale * (self._K_tR.T @ t))
+        t = self._solve_tt(self._P_tR @ (self._scale * Y))
+        return np.asarray(self._H_RR @ Y - self._scale * (self._P_tR.T @ t))
 
     def _solve_tt(self, b: Array) -> Array:
         return b if self._factor_tt is None else self._factor_tt.solve(b)

@@ -9,7 +9,7 @@ from robots import Killed
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import EngineError, FileFormatError
+from pgo_models.errors import EngineError, PGOError
 from solvers.robots import Checkpoint
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
@@ -74,7 +74,8 @@ def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after
 
 def test_where_nothing_can_be_written_is_told_before_the_solve(tmp_path):
     with pytest.raises(
-        FileFormatError, match=r"missing/run\.ckpt: cannot be written \(No such file or directory\)"
+        PGOError,
+        match=r"cannot write .*missing/run\.ckpt: No such file or directory; choose a place",
     ):
         solvers.solve(
             varied_graph(9, 30, 2),
@@ -82,7 +83,7 @@ def test_where_nothing_can_be_written_is_told_before_the_solve(tmp_path):
         )
 
 
-def test_the_lock_is_let_go_when_the_robots_cannot_start(tmp_path):
+def test_nothing_is_left_behind_when_the_robots_cannot_start(tmp_path):
     class Nowhere:
         def open(self, make, shares):
             raise EngineError("nowhere")

@@ -34,7 +34,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver, collect
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots import recursion
 from solvers.loop import iterate, run
 from solvers.pipeline import solve
 from solvers.request import Pipeline
@@ -300,7 +300,7 @@ def test_solve_and_soc_have_the_same_robots() -> None:
     engine = Recording()
     solution = solve(graph, pipeline, robots=Robots(3, engine=engine))  # so many are SOC's
     assert solution.robots is three
-    assert engine.times(ConsensusRobot.turn, Interior.penalize) == 0
+    assert engine.times(ConsensusRobot.turn, recursion.penalize) == 0
     assert engine.times(ConsensusRobot.step) == solution.stages[1].iterations > 0
     same = Partition(three.robot.copy(), three.method)
     assert solve(graph, pipeline, robots=same).gap == solution.gap

@@ -38,7 +38,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import collect
 from solvers.distributed.interface import Interface, InterfaceFactor
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots import current_poses, descent, recursion, start, translations
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.network.engine import InProcess
@@ -53,7 +53,7 @@ from solvers.solution import Solution
 SIZES = st.integers(2, 24)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 # orders that are not counted
-OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")
+OFF = ("describe", "set_poses", "cost", "result")
 
 PROOF = (fits_part, prove_interior, move_proof)
 
@@ -217,17 +217,17 @@ def test_the_ledger_counts_what_was_sent(
     # round each, and so does a move at rounding level, whose translations move straight on.
     counted = (
         *(
-            Interior.project,
-            Interior.turn_by,
-            Interior.set_translations,
-            Interior.penalize,
-            Interior.rescale,
-            Interior.solve,
+            start.project,
+            start.turn_by,
+            translations.set_translations,
+            recursion.penalize,
+            recursion.rescale,
+            recursion.solve,
         ),
-        *(Interior.finish, Interior.move, Interior.evaluate_trial, Interior.move_straight, *PROOF),
+        *(recursion.finish, descent.move, descent.evaluate_trial, descent.move_straight, *PROOF),
     )
     assert ledger.rounds == engine.times(*counted)
-    assert ledger.all_reduces == engine.times(Interior.agree)
+    assert ledger.all_reduces == engine.times(recursion.agree)
     last = solution.stages[-1].history.records[-1].measurement
     assert last.rounds == ledger.rounds - engine.times(*PROOF)
 
@@ -238,11 +238,11 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     solution = solve(graph, robots=Robots(partition(graph, 3), engine=engine))
     assert solution.ledger is not None
     start, soc, newton = solution.stages
-    moves = engine.times(Interior.move)
+    moves = engine.times(descent.move)
     assert start.name == "chordal start"
-    assert engine.times(Interior.rescale, Interior.turn) == 0
+    assert engine.times(recursion.rescale, descent.turn) == 0
     assert engine.times(prove_interior) == 1
-    assert engine.times(Interior.penalize) == 1  # no refresh
+    assert engine.times(recursion.penalize) == 1  # no refresh
     # 2 to start, 1 for the penalty and 1 a step and 2 for the result of SOC, 2 a move of Newton, 2
     # for the proof.
     assert engine.times(move_proof) == 1
@@ -295,19 +295,19 @@ def test_what_crosses_has_the_size_of_the_separators(
         }
         sums = allowed["sums"]
         values = {  # of orders that take or give one array
-            "Interior.describe": {((d + 1) * g,)},
-            "Interior.project": any_side,
-            "Interior.turn_by": {(g, 1)},
-            "Interior.set_translations": {(g, d)},
-            "Interior.evaluate_trial": {(g, d)},
-            "Interior.solve": any_side | sums,
-            "Interior.cost": {(d * g, d), ()},
-            "Interior.finish": {(d * g, d)},
-            "Interior.agree": {()},
+            "describe": {((d + 1) * g,)},
+            "project": any_side,
+            "turn_by": {(g, 1)},
+            "set_translations": {(g, d)},
+            "evaluate_trial": {(g, d)},
+            "solve": any_side | sums,
+            "cost": {(d * g, d), ()},
+            "finish": {(d * g, d)},
+            "agree": {()},
             "move_proof": any_side | {()},
         }
         for order, sent, got in engine.log:
-            if order == "Interior.result":
+            if order == "result":
                 continue
             for record in (sent[share.robot], got[share.robot]):
                 for name, value in arrays_in(record):
@@ -347,7 +347,9 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
     # ||Lambda_i|| and m_i, for the quantile of the penalty, and the largest diagonal entry of M are
     # sent: of a pose with one edge they are its precision.
     sent = [
-        value for name, value in engine.crossed(Interior.result) if name not in ("norms", "scale")
+        value
+        for name, value in engine.crossed(current_poses.result)
+        if name not in ("norms", "scale")
     ]
     assert not np.isin(secrets, np.concatenate(sent)).any()
 

@@ -10,7 +10,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import elimination_choice, forecast as forecasts
 from solvers.distributed.forecast import advice, forecast
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots import current_poses
 from solvers.distributed.robots_of_graph import open_driver
 
 pytest.importorskip("cvxopt")
@@ -38,7 +38,7 @@ def test_a_forecast_is_what_a_driver_takes(is_interleaved: bool) -> None:
     expected = forecast(robots, graph)
     engine = Recording()
     driver = open_driver(PGOProblem(graph), robots, engine)
-    driver.ask(Interior.save_poses, None)
+    driver.ask(current_poses.save_poses, None)
     driver.go_to_chordal_start()
     assert expected.num_poses == len(driver.cover)
     assert (expected.num_left > 0) == is_interleaved

@@ -26,7 +26,7 @@ from solvers.request import Pipeline
 from solvers.robots import Checkpoint, Robots
 from solvers.solution import Solution
 
-OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result", "take_front")
+OFF = ("describe", "set_poses", "cost", "result", "take_front")
 
 
 @pytest.fixture

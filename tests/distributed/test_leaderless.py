@@ -55,7 +55,7 @@ from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 
 TOLERANCE = 1e-6
-OFF = ("Interior.describe", "Interior.set_poses")
+OFF = ("describe", "set_poses")
 ALONE = ("in_cover", "force", "schur", "b")  # fields that are sent to a driver only
 
 

@@ -35,8 +35,7 @@ from solvers.distributed import (
     substructured,
 )
 from solvers.distributed.driver_place import DriverPlace
-from solvers.distributed.robots import climbing
-from solvers.distributed.robots.interior import Interior
+from solvers.distributed.robots import climbing, current_poses
 from solvers.folder_solve import FolderSolution, solve_folder
 from solvers.place import Attempt
 from solvers.result import Status
@@ -505,7 +504,7 @@ def test_the_staircase_climbs_from_the_best(
         began.extend(
             [
                 driver.current.objective,
-                math.fsum(part.objective for part in driver.ask(Interior.evaluate, None)),
+                math.fsum(part.objective for part in driver.ask(current_poses.evaluate, None)),
             ]
         )
         return climb(place, staircase)

@@ -16,8 +16,8 @@ from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.thresholds import chi2_thresholds
+from solvers.distributed.robots import current_poses
 from solvers.distributed.robots.agent import CLASSES, Agent, order_interior
-from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Reweigh
 from solvers.distributed.robots.reweighting import reweigh, sum_ratios
 from solvers.distributed.robots_of_graph import open_driver
@@ -129,14 +129,14 @@ def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
     agent = Agent(subgraph, None)
     again = Agent(subgraph, None)
     order_interior(
-        Interior.set_poses,
+        current_poses.set_poses,
         agent,
         first_poses(problem.graph, subgraph_known(problem))[subgraph.part.poses],
     )
     order_interior(reweigh, agent, Reweigh(True, 0.01, 1.0, 1e-9))
-    before = order_interior(Interior.evaluate, agent, None)
+    before = order_interior(current_poses.evaluate, agent, None)
     again.restore(agent.snapshot())
-    after = order_interior(Interior.evaluate, again, None)
+    after = order_interior(current_poses.evaluate, again, None)
     assert before.objective == after.objective
     np.testing.assert_array_equal(before.force, after.force)
     weights = agent.interior.state.weights

@@ -63,7 +63,7 @@ def test_the_ledger_counts_the_entries_that_are_sent() -> None:
     with sparse_elimination(8):
         ledger = solve(graph, Pipeline(staircase=None), robots=Robots(4, engine=engine)).ledger
     assert ledger is not None
-    off = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")
+    off = ("describe", "set_poses", "cost", "result")
     counted = [said for said in engine.log if said[0] not in off]
     for robot, agent in enumerate(engine.agents):
         answers = [answers[robot] for _, _, answers in counted]

@@ -30,6 +30,7 @@ from pgo_models.graphs.scenes import NoiseModel, grid, victoria_park
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.distributed.robots import current_poses
 from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
@@ -193,7 +194,7 @@ def test_a_start_or_a_partition_of_another_graph_is_refused() -> None:
 def test_ctrl_c_while_robots_go_to_a_trial_leaves_none_behind(
     robot: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    accept = Interior.accept
+    accept = current_poses.accept
     calls = list[int]()
 
     def interrupted(interior: Interior, request: None) -> tuple[Interior, None]:
@@ -204,7 +205,7 @@ def test_ctrl_c_while_robots_go_to_a_trial_leaves_none_behind(
 
     problem = varied_problem(6, 25, 3, LOUD_NOISE)
     parts = metis(problem.graph, 4)
-    monkeypatch.setattr(Interior, "accept", interrupted)
+    monkeypatch.setattr(current_poses, "accept", interrupted)
     solution = solve(problem, replace(SHORT, soc=None), robots=parts)
     newton = solution.stages[-1]
     assert newton.status is Status.INTERRUPTED

@@ -1,19 +1,12 @@
 import time
-from functools import partial
 
 import numpy as np
 import pytest
 from graphs import varied_graph
-from robots import arrays_in
 
 import solvers
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import partition
-from solvers.distributed.robots.agent import Agent, order_interior
-from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
-from solvers.network.messages import restore, take_snapshot
-from solvers.soc.subgraph import split_graph
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -80,32 +73,3 @@ def test_a_solve_that_is_broken_off_while_robots_are_set_up_lets_them_go():
 def test_there_is_a_thread_at_least():
     with pytest.raises(SettingError, match="threads must be at least 1, got 0"):
         InProcess(0)
-
-
-def test_robots_restored_from_snapshots_answer_as_those_that_were_asked():
-    graph = varied_graph(1, 30, 3)
-    shares = split_graph(graph, partition(graph, 3))
-    nothing = [None] * len(shares)
-    make = partial(Agent, backend=None)
-    old = InProcess().open(make, shares)
-    new = InProcess().open(make, shares)
-    chordal = old.ask(partial(order_interior, Interior.chordal), nothing)
-    old.ask(
-        partial(order_interior, Interior.project),
-        [np.ones_like(answer.right.b) for answer in chordal],
-    )
-    new.ask(restore, old.ask(take_snapshot, nothing))
-    orders = (
-        Interior.eliminated,
-        Interior.translations,
-        Interior.multiplier_norms,
-        Interior.evaluate,
-    )
-    for method in (*orders, Interior.eliminated_translations):
-        order = partial(order_interior, method)
-        for before, after in zip(old.ask(order, nothing), new.ask(order, nothing), strict=True):
-            for (name, value), (other_name, other) in zip(
-                arrays_in(before), arrays_in(after), strict=True
-            ):
-                assert name == other_name
-                np.testing.assert_array_equal(value, other)

@@ -27,8 +27,8 @@ from pgo_models.errors import (
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.pose_graph import PoseGraph
 from solvers.cli import app as cli
+from solvers.distributed.robots import recursion
 from solvers.distributed.robots.agent import Agent, order_interior
-from solvers.distributed.robots.interior import Interior
 from solvers.network import ray_engine
 from solvers.network.ray_engine import RayEngine, connect
 from solvers.network.recovery import Recovery
@@ -212,7 +212,7 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
             NotPositiveDefiniteError, match=r"^the matrix has nan or inf; check the weights"
         ):
             pool.ask(
-                partial(order_interior, Interior.penalize), [PenaltyOrder(np.nan, np.nan, np.nan)]
+                partial(order_interior, recursion.penalize), [PenaltyOrder(np.nan, np.nan, np.nan)]
             )
     finally:
         pool.close()

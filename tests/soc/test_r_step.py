@@ -218,8 +218,8 @@ def test_K_is_M_plus_half_the_penalty_grounded_where_needed() -> None:
         expected = problem.M.toarray() + 0.5 * np.diag(penalty)
         if not translations:
             expected[0, 0] *= 2
-        np.testing.assert_allclose(subproblem.K.toarray(), expected, rtol=1e-15, atol=0)
-        np.testing.assert_array_equal(subproblem.K.indices, problem.M.indices)
+        np.testing.assert_allclose(subproblem.matrix.toarray(), expected, rtol=1e-15, atol=0)
+        np.testing.assert_array_equal(subproblem.matrix.indices, problem.M.indices)
 
 
 def problem_named(name: str, request: pytest.FixtureRequest) -> PGOProblem:

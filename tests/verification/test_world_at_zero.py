@@ -66,13 +66,11 @@ def test_measurements_of_the_world_are_moved_exactly_and_no_others(d: int, tmp_p
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_cost_and_bound_are_the_same_with_the_world_moved_or_not(
-    d: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ctx, "prec", 256)  # with 53 bits the claims are not decided
-    graph, proof = read(*proven(d, tmp_path), d)
-    far = prove(graph, proof, "far")
-    near = prove(*with_world_at_zero(graph, proof), "near")
+def test_cost_and_bound_are_the_same_with_the_world_moved_or_not(d: int, tmp_path: Path) -> None:
+    with ctx.workprec(256):  # with 53 bits the claims are not decided
+        graph, proof = read(*proven(d, tmp_path), d)
+        far = prove(graph, proof, "far")
+        near = prove(*with_world_at_zero(graph, proof), "near")
     assert far.objective is not None
     assert near.objective is not None
     assert far.objective.overlaps(near.objective)

@@ -1,7 +1,8 @@
 """One robot as an engine runs it: its interior for the driver, and its copies for CONSENSUS."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -12,10 +13,18 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.relaxations.low_rank import LiftedPoses
 from solvers.distributed.robots.elimination import FrontFactor, HeldFront
-from solvers.distributed.robots.factors import Eliminated
-from solvers.distributed.robots.interior import Interior, InteriorState, interior_of
+from solvers.distributed.robots.interior import Interior, interior_of
 from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import RobotAscent
+from solvers.distributed.robots.state import (
+    AveragingSession,
+    DescentSession,
+    InteriorState,
+    ProofSession,
+    RecursionSession,
+    RelaxationSession,
+)
+from solvers.distributed.robots.system import System
 from solvers.network.messages import Snapshot
 from solvers.network.moments import Recall
 from solvers.network.serialization import deserialize, serialize
@@ -81,23 +90,32 @@ CLASSES = (
     RobotProof,
     HandednessTerms,
     RobotAscent,
-    Eliminated,
+    System,
+    RelaxationSession,
+    AveragingSession,
+    RecursionSession,
+    DescentSession,
+    ProofSession,
     HeldFront,
     FrontFactor,
 )
 
 
-class Agent:
+class BaseAgent(ABC):
     """A robot that obeys orders: an order replaces its state by the one that the order returns."""
 
-    def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
-        self.subgraph = subgraph
+    def __init__(self, backend: CholeskyBackend | None, interior: Interior | None) -> None:
         self.backend = backend
         # As in `Held`.
-        self.interior = interior_of(subgraph, backend)
+        self.interior: Interior | None = interior
         self.copies: ConsensusRobot | None = None
         self.front: HeldFront | None = None  # None if it holds no front of the separator tree
         self.moments: dict[int, Held] = {}
+
+    @property
+    @abstractmethod
+    def subgraph(self) -> Subgraph:
+        """Its part of the graph."""
 
     def recall(self, recall: Recall) -> None:
         """Forget, keep, and return to moments."""
@@ -129,7 +147,7 @@ class Agent:
         """What belongs to states."""
         interior = self.interior
         if interior is not None and states.interior is not None:
-            interior = replace(interior, state=states.interior).restored()
+            interior = interior.in_state_of(states.interior)
         copies = None
         if states.copies is not None:
             copies = self._new_copies.restored(states.copies)
@@ -139,6 +157,19 @@ class Agent:
     def _new_copies(self) -> ConsensusRobot:
         """Copies without a state."""
         return ConsensusRobot(CopyLayout(self.subgraph, self.backend), CopiesState())
+
+
+class Agent(BaseAgent):
+    """A robot that was given its part of the graph."""
+
+    def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
+        super().__init__(backend, interior_of(subgraph, backend))
+        self._subgraph = subgraph
+
+    @property
+    def subgraph(self) -> Subgraph:
+        """The part of the graph that it was given."""
+        return self._subgraph
 
 
 def _states(held: Held) -> HeldStates:
@@ -151,7 +182,7 @@ def _states(held: Held) -> HeldStates:
 
 
 def order_interior(
-    order: Callable[[Interior, Q], tuple[Interior, A]], agent: Agent, request: Q
+    order: Callable[[Interior, Q], tuple[Interior, A]], agent: BaseAgent, request: Q
 ) -> A | None:
     """Give the interior an order; None if the robot counts no edge."""
     if agent.interior is None:
@@ -161,7 +192,7 @@ def order_interior(
 
 
 def order_copies(
-    order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]], agent: Agent, request: Q
+    order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]], agent: BaseAgent, request: Q
 ) -> A:
     """Give the copies an order."""
     assert agent.copies is not None
@@ -169,13 +200,13 @@ def order_copies(
     return answer
 
 
-def take_front(agent: Agent, front: HeldFront | None) -> None:
+def take_front(agent: BaseAgent, front: HeldFront | None) -> None:
     """Hold this front of the separator tree from now on."""
     agent.front = front
 
 
 def order_front(
-    order: Callable[[HeldFront, Q], tuple[HeldFront, A]], agent: Agent, request: Q
+    order: Callable[[HeldFront, Q], tuple[HeldFront, A]], agent: BaseAgent, request: Q
 ) -> A:
     """Give an order to the front that the robot holds."""
     assert agent.front is not None
@@ -183,14 +214,14 @@ def order_front(
     return answer
 
 
-def begin_copies(agent: Agent, cover: Poses) -> Rows:
+def begin_copies(agent: BaseAgent, cover: Poses) -> Rows:
     """Start the copies at the current poses, of which the driver sends those of the cover."""
     if agent.copies is None:
         agent.copies = agent._new_copies
     return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
 
 
-def held_poses(agent: Agent, cover: Poses) -> Poses:
+def held_poses(agent: BaseAgent, cover: Poses) -> Poses:
     """Current poses of all that the robot holds, (n_a).
 
     Other robots' poses are at the identity unless they are in the cover.
@@ -205,14 +236,14 @@ def held_poses(agent: Agent, cover: Poses) -> Poses:
     t[in_cover] = cover.t
     if agent.interior is not None:
         part = agent.interior.part
-        poses = agent.interior.state.poses
+        poses = agent.interior.poses
         position = np.searchsorted(subgraph.poses, part.poses[part.interior])
         R[position] = poses.R[part.interior]
         t[position] = poses.t[part.interior]
     return Poses(R, t)
 
 
-def finish_copies(agent: Agent, _: None) -> CoverRotations:
+def finish_copies(agent: BaseAgent, _: None) -> CoverRotations:
     """Take omega for the rotations of the interior; return those of the own poses in the cover."""
     assert agent.copies is not None
     subgraph = agent.subgraph
@@ -220,7 +251,6 @@ def finish_copies(agent: Agent, _: None) -> CoverRotations:
     interior = agent.interior
     if interior is not None:
         position = np.searchsorted(subgraph.poses, interior.part.poses)
-        poses = Poses(omega[position], interior.state.poses.t)
-        agent.interior = replace(interior, state=replace(interior.state, poses=poses))
+        agent.interior = interior.at_rotations(omega[position])
     own = np.flatnonzero(subgraph.is_own & (subgraph.in_cover >= 0))
     return CoverRotations(subgraph.in_cover[own], omega[own])

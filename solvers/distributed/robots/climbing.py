@@ -4,15 +4,18 @@ The orders about a direction need the elimination of S + eta blockdiag(0, I) tha
 from a proof.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
 from pgo_models.relaxations.low_rank import append_dimension, gram_matrix
+from solvers.distributed.robots.descent import at_trial, moved
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import CostParts, Move, ReducedTranslations, RightHandSide
+from solvers.distributed.robots.state import DescentSession, ProofSession
+from solvers.distributed.robots.translations import reduce_translations
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,7 @@ def begin_direction(robot: Interior, _: None) -> tuple[Interior, PowerStep]:
 
 def follow_direction(robot: Interior, order: Move) -> tuple[Interior, PowerStep]:
     """Take one inverse iteration, from its solution on the boundary, times a length."""
-    x = robot.back_substitute(order.x)
+    x = robot.session(ProofSession).system.back_substitute(order.x)
     v = order.length * x[robot.interior_rows, 0]
     return _power_step(robot, v)
 
@@ -44,14 +47,14 @@ def climb(robot: Interior, order: Move) -> tuple[Interior, float]:
 
     The order has the solution on the boundary that gives x, and the length that it is scaled by.
     """
-    x = order.length * robot.back_substitute(order.x)
-    poses = append_dimension(robot.state.poses)
+    x = order.length * robot.session(ProofSession).system.back_substitute(order.x)
+    poses = append_dimension(robot.poses)
     Lambda = robot.multipliers()[robot.part.interior]
     own_rows = x[robot.interior_rows]
     objective = robot.problem.objective_stacked(x)
     value = objective - pulled(Lambda, own_rows)
-    step = poses.upwards(x[:, 0])
-    return robot.with_changes(poses=poses, step=step), value
+    descent = DescentSession(system=None, step=poses.upwards(x[:, 0]))
+    return robot.in_session(descent).at_poses(poses), value
 
 
 def pulled(Lambda: Array, x: Array) -> float:
@@ -63,24 +66,24 @@ def pulled(Lambda: Array, x: Array) -> float:
 
 def try_climb(robot: Interior, length: float) -> tuple[Interior, CostParts]:
     """Move a length along the direction: a trial, and the parts of F there."""
-    trial = robot.moved(length)
-    following = robot.with_changes(trial=trial)
+    trial = moved(robot, length)
+    following = at_trial(robot, trial)
     return following, following.evaluation(trial)
 
 
 def gram(robot: Interior, _: None) -> tuple[Interior, Array]:
     """Compute the sum of R_i R_i^T over the interior, (r, r)."""
     interior = robot.part.interior
-    return robot, gram_matrix(robot.state.poses.R[interior])
+    return robot, gram_matrix(robot.poses.R[interior])
 
 
 def round_to(robot: Interior, V: Array) -> tuple[Interior, ReducedTranslations]:
-    """Project the poses V^T R_i to rotations; then as `Interior.translations`."""
-    poses = robot.state.poses
+    """Project the poses V^T R_i to rotations; then as `reduce_translations`."""
+    poses = robot.poses
     R = project_to_rotations(V.T @ poses.R)
     rounded = Poses(R, poses.t @ V)
-    following = robot.with_changes(poses=rounded, trial=rounded, kept=rounded, step=None)
-    return following.translations(None)
+    state = replace(robot.state, poses=rounded, saved=rounded, session=None)
+    return reduce_translations(robot.with_state(state), None)
 
 
 def _power_step(robot: Interior, v: Array) -> tuple[Interior, PowerStep]:
@@ -88,7 +91,9 @@ def _power_step(robot: Interior, v: Array) -> tuple[Interior, PowerStep]:
     problem = robot.part.problem
     b = np.zeros((problem.side, 1))
     b[robot.interior_rows, 0] = v
-    following, right = robot.reduced(b)
+    session = robot.session(ProofSession)
+    system, right = session.system.with_right(b)
+    following = robot.in_session(replace(session, system=system))
     blocks = v.reshape(-1, problem.d)
     squares = np.sum(blocks**2, axis=1)
     square = float(squares.sum())

@@ -2,7 +2,7 @@
 
 These terms (`pgo_models.certificates.handedness`) are in closed form, or an ascent moves them
 (`solvers.handedness.ascent`). The lowest eigenvectors that it needs come from inverse iteration
-with an elimination of S less the terms, which the robot has kept from `prove_interior`.
+with an elimination of S less the terms, that of the session that `prove_interior` began.
 """
 
 from dataclasses import replace
@@ -21,6 +21,7 @@ from solvers.distributed.robots.records import (
     VectorsAnswer,
     VectorsOrder,
 )
+from solvers.distributed.robots.state import ProofSession
 from solvers.handedness.ascent import derivative_of_minimum, nearest_semidefinite
 
 
@@ -28,7 +29,7 @@ def take_closed_form(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
     """Take the terms of the robot's edges that are known in closed form."""
     terms = None
     if robot.problem.d == 3:
-        terms = closed_form_terms(robot.tangent_problem, robot.state.poses)
+        terms = closed_form_terms(robot.tangent_problem, robot.poses)
     return _with_terms(robot, terms)
 
 
@@ -56,7 +57,7 @@ def begin_ascent(robot: Interior, P: Array | None) -> tuple[Interior, TermsAnswe
 def keep_best(robot: Interior, _: None) -> tuple[Interior, None]:
     """Remember the P as the best so far."""
     ascent = _ascent(robot)
-    return robot.with_changes(ascent=replace(ascent, best=ascent.P)), None
+    return _with_ascent(robot, replace(ascent, best=ascent.P)), None
 
 
 def return_to_best(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
@@ -78,8 +79,9 @@ def begin_vectors(robot: Interior, count: int) -> tuple[Interior, VectorsAnswer]
 
 def follow_vectors(robot: Interior, order: VectorsOrder) -> tuple[Interior, VectorsAnswer]:
     """Take one inverse iteration of X C, from its solution on the boundary."""
-    b = robot.state.b @ order.C
-    X = robot.with_changes(b=b).back_substitute(order.x)
+    system = robot.session(ProofSession).system
+    b = system.b @ order.C
+    X = replace(system, b=b).back_substitute(order.x)
     return _with_vectors(robot, X, b)
 
 
@@ -92,9 +94,9 @@ def find_derivative(robot: Interior, order: Array) -> tuple[Interior, float]:
     i, j = _pairs(robot).T
     vectors = ascent.X @ order
     z = vectors[robot.part.problem.num_poses :].reshape(-1, 3, vectors.shape[1])
-    moves = z[j] - np.swapaxes(_turns(robot.state.poses, i, j), 1, 2) @ z[i]
+    moves = z[j] - np.swapaxes(_turns(robot.poses, i, j), 1, 2) @ z[i]
     derivative = derivative_of_minimum(moves, np.ones(vectors.shape[1]))
-    following = robot.with_changes(ascent=replace(ascent, derivative=derivative))
+    following = _with_ascent(robot, replace(ascent, derivative=derivative))
     return following, inner(derivative, derivative)
 
 
@@ -108,8 +110,8 @@ def ascend(robot: Interior, length: float) -> tuple[Interior, TermsAnswer]:
 def _at(robot: Interior, ascent: RobotAscent) -> tuple[Interior, TermsAnswer]:
     """The robot with an ascent, and the terms of its P."""
     i, j = _pairs(robot).T
-    terms = HandednessTerms.at(robot.state.poses, i, j, ascent.P)
-    return _with_terms(robot.with_changes(ascent=ascent), terms if terms.num_pairs else None)
+    terms = HandednessTerms.at(robot.poses, i, j, ascent.P)
+    return _with_terms(_with_ascent(robot, ascent), terms if terms.num_pairs else None)
 
 
 def _with_terms(robot: Interior, terms: HandednessTerms | None) -> tuple[Interior, TermsAnswer]:
@@ -121,7 +123,7 @@ def _with_terms(robot: Interior, terms: HandednessTerms | None) -> tuple[Interio
         num_pairs = terms.num_pairs
     diagonal = problem.M.data[problem.diagonal_positions]
     answer = TermsAnswer(num_pairs, diagonal[robot.boundary_rows])
-    return robot.with_changes(terms=terms), answer
+    return robot.with_state(replace(robot.state, terms=terms)), answer
 
 
 def _with_vectors(robot: Interior, X: Array, b: Array) -> tuple[Interior, VectorsAnswer]:
@@ -130,9 +132,15 @@ def _with_vectors(robot: Interior, X: Array, b: Array) -> tuple[Interior, Vector
     own = X[rows]
     right_hand_side = np.zeros_like(X)
     right_hand_side[rows] = own
-    following = robot.with_changes(ascent=replace(_ascent(robot), X=X))
-    following, right = following.reduced(right_hand_side)
+    session = robot.session(ProofSession)
+    system, right = session.system.with_right(right_hand_side)
+    following = robot.in_session(replace(session, system=system))
+    following = _with_ascent(following, replace(_ascent(robot), X=X))
     return following, VectorsAnswer(right.b, own.T @ b[rows], own.T @ own)
+
+
+def _with_ascent(robot: Interior, ascent: RobotAscent) -> Interior:
+    return robot.with_state(replace(robot.state, ascent=ascent))
 
 
 def _ascent(robot: Interior) -> RobotAscent:

@@ -11,6 +11,8 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof import begin_proof, verify_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep
+from solvers.distributed.robots.state import ProofSession
+from solvers.distributed.robots.system import System
 
 
 def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofAnswer]:
@@ -21,29 +23,35 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     if terms is not None:
         problem = terms.taken_off(problem)
         lost = terms.loss()
-    factors = robot.factors
+    factored = robot.factored
     Lambda = robot.multipliers()
     Lambda[robot.part.boundary] = 0.0  # those are the driver's
     trace = _trace(problem, Lambda, lost)
-    widths = (1, problem.d)
-    cut = factors.cut(*widths)
+    cut = factored.cut(robot.widths)
     fixed = cut.boundary[order.fixed > 0]
-    if not order.is_grounded and factors.grounds:
+    if not order.is_grounded and factored.grounds:
+        # Without a pose that is left out S is singular, as a shift of all translations costs
+        # nothing: one translation is left out in its place.
         fixed = np.append(fixed, 0)
     if not problem.has_translations:
         fixed = np.union1d(np.arange(problem.num_poses), fixed)
-    verified = verify_interior(problem, Lambda, order.eta, cut, fixed, order.share, factors.backend)
+    verified = verify_interior(
+        problem, Lambda, order.eta, cut, fixed, order.share, factored.backend
+    )
     if verified is None:
-        return robot.with_changes(proof=None), ProofAnswer(None, None, trace, None)
+        return robot.in_session(None), ProofAnswer(None, None, trace, None)
     matrix, elimination, slack = verified
-    eliminated = factors.keep(matrix, widths, elimination)
-    following = robot.with_changes(proof=None, eliminated=eliminated)
+    factored = factored.with_cut(robot.widths, elimination.cut)
+    no_right = np.zeros((problem.side, 0))
+    system = System.of(matrix, robot.widths, no_right, elimination)
+    session = ProofSession(system)
+    following = replace(robot, factored=factored).in_session(session)
     sizes = elimination.schur_row_sums(order.diagonal)
     if order.point is None:
         return following, ProofAnswer(elimination.schur, sizes, trace, None)
     proof = begin_proof(
         robot.part,
-        robot.state.poses,
+        robot.poses,
         Lambda,
         slack,
         elimination.cut,
@@ -51,21 +59,21 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
         order.fixed,
         terms,
     )
-    following, step = _evaluated(following.with_changes(proof=proof))
+    following, step = _evaluated(following.in_session(replace(session, proof=proof)))
     return following, ProofAnswer(elimination.schur, sizes, trace, step)
 
 
 def fits_part(robot: Interior, _: None) -> tuple[Interior, bool]:
     """Whether every edge of the robot fits to its rounding at the poses."""
-    return robot, fits_to_rounding(robot.problem, robot.state.poses)
+    return robot, fits_to_rounding(robot.problem, robot.poses)
 
 
 def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
     """Move X by -S_r^-1 G, from its rows on the boundary: parts of the bound there."""
-    proof = robot.state.proof
-    assert proof is not None
-    moved = proof.moved(robot.back_substitute(x))
-    return _evaluated(robot.with_changes(proof=moved))
+    session = robot.session(ProofSession)
+    assert session.proof is not None
+    moved = session.proof.moved(session.system.back_substitute(x))
+    return _evaluated(robot.in_session(replace(session, proof=moved)))
 
 
 def _trace(problem: PGOProblem, Lambda: Array, lost: float) -> float:
@@ -80,9 +88,11 @@ def _trace(problem: PGOProblem, Lambda: Array, lost: float) -> float:
 
 def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:
     """Evaluate the proof at its X, and reduce S X without the rows that are left out."""
-    proof = robot.state.proof
+    session = robot.session(ProofSession)
+    proof = session.proof
     assert proof is not None
     sums, product = proof.evaluated(robot.tangent_problem, robot.boundary_rows)
-    following, right = robot.reduced(product)
+    system, right = session.system.with_right(product)
+    following = robot.in_session(replace(session, system=system))
     b = np.where(proof.fixed[:, None] > 0, 0.0, right.b)
     return following, ProofStep(sums, replace(right, b=b))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
+from solvers.distributed.robots.current_poses import describe
 from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.records import Reweigh, Reweighed
 from solvers.robust.losses import RobustLoss
@@ -18,21 +21,20 @@ _LEFT_OUT_SHARE = 1e-4
 
 def reweigh(interior: Interior, order: Reweigh) -> tuple[Interior, Reweighed]:
     """Weights for the residuals at the current poses, and the cost with them."""
-    ratio = interior.whole.ratios(interior.state.poses, order.scale)
+    ratio = interior.whole.ratios(interior.poses, order.scale)
     weights = _loss(order).weights(ratio, order.mu)
     least = _LEFT_OUT_SHARE * order.least
     weights = np.where(weights > order.least, weights, least)
     weights = np.where(_is_known(interior), 1.0, weights)
-    following = interior.with_changes(
-        weights=weights, eliminated=None, has_laplacian=False, proof=None
-    ).restored()
-    _, diagonal = following.describe(None)
-    return following, Reweighed(diagonal, following.evaluation(interior.state.poses))
+    state = replace(interior.state, weights=weights, session=None, has_sent_laplacian=False)
+    following = interior.in_state_of(state)
+    _, diagonal = describe(following, None)
+    return following, Reweighed(diagonal, following.evaluation(interior.poses))
 
 
 def sum_ratios(interior: Interior, order: Reweigh) -> tuple[Interior, RatioSums]:
     """Sums over the edges at the current poses."""
-    costs = interior.whole.costs(interior.state.poses)
+    costs = interior.whole.costs(interior.poses)
     thresholds = order.scale * _thresholds(interior)
     known = _is_known(interior)
     sums = RatioSums.of_edges(costs, thresholds, known, _loss(order), order.mu)
@@ -45,7 +47,7 @@ def count_below(interior: Interior, bounds: tuple[float, float]) -> tuple[Interi
     `bounds` are the scale of the thresholds c^2, and that bound.
     """
     scale, largest_ratio = bounds
-    ratio = interior.whole.ratios(interior.state.poses, scale)
+    ratio = interior.whole.ratios(interior.poses, scale)
     is_below = (ratio <= largest_ratio) & ~_is_known(interior)
     return interior, float(np.sum(is_below))
 
@@ -53,7 +55,7 @@ def count_below(interior: Interior, bounds: tuple[float, float]) -> tuple[Interi
 def edges_within(interior: Interior, scale: float) -> tuple[Interior, IntArray]:
     """Numbers of the edges within their scaled thresholds, for the result."""
     assert interior.whole.edges is not None
-    ratio = interior.whole.ratios(interior.state.poses, scale)
+    ratio = interior.whole.ratios(interior.poses, scale)
     return interior, interior.whole.edges[ratio <= 1.0]
 
 

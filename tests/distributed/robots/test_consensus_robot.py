@@ -24,8 +24,8 @@ from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, grid
+from solvers.distributed.robots import descent, start, translations
 from solvers.distributed.robots.agent import begin_copies
-from solvers.distributed.robots.interior import Interior
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve
@@ -68,20 +68,19 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
     *("gamma", "is_best", "sums", "squares", "gradient", "cost", "rotations", "value"),
 }
 Copies = ConsensusRobot
-Inner = Interior
 ROUNDS = (  # orders that are, or end, a round
     *(
-        Inner.project,
-        Inner.set_translations,
-        Inner.move,
-        Inner.evaluate_trial,
-        Inner.move_straight,
+        start.project,
+        translations.set_translations,
+        descent.move,
+        descent.evaluate_trial,
+        descent.move_straight,
         fits_part,
         prove_interior,
     ),
     *(
         move_proof,
-        Inner.adopt,
+        translations.adopt,
         begin_copies,
         Copies.penalize,
         Copies.solve,
@@ -102,7 +101,7 @@ ALL_REDUCES = (
         Copies.step,
     ),
 )
-OFF = ("Interior.describe", "Interior.set_poses", "Interior.cost", "Interior.result")
+OFF = ("describe", "set_poses", "cost", "result")
 
 
 class Watching(Recording):
@@ -119,7 +118,7 @@ class Watching(Recording):
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         answers = super().ask(order, requests)
         grounded = middle_separator(self.graph, tuple(self.shares))
-        if name_of(order) == "Interior.describe":
+        if name_of(order) == "describe":
             self.secrets: list[list[Array]] = [[] for _ in self.agents]
         for agent in self.agents:
             holder = agent.copies
@@ -212,7 +211,7 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     # of SOC, 2 a move of Newton, 2 for the proof.
     assert (
         solution.ledger.rounds
-        == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(Interior.move) + 2
+        == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(descent.move) + 2
     )
     assert solution.ledger.all_reduces == 3 + 1 + stage.iterations
 

@@ -38,7 +38,7 @@ from solvers.distributed.robots.elimination import (
     packed,
     unpacked,
 )
-from solvers.distributed.robots.factors import Factors
+from solvers.distributed.robots.system import FactoredPart
 from solvers.soc.subgraph import Part, split_graph
 
 SIZES = st.integers(2, 30)
@@ -111,7 +111,7 @@ def split(
     columns = []
     for part in working:
         local = Poses(poses.R[part.poses], poses.t[part.poses])
-        cut = Factors(part, None).cut(*widths)
+        cut = FactoredPart(part, None).cut(widths)
         mine = columns_of(part.poses, n, widths)
         added = np.zeros(len(mine))
         added[cut.interior] = diagonal[mine[cut.interior]]

@@ -44,9 +44,9 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import TreeFactor
 from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums, unpacked
-from solvers.distributed.robots.factors import Factors
 from solvers.distributed.robots.proof import verify_interior
 from solvers.distributed.robots.subdomain_blocks import SubdomainBlocks
+from solvers.distributed.robots.system import FactoredPart
 from solvers.soc.subdomains import Subdomains
 from solvers.soc.subgraph import Part, split_graph
 
@@ -278,7 +278,7 @@ def is_true_of_robot(
     """
     p = problem.num_poses
     d = problem.d
-    cut = Factors(part, backend).cut(1, d)
+    cut = FactoredPart(part, backend).cut((1, d))
     proved = verify_interior(problem, Lambda, eta, cut, np.zeros(0, dtype=np.int64), share, backend)
     if proved is None:
         return None

@@ -1,0 +1,34 @@
+"""The frame of the answer: the cost is the same in all, so that one has to be chosen."""
+
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.pose_graph import PoseGraph
+
+
+def choose_gauge(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Poses, str, int]:
+    """Poses in the frame of priors, anchor, first FIX line, estimate or pose 0.
+
+    Returned are the moved poses, a sentence on their frame, and the pose that it is held by, 0
+    where there is none.
+    """
+    reference = graph.initial
+    if graph.world is not None:
+        ignored = "; FIX lines are ignored beside them" if len(graph.fixed) else ""
+        return poses.with_gauge_at(graph.world), f"that of the priors{ignored}", graph.world
+    held = anchor
+    why = "as asked for"
+    if anchor is None and len(graph.fixed):
+        held = int(graph.fixed[0])
+        why = "by its FIX line"
+        num_others = len(graph.fixed) - 1
+        if num_others:
+            why += f"; those of {num_others} other poses are ignored, F leaves one frame open"
+    if held is None:
+        if reference is not None:
+            frame = "aligned with the estimate that came with the graph"
+            return poses.aligned_to(reference), frame, 0
+        return poses.with_gauge_at(0), f"pose {graph.pose_ids[0]} at the identity", 0
+    name = f"pose {graph.pose_ids[held]}"
+    if reference is not None:
+        moved = poses.anchored_to(reference, held)
+        return moved, f"{name} where the estimate has it, {why}", held
+    return poses.with_gauge_at(held), f"{name} at the identity, {why}", held
