@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pgo_models.errors import check_settings
+from pgo_models.errors import SettingError, check_settings
+from pgo_models.geometry.arrays import whole_number
 from pgo_models.graphs.partitioning import Partition
 from solvers.network.engine import DEFAULT_MEMORY, Engine
 from solvers.network.faults import Faults
@@ -114,7 +115,11 @@ class Robots:
         robots : Robots, Partition or int
             Robots, or owners of the poses.
         """
-        return robots if isinstance(robots, Robots) else cls(robots)
+        if isinstance(robots, Robots):
+            return robots
+        if isinstance(robots, Partition):
+            return cls(robots)
+        return cls(whole_number(robots, "robots", SettingError))
 
     def with_owners(self, owners: Partition) -> Robots:
         """The robots with the owners that a number of them stands for.

@@ -585,8 +585,8 @@ MUTANTS = (
     Mutant(
         "growing: an update that was interrupted is followed by another solve",
         "solvers/growing.py",
-        "update.status in OUT_OF_TIME or not",
-        "not",
+        "if not update.is_open:",
+        "if not update.proof.can_improve:",
         ("tests/test_growing.py",),
     ),
     Mutant(

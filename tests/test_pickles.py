@@ -200,6 +200,7 @@ SETTINGS += (
     "GaussSeidel",
     "LevenbergMarquardt",
     "Faults",
+    "Robots",
     "InProcess",
 )
 SETTINGS += (

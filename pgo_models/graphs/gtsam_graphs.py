@@ -160,6 +160,11 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
         do not fit it.
     MissingExtraError
         Without the extra `peers`.
+
+    Examples
+    --------
+    >>> import pgo_models as pgo
+    >>> factors, values = pgo.to_gtsam(pgo.load("sphere"))  # doctest: +SKIP
     """
     gtsam = extra_module("gtsam", "peers")
     if len(graph.landmarks):

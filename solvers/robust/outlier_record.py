@@ -1,0 +1,81 @@
+"""What is proven of the closures of a graph, as a robust answer carries it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.geometry.rotations import BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class OutlierProof:
+    """What is proven of the closures of a graph whose known inliers are right.
+
+    Parameters
+    ----------
+    proven_wrong : BoolArray, shape (m,)
+        Edges that no map at least as good as this one keeps.
+    num_kept : int
+        Closures that this map keeps.
+    num_closures : int
+        Edges that are not known inliers.
+    most_closures : int
+        Closures that a map at least as good as this one keeps, at most.
+    truncated_cost : float
+        Upper bound on the truncated cost of this map.
+    truncated_cost_bound : float
+        Lower bound on the truncated cost of every map.
+    is_complete : bool
+        Whether everything that was worth trying was tried in the time given.
+    """
+
+    proven_wrong: BoolArray
+    num_kept: int
+    num_closures: int
+    most_closures: int
+    truncated_cost: float
+    truncated_cost_bound: float
+    is_complete: bool = True
+
+    @property
+    def gap(self) -> float:
+        """How far the truncated cost may be above the least possible, relative."""
+        if self.truncated_cost <= 0.0:
+            return 0.0
+        distance = self.truncated_cost - self.truncated_cost_bound
+        return float(min(1.0, max(0.0, distance / self.truncated_cost)))
+
+    def __str__(self) -> str:
+        num_wrong = int(self.proven_wrong.sum())
+        if not num_wrong and self.most_closures == self.num_closures:
+            return (
+                "no closure can be proven wrong: the known inliers can follow every one of the "
+                f"{self.num_closures}"
+            )
+        percent = math.ceil(1000.0 * self.gap) / 10.0
+        text = (
+            f"{num_wrong} of {self.num_closures} closures are proven wrong, if all known inliers "
+            f"are right. No map at least as good keeps more than {self.most_closures} closures; "
+            f"this one keeps {self.num_kept}. The truncated cost is within {percent:g} % of the "
+            "least possible"
+        )
+        return text if self.is_complete else f"{text}; the time did not suffice to try all"
+
+    def as_json(self) -> dict[str, object]:
+        """Return what is written as JSON.
+
+        Returns
+        -------
+        dict
+            Edges count from 0.
+        """
+        return {
+            "proven_wrong": np.flatnonzero(self.proven_wrong).tolist(),
+            "most_closures": self.most_closures,
+            "truncated_cost": self.truncated_cost,
+            "truncated_cost_bound": self.truncated_cost_bound,
+            "is_complete": self.is_complete,
+        }

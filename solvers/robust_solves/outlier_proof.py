@@ -1,0 +1,364 @@
+"""Wrong closures proven wrong, one by one, and how far a robust answer is from the best one.
+
+The known inliers are taken to be right, which is the only assumption. For poses X let
+
+    TLS(X) = sum over known inliers of r_e^2 + sum over closures of min(r_e^2, c_e^2)
+
+be the truncated cost, U its value at the answer, and C the sum of all c_e^2. A map X with TLS(X) at
+most U keeps a set K of closures, those with r_e^2 <= c_e^2. The cost of known inliers and K is then
+
+    F_K(X) = TLS(X) - C + sum over K of c_e^2  <=  s,   s = U - C + largest possible sum over K.
+
+So each closure of K, and each pair, fits the known inliers at a cost of at most s:
+d_e = min F_e <= s and d_ef = min F_ef <= s.
+
+1. A closure whose proven lower bound of d_e is above s is wrong in every map that is as good as the
+   answer. Without it the sum over K is smaller, and so is s: the others are tried again.
+2. Closures are divided into classes of which any two are proven inconsistent, d_ef > s. K has at
+   most one of a class, so that the sum over K is at most that of the largest c_e^2 of each class;
+   with this s more closures may be wrong, and more pairs inconsistent.
+
+In the end K has at most as many closures as there are classes, and TLS(X) is at least C less the
+sum of the largest c_e^2 of each class, for all X: for those worse than the answer it is above U.
+
+Which closures and pairs are tried is decided by first-order distances on the known inliers
+(`solvers.robust.chains`); what is claimed rests on certificates alone. Guaranteed outlier removal
+does this for registration (Parra Bustos & Chin, "Guaranteed outlier removal for point cloud
+registration with correspondences", IEEE TPAMI 2018).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pgo_models.certificates.rounding_errors import objective_rounding
+from pgo_models.certificates.shrunk_information import shrink_information
+from pgo_models.errors import FAILURES, SettingError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.graphs.precisions import proper_information
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.problem.weighting import Weighting
+from solvers.here import Here
+from solvers.loop import RunMonitor
+from solvers.plan import solve_at
+from solvers.request import Pipeline
+from solvers.robust.chains import Chains, cycle_distances, is_whole, squared_distances
+from solvers.robust.outlier_record import OutlierProof
+from solvers.solution import Solution
+
+# What first-order distances have to be, in units of s, for a proof to be tried.
+_MARGIN = 1.2
+# Relative gap of the first certificate: of most wrong closures the cost is many times s.
+_WIDE_GAP = 0.5
+# Closures of which all pairs are compared within seconds.
+_MOST_PAIRED = 2000
+_OUTWARD = 1.0 + 1e-12  # for sums of up to a million positive terms
+_ROUNDING = 2.0**-40  # of an eigenvalue, over the trace
+
+
+def prove_outliers(solution: Solution, time_limit: float = math.inf) -> Solution:
+    """Prove closures wrong, for all maps that are as good as that of a robust solve.
+
+    Known inliers, odometry unless others were given, are taken to be right. What is proven is exact
+    for the thresholds of the truncated cost: closures that no map at least as good keeps, how many
+    closures such a map keeps at most, and a lower bound on the truncated cost of every map.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of a robust solve.
+    time_limit : float, optional
+        Seconds after which no further proof is tried; unlimited unless given.
+
+    Returns
+    -------
+    Solution
+        The same, with `solution.robust.proof`.
+
+    Raises
+    ------
+    SettingError
+        When the solution is not of a robust solve, or an edge has a negative cost, as chi2 of an
+        indefinite information matrix can.
+
+    References
+    ----------
+    A. Parra Bustos and T.-J. Chin, "Guaranteed outlier removal for point cloud registration with
+    correspondences", IEEE TPAMI 2018, for the idea.
+
+    Examples
+    --------
+    A chain of odometry with a closure that it contradicts:
+
+    >>> import pgo_models as pgo, solvers
+    >>> chain = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
+    >>> far = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
+    >>> graph = chain.with_edges(np.array([2]), np.array([25]), far, 1e4, 1e4)
+    >>> solution = prove_outliers(solvers.solve(graph, robust=solvers.GNC()))
+    >>> np.flatnonzero(solution.robust.proof.proven_wrong).tolist() == [chain.num_edges]
+    True
+    """
+    rejection = solution.robust
+    if rejection is None:
+        raise SettingError("outliers are proven of a robust solve; give solve(.., robust=GNC())")
+    problem = rejection.problem
+    if (problem.edge_costs(solution.poses) < 0.0).any():
+        raise SettingError("an edge has a negative cost, so that nothing can be proven; use F")
+    thresholds = rejection.threshold_scale * chi2_thresholds(problem, rejection.quantile)
+    deadline = time.perf_counter() + time_limit
+    search = _Search.of(problem, rejection.known, thresholds, solution.poses, deadline)
+    search.run()
+    return replace(solution, robust=replace(rejection, proof=search.proof()))
+
+
+@dataclass(eq=False)
+class _Search:
+    """A search under way.
+
+    `cost` is U, an upper bound. `classes` has the closures that are not proven wrong; any two of a
+    class are proven inconsistent. `single` are first-order distances of all edges, (m,), and
+    `refuted` the pairs whose proof has failed.
+    """
+
+    problem: PGOProblem
+    known: BoolArray
+    thresholds: Array
+    chains: Chains
+    kept: BoolArray
+    cost: float
+    classes: list[list[int]]
+    single: Array
+    deadline: float
+    proven: dict[tuple[int, ...], float] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, problem: PGOProblem, known: BoolArray, thresholds: Array, poses: Poses, deadline: float
+    ) -> _Search:
+        graph = problem.graph
+        kept = known | (problem.edge_costs(poses) <= thresholds)
+        inliers = PGOProblem(graph.without_edges(~kept), problem.backend, problem.weighting)
+        error = objective_rounding(inliers, poses).error
+        cost = inliers.objective(poses) + error + float(thresholds[~kept].sum())
+        chains = Chains.of(graph, known)
+        single = _single_distances(chains, np.flatnonzero(~known))
+        classes = [[e] for e in np.flatnonzero(~known).tolist()]
+        return cls(
+            problem, known, thresholds, chains, kept, _OUTWARD * cost, classes, single, deadline
+        )
+
+    @property
+    def most_cost(self) -> float:
+        """s: what known inliers and closures of a map as good as this one cost at most.
+
+        It is U less the thresholds of the closures that no such map keeps: of each class all but
+        the largest, and of those proven wrong all.
+        """
+        is_left_out = ~self.known
+        for members in self.classes:
+            largest = max(members, key=lambda e: self.thresholds[e])
+            is_left_out[largest] = False
+        return max(0.0, self.cost - math.fsum(self.thresholds[is_left_out]) / _OUTWARD)
+
+    def run(self) -> None:
+        """Prove single closures wrong, then pairs inconsistent, until nothing changes."""
+        while True:
+            before = self.most_cost
+            self.exclude_single_closures()
+            self.join_classes()
+            if self.is_out_of_time() or not self.most_cost < before:
+                return
+
+    def is_out_of_time(self) -> bool:
+        """Whether no further proof is to be tried."""
+        return time.perf_counter() > self.deadline
+
+    def exclude_single_closures(self) -> None:
+        """Step 1: closures that cost more than s beside the known inliers, the farthest first."""
+        while not self.is_out_of_time():
+            s = self.most_cost
+            doubted = [e for members in self.classes for e in members]
+            far = [e for e in doubted if self.single[e] > _MARGIN * s]
+            far.sort(key=lambda e: -self.single[e])
+            wrong = set()
+            for e in far:
+                if self.is_proven((e,), s):
+                    wrong.add(e)
+            if not wrong:
+                return
+            members = [[e for e in of_class if e not in wrong] for of_class in self.classes]
+            self.classes = [of_class for of_class in members if of_class]
+
+    def join_classes(self) -> None:
+        """Step 2: join classes whose closures are inconsistent, pair by pair.
+
+        Closures that the answer keeps stand in different classes; others join one of them.
+        """
+        doubted = np.array([e for members in self.classes for e in members], dtype=np.int64)
+        if not 1 < len(doubted) <= _MOST_PAIRED:
+            return
+        distance = _pair_distances(self.chains, doubted)
+        place = {int(e): k for k, e in enumerate(doubted)}
+        s = self.most_cost
+        ordered = sorted(self.classes, key=lambda members: not self.kept[members].any())
+        joined: list[list[int]] = []
+        for members in ordered:
+            rows = [place[e] for e in members]
+            for other in joined:
+                columns = [place[e] for e in other]
+                if (distance[np.ix_(rows, columns)] <= _MARGIN * s).any():
+                    continue
+                if all(self.is_proven((e, f), s) for e in members for f in other):
+                    other += members
+                    break
+            else:
+                joined.append(members)
+        self.classes = joined
+
+    def is_proven(self, edges: tuple[int, ...], s: float) -> bool:
+        """Whether known inliers and these closures are proven to cost more than s."""
+        edges = tuple(sorted(edges))
+        if edges not in self.proven and self.is_out_of_time():
+            return False
+        if edges not in self.proven:
+            self.proven[edges] = self._lower_bound(edges, s)
+        return self.proven[edges] > s
+
+    def _lower_bound(self, edges: tuple[int, ...], s: float) -> float:
+        """Proven lower bound on the cost of known inliers and closures, as far as it is above s.
+
+        It is that of the subgraph between the ends of the closures: what is left out costs nothing
+        at least. Where chi2 is not quadratic its tangent proves little of a cost as large as that
+        of a wrong closure, and the bound is that of an F below it.
+        """
+        subgraph = self._between_ends(edges)
+        if subgraph is None:
+            return 0.0
+        bound = 0.0
+        for problem in _easier_problems(subgraph):
+            bound = max(bound, _bound_above(problem, s))
+            if bound > s:
+                break
+        return bound
+
+    def _between_ends(self, edges: Sequence[int]) -> PGOProblem | None:
+        """The problem of known inliers and closures between the ends of these; None if apart."""
+        graph = self.problem.graph
+        ends = np.concatenate([graph.i[list(edges)], graph.j[list(edges)]])
+        chain = self.chains.chain
+        poses = [
+            np.arange(ends[chain[ends] == c].min(), ends[chain[ends] == c].max() + 1)
+            for c in np.unique(chain[ends])
+        ]
+        chosen = self.known.copy()
+        chosen[list(edges)] = True
+        subgraph = graph.without_edges(~chosen).subgraph(np.concatenate(poses))
+        if len(subgraph.components()) > 1:
+            return None
+        return PGOProblem(subgraph, self.problem.backend, self.problem.weighting)
+
+    def proof(self) -> OutlierProof:
+        """What has been proven so far."""
+        doubted = [e for members in self.classes for e in members]
+        proven_wrong = ~self.known
+        proven_wrong[doubted] = False
+        largest = math.fsum(max(self.thresholds[members]) for members in self.classes)
+        bound = math.fsum(self.thresholds[~self.known]) / _OUTWARD - _OUTWARD * largest
+        return OutlierProof(
+            proven_wrong,
+            num_kept=int((self.kept & ~self.known).sum()),
+            num_closures=int((~self.known).sum()),
+            most_closures=len(self.classes),
+            truncated_cost=self.cost,
+            truncated_cost_bound=min(max(0.0, bound), self.cost),
+            is_complete=not self.is_out_of_time(),
+        )
+
+
+def _easier_problems(problem: PGOProblem) -> Iterator[PGOProblem]:
+    """Problems whose cost is at most that of a problem, the easiest to bound first."""
+    if not problem.is_quadratic:
+        yield isotropic_below(problem)
+    yield problem
+
+
+def isotropic_below(problem: PGOProblem) -> PGOProblem:
+    """F with precisions so small that it is below chi2 at all poses.
+
+    Of matrices without coupling, below those of the graph (`shrink_information`), the smallest
+    eigenvalues are taken. With the turn theta of an edge, chi2 has at least 2 (1 - cos theta) times
+    that of I_rr, and F 4 (1 - cos theta) kappa.
+    """
+    d = problem.d
+    graph = shrink_information(problem.graph, cap=1.0)
+    information = proper_information(graph)
+    tau = _least_eigenvalues(information[:, :d, :d])
+    kappa = 0.5 * _least_eigenvalues(information[:, d:, d:])
+    weighted = replace(graph.with_weights(kappa, tau), information=None)
+    return PGOProblem(weighted, problem.backend, Weighting.ISOTROPIC)
+
+
+def _least_eigenvalues(blocks: Array) -> Array:
+    """Smallest eigenvalues, (m,), rounded down, and zero where rounding hides them."""
+    traces = np.einsum("mkk->m", blocks)
+    least = np.linalg.eigvalsh(blocks)[:, 0]
+    return np.asarray(np.maximum(least - _ROUNDING * traces, 0.0))
+
+
+def _bound_above(problem: PGOProblem, s: float) -> float:
+    """Proven lower bound on a cost, with a gap that suffices where its minimum is above s."""
+    bound = 0.0
+    gap = _WIDE_GAP
+    for _ in range(2):
+        place = Here(RunMonitor(progress=False), [], problem, gap)
+        try:
+            found = solve_at(place, Pipeline(soc=None, gap=gap, handedness=None), None)
+        except FAILURES:
+            break
+        bound = max(bound, found.proof.lower_bound)
+        least = found.proof.objective
+        if bound > s or least <= s:
+            break
+        gap = 0.5 * (least - s) / least
+    return bound
+
+
+def _single_distances(chains: Chains, edges: IntArray) -> Array:
+    """First-order distances, (m,), of edges from the chain between their ends; zero elsewhere."""
+    graph = chains.graph
+    distances = np.zeros(graph.num_edges)
+    whole = edges[is_whole(graph)[edges]]
+    closures = chains.closures(whole)
+    own = chains.chain[closures.i] == chains.chain[closures.j]
+    along = chains.covariance[closures.j[own]] - chains.covariance[closures.i[own]]
+    covariance = closures.covariance[own] + along
+    distances[whole[own]] = squared_distances(
+        (closures.cycle[0][own], closures.cycle[1][own]), covariance
+    )
+    return distances
+
+
+def _pair_distances(chains: Chains, edges: IntArray) -> Array:
+    """First-order distances, (k, k), of the cycles of two edges and the chains between their ends.
+
+    They are zero where the ends are not in the same two chains.
+    """
+    k = len(edges)
+    distances = np.zeros((k, k))
+    whole = np.flatnonzero(is_whole(chains.graph)[edges])
+    closures = chains.closures(edges[whole])
+    a, b = np.triu_indices(len(whole), 1)
+    in_first = chains.chain[closures.i[a]] == chains.chain[closures.i[b]]
+    in_second = chains.chain[closures.j[a]] == chains.chain[closures.j[b]]
+    a = a[in_first & in_second]
+    b = b[in_first & in_second]
+    distances[whole[a], whole[b]] = cycle_distances(closures, chains.covariance, a, b)
+    return distances + distances.T
