@@ -22,7 +22,7 @@ from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
-from solvers.robust.revision import drop_contradicted
+from solvers.robust.revision import Fit, drop_contradicted
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
@@ -210,10 +210,7 @@ class _RobustSolve:
         """
         choice = self.choice
         doubted = self.doubted
-        scale = choice.threshold_scale
-        search = ClusterSearch(
-            doubted.problem, doubted.known, scale * doubted.thresholds, scale, self._has_time
-        )
+        search = self._search(choice)
         fit = search.improved(estimate.kept, estimate.poses)
         kept = drop_contradicted(doubted.problem, doubted.known, fit.kept, fit.poses, _settled)
         if np.array_equal(kept, estimate.kept):
@@ -222,6 +219,23 @@ class _RobustSolve:
         is_no_dearer = choice.cost(revised.poses) <= choice.cost(estimate.poses)
         only_drops = not (kept & ~estimate.kept).any()
         return revised if is_no_dearer or only_drops else estimate
+
+    def _search(self, choice: Choice) -> ClusterSearch:
+        """Search for clusters with the thresholds by which attempts are compared."""
+        doubted = self.doubted
+        scale = choice.threshold_scale
+        allowed = scale * doubted.thresholds
+        return ClusterSearch(doubted.problem, doubted.known, allowed, scale, self._has_time)
+
+    def _by_chance(self, solution: Solution, kept: BoolArray) -> float:
+        """Number of wrong closures that are expected to fit by chance.
+
+        It is zero where all are kept, and is not looked for where the solve was broken off.
+        """
+        if kept.all() or solution.status in OUT_OF_TIME:
+            return 0.0
+        fit = Fit.of(self.doubted.problem, kept, solution.poses)
+        return self._search(self.choice).expected_by_chance(fit)
 
     def _has_time(self) -> bool:
         return self.places.request.monitor.left > _LEAST_SECONDS
@@ -278,6 +292,7 @@ class _RobustSolve:
             threshold_scale=choice.threshold_scale,
             verdict=solution.certificate.verdict,
             is_misfit=solution.edge_residuals.is_overall_misfit,
+            by_chance=self._by_chance(solution, kept),
             fit=solution.certificate.fit,
         )
         ledgers = self.places.ledgers

@@ -185,19 +185,33 @@ def test_the_command_ends_with_3_where_nothing_checks_the_edges(
     assert json.loads(output)["verdict"] == "UNCHECKED"
 
 
-def test_more_than_half_rejected_is_said_first(
+def test_more_than_half_rejected_is_said_in_the_first_line() -> None:
+    graph, is_wrong = spoiled(world(150, 0.1), 0.9, "random", 0)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    np.testing.assert_array_equal(robust.rejected, is_wrong)
+    assert robust.support is Support.CHECKED
+    assert robust.headline.startswith("CERTIFIED for the ")
+    assert robust.headline.endswith("more than half were rejected")
+
+
+def test_a_loose_map_that_wrong_closures_fit_by_chance_is_doubted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    graph, is_wrong = spoiled(world(150, 0.1), 0.7, "random", 0)
+    """Sixty poses, whose odometry has drifted so far that it follows many a wrong closure."""
+    right = pgo.grid_world(
+        1,
+        60,
+        np.random.default_rng(0),
+        d=2,
+        loop_closure_probability=0.02,
+        noise=NoiseModel(0.3, 0.1),
+    )
+    graph, _ = spoiled(right, 0.9, "random", 0)
     solution = solvers.solve(graph, robust=solvers.GNC())
-    np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
-    assert solution.verdict is Support.DOUBTFUL
-    assert not solution.is_certified
     robust = solution.robust
-    gone = f"{is_wrong.sum()} of {robust.num_closures}"
-    first = f"DOUBTFUL, more than half of the closures were rejected, {gone}: CERTIFIED for"
-    assert robust.headline.startswith(first)
-    assert solution.as_json()["robust"]["doubts"] == list(robust.doubts)
+    assert any("expected to fit this map by chance" in doubt for doubt in robust.doubts)
+    assert not solution.is_certified
+    assert solution.as_json()["robust"]["expected_by_chance"] == robust.by_chance
     file = tmp_path / "wrong.g2o"
     pgo.write_g2o(graph, file)
     assert run_cli(capsys, "solve", file, "--robust", "gnc", "--quiet")[0] == 3
@@ -289,4 +303,4 @@ def test_nine_closures_of_ten_are_wrong(benchmark_problem, name: str, kind: str)
     graph, is_wrong = spoiled(benchmark_problem(name).graph, 0.9, kind, 0)
     solution = solvers.solve(graph, robust=solvers.GNC())
     assert_not_silent(solution, is_wrong)
-    assert not solution.is_certified  # most were rejected
+    assert quality(solution, is_wrong) >= ENOUGH or not solution.is_certified
