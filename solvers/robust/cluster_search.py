@@ -23,7 +23,7 @@ import scipy  # and scipy.special when it is used
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
-from pgo_models.graphs.pose_graph import IntArray, bridges
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import FALSE_ALARM, RightCosts
@@ -31,7 +31,8 @@ from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust.clusters import closure_clusters
 from solvers.robust.distances import FirstOrder
-from solvers.robust.revision import Fit, inlier_problem, truncated_cost
+from solvers.robust.revision import Fit, inlier_problem, is_held, truncated_cost
+from solvers.robust.weighted_edges import held_together
 
 # Probability with which a right cluster passes the test.
 _QUANTILE = 0.99
@@ -107,16 +108,19 @@ class ClusterSearch:
         return Chains.of(self.problem.graph, self.known)
 
     def improved(self, kept: BoolArray, poses: Poses) -> Fit:
-        """Edges to keep, and their poses, from those of an estimate.
+        """Edges to keep, and their poses, from those of an estimate with the edges `kept`, (m,).
 
-        The truncated cost is no higher than that of the edges `kept`, (m,), at their best poses.
+        Clusters are added and removed, then one is exchanged, and so on while exchanges lower the
+        truncated cost.
         """
         fit = self._settled(kept, poses)
+        least_cost = np.inf
         while True:
             fit = self._without_misfits(self._with_clusters(fit))
             exchanged = self._exchanged(fit)
-            if exchanged is None:
+            if exchanged is None or self.cost(exchanged) >= (1.0 - _LEAST_DECREASE) * least_cost:
                 return fit
+            least_cost = self.cost(exchanged)
             fit = exchanged
 
     def expected_by_chance(self, fit: Fit) -> float:
@@ -252,7 +256,7 @@ class ClusterSearch:
         for k in np.argsort(-ratio, kind="stable")[:_MOST_REMOVALS].tolist():
             kept = fit.kept.copy()
             kept[groups[k]] = False
-            if len(self.problem.graph.components(kept)) > 1:
+            if not is_held(self.problem.graph, kept):
                 continue
             smaller = self._settled(kept, fit.poses)
             rise = (fit.cost - smaller.cost) / thresholds[k]
@@ -282,8 +286,7 @@ class ClusterSearch:
         other = self._settled(_with_edges(fit.kept, cluster), fit.poses)
         for _ in range(_MOST_ROUNDS):
             ratio = self.problem.edge_costs(other.poses) / self.allowed
-            kept = self.known | (ratio <= 1.0)
-            kept[bridges(self.problem.graph, kept, ratio)] = True
+            kept = held_together(self.problem.graph, self.known | (ratio <= 1.0), ratio)
             if np.array_equal(kept, other.kept):
                 return other
             other = self._settled(kept, other.poses)

@@ -175,7 +175,9 @@ class Rejection:
     def held(self) -> str:
         """How many closures constrain the map, in words."""
         num_kept = self.num_closures_kept
-        closures = f"{num_kept} of {self.num_closures} closures"
+        has_suspected_fixes = bool((self.problem.graph.is_prior & ~self.known).any())
+        names = "closures and fixes" if has_suspected_fixes else "closures"
+        closures = f"{num_kept} of {self.num_closures} {names}"
         held = f"{closures} hold the map ({self.num_cycles} cycles)"
         keeps_most = 2 * num_kept >= self.num_closures
         return held if keeps_most else f"{held}, more than half were rejected"
@@ -229,6 +231,7 @@ class Rejection:
             rejected += "; written files are without them"
         rows = [
             ("given", self.conditional),
+            ("taken for right", self.named(self.known)),
             ("rejected", rejected),
             ("doubtful", self.named(self.doubtful)),
             ("found by", self.start),

@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from solvers.robust_solves.attempts import Plan
 
 pytestmark = pytest.mark.slow  # robust solves from end to end
 
+CASES = Path(__file__).parent.parent / "cases"
 POLISHED = partial(polish, max_steps=4)
 KINDS = pytest.mark.parametrize("kind", ["random", "aliased"])
 
@@ -412,3 +414,42 @@ def test_robots_take_back_what_one_place_does():
     assert "that they can follow" in solution.robust.start
     np.testing.assert_array_equal(solution.robust.kept, ~wrong)
     assert solution.is_certified
+
+
+@pytest.mark.parametrize(
+    ("name", "false_fix"), [("one_wrong_gps.g2o", 30), ("gps_one_bad.g2o", 33)]
+)
+def test_of_six_fixes_the_false_one_is_rejected_and_no_closure(name, false_fix):
+    graph = pgo.read_g2o(CASES / name)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert np.flatnonzero(solution.robust.rejected).tolist() == [false_fix]
+    assert graph.is_prior[false_fix]
+    assert solution.is_certified
+    assert "closures and fixes hold the map" in solution.robust.headline
+    facts = dict(solution.robust.facts())
+    assert facts["taken for right"] == solution.robust.named(solution.robust.known)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_fixes_moved_by_metres_are_rejected_among_many(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    right = pgo.grid_world(1, 200, rng, d=2, loop_closure_probability=0.02)
+    fixed = np.arange(0, 200, 3)
+    is_moved = np.zeros(len(fixed), dtype=bool)
+    is_moved[rng.choice(len(fixed), 5, replace=False)] = True
+    t = right.truth.t[fixed] + 0.3 * rng.standard_normal((len(fixed), 2))
+    t[is_moved] += rng.choice([-5.0, 5.0], (5, 2))
+    lines = [
+        f"EDGE_PRIOR_SE2_XY {pose} {x:.9g} {y:.9g} 11.1 0 11.1"
+        for pose, (x, y) in zip(fixed, t, strict=True)
+    ]
+    file = tmp_path / "fixes.g2o"
+    pgo.write_g2o(right, file)
+    with file.open("a") as written:
+        written.write("\n".join(lines))
+    graph = pgo.read_g2o(file)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    rejected = robust.rejected[graph.is_prior]
+    assert rejected[is_moved].all()
+    assert rejected[~is_moved].sum() <= 4  # 0.6 are expected at the quantile 0.99
+    assert robust.rejected[~graph.is_prior].sum() <= 2
