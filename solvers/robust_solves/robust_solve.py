@@ -11,8 +11,9 @@ import numpy as np
 from pgo_models.errors import FAILURES, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
+from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.network.ledger import Ledger
 from solvers.places import with_partition
 from solvers.request import SolveRequest
@@ -22,7 +23,7 @@ from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
-from solvers.robust.revision import Fit, drop_contradicted
+from solvers.robust.revision import Fit, drop_contradicted, error_scale
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
@@ -31,11 +32,15 @@ from solvers.robust_solves.attempts import (
     Plan,
     plans_in_order,
 )
-from solvers.robust_solves.choice import Choice
+from solvers.robust_solves.choice import Choice, threshold_scale
 from solvers.solution import Solution, joined_notes
 
 # Newton steps after one edge was dropped.
 _STEPS_AFTER_EDGE = 4
+# A plain solve comes first on a large graph where this share of closures is at most so many times
+# beyond its thresholds at the chordal start.
+_NEAR_AT_START = 10.0
+_NEAR_SHARE = 0.9
 # Seconds that have to be left for another step of a revision.
 _LEAST_SECONDS = 1e-6
 
@@ -45,10 +50,11 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
 
     `Solution.robust` says which these are, what is proven of them, and what supports them.
 
-    1. Least squares. Where factoring the matrix of all edges is cheap and no start is given, the
-       solution with every edge comes first. It is the answer if time has run out, or if nothing
-       speaks against any edge: it is certified, no edge but known inliers is beyond its threshold
-       or contradicted, and all together cost no more than they may.
+    1. Least squares. Where factoring the matrix of all edges is cheap, or affordable and most
+       closures fit the chordal start, and no start is given, the solution with every edge comes
+       first. It is the answer if time has run out, or if nothing speaks against any edge: it is
+       certified, no edge but known inliers is improbable or contradicted, and all together cost no
+       more than they may.
     2. Attempts (`plans_in_order`). Graduated non-convexity is run as set; then there are the known
        inliers alone; then it is run on the pairwise consistent edges; with more and smaller steps;
        with tight thresholds, which the edges kept then widen; from the least-squares solution; with
@@ -74,7 +80,7 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     thresholds = chi2_thresholds(problem, robust.quantile)
     doubted = DoubtedProblem(problem, known, thresholds, robust.quantile)
     job = _RobustSolve(doubted, PlacesOfEdges(doubted, request), request.start)
-    if doubted.is_cheap and request.start is None:
+    if request.start is None and (doubted.is_cheap or job.seems_right()):
         answer = job.answer_by_least_squares()
         if answer is not None:
             return answer
@@ -107,6 +113,15 @@ class _RobustSolve:
 
     # Stage 1: least squares, and pairwise consistency alone
 
+    def seems_right(self) -> bool:
+        """Whether a plain solve is worth its time: affordable, and most closures fit its start."""
+        doubted = self.doubted
+        if not doubted.is_affordable:
+            return False
+        costs = doubted.problem.edge_costs(chordal_start(doubted.problem))
+        is_near = (costs <= _NEAR_AT_START * doubted.thresholds)[~doubted.known]
+        return is_near.size == 0 or float(is_near.mean()) >= _NEAR_SHARE
+
     def answer_by_least_squares(self) -> Solution | None:
         """The solution with every edge, if nothing speaks against any or there is no time left."""
         every_edge = self.doubted.every_edge
@@ -121,17 +136,22 @@ class _RobustSolve:
         return None
 
     def _fits_every_edge(self, solution: Solution) -> bool:
-        """Whether nothing speaks against any edge at the least-squares solution."""
+        """Whether nothing speaks against any edge at the least-squares solution.
+
+        The thresholds of single edges are those that none of all right ones exceeds, but with
+        probability `FALSE_ALARM`, at the scale of the errors.
+        """
         known = self.doubted.known
         residuals = solution.edge_residuals
         if not solution.is_certified or residuals.is_overall_misfit:
             return False
-        if not (known | (residuals.cost <= self.doubted.thresholds)).all():
+        problem = self.doubted.problem
+        quantile = max(self.doubted.quantile, 1.0 - FALSE_ALARM / problem.graph.num_edges)
+        scale = threshold_scale(error_scale(problem, solution.poses))
+        if not (known | (residuals.cost <= scale * chi2_thresholds(problem, quantile))).all():
             return False
         every_edge = self.doubted.every_edge
-        remaining = drop_contradicted(
-            self.doubted.problem, known, every_edge, solution.poses, _settled
-        )
+        remaining = drop_contradicted(problem, known, every_edge, solution.poses, _settled)
         return bool(remaining.all())
 
     def answer_by_consistency(self, quantile: float) -> Solution:
