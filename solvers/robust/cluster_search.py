@@ -126,20 +126,19 @@ class ClusterSearch:
     def expected_by_chance(self, fit: Fit) -> float:
         """Number of wrong edges that fit the map by chance, estimated from those that nearly do.
 
-        Of wrong closures that lie anywhere, those within x times the threshold of their
-        first-order distance are to those within it as x^(dof / 2) to 1, the ratio of the volumes.
-        So the rejected ones between 1 and x = 4 times tell how many are expected below 1. Of more
-        than a hundred, a hundred are looked at.
+        Of wrong motions that lie anywhere, those within x times the threshold of their first-order
+        distance are to those within it as x^(p / 2) to 1, the ratio of the volumes, with p = 3 or 6
+        numbers of a motion. A run of closures under one wrong motion is one such motion. So the
+        rejected ones between 1 and x = 4 times tell how many are expected below 1. Of more than a
+        hundred, a hundred are looked at.
         """
         candidates = self._candidates(fit, _FAR)
         chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
+        p = self.problem.d + tangent_dimension(self.problem.d)
         expected = 0.0
         for k in chosen.tolist():
             if 1.0 < candidates.ratio(k) <= _FAR:
-                size = len(candidates.groups[k])
-                dof = size * (self.problem.d + tangent_dimension(self.problem.d))
-                within = _FAR ** (-0.5 * dof)
-                expected += size * within / (1.0 - within)
+                expected += len(candidates.groups[k]) / (_FAR ** (0.5 * p) - 1.0)
         return expected * len(candidates.order) / max(1, len(chosen))
 
     # Adding clusters

@@ -85,6 +85,8 @@ class Rejection:
     by_chance : float
         Number of wrong closures that are expected to fit the map by chance
         (`ClusterSearch.expected_by_chance`).
+    noise : float
+        How many times their claim the squared errors are, where they are larger on all edges alike.
     places : tuple of str
         `file:line` of every edge, where they are known.
     fit : Fit
@@ -103,6 +105,7 @@ class Rejection:
     verdict: Verdict
     is_misfit: bool
     by_chance: float = 0.0
+    noise: float = 1.0
     places: tuple[str, ...] = ()
     fit: Fit = Fit.NONE
 
@@ -190,6 +193,8 @@ class Rejection:
         edges = f"for all {len(self.kept)} edges"
         if self.rejected.any():
             edges = f"for the {int(self.kept.sum())} edges kept"
+        if self.noise > 1.0:
+            edges += f", whose squared errors are {rounded_up(self.noise, 2)} times those claimed"
         digits = " to the digits of the file" if self.fit is Fit.DIGITS else ""
         proven = f"{self.verdict.name}{digits} {edges}; {self.held}"
         if not self.doubts:
@@ -292,6 +297,7 @@ class Rejection:
             "cycles": self.num_cycles,
             "truncated_cost": self.cost,
             "expected_by_chance": self.by_chance,
+            "noise": self.noise,
             "threshold_scale": self.threshold_scale,
         }
         return {"rejected": rejected, "robust": robust}

@@ -41,6 +41,9 @@ _STEPS_AFTER_EDGE = 4
 # beyond its thresholds at the chordal start.
 _NEAR_AT_START = 10.0
 _NEAR_SHARE = 0.9
+# Largest quotient of the mean errors of known edges and closures that are alike. It is 0.99 on
+# noisy spheres whose errors are four times those claimed.
+_ALIKE = 1.5
 # Seconds that have to be left for another step of a revision.
 _LEAST_SECONDS = 1e-6
 
@@ -132,6 +135,10 @@ class _RobustSolve:
         if self._fits_every_edge(solution):
             name = "the plain solution, which fits every edge"
             return self._result(solution, every_edge, 1.0, name)
+        noise = self._noise_of_every_edge(solution)
+        if noise is not None:
+            name = "the plain solution: errors are larger than claimed, on all edges alike"
+            return self._result(solution, every_edge, noise, name, noise)
         self.least_squares = solution.poses
         return None
 
@@ -153,6 +160,27 @@ class _RobustSolve:
         every_edge = self.doubted.every_edge
         remaining = drop_contradicted(problem, known, every_edge, solution.poses, _settled)
         return bool(remaining.all())
+
+    def _noise_of_every_edge(self, solution: Solution) -> float | None:
+        """How many times their claim the squared errors are, if on all edges alike; else None.
+
+        At the least-squares solution the mean cost over its threshold is then the same for known
+        edges and closures, and times this factor no edge is improbable. Few closures bend the map
+        evenly where they are wrong: there have to be half as many as poses.
+        """
+        problem = self.doubted.problem
+        known = self.doubted.known
+        closures_per_pose = self.doubted.num_closures / problem.num_poses
+        is_misfit = solution.edge_residuals.is_overall_misfit
+        if not (solution.is_certified and is_misfit and known.any() and closures_per_pose >= 0.5):
+            return None
+        cost = solution.edge_residuals.cost
+        noise = solution.edge_residuals.overall
+        improbable = chi2_thresholds(problem, 1.0 - FALSE_ALARM / problem.graph.num_edges)
+        ratio = cost / self.doubted.thresholds
+        quotient = float(ratio[known].mean() / ratio[~known].mean())
+        is_alike = 1.0 / _ALIKE < quotient < _ALIKE
+        return noise if is_alike and (cost <= noise * improbable).all() else None
 
     def answer_by_consistency(self, quantile: float) -> Solution:
         """The solution of the known inliers and the pairwise consistent edges."""
@@ -293,10 +321,13 @@ class _RobustSolve:
 
     # Stage 4: verdict
 
-    def _result(self, solution: Solution, kept: BoolArray, scale: float, name: str) -> Solution:
+    def _result(
+        self, solution: Solution, kept: BoolArray, scale: float, name: str, noise: float = 1.0
+    ) -> Solution:
         """The solution with the decision on every edge, and the account of all that was sent.
 
-        `scale` is that of the thresholds beside which the residuals are reported.
+        `scale` is that of the thresholds beside which the residuals are reported, and
+        `noise` how many times their claim the squared errors of all edges are.
         """
         choice = self.choice
         allowed = scale * self.doubted.thresholds
@@ -311,7 +342,8 @@ class _RobustSolve:
             cost=choice.cost(solution.poses),
             threshold_scale=choice.threshold_scale,
             verdict=solution.certificate.verdict,
-            is_misfit=solution.edge_residuals.is_overall_misfit,
+            is_misfit=noise == 1.0 and solution.edge_residuals.is_overall_misfit,
+            noise=noise,
             by_chance=self._by_chance(solution, kept),
             fit=solution.certificate.fit,
         )

@@ -258,6 +258,20 @@ def test_a_noisy_sphere_is_not_certified_without_its_closures(start: str | None)
     assert_not_silent(solution, np.zeros(graph.num_edges, dtype=bool))
 
 
+@pytest.mark.parametrize("claim", [4.0, 16.0])
+def test_noise_above_its_claim_on_all_edges_alike_rejects_none(claim: float) -> None:
+    graph = noisy_sphere(300, 20, NoiseModel(0.1, 0.1), 0)
+    graph = replace(graph, kappa=claim * graph.kappa, tau=claim * graph.tau, information=None)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    assert robust.kept.all()
+    assert robust.noise == pytest.approx(claim, rel=0.1)
+    assert "times those claimed" in robust.headline
+    spoiled_graph, is_wrong = spoiled(graph, 0.05, "random", 0)
+    robust = solvers.solve(spoiled_graph, robust=solvers.GNC()).robust
+    assert robust.noise == 1.0  # of closures alone it is not that of all edges
+    assert robust.rejected[is_wrong].all()
+
+
 def test_least_squares_is_a_start_where_odometry_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tight thresholds on a noisy sphere leave a certified tree: not enough, and not cheap."""
     graph = noisy_sphere(300, 15, NoiseModel(0.4, 0.4), 0)
