@@ -44,8 +44,8 @@ _NEAR_SHARE = 0.9
 # Largest quotient of the mean errors of known edges and closures that are alike. It is 0.99 on
 # noisy spheres whose errors are four times those claimed.
 _ALIKE = 1.5
-# Seconds that have to be left for another step of a revision.
-_LEAST_SECONDS = 1e-6
+# Share of the time limit that revisions leave to the solution and its certificate.
+_LAST_SHARE = 0.15
 
 
 def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
@@ -260,7 +260,9 @@ class _RobustSolve:
         doubted = self.doubted
         search = self._search(choice)
         fit = search.improved(estimate.kept, estimate.poses)
-        kept = drop_contradicted(doubted.problem, doubted.known, fit.kept, fit.poses, _settled)
+        kept = fit.kept
+        if self._has_time():
+            kept = drop_contradicted(doubted.problem, doubted.known, kept, fit.poses, _settled)
         if np.array_equal(kept, estimate.kept):
             return estimate
         revised = self.places.revised(estimate, kept, fit.poses)
@@ -286,7 +288,8 @@ class _RobustSolve:
         return self._search(self.choice).expected_by_chance(fit)
 
     def _has_time(self) -> bool:
-        return self.places.request.monitor.left > _LEAST_SECONDS
+        monitor = self.places.request.monitor
+        return monitor.left >= _LAST_SHARE * monitor.time_limit
 
     # Stage 3: choice
 
