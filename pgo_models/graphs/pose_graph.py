@@ -671,17 +671,39 @@ class PoseGraph(ReadOnly):
                 f"no edge between has {precision} > 0; add one, or leave these out"
             )
 
-    def _check_priors_fix_world(self) -> None:
-        """Raise a GraphError when priors of positions lie in a point or, in space, on a line."""
-        # One position of every pose that has priors.
-        measured_poses = self.j[self.is_prior]
-        _, first = np.unique(measured_poses, return_index=True)
-        measured = self.t_ij[self.is_prior][first]
+    def is_world_fixed(self, kept: BoolArray) -> bool:
+        """Return whether positions fix the rotation of the world.
+
+        In a point or, in space, on a line they do not.
+
+        Parameters
+        ----------
+        kept : BoolArray, (m,)
+            Edges that count.
+
+        Returns
+        -------
+        bool
+            Whether those of them that are priors of positions do.
+        """
+        measured = self._first_positions(self.is_prior & kept)
+        if len(measured) < self.d:
+            return False
         centred = measured - measured.mean(axis=0)
         spread = np.linalg.svd(centred, compute_uv=False)
         rounding = _ROUNDING * np.abs(measured).max(initial=0.0)
         threshold = max(_COLLINEAR * spread[0], rounding, 1e-300)
-        if len(measured) < self.d or not spread[self.d - 2] > threshold:
+        return bool(spread[self.d - 2] > threshold)
+
+    def _first_positions(self, priors: BoolArray) -> Array:
+        """One measured position of every pose that has priors among those chosen, (m,)."""
+        _, first = np.unique(self.j[priors], return_index=True)
+        return self.t_ij[priors][first]
+
+    def _check_priors_fix_world(self) -> None:
+        """Raise a GraphError when priors of positions lie in a point or, in space, on a line."""
+        if not self.is_world_fixed(self.is_prior):
+            measured = self._first_positions(self.is_prior)
             raise GraphError(
                 f"the priors do not fix the gauge: positions of {len(measured)} poses, in a point "
                 "or on a line, leave turns of the world open; "

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.graphs.pose_graph import PoseGraph, bridges
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.distributed.driver import Driver, collect
@@ -32,6 +32,7 @@ from solvers.robust.gnc import (
 from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import (
     RatioSums,
+    held_together,
     known_inliers,
     negligible_weight,
 )
@@ -144,7 +145,7 @@ def inliers_of(
     kept[np.concatenate(driver.ask(edges_within, scale, Count.OFF))] = True
     poses = collect(driver)[0]
     ratio = problem.edge_costs(poses) / chi2_thresholds(problem, gnc.quantile)
-    kept[bridges(problem.graph, kept, ratio)] = True
+    kept = held_together(problem.graph, kept, ratio)
     stage = Stage(
         "GNC",
         finished.status,

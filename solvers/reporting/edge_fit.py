@@ -117,7 +117,7 @@ class EdgeFit:
         if self.lowered is not None:
             solve = _for_own_cost(solve)
             text = f"With less chi2, too, the edges do not fit: {text[0].lower()}{text[1:]}"
-        text = f"{text} Look for wrong loop closures, which need not be the worst edges."
+        text = f"{text} Look for wrong loop closures and fixes, which need not be the worst edges."
         suggestions = [Advice(text, f"{solve} --robust gnc")]
         if self.places and residuals.is_misfit.any():
             worst = self.places[int((residuals.cost / residuals.allowed).argmax())]

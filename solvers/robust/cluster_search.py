@@ -23,15 +23,16 @@ import scipy  # and scipy.special when it is used
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
-from pgo_models.graphs.pose_graph import IntArray, bridges
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import FALSE_ALARM, RightCosts
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust.clusters import closure_clusters
-from solvers.robust.distances import least_distances
-from solvers.robust.revision import Fit, inlier_problem, truncated_cost
+from solvers.robust.distances import FirstOrder
+from solvers.robust.revision import Fit, inlier_problem, is_held, truncated_cost
+from solvers.robust.weighted_edges import held_together
 
 # Probability with which a right cluster passes the test.
 _QUANTILE = 0.99
@@ -47,19 +48,34 @@ _MOST_TRIALS = 3
 _MOST_REMOVALS = 5
 _MOST_EXCHANGES = 30
 _MOST_ROUNDS = 3
+# Rejected clusters up to this many times their thresholds tell how many wrong ones fit by chance;
+# so many of them are looked at.
+_FAR = 4.0
+_MOST_SAMPLED = 100
 # Relative decrease of a cost that is more than rounding.
 _LEAST_DECREASE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
-    """Clusters without the edges kept: their names, edges, thresholds (k,) of T, and T at least."""
+    """Clusters without the edges kept: their names, edges, and thresholds (k,) of T.
+
+    `farthest` (k,) is the edge of every cluster that is farthest from the map to first order,
+    `first_order` what knows its distance, `largest` (k,) the quantile of this in chi^2. `order` are
+    those that may fit, the one of most promise first.
+    """
 
     names: list[int]
     groups: list[IntArray]
     thresholds: Array
-    least_rises: Array
+    first_order: FirstOrder
+    farthest: IntArray
+    largest: Array
     order: IntArray
+
+    def ratio(self, k: int) -> float:
+        """First-order distance of a cluster's farthest edge, over its quantile."""
+        return self.first_order.distance(int(self.farthest[k])) / float(self.largest[k])
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +95,7 @@ class ClusterSearch:
     @cached_property
     def clusters(self) -> list[IntArray]:
         """Clusters of the edges that are not known."""
-        return closure_clusters(self.problem.graph, self.known)
+        return closure_clusters(self.problem.graph, self.known, self.scale)
 
     @cached_property
     def right_costs(self) -> RightCosts:
@@ -92,17 +108,38 @@ class ClusterSearch:
         return Chains.of(self.problem.graph, self.known)
 
     def improved(self, kept: BoolArray, poses: Poses) -> Fit:
-        """Edges to keep, and their poses, from those of an estimate.
+        """Edges to keep, and their poses, from those of an estimate with the edges `kept`, (m,).
 
-        The truncated cost is no higher than that of the edges `kept`, (m,), at their best poses.
+        Clusters are added and removed, then one is exchanged, and so on while exchanges lower the
+        truncated cost.
         """
         fit = self._settled(kept, poses)
+        least_cost = np.inf
         while True:
             fit = self._without_misfits(self._with_clusters(fit))
             exchanged = self._exchanged(fit)
-            if exchanged is None:
+            if exchanged is None or self.cost(exchanged) >= (1.0 - _LEAST_DECREASE) * least_cost:
                 return fit
+            least_cost = self.cost(exchanged)
             fit = exchanged
+
+    def expected_by_chance(self, fit: Fit) -> float:
+        """Number of wrong edges that fit the map by chance, estimated from those that nearly do.
+
+        Of wrong motions that lie anywhere, those within x times the threshold of their first-order
+        distance are to those within it as x^(p / 2) to 1, the ratio of the volumes, with p = 3 or 6
+        numbers of a motion. A run of closures under one wrong motion is one such motion. So the
+        rejected ones between 1 and x = 4 times tell how many are expected below 1. Of more than a
+        hundred, a hundred are looked at.
+        """
+        candidates = self._candidates(fit, _FAR)
+        chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
+        p = self.problem.d + tangent_dimension(self.problem.d)
+        expected = 0.0
+        for k in chosen.tolist():
+            if 1.0 < candidates.ratio(k) <= _FAR:
+                expected += len(candidates.groups[k]) / (_FAR ** (0.5 * p) - 1.0)
+        return expected * len(candidates.order) / max(1, len(chosen))
 
     # Adding clusters
 
@@ -135,8 +172,10 @@ class ClusterSearch:
         larger = self._settled(_with_edges(fit.kept, np.concatenate(fitting)), fit.poses)
         return larger if self.cost(larger) <= self.cost(fit) else fit
 
-    def _candidates(self, fit: Fit) -> _Candidates:
-        """Rejected clusters that may fit to first order, the one of most promise first.
+    def _candidates(self, fit: Fit, most: float = _NEAR) -> _Candidates:
+        """Rejected clusters within `most` times their thresholds to first order, at least.
+
+        The one of most promise comes first.
 
         A cluster promises its thresholds in the truncated cost, less its T.
         """
@@ -144,25 +183,25 @@ class ClusterSearch:
         names = [name for name, cluster in enumerate(clusters) if len(cluster)]
         groups = [clusters[name] for name in names]
         thresholds = self.scale * self.right_costs.thresholds(groups, _QUANTILE)
-        ratio = self._least_ratios(fit, groups)
-        least_rises = ratio * thresholds
-        promise = np.array([self.allowed[group].sum() for group in groups]) - least_rises
-        order = np.argsort(-promise, kind="stable")
-        return _Candidates(names, groups, thresholds, least_rises, order[ratio[order] <= _NEAR])
-
-    def _least_ratios(self, fit: Fit, groups: list[IntArray]) -> Array:
-        """Least T of every group over its threshold, (k,): of the edge that is farthest."""
-        if not groups:
-            return np.zeros(0)
-        d = self.problem.d
-        sizes = np.array([len(group) for group in groups])
-        dof = sizes * (d + tangent_dimension(d))
-        label = np.repeat(np.arange(len(groups)), sizes)
         inliers = inlier_problem(self.problem, fit.kept)
-        distances = least_distances(self.chains, inliers, fit.poses, np.concatenate(groups))
-        farthest = np.zeros(len(groups))
-        np.maximum.at(farthest, label, distances)
-        return np.asarray(farthest / (self.scale * scipy.special.chdtri(dof, 1.0 - _QUANTILE)))
+        first_order = FirstOrder(self.chains, inliers, fit.poses)
+        sizes = np.array([len(group) for group in groups], dtype=int)
+        d = self.problem.d
+        dof = sizes * (d + tangent_dimension(d))
+        largest = np.asarray(self.scale * scipy.special.chdtri(dof, 1.0 - _QUANTILE), dtype=float)
+        farthest, ratio = np.zeros(0, dtype=int), np.zeros(0)
+        if groups:
+            edges = np.concatenate(groups)
+            distances = first_order.least_distances(edges)
+            beginnings = np.cumsum(sizes) - sizes
+            ratio = np.maximum.reduceat(distances, beginnings) / largest
+            by_cluster = np.repeat(np.arange(len(groups)), sizes)
+            last = np.lexsort([distances, by_cluster])[beginnings + sizes - 1]
+            farthest = edges[last]
+        promise = np.array([self.allowed[group].sum() for group in groups]) - ratio * thresholds
+        order = np.argsort(-promise, kind="stable")
+        order = order[ratio[order] <= most]
+        return _Candidates(names, groups, thresholds, first_order, farthest, largest, order)
 
     def _with_best_cluster(
         self, fit: Fit, candidates: _Candidates, trials: dict[int, int]
@@ -178,6 +217,8 @@ class ClusterSearch:
                 continue
             if num_failures == _MOST_FAILURES or not self.has_time():
                 return None
+            if candidates.ratio(k) > _NEAR:
+                continue
             threshold = candidates.thresholds[k]
             kept = _with_edges(fit.kept, candidates.groups[k])
             larger = self._settled(kept, fit.poses)
@@ -214,7 +255,7 @@ class ClusterSearch:
         for k in np.argsort(-ratio, kind="stable")[:_MOST_REMOVALS].tolist():
             kept = fit.kept.copy()
             kept[groups[k]] = False
-            if len(self.problem.graph.components(kept)) > 1:
+            if not is_held(self.problem.graph, kept):
                 continue
             smaller = self._settled(kept, fit.poses)
             rise = (fit.cost - smaller.cost) / thresholds[k]
@@ -232,6 +273,8 @@ class ClusterSearch:
         for k in candidates.order[:_MOST_EXCHANGES].tolist():
             if not self.has_time():
                 return None
+            if candidates.ratio(k) > _NEAR:
+                continue
             other = self._in_place_of_misfits(fit, candidates.groups[k])
             if self.cost(other) < (1.0 - _LEAST_DECREASE) * cost:
                 return other
@@ -242,8 +285,7 @@ class ClusterSearch:
         other = self._settled(_with_edges(fit.kept, cluster), fit.poses)
         for _ in range(_MOST_ROUNDS):
             ratio = self.problem.edge_costs(other.poses) / self.allowed
-            kept = self.known | (ratio <= 1.0)
-            kept[bridges(self.problem.graph, kept, ratio)] = True
+            kept = held_together(self.problem.graph, self.known | (ratio <= 1.0), ratio)
             if np.array_equal(kept, other.kept):
                 return other
             other = self._settled(kept, other.poses)

@@ -22,13 +22,14 @@ _REACH = 12
 _QUANTILE = 0.99
 
 
-def closure_clusters(graph: PoseGraph, known: BoolArray) -> list[IntArray]:
+def closure_clusters(graph: PoseGraph, known: BoolArray, scale: float = 1.0) -> list[IntArray]:
     """Edges of every cluster of the edges that are not `known`, (m,).
 
     Two closures are neighbours if their first ends are at most 12 poses apart, and their second
     ends, too. Neighbours agree if the cycle of both and of the known edges between their ends
     passes the test of `pairwise_consistent`: over such distances odometry is good. Clusters are the
-    components of the graph of neighbours that agree. An edge that measures no whole motion is a
+    components of the graph of neighbours that agree. `scale` is that of the errors, in the squares
+    of what the matrices claim. An edge that measures no whole motion is a
     cluster of its own.
     """
     doubted = np.flatnonzero(~known)
@@ -45,7 +46,7 @@ def closure_clusters(graph: PoseGraph, known: BoolArray) -> list[IntArray]:
     pairs = scipy.spatial.cKDTree(ends).query_pairs(_REACH, p=np.inf, output_type="ndarray")
     a, b = pairs.T
     dof = graph.d + tangent_dimension(graph.d)
-    threshold = float(scipy.special.chdtri(dof, 1.0 - _QUANTILE))
+    threshold = scale * float(scipy.special.chdtri(dof, 1.0 - _QUANTILE))
     agree = cycle_distances(closures, chains.covariance, a, b) <= threshold
     links = a[agree].astype(np.int32), b[agree].astype(np.int32)
     size = len(tested)

@@ -37,7 +37,7 @@ class PCM(ValueEquality):
     Parameters
     ----------
     known : BoolArray, (m,), optional
-        Edges that are right: `odometry` and priors unless given.
+        Edges that are right: `odometry` unless given.
     quantile : float
         Probability that two right loop closures agree, in (0, 1).
 

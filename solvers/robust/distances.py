@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 
 from pgo_models.errors import NotPositiveDefiniteError
@@ -14,59 +17,88 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.robust.chains import Chains, Closures, adjoint, is_whole, squared_distances
 
 
-def least_distances(chains: Chains, inliers: PGOProblem, poses: Poses, edges: IntArray) -> Array:
-    """Least increase of the cost of the inliers, (k,), by which their map can follow each edge.
+@dataclass(frozen=True, eq=False)
+class FirstOrder:
+    """First-order distances of edges from the map of the inliers, at its stationary poses.
 
-    At stationary poses of the inliers, with H half the Hessian of their cost, J the derivative of
-    the cycle T = P_i X_ij P_j^-1 of an edge, and C the covariance of its measurement, the increase
-    is
+    With H half the Hessian of their cost, J the derivative of the cycle T = P_i X_ij P_j^-1 of an
+    edge, and C the covariance of its measurement, the least cost rises by
 
         e^T (C + J H^-1 J^T)^-1 e,  e = log T,
 
-    to first order. Of the compliance J H^-1 J^T two upper bounds are known without a solve for each
-    edge: that of the chain between the ends alone, and 2 (S_i + S_j), with the marginal covariances
-    S of the ends. The larger of the two lower bounds that follow is returned; zero for an edge that
-    measures no whole motion.
+    to first order when the edge is added, as the map follows it. Distances are those of chi^2,
+    whatever the cost; they are zero for an edge that measures no whole motion, and where the map is
+    not held in some way.
     """
-    distances = np.zeros(len(edges))
-    whole = is_whole(chains.graph)[edges]
-    closures = chains.closures(edges[whole], (poses.R, poses.t))
-    along_chain = _along_chain(chains, closures, poses)
-    of_map = _of_map(inliers, closures, poses)
-    distances[whole] = np.maximum(along_chain, of_map)
-    return distances
 
+    chains: Chains
+    inliers: PGOProblem
+    poses: Poses
 
-def _along_chain(chains: Chains, closures: Closures, poses: Poses) -> Array:
-    """Distances with the compliance of the chain between the ends; zero between two chains."""
-    distances = np.zeros(len(closures))
-    own = chains.chain[closures.i] == chains.chain[closures.j]
-    of_one_chain = closures[own]
-    along = chains.covariance_at((poses.R, poses.t))
-    compliance = along[of_one_chain.j] - along[of_one_chain.i]
-    covariance = of_one_chain.covariance + compliance
-    distances[own] = squared_distances(of_one_chain.cycle, covariance)
-    return distances
+    def least_distances(self, edges: IntArray) -> Array:
+        """Lower bounds of the distances, (k,), without a solve for each edge.
 
+        Two upper bounds of the compliance J H^-1 J^T are known: that of the chain between the ends
+        alone, and 2 (S_i + S_j), with the marginal covariances S of the ends.
+        """
+        distances = np.zeros(len(edges))
+        whole = is_whole(self.chains.graph)[edges]
+        closures = self._closures(edges[whole])
+        distances[whole] = np.maximum(self._along_chain(closures), self._of_map(closures))
+        return distances
 
-def _of_map(inliers: PGOProblem, closures: Closures, poses: Poses) -> Array:
-    """Distances with the compliance 2 (S_i + S_j); zero where the map is not held in some way."""
-    if not inliers.has_translations:
-        return np.zeros(len(closures))
-    hessian = riemannian_hessian(inliers.at(poses), None)
-    layout = TangentLayout(inliers.num_poses, inliers.d)
-    try:
-        marginals = Marginals(hessian, layout, backend=inliers.backend).diagonal
-    except NotPositiveDefiniteError:
-        return np.zeros(len(closures))
-    d = inliers.d
+    def distance(self, edge: int) -> float:
+        """Distance of an edge, by a solve."""
+        if not is_whole(self.chains.graph)[edge] or not self.inliers.has_translations:
+            return 0.0
+        closures = self._closures(np.array([edge]))
+        ends = np.array([closures.i[0], closures.j[0]])
+        try:
+            joint = self._marginals.joint(*ends.tolist())
+        except NotPositiveDefiniteError:
+            return 0.0
+        first, second = self._in_frame(ends)
+        J = np.concatenate([first, -second], axis=1)
+        compliance = (J @ joint @ J.T)[None]
+        return float(squared_distances(closures.cycle, closures.covariance + compliance)[0])
 
-    def in_frame(ends: IntArray) -> Array:
-        """Covariances of moves (v, w) of poses as those of errors of the cycle, which P follows."""
-        t = poses.t[ends]
-        J = adjoint((poses.R[ends], t))
+    @cached_property
+    def _marginals(self) -> Marginals:
+        hessian = riemannian_hessian(self.inliers.at(self.poses), None)
+        layout = TangentLayout(self.inliers.num_poses, self.inliers.d)
+        return Marginals(hessian, layout, backend=self.inliers.backend)
+
+    def _closures(self, edges: IntArray) -> Closures:
+        return self.chains.closures(edges, (self.poses.R, self.poses.t))
+
+    def _along_chain(self, closures: Closures) -> Array:
+        """Distances with the compliance of the chain between the ends; zero between two chains."""
+        distances = np.zeros(len(closures))
+        own = self.chains.chain[closures.i] == self.chains.chain[closures.j]
+        of_one_chain = closures[own]
+        along = self.chains.covariance_at((self.poses.R, self.poses.t))
+        compliance = along[of_one_chain.j] - along[of_one_chain.i]
+        covariance = of_one_chain.covariance + compliance
+        distances[own] = squared_distances(of_one_chain.cycle, covariance)
+        return distances
+
+    def _of_map(self, closures: Closures) -> Array:
+        """Distances with the compliance 2 (S_i + S_j)."""
+        if not self.inliers.has_translations:
+            return np.zeros(len(closures))
+        try:
+            marginals = self._marginals.diagonal
+        except NotPositiveDefiniteError:
+            return np.zeros(len(closures))
+        compliance = np.zeros_like(closures.covariance)
+        for ends in (closures.i, closures.j):
+            J = self._in_frame(ends)
+            compliance += 2.0 * J @ marginals[ends] @ np.swapaxes(J, 1, 2)
+        return squared_distances(closures.cycle, closures.covariance + compliance)
+
+    def _in_frame(self, ends: IntArray) -> Array:
+        """What turns a move (v, w) of a pose into the error of its cycles, (k, p, p)."""
+        d = self.inliers.d
+        J = adjoint((self.poses.R[ends], self.poses.t[ends]))
         J[:, :d, :d] = np.eye(d)
-        return np.asarray(J @ marginals[ends] @ np.swapaxes(J, 1, 2))
-
-    compliance = 2.0 * (in_frame(closures.i) + in_frame(closures.j))
-    return squared_distances(closures.cycle, closures.covariance + compliance)
+        return J

@@ -91,7 +91,7 @@ class GNC(ValueEquality):
         thresholds are scaled.
     known : BoolArray, (m,), optional
         Known inliers, whose weight stays 1. Unless given, odometry (edges between consecutive poses
-        of a robot) and priors.
+        of a robot). Priors are suspects like closures.
     growth : float
         Factor, above 1, by which the control mu is multiplied in every step (truncated least
         squares), or divided (Geman-McClure).

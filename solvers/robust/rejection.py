@@ -82,6 +82,11 @@ class Rejection:
         Verdict of the certificate of the kept edges.
     is_misfit : bool
         Whether the kept edges cost more together than right ones may.
+    by_chance : float
+        Number of wrong closures that are expected to fit the map by chance
+        (`ClusterSearch.expected_by_chance`).
+    noise : float
+        How many times their claim the squared errors are, where they are larger on all edges alike.
     places : tuple of str
         `file:line` of every edge, where they are known.
     fit : Fit
@@ -99,6 +104,8 @@ class Rejection:
     threshold_scale: float
     verdict: Verdict
     is_misfit: bool
+    by_chance: float = 0.0
+    noise: float = 1.0
     places: tuple[str, ...] = ()
     fit: Fit = Fit.NONE
 
@@ -137,12 +144,11 @@ class Rejection:
     def doubts(self) -> tuple[str, ...]:
         """What speaks against the edges kept, in a few words each."""
         doubts = []
-        num_rejected = self.num_closures - self.num_closures_kept
-        if 2 * num_rejected > self.num_closures:
-            share = f"{num_rejected} of {self.num_closures}"
-            doubts.append(f"more than half of the closures were rejected, {share}")
         if self.is_misfit:
             doubts.append("the edges kept do not fit together")
+        if self.by_chance > _TOLERATED_SHARE * self.num_closures_kept:
+            number = rounded_up(self.by_chance, 2)
+            doubts.append(f"about {number} wrong closures are expected to fit this map by chance")
         num_near = int((self.rejected & self.doubtful).sum())
         if num_near > self._num_tolerated:
             doubts.append(f"{num_near} rejected edges are near their thresholds")
@@ -171,8 +177,13 @@ class Rejection:
     @property
     def held(self) -> str:
         """How many closures constrain the map, in words."""
-        closures = f"{self.num_closures_kept} of {self.num_closures} closures"
-        return f"{closures} hold the map ({self.num_cycles} cycles)"
+        num_kept = self.num_closures_kept
+        has_suspected_fixes = bool((self.problem.graph.is_prior & ~self.known).any())
+        names = "closures and fixes" if has_suspected_fixes else "closures"
+        closures = f"{num_kept} of {self.num_closures} {names}"
+        held = f"{closures} hold the map ({self.num_cycles} cycles)"
+        keeps_most = 2 * num_kept >= self.num_closures
+        return held if keeps_most else f"{held}, more than half were rejected"
 
     @property
     def headline(self) -> str:
@@ -182,6 +193,8 @@ class Rejection:
         edges = f"for all {len(self.kept)} edges"
         if self.rejected.any():
             edges = f"for the {int(self.kept.sum())} edges kept"
+        if self.noise > 1.0:
+            edges += f", whose squared errors are {rounded_up(self.noise, 2)} times those claimed"
         digits = " to the digits of the file" if self.fit is Fit.DIGITS else ""
         proven = f"{self.verdict.name}{digits} {edges}; {self.held}"
         if not self.doubts:
@@ -223,6 +236,7 @@ class Rejection:
             rejected += "; written files are without them"
         rows = [
             ("given", self.conditional),
+            ("taken for right", self.named(self.known)),
             ("rejected", rejected),
             ("doubtful", self.named(self.doubtful)),
             ("found by", self.start),
@@ -282,6 +296,8 @@ class Rejection:
             "closures_kept": self.num_closures_kept,
             "cycles": self.num_cycles,
             "truncated_cost": self.cost,
+            "expected_by_chance": self.by_chance,
+            "noise": self.noise,
             "threshold_scale": self.threshold_scale,
         }
         return {"rejected": rejected, "robust": robust}

@@ -19,6 +19,7 @@ import numpy as np
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds, edge_residuals
 
@@ -48,6 +49,12 @@ def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
             "name more known inliers, or raise the quantile"
         )
     return PGOProblem(graph.without_edges(~kept), problem.backend, problem.weighting)
+
+
+def is_held(graph: PoseGraph, kept: BoolArray) -> bool:
+    """Whether the edges kept, (m,), connect the poses and fix the rotation of the world."""
+    is_connected = len(graph.components(kept)) == 1
+    return is_connected and (not graph.is_world_loose or graph.is_world_fixed(kept))
 
 
 def truncated_cost(problem: PGOProblem, known: BoolArray, thresholds: Array, poses: Poses) -> float:
@@ -142,7 +149,7 @@ def _remove_worst(
     worst = int(ratio.argmax())
     others = fit.kept.copy()
     others[worst] = False
-    if ratio[worst] == 0.0 or len(problem.graph.components(others)) > 1:
+    if ratio[worst] == 0.0 or not is_held(problem.graph, others):
         return None
     poses = settle(inlier_problem(problem, others), fit.poses)
     without = Fit.of(problem, others, poses)

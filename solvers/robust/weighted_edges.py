@@ -142,7 +142,7 @@ class WeightedEdges:
         weights = np.where(self.known, 1.0, loss.weights(ratio, mu))
         least_weight = self.least_weight
         kept = weights > least_weight
-        kept[bridges(graph, kept, ratio)] = True
+        kept = held_together(graph, kept, ratio)
         weights = np.maximum(weights, least_weight)
         has_same_edges = self.in_reduced is not None and np.array_equal(kept, self.in_reduced)
         same_edges = self.reduced if has_same_edges else None
@@ -161,14 +161,32 @@ class WeightedEdges:
 
 
 def known_inliers(graph: PoseGraph, known: BoolArray | None) -> BoolArray:
-    """Edges that are right, (m,): those given, else odometry and priors."""
+    """Edges that are right, (m,): those given, else odometry."""
     if known is None:
-        return odometry(graph) | graph.is_prior
+        return odometry(graph)
     if np.shape(known) != (graph.num_edges,):
         raise SettingError(
             f"known has shape {np.shape(known)}; give one for each of the {graph.num_edges} edges"
         )
     return np.asarray(known, dtype=bool)
+
+
+def held_together(graph: PoseGraph, kept: BoolArray, ratio: Array) -> BoolArray:
+    """Edges kept, (m,), and those of the smallest ratios, (m,), that the poses need beside them.
+
+    They connect the poses. Where priors measure positions alone, as many are added as fix the
+    rotation of the world.
+    """
+    held = kept.copy()
+    held[bridges(graph, kept, ratio)] = True
+    if not graph.is_world_loose:
+        return held
+    others = np.flatnonzero(graph.is_prior & ~held)
+    for prior in others[np.argsort(ratio[others], kind="stable")].tolist():
+        if graph.is_world_fixed(held):
+            break
+        held[prior] = True
+    return held
 
 
 def negligible_weight(graph: PoseGraph, known: BoolArray) -> float:
@@ -202,6 +220,5 @@ def weighted_problem(
 
 def first_poses(graph: PoseGraph, known: BoolArray) -> Poses:
     """Poses along a tree of known inliers; other edges only where these leave poses apart."""
-    chosen = known.copy()
-    chosen[bridges(graph, known, np.zeros(graph.num_edges))] = True
+    chosen = held_together(graph, known, np.zeros(graph.num_edges))
     return spanning_tree_start(graph.without_edges(~chosen))

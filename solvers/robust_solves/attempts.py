@@ -18,7 +18,6 @@ import numpy as np
 from pgo_models.certificates.certificate import Certificate
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import bridges
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order
 from pgo_models.problem.problem import PGOProblem
@@ -33,7 +32,7 @@ from solvers.robust.gnc import GNC, LAST_STEPS
 from solvers.robust.losses import RobustLoss
 from solvers.robust.rejection import Attempt
 from solvers.robust.revision import error_scale, inlier_problem, truncated_cost
-from solvers.robust.weighted_edges import first_poses
+from solvers.robust.weighted_edges import first_poses, held_together
 from solvers.solution import Solution
 
 # Number of loop closures all pairs of which are compared within seconds.
@@ -125,8 +124,7 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     if settings.consistent:
         candidates = known | pairwise_consistent(graph, known)
     yield Plan("as set", settings, candidates)
-    tree = known.copy()
-    tree[bridges(graph, known, np.zeros(graph.num_edges))] = True
+    tree = held_together(graph, known, np.zeros(graph.num_edges))
     yield Plan("known inliers", None, tree)
     if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
         consistent = known | pairwise_consistent(graph, known)

@@ -39,7 +39,7 @@ class Choice:
     def threshold_scale(self) -> float:
         """Scale s of the thresholds."""
         least = min((estimate.error_scale for estimate in self.estimates), default=1.0)
-        return min(1.0, _TAIL_FACTOR * least)
+        return threshold_scale(least)
 
     def cost(self, poses: Poses) -> float:
         """Truncated cost TLS of poses."""
@@ -91,3 +91,8 @@ class Choice:
 
     def _num_closures_kept(self, estimate: Estimate) -> int:
         return int((estimate.kept & ~self.doubted.known).sum())
+
+
+def threshold_scale(error_scale: float) -> float:
+    """Scale of the thresholds, at most 1, where the edges kept have errors of this scale."""
+    return min(1.0, _TAIL_FACTOR * error_scale)

@@ -11,8 +11,9 @@ import numpy as np
 from pgo_models.errors import FAILURES, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
+from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.network.ledger import Ledger
 from solvers.places import with_partition
 from solvers.request import SolveRequest
@@ -22,7 +23,7 @@ from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
-from solvers.robust.revision import drop_contradicted
+from solvers.robust.revision import Fit, drop_contradicted, error_scale
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
@@ -31,13 +32,20 @@ from solvers.robust_solves.attempts import (
     Plan,
     plans_in_order,
 )
-from solvers.robust_solves.choice import Choice
+from solvers.robust_solves.choice import Choice, threshold_scale
 from solvers.solution import Solution, joined_notes
 
 # Newton steps after one edge was dropped.
 _STEPS_AFTER_EDGE = 4
-# Seconds that have to be left for another step of a revision.
-_LEAST_SECONDS = 1e-6
+# A plain solve comes first on a large graph where this share of closures is at most so many times
+# beyond its thresholds at the chordal start.
+_NEAR_AT_START = 10.0
+_NEAR_SHARE = 0.9
+# Largest quotient of the mean errors of known edges and closures that are alike. It is 0.99 on
+# noisy spheres whose errors are four times those claimed.
+_ALIKE = 1.5
+# Share of the time limit that revisions leave to the solution and its certificate.
+_LAST_SHARE = 0.15
 
 
 def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
@@ -45,10 +53,11 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
 
     `Solution.robust` says which these are, what is proven of them, and what supports them.
 
-    1. Least squares. Where factoring the matrix of all edges is cheap and no start is given, the
-       solution with every edge comes first. It is the answer if time has run out, or if nothing
-       speaks against any edge: it is certified, no edge but known inliers is beyond its threshold
-       or contradicted, and all together cost no more than they may.
+    1. Least squares. Where factoring the matrix of all edges is cheap, or affordable and most
+       closures fit the chordal start, and no start is given, the solution with every edge comes
+       first. It is the answer if time has run out, or if nothing speaks against any edge: it is
+       certified, no edge but known inliers is improbable or contradicted, and all together cost no
+       more than they may.
     2. Attempts (`plans_in_order`). Graduated non-convexity is run as set; then there are the known
        inliers alone; then it is run on the pairwise consistent edges; with more and smaller steps;
        with tight thresholds, which the edges kept then widen; from the least-squares solution; with
@@ -74,7 +83,7 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     thresholds = chi2_thresholds(problem, robust.quantile)
     doubted = DoubtedProblem(problem, known, thresholds, robust.quantile)
     job = _RobustSolve(doubted, PlacesOfEdges(doubted, request), request.start)
-    if doubted.is_cheap and request.start is None:
+    if request.start is None and (doubted.is_cheap or job.seems_right()):
         answer = job.answer_by_least_squares()
         if answer is not None:
             return answer
@@ -107,6 +116,15 @@ class _RobustSolve:
 
     # Stage 1: least squares, and pairwise consistency alone
 
+    def seems_right(self) -> bool:
+        """Whether a plain solve is worth its time: affordable, and most closures fit its start."""
+        doubted = self.doubted
+        if not doubted.is_affordable:
+            return False
+        costs = doubted.problem.edge_costs(chordal_start(doubted.problem))
+        is_near = (costs <= _NEAR_AT_START * doubted.thresholds)[~doubted.known]
+        return is_near.size == 0 or float(is_near.mean()) >= _NEAR_SHARE
+
     def answer_by_least_squares(self) -> Solution | None:
         """The solution with every edge, if nothing speaks against any or there is no time left."""
         every_edge = self.doubted.every_edge
@@ -117,22 +135,52 @@ class _RobustSolve:
         if self._fits_every_edge(solution):
             name = "the plain solution, which fits every edge"
             return self._result(solution, every_edge, 1.0, name)
+        noise = self._noise_of_every_edge(solution)
+        if noise is not None:
+            name = "the plain solution: errors are larger than claimed, on all edges alike"
+            return self._result(solution, every_edge, noise, name, noise)
         self.least_squares = solution.poses
         return None
 
     def _fits_every_edge(self, solution: Solution) -> bool:
-        """Whether nothing speaks against any edge at the least-squares solution."""
+        """Whether nothing speaks against any edge at the least-squares solution.
+
+        The thresholds of single edges are those that none of all right ones exceeds, but with
+        probability `FALSE_ALARM`, at the scale of the errors.
+        """
         known = self.doubted.known
         residuals = solution.edge_residuals
         if not solution.is_certified or residuals.is_overall_misfit:
             return False
-        if not (known | (residuals.cost <= self.doubted.thresholds)).all():
+        problem = self.doubted.problem
+        quantile = max(self.doubted.quantile, 1.0 - FALSE_ALARM / problem.graph.num_edges)
+        scale = threshold_scale(error_scale(problem, solution.poses))
+        if not (known | (residuals.cost <= scale * chi2_thresholds(problem, quantile))).all():
             return False
         every_edge = self.doubted.every_edge
-        remaining = drop_contradicted(
-            self.doubted.problem, known, every_edge, solution.poses, _settled
-        )
+        remaining = drop_contradicted(problem, known, every_edge, solution.poses, _settled)
         return bool(remaining.all())
+
+    def _noise_of_every_edge(self, solution: Solution) -> float | None:
+        """How many times their claim the squared errors are, if on all edges alike; else None.
+
+        At the least-squares solution the mean cost over its threshold is then the same for known
+        edges and closures, and times this factor no edge is improbable. Few closures bend the map
+        evenly where they are wrong: there have to be half as many as poses.
+        """
+        problem = self.doubted.problem
+        known = self.doubted.known
+        closures_per_pose = self.doubted.num_closures / problem.num_poses
+        is_misfit = solution.edge_residuals.is_overall_misfit
+        if not (solution.is_certified and is_misfit and known.any() and closures_per_pose >= 0.5):
+            return None
+        cost = solution.edge_residuals.cost
+        noise = solution.edge_residuals.overall
+        improbable = chi2_thresholds(problem, 1.0 - FALSE_ALARM / problem.graph.num_edges)
+        ratio = cost / self.doubted.thresholds
+        quotient = float(ratio[known].mean() / ratio[~known].mean())
+        is_alike = 1.0 / _ALIKE < quotient < _ALIKE
+        return noise if is_alike and (cost <= noise * improbable).all() else None
 
     def answer_by_consistency(self, quantile: float) -> Solution:
         """The solution of the known inliers and the pairwise consistent edges."""
@@ -210,12 +258,11 @@ class _RobustSolve:
         """
         choice = self.choice
         doubted = self.doubted
-        scale = choice.threshold_scale
-        search = ClusterSearch(
-            doubted.problem, doubted.known, scale * doubted.thresholds, scale, self._has_time
-        )
+        search = self._search(choice)
         fit = search.improved(estimate.kept, estimate.poses)
-        kept = drop_contradicted(doubted.problem, doubted.known, fit.kept, fit.poses, _settled)
+        kept = fit.kept
+        if self._has_time():
+            kept = drop_contradicted(doubted.problem, doubted.known, kept, fit.poses, _settled)
         if np.array_equal(kept, estimate.kept):
             return estimate
         revised = self.places.revised(estimate, kept, fit.poses)
@@ -223,8 +270,26 @@ class _RobustSolve:
         only_drops = not (kept & ~estimate.kept).any()
         return revised if is_no_dearer or only_drops else estimate
 
+    def _search(self, choice: Choice) -> ClusterSearch:
+        """Search for clusters with the thresholds by which attempts are compared."""
+        doubted = self.doubted
+        scale = choice.threshold_scale
+        allowed = scale * doubted.thresholds
+        return ClusterSearch(doubted.problem, doubted.known, allowed, scale, self._has_time)
+
+    def _by_chance(self, solution: Solution, kept: BoolArray) -> float:
+        """Number of wrong closures that are expected to fit by chance.
+
+        It is zero where all are kept, and is not looked for where the solve was broken off.
+        """
+        if kept.all() or solution.status in OUT_OF_TIME:
+            return 0.0
+        fit = Fit.of(self.doubted.problem, kept, solution.poses)
+        return self._search(self.choice).expected_by_chance(fit)
+
     def _has_time(self) -> bool:
-        return self.places.request.monitor.left > _LEAST_SECONDS
+        monitor = self.places.request.monitor
+        return monitor.left >= _LAST_SHARE * monitor.time_limit
 
     # Stage 3: choice
 
@@ -259,10 +324,13 @@ class _RobustSolve:
 
     # Stage 4: verdict
 
-    def _result(self, solution: Solution, kept: BoolArray, scale: float, name: str) -> Solution:
+    def _result(
+        self, solution: Solution, kept: BoolArray, scale: float, name: str, noise: float = 1.0
+    ) -> Solution:
         """The solution with the decision on every edge, and the account of all that was sent.
 
-        `scale` is that of the thresholds beside which the residuals are reported.
+        `scale` is that of the thresholds beside which the residuals are reported, and
+        `noise` how many times their claim the squared errors of all edges are.
         """
         choice = self.choice
         allowed = scale * self.doubted.thresholds
@@ -277,7 +345,9 @@ class _RobustSolve:
             cost=choice.cost(solution.poses),
             threshold_scale=choice.threshold_scale,
             verdict=solution.certificate.verdict,
-            is_misfit=solution.edge_residuals.is_overall_misfit,
+            is_misfit=noise == 1.0 and solution.edge_residuals.is_overall_misfit,
+            noise=noise,
+            by_chance=self._by_chance(solution, kept),
             fit=solution.certificate.fit,
         )
         ledgers = self.places.ledgers

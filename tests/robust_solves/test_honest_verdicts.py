@@ -110,6 +110,8 @@ def test_the_certificate_does_not_choose(monkeypatch: pytest.MonkeyPatch) -> Non
         return estimates[-1]
 
     monkeypatch.setattr(robust_attempts.PlacesOfEdges, "attempt", recorded)
+    # Revision would mend the worse attempts.
+    monkeypatch.setattr(robust_solve._RobustSolve, "_improved", lambda _, estimate: estimate)
     solution = solvers.solve(graph, robust=solvers.GNC())
     assert len(estimates) > 1
     np.testing.assert_array_equal(solution.robust.kept & estimates[0].kept, estimates[0].kept)
@@ -134,6 +136,7 @@ def test_an_attempt_that_keeps_the_best_edges_alone_is_not_cheaper(
         Plan("as set", solvers.GNC(), every),
         Plan("few", solvers.GNC(scale=1e-2, spread=2.0), every),
     ]
+    monkeypatch.setattr(robust_solve._RobustSolve, "_improved", lambda _, estimate: estimate)
     monkeypatch.setattr(robust_solve, "plans_in_order", lambda *_: plans)
     robust = solvers.solve(graph, robust=solvers.GNC()).robust
     assert robust.attempts[1].rejected > is_wrong.sum() + 5
@@ -185,19 +188,33 @@ def test_the_command_ends_with_3_where_nothing_checks_the_edges(
     assert json.loads(output)["verdict"] == "UNCHECKED"
 
 
-def test_more_than_half_rejected_is_said_first(
+def test_more_than_half_rejected_is_said_in_the_first_line() -> None:
+    graph, is_wrong = spoiled(world(150, 0.1), 0.9, "random", 0)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    np.testing.assert_array_equal(robust.rejected, is_wrong)
+    assert robust.support is Support.CHECKED
+    assert robust.headline.startswith("CERTIFIED for the ")
+    assert robust.headline.endswith("more than half were rejected")
+
+
+def test_a_loose_map_that_wrong_closures_fit_by_chance_is_doubted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    graph, is_wrong = spoiled(world(150, 0.1), 0.7, "random", 0)
+    """Sixty poses, whose odometry has drifted so far that it follows many a wrong closure."""
+    right = pgo.grid_world(
+        1,
+        60,
+        np.random.default_rng(0),
+        d=2,
+        loop_closure_probability=0.02,
+        noise=NoiseModel(0.3, 0.1),
+    )
+    graph, _ = spoiled(right, 0.9, "random", 0)
     solution = solvers.solve(graph, robust=solvers.GNC())
-    np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
-    assert solution.verdict is Support.DOUBTFUL
-    assert not solution.is_certified
     robust = solution.robust
-    gone = f"{is_wrong.sum()} of {robust.num_closures}"
-    first = f"DOUBTFUL, more than half of the closures were rejected, {gone}: CERTIFIED for"
-    assert robust.headline.startswith(first)
-    assert solution.as_json()["robust"]["doubts"] == list(robust.doubts)
+    assert any("expected to fit this map by chance" in doubt for doubt in robust.doubts)
+    assert not solution.is_certified
+    assert solution.as_json()["robust"]["expected_by_chance"] == robust.by_chance
     file = tmp_path / "wrong.g2o"
     pgo.write_g2o(graph, file)
     assert run_cli(capsys, "solve", file, "--robust", "gnc", "--quiet")[0] == 3
@@ -241,6 +258,20 @@ def test_a_noisy_sphere_is_not_certified_without_its_closures(start: str | None)
     assert_not_silent(solution, np.zeros(graph.num_edges, dtype=bool))
 
 
+@pytest.mark.parametrize("claim", [4.0, 16.0])
+def test_noise_above_its_claim_on_all_edges_alike_rejects_none(claim: float) -> None:
+    graph = noisy_sphere(300, 20, NoiseModel(0.1, 0.1), 0)
+    graph = replace(graph, kappa=claim * graph.kappa, tau=claim * graph.tau, information=None)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    assert robust.kept.all()
+    assert robust.noise == pytest.approx(claim, rel=0.1)
+    assert "times those claimed" in robust.headline
+    spoiled_graph, is_wrong = spoiled(graph, 0.05, "random", 0)
+    robust = solvers.solve(spoiled_graph, robust=solvers.GNC()).robust
+    assert robust.noise == 1.0  # of closures alone it is not that of all edges
+    assert robust.rejected[is_wrong].all()
+
+
 def test_least_squares_is_a_start_where_odometry_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tight thresholds on a noisy sphere leave a certified tree: not enough, and not cheap."""
     graph = noisy_sphere(300, 15, NoiseModel(0.4, 0.4), 0)
@@ -249,6 +280,8 @@ def test_least_squares_is_a_start_where_odometry_is_none(monkeypatch: pytest.Mon
         Plan("tight", solvers.GNC(scale=1e-3, spread=30.0), every),
         Plan("least squares", solvers.GNC(), every, starts_at_least_squares=True),
     ]
+    # Revision would bring the closures back.
+    monkeypatch.setattr(robust_solve._RobustSolve, "_improved", lambda _, estimate: estimate)
     # as on a large graph: no plain solution at first
     monkeypatch.setattr(robust_attempts, "_CHEAP_ROWS", -1)
     monkeypatch.setattr(robust_solve, "plans_in_order", lambda *_: plans)
@@ -289,4 +322,4 @@ def test_nine_closures_of_ten_are_wrong(benchmark_problem, name: str, kind: str)
     graph, is_wrong = spoiled(benchmark_problem(name).graph, 0.9, kind, 0)
     solution = solvers.solve(graph, robust=solvers.GNC())
     assert_not_silent(solution, is_wrong)
-    assert not solution.is_certified  # most were rejected
+    assert quality(solution, is_wrong) >= ENOUGH or not solution.is_certified

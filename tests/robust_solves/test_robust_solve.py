@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from solvers.robust_solves.attempts import Plan
 
 pytestmark = pytest.mark.slow  # robust solves from end to end
 
+CASES = Path(__file__).parent.parent / "cases"
 POLISHED = partial(polish, max_steps=4)
 KINDS = pytest.mark.parametrize("kind", ["random", "aliased"])
 
@@ -75,9 +77,6 @@ def test_right_closures_stay_where_noise_leaves_no_certificate(seed):
         3, 15, np.random.default_rng(seed), d=3, loop_closure_probability=0.2, noise=noise
     )
     solution = solvers.solve(graph, robust=solvers.GNC())
-    assert any(
-        attempt.is_certified for attempt in solution.robust.attempts
-    )  # with hardly a closure left
     assert not solution.robust.rejected.any()
     assert not solution.is_certified
     assert "not certified after all attempts" in str(solution)
@@ -111,15 +110,14 @@ def test_an_attempt_that_leaves_poses_apart_is_passed_over(clean, monkeypatch):
         without(["as set"])
 
 
-@pytest.mark.parametrize("where", ["drop_contradicted", "ClusterSearch", "pairwise_consistent"])
+@pytest.mark.parametrize("where", ["drop_contradicted", "ClusterSearch"])
 def test_ctrl_c_between_the_loops_keeps_the_best_attempt(clean, where, monkeypatch):
     graph, is_wrong = spoiled(clean, 0.3, "random", seed=0)
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    module = robust_attempts if where == "pairwise_consistent" else robust_solve
-    monkeypatch.setattr(module, where, interrupted)
+    monkeypatch.setattr(robust_solve, where, interrupted)
     solution = solvers.solve(graph, robust=solvers.GNC())
     assert solution.status is solvers.Status.INTERRUPTED
     assert not solution.robust.rejected[~is_wrong].any()
@@ -186,9 +184,9 @@ def test_where_the_certificate_fails_other_attempts_are_made(clean, share):
     assert f"{first.name}: {first.rejected} rejected" in str(solution)
     assert (solution.robust.rejected & ~is_wrong).sum() == 0
     assert (solution.robust.kept & is_wrong).sum() <= 1 < (alone.inliers & is_wrong).sum()
-    assert [stage.name for stage in solution.stages[: len(solution.robust.attempts)]] == [
-        f"GNC, {attempt.name}" for attempt in solution.robust.attempts
-    ]
+    stages = solution.stages[: len(solution.robust.attempts)]
+    names = [stage.name.removeprefix("GNC, ") for stage in stages]
+    assert names == [attempt.name for attempt in solution.robust.attempts]
 
 
 @pytest.mark.parametrize("is_large", [False, True])
@@ -198,12 +196,14 @@ def test_on_large_graphs_smaller_steps_come_last(clean, is_large, monkeypatch):
         monkeypatch.setattr(robust_attempts, "_CHEAP_ROWS", -1)  # no edge but known ones
     # wrong ones, too: no attempt is certified
     given = solvers.GNC(known=np.ones(graph.num_edges, dtype=bool))
-    tried = [attempt.name for attempt in solvers.solve(graph, robust=given).robust.attempts]
+    monkeypatch.setattr(robust_solve.Choice, "is_enough", False)
+    attempts = solvers.solve(graph, robust=given).robust.attempts
+    tried = [attempt.name for attempt in attempts]
     slow = ["smaller steps"]
     tight = ["thresholds times 0.1 at first", "thresholds times 0.01 at first"]
     middle = tight + slow if is_large else slow + tight
     last = ["from least squares with every edge", "geman-mcclure loss"]
-    assert tried == ["as set", "known inliers", "pairwise consistent edges", *middle, *last]
+    assert tried == ["as set", "pairwise consistent edges", *middle, *last]
 
 
 def test_doubtful_edges_are_within_a_factor_of_two_of_their_threshold(clean):
@@ -358,7 +358,7 @@ def test_robots_take_out_what_one_place_does():
     central = solvers.solve(graph, robust=solvers.GNC())
     shared = solvers.solve(graph, robust=solvers.GNC(), robots=3)
     for solution in (central, shared):
-        assert "less 1 that all others contradict" in solution.robust.start
+        assert "less 1 that others contradict" in solution.robust.start
         assert solution.is_certified
         assert solution.robust.rejected[right.num_edges]
     np.testing.assert_array_equal(shared.robust.kept, central.robust.kept)
@@ -414,3 +414,42 @@ def test_robots_take_back_what_one_place_does():
     assert "that they can follow" in solution.robust.start
     np.testing.assert_array_equal(solution.robust.kept, ~wrong)
     assert solution.is_certified
+
+
+@pytest.mark.parametrize(
+    ("name", "false_fix"), [("one_wrong_gps.g2o", 30), ("gps_one_bad.g2o", 33)]
+)
+def test_of_six_fixes_the_false_one_is_rejected_and_no_closure(name, false_fix):
+    graph = pgo.read_g2o(CASES / name)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert np.flatnonzero(solution.robust.rejected).tolist() == [false_fix]
+    assert graph.is_prior[false_fix]
+    assert solution.is_certified
+    assert "closures and fixes hold the map" in solution.robust.headline
+    facts = dict(solution.robust.facts())
+    assert facts["taken for right"] == solution.robust.named(solution.robust.known)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_fixes_moved_by_metres_are_rejected_among_many(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    right = pgo.grid_world(1, 200, rng, d=2, loop_closure_probability=0.02)
+    fixed = np.arange(0, 200, 3)
+    is_moved = np.zeros(len(fixed), dtype=bool)
+    is_moved[rng.choice(len(fixed), 5, replace=False)] = True
+    t = right.truth.t[fixed] + 0.3 * rng.standard_normal((len(fixed), 2))
+    t[is_moved] += rng.choice([-5.0, 5.0], (5, 2))
+    lines = [
+        f"EDGE_PRIOR_SE2_XY {pose} {x:.9g} {y:.9g} 11.1 0 11.1"
+        for pose, (x, y) in zip(fixed, t, strict=True)
+    ]
+    file = tmp_path / "fixes.g2o"
+    pgo.write_g2o(right, file)
+    with file.open("a") as written:
+        written.write("\n".join(lines))
+    graph = pgo.read_g2o(file)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    rejected = robust.rejected[graph.is_prior]
+    assert rejected[is_moved].all()
+    assert rejected[~is_moved].sum() <= 4  # 0.6 are expected at the quantile 0.99
+    assert robust.rejected[~graph.is_prior].sum() <= 2
