@@ -54,7 +54,9 @@ from solvers.robust.consistency import PCM as PCM, pairwise_consistent as pairwi
 from solvers.robust.gnc import GNC as GNC
 from solvers.robust.irls import IRLS as IRLS
 from solvers.robust.losses import RobustLoss as RobustLoss
+from solvers.robust.outlier_record import OutlierProof as OutlierProof
 from solvers.robust.rejection import Rejection as Rejection, Support as Support
+from solvers.robust_solves.outlier_proof import prove_outliers as prove_outliers
 from solvers.soc.anderson import Anderson as Anderson
 from solvers.soc.paper import PaperSOC as PaperSOC, PaperStop as PaperStop
 from solvers.soc.penalty import (
@@ -129,7 +131,7 @@ __all__ += [
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
 __all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
-__all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
+__all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent", "prove_outliers"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
 __all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]

@@ -75,7 +75,7 @@ class OutlierProof:
         return {
             "proven_wrong": np.flatnonzero(self.proven_wrong).tolist(),
             "most_closures": self.most_closures,
-            "truncated_cost": self.truncated_cost,
+            "truncated_cost_at_most": self.truncated_cost,
             "truncated_cost_bound": self.truncated_cost_bound,
             "is_complete": self.is_complete,
         }

@@ -12,6 +12,7 @@ from pgo_models.certificates.fit import Fit
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.problem import PGOProblem
+from solvers.robust.outlier_record import OutlierProof
 
 # Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
 # half their threshold.
@@ -91,6 +92,8 @@ class Rejection:
         `file:line` of every edge, where they are known.
     fit : Fit
         How closely the poses fit the kept edges, where the verdict on these is EXACT.
+    proof : OutlierProof, optional
+        What `prove_outliers` has proven of the closures.
     """
 
     problem: PGOProblem
@@ -108,6 +111,7 @@ class Rejection:
     noise: float = 1.0
     places: tuple[str, ...] = ()
     fit: Fit = Fit.NONE
+    proof: OutlierProof | None = None
 
     @property
     def rejected(self) -> BoolArray:
@@ -214,6 +218,9 @@ class Rejection:
         bound = f"The bound is on the cost of the {num_edges - num_rejected} edges kept"
         rejected = f"{num_rejected} of {num_edges} were rejected"
         condition = "that the rejected edges are wrong is not proven"
+        if self.proof is not None:
+            unproven = int((self.rejected & ~self.proof.proven_wrong).sum())
+            condition = f"that {unproven} of these are wrong is not proven"
         return f"{bound}; {rejected}, and {condition}, nor that all others are right."
 
     @property
@@ -241,6 +248,8 @@ class Rejection:
             ("doubtful", self.named(self.doubtful)),
             ("found by", self.start),
         ]
+        if self.proof is not None:
+            rows.append(("proven", f"{self.proof}"))
         if len(self.attempts) > 1:
             attempts = "; ".join(map(_summary, self.attempts))
             rows.append(("attempts", attempts))
@@ -300,6 +309,8 @@ class Rejection:
             "noise": self.noise,
             "threshold_scale": self.threshold_scale,
         }
+        if self.proof is not None:
+            robust |= self.proof.as_json()
         return {"rejected": rejected, "robust": robust}
 
     @property
