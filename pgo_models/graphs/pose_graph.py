@@ -642,6 +642,16 @@ class PoseGraph(ReadOnly):
     def _check_one_component(self) -> None:
         """Raise a GraphError that names the components where there are several."""
         parts = self.components()
+        alone = [part[0] for part in parts[1:] if len(part) == 1]
+        if alone and len(alone) == len(parts) - 1:
+            first = self.pose_name(alone[0])
+            poses = f"{len(alone)} poses have no edges (the first is {first})"
+            if len(alone) == 1:
+                poses = f"pose {first} has no edges"
+            raise GraphError(
+                f"{poses}; leave out what is not connected with --largest-component "
+                "(PoseGraph.components and subgraph), or add edges"
+            )
         if len(parts) > 1:
             named = parts[:_NAMED_COMPONENTS]
             num_unnamed = len(parts) - len(named)
@@ -651,7 +661,8 @@ class PoseGraph(ReadOnly):
             raise GraphError(
                 f"pose graph has {len(parts)} components "
                 f"(sizes {sizes}{rest}; with poses {firsts}{rest}); add edges between them, "
-                "or solve each on its own (PoseGraph.components, PoseGraph.subgraph)"
+                "or solve the first with --largest-component, and each with PoseGraph.components "
+                "and PoseGraph.subgraph"
             )
 
     def _check_tied(self, precision: str, quantity: str) -> None:

@@ -92,6 +92,14 @@ SkipUnknownOption = Annotated[
         "--skip-unknown", help="Skip lines of a g2o file with unknown tags, and say which."
     ),
 ]
+LargestComponentOption = Annotated[
+    bool,
+    typer.Option(
+        "--largest-component",
+        help="Take the largest component of a graph in parts, and say what is left out: other "
+        "parts, and poses without edges.",
+    ),
+]
 TrustFolderOption = Annotated[
     bool,
     typer.Option(

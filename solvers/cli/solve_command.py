@@ -49,6 +49,7 @@ from solvers.cli.options import (
     GapOption,
     GraphArgument,
     InformationOption,
+    LargestComponentOption,
     ProofOption,
     Robust,
     RotationsOption,
@@ -166,6 +167,7 @@ def solve_command(
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
+    largest_component: LargestComponentOption = False,
     anchor: Annotated[
         int | None,
         typer.Option(
@@ -222,6 +224,7 @@ def solve_command(
         drop_edge,
         rotations,
         trust_folder,
+        largest_component,
     )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)

@@ -23,7 +23,7 @@ LOADED = {
     "Klaus3.g2o": (3, 0, 3, ""),
     "cityTrees_reduced_1k.g2o": (1000, 66, 1405, "LANDMARK2"),
     "edge_se3_trackxyz_example.g2o": (1, 1, 1, ""),
-    "edge_se3_trackxyz_missing_vertex.g2o": (1, 1, 1, ""),
+    "edge_se3_trackxyz_missing_vertex.g2o": (1, 1, 1, "they are placed along edges"),
     "edge_se3_trackxyz_nonidentity_offset.g2o": (1, 1, 1, ""),
     "edge_se3_trackxyz_zero_range.g2o": (1, 1, 1, ""),
     "example.graph": (95, 24, 516, "BR"),
