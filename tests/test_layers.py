@@ -59,6 +59,8 @@ ORDER = {
         "pipeline",
         "folder_solve",
         "growing",
+        "readings",
+        "noise",
         "studies",
         "cli",
     ),

@@ -47,6 +47,8 @@ class EdgeResiduals:
         the odometry, so that no edge exceeds its own threshold.
     overall_allowed : float
         Bound that `overall` exceeds with probability FALSE_ALARM.
+    overall_least : float
+        Bound that `overall` falls below with probability FALSE_ALARM.
     """
 
     translation: Array
@@ -56,6 +58,7 @@ class EdgeResiduals:
     scale: float
     overall: float
     overall_allowed: float
+    overall_least: float
 
     @property
     def share(self) -> Array:
@@ -133,7 +136,10 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
         overall = float(cost.sum() / mean)
         dof = mean**2 / half_variance
     overall_allowed = float(scipy.special.chdtri(dof, FALSE_ALARM) / dof)
-    return EdgeResiduals(translation, rotation, cost, allowed, scale, overall, overall_allowed)
+    overall_least = float(scipy.special.chdtri(dof, 1.0 - FALSE_ALARM) / dof)
+    return EdgeResiduals(
+        translation, rotation, cost, allowed, scale, overall, overall_allowed, overall_least
+    )
 
 
 def _median_ratio(cost: Array, w: Array) -> float:

@@ -16,13 +16,20 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.separators import report_partition
 from solvers.cli.explanations import explained_by_its_graph
-from solvers.cli.inputs import chosen_partition, indefinite_matrices, load_graph
+from solvers.cli.inputs import (
+    chosen_partition,
+    indefinite_matrices,
+    load_graph,
+    with_estimated_noise,
+)
 from solvers.cli.options import (
+    EstimateNoiseOption,
     LargestComponentOption,
     SkipUnknownOption,
     Split,
     SplitOption,
     TrustFolderOption,
+    UnitWeightsOption,
 )
 from solvers.cli.shell import JsonOption, figures_of_facts, save_then_show, wrapped
 from solvers.reporting.graph_facts import describe_graph
@@ -46,6 +53,8 @@ def info_command(
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
     largest_component: LargestComponentOption = False,
+    unit_weights: UnitWeightsOption = False,
+    estimate_noise: EstimateNoiseOption = False,
     reading: Annotated[
         Reading,
         typer.Option(
@@ -76,12 +85,14 @@ def info_command(
             _check_out(out)
         loaded = load_graph(
             graph,
-            False,
+            unit_weights or estimate_noise,
             skip_unknown,
             reading=reading,
             trust_folder=trust_folder,
             largest_component=largest_component,
         )
+        if estimate_noise:
+            loaded = with_estimated_noise(loaded)
         facts, record = _describe_graph(graph, loaded, robots, split)
         if out is not None:
             targets = [(out, partial(write_g2o, loaded))]

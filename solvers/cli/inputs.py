@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -51,9 +52,15 @@ class GraphOptions:
     rotations: bool = False
     trust_folder: bool = False
     largest_component: bool = False
+    estimate_noise: bool = False
 
     def __post_init__(self) -> None:
         asked = self._asked
+        if self.estimate_noise and self.chosen_cost is Cost.UNIT:
+            (option,) = list(asked)[:1]
+            raise SettingError(
+                f"--estimate-noise and {option} ask for different weights; leave out one"
+            )
         if len(set(asked.values())) > 1:
             first, second = list(asked)[:2]
             raise SettingError(f"{first} and {second} ask for different costs; leave out one")
@@ -79,8 +86,8 @@ class GraphOptions:
 
     def loaded(self) -> PoseGraph:
         """The graph, without the edges to leave out."""
-        has_unit_weights = self.chosen_cost is Cost.UNIT
-        return load_graph(
+        has_unit_weights = self.chosen_cost is Cost.UNIT or self.estimate_noise
+        loaded = load_graph(
             self.graph,
             has_unit_weights,
             self.skip_unknown,
@@ -88,6 +95,7 @@ class GraphOptions:
             trust_folder=self.trust_folder,
             largest_component=self.largest_component,
         )
+        return with_estimated_noise(loaded) if self.estimate_noise else loaded
 
     def problem(self, loaded: PoseGraph) -> PGOProblem:
         """Problem of the loaded graph, with the cost that was asked for, or its own.
@@ -119,6 +127,13 @@ class GraphOptions:
         return PGOProblem(loaded, weighting=Weighting.INFORMATION)
 
     @property
+    def is_as_written(self) -> bool:
+        """Whether the whole graph is solved, with the weights of its file."""
+        is_whole = not (self.drop_edge or self.rotations or self.largest_component)
+        has_own_weights = self.chosen_cost is not Cost.UNIT and not self.estimate_noise
+        return is_whole and has_own_weights and not self.skip_unknown
+
+    @property
     def in_commands(self) -> str:
         """The name of the graph with all these options, as one types them."""
         options = {
@@ -127,6 +142,7 @@ class GraphOptions:
             "--skip-unknown": self.skip_unknown,
             "--trust-folder": self.trust_folder,
             "--largest-component": self.largest_component,
+            "--estimate-noise": self.estimate_noise,
         }
         cost = self.chosen_cost
         if cost in (Cost.ISOTROPIC, Cost.UNIT):
@@ -198,6 +214,15 @@ def load_graph(
         kept, _ = kept_edges(graph, dropped)
         loaded = loaded.without_edges(~kept)
     return _largest_component(loaded) if largest_component else loaded
+
+
+def with_estimated_noise(graph: PoseGraph) -> PoseGraph:
+    """The graph with weights of the noise that its edges have; what that is goes to stderr."""
+    from solvers.noise import estimate_noise
+
+    estimate = estimate_noise(graph)
+    print(f"pgo: noise of {estimate}, estimated from the measurements", file=sys.stderr)
+    return estimate.graph
 
 
 def _largest_component(graph: PoseGraph) -> PoseGraph:

@@ -100,6 +100,14 @@ LargestComponentOption = Annotated[
         "parts, and poses without edges.",
     ),
 ]
+EstimateNoiseOption = Annotated[
+    bool,
+    typer.Option(
+        "--estimate-noise",
+        help="Find the noise of odometry and closures from how well they fit each other, say what "
+        "it is, and take the weights of it, whatever matrices the file has.",
+    ),
+]
 TrustFolderOption = Annotated[
     bool,
     typer.Option(

@@ -23,6 +23,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.cli import choices
 from solvers.cli.explanations import (
+    advice_on_file,
     edge_fit_of_solution,
     explained_by_its_graph,
     say_memory_of_solve,
@@ -45,6 +46,7 @@ from solvers.cli.options import (
     CostOption,
     DropCouplingOption,
     DropEdgeOption,
+    EstimateNoiseOption,
     FirstStage,
     GapOption,
     GraphArgument,
@@ -168,6 +170,7 @@ def solve_command(
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
     largest_component: LargestComponentOption = False,
+    estimate_noise: EstimateNoiseOption = False,
     anchor: Annotated[
         int | None,
         typer.Option(
@@ -225,6 +228,7 @@ def solve_command(
         rotations,
         trust_folder,
         largest_component,
+        estimate_noise,
     )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
@@ -564,6 +568,8 @@ def _save_and_show(
     def show() -> None:
         typer.echo(wrapped(_text_with_error(solution), _INDENT))
         is_robust = stages.robust is not None
+        if not is_robust:
+            show_advice(advice_on_file(judged(), solution.problem.graph, source))
         show_advice(judged().advice(f"pgo solve {command_source}", is_robust=is_robust))
 
     record = solution.as_json if display.as_json else None

@@ -180,7 +180,7 @@ def test_a_tree_has_nothing_to_test_by():
 def test_where_nothing_costs_anything_no_edge_has_a_share():
     def of(cost):
         return EdgeResiduals(
-            np.zeros(2), np.zeros(2), np.array(cost), np.full(2, 12.0), 1.0, 0.0, 2.0
+            np.zeros(2), np.zeros(2), np.array(cost), np.full(2, 12.0), 1.0, 0.0, 2.0, 0.0
         )
 
     assert of([0.0, 0.0]).share.tolist() == [0.0, 0.0]
