@@ -34,6 +34,7 @@ _COMMENT_SIGNS = ("#", "//", "%")
 _COMMENT = re.compile(r"\s*(#|//|%).*")
 # Fortran writes 1.5e-3 as 1.5D-03.
 _FORTRAN_EXPONENT = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
+_INFINITE = re.compile(r"[+-]?(inf|infinity|nan)", re.IGNORECASE)
 # A robust kernel, with or without its width, behind the numbers of an edge.
 _KERNEL = re.compile(
     r"\s((ROBUST_)?KERNEL|(RobustKernel)?(Huber|PseudoHuber|Cauchy|DCS|Fair|GemanMcClure|Saturated"
@@ -242,7 +243,13 @@ class Source:
         words_of_numbers = words[kind.num_ids :]
         for word in [*words_of_ids, *other_ids]:
             self._id(number, word)
-        for word in words_of_numbers:
+        for place, word in enumerate(words_of_numbers):
+            if kind.is_edge and place >= kind.num_measured and _INFINITE.fullmatch(word):
+                problem = (
+                    f"{word} is not finite, like the information of a covariance of zero; give the "
+                    "variances of the sensor, or remove the line"
+                )
+                raise self._error(number, problem)
             finite_number(self.path, number, word)
         expected = kind.num_ids + kind.num_numbers
         if len(words) == expected:

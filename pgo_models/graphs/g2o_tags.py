@@ -108,7 +108,10 @@ class Tag:
         if self.noise is Noise.COVARIANCE:
             covariances = numbers[:, self.num_measured + triangle_places(self._side)]
             is_covariance = are_definite(covariances, SINGULAR)
-            problem = "the covariance matrix is not positive definite; correct or remove it"
+            problem = (
+                "the covariance matrix is not positive definite, and no sensor is without error: "
+                "give its variances, or remove it"
+            )
             return ~is_covariance, problem
         return np.zeros(len(numbers), dtype=bool), ""
 

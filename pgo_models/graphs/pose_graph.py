@@ -605,12 +605,15 @@ class PoseGraph(ReadOnly):
         GraphError
             When the graph has several components, which the message names; when no edge with a
             positive precision ties the positions or rotations of some poses to those of the
-            others; or when priors of positions do not fix the rotation of the world.
+            others; when there are priors of positions alone, and no edges between poses, or of
+            rotations alone; or when priors of positions do not fix the rotation of the world.
         """
         if not self.has_translations:
             self.check_rotations_connected()
             return
         self._check_one_component()
+        if self.world is not None:
+            self._check_kinds_of_priors()
         self._check_tied("tau", "position")
         self._check_tied("kappa", "rotation")
         if self.is_world_loose:
@@ -682,6 +685,20 @@ class PoseGraph(ReadOnly):
                 f"no edge between has {precision} > 0; add one, or leave these out"
             )
 
+    def _check_kinds_of_priors(self) -> None:
+        """Raise a GraphError where positions are all that is measured, or priors have none."""
+        if self.is_prior.all() and self.is_world_loose:
+            raise GraphError(
+                f"{self.name} has {self.num_edges} positions of single poses (GPS) and no edges "
+                "between poses: nothing says how the poses are turned; add odometry"
+            )
+        if not self.tau[self.is_prior].any():
+            raise GraphError(
+                f"the priors of {self.name} measure rotations alone, and nothing says where the "
+                "origin of their frame is; add the position of a pose "
+                "(EDGE_SE3_PRIORXYZ, EDGE_PRIOR_SE2_XY), or leave these priors out"
+            )
+
     def _check_priors_fix_world(self) -> None:
         """Raise a GraphError when priors of positions lie in a point or, in space, on a line."""
         # One position of every pose that has priors.
@@ -693,10 +710,11 @@ class PoseGraph(ReadOnly):
         rounding = _ROUNDING * np.abs(measured).max(initial=0.0)
         threshold = max(_COLLINEAR * spread[0], rounding, 1e-300)
         if len(measured) < self.d or not spread[self.d - 2] > threshold:
+            needed = "two poses apart" if self.d == 2 else "three poses that are not on a line"
             raise GraphError(
                 f"the priors do not fix the gauge: positions of {len(measured)} poses, in a point "
-                "or on a line, leave turns of the world open; "
-                "give more, or a prior with a rotation"
+                "or on a line, leave turns of the world open; give positions of "
+                f"{needed}, a prior with a rotation, or no priors"
             )
 
     # Other graphs made of this one

@@ -307,3 +307,10 @@ def test_readings_of_angles_quaternions_and_matrices(tmp_path: Path) -> None:
     line = EDGE_2D.replace("4 0 0 4 0 9", "4 0 4 9 0 1")
     graph = read(tmp_path, [line], reading=Reading.TORO_ORDER)
     np.testing.assert_array_equal(graph.information[0], [[4, 0, 0], [0, 4, 1], [0, 1, 9]])
+
+
+def test_an_infinite_matrix_is_that_of_a_covariance_of_zero(tmp_path: Path) -> None:
+    with pytest.raises(
+        FileFormatError, match=r":2: inf is not finite, .* covariance of zero; give"
+    ):
+        read(tmp_path, [EDGE_2D, "EDGE_PRIOR_SE2_XY 0 5 6 inf 0 inf"])
