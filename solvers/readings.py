@@ -29,8 +29,6 @@ from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.riemannian.newton import Newton
 
-# Readings under which the weights are others, so that the costs cannot be compared.
-_OF_MATRICES = (Reading.TORO_ORDER, Reading.COVARIANCES, Reading.SQUARE_ROOTS)
 # Factors by which lengths, or angles of less than a turn, are made smaller.
 _SHRINKING = {
     Reading.CLOSURES_IN_MILLIMETRES: 1e-3,
@@ -44,10 +42,19 @@ _OF_SOME_EDGES = (
     Reading.CLOSURES_IN_MILLIMETRES,
     Reading.ODOMETRY_IN_MILLIMETRES,
 )
-_LEAST_EVIDENCE = math.log(1e5)  # from which on a reading is proposed,
-_LEAST_RATIO = 10.0  # where the cost is so much smaller than as written; or of matrices,
-_LEAST_MISFIT = 1000.0  # where the cost is off from what is expected by so much as written,
-_MOST_MISFIT = 10.0  # and by no more than this as proposed
+# A reading is proposed from this evidence on, odds of 100,000 to one. It also has to be clearly
+# better: its cost is smaller by the next factor. Where the weights are others, so that the costs
+# cannot be compared, the cost is off by a factor of _LEAST_MISFIT from what is expected as written,
+# and by _MOST_MISFIT at most as proposed. Many files claim a hundredth of the information that they
+# have, and mean no square roots.
+_LEAST_EVIDENCE = math.log(1e5)
+_LEAST_RATIO = 10.0
+_LEAST_MISFIT = {
+    Reading.COVARIANCES: 30.0,
+    Reading.SQUARE_ROOTS: 1000.0,
+    Reading.TORO_ORDER: 1000.0,
+}
+_MOST_MISFIT = 10.0
 _CLOSE = math.log(1e3)  # difference of evidence up to which a reading is named beside the best
 _TURN = 2.0 * math.pi  # no program writes larger angles in radians
 # There is nothing to gain from a second attempt or a better bound under a wrong reading.
@@ -256,7 +263,7 @@ class _Trial:
         half_freedom = 0.5 * degrees_of_freedom(self.graph)
         if not (half_freedom > 0 and cost > 0 and self.written.cost > 0):
             return -math.inf
-        if reading in _OF_MATRICES:
+        if reading in _LEAST_MISFIT:
             misfit = _misfit(self.written.times_expected) - _misfit(times_expected)
             return half_freedom * misfit
         return half_freedom * math.log(self.written.cost / self._comparable(reading, cost))
@@ -282,14 +289,15 @@ def _proposed(fits: tuple[ReadingFit, ...], written: ReadingFit) -> tuple[Readin
 
 def _is_clear(fit: ReadingFit, written: ReadingFit) -> bool:
     """Whether a reading fits not only beyond chance, but clearly better."""
-    if fit.reading not in _OF_MATRICES:
+    if fit.reading not in _LEAST_MISFIT:
         return fit.cost * _LEAST_RATIO <= written.cost
     if not 1.0 / _MOST_MISFIT <= fit.times_expected <= _MOST_MISFIT:
         return False
     # Covariances and square roots of less than one make the cost too small. One that is too large
     # is more often that of a wrong edge, which larger covariances would only hide.
-    is_too_small = written.times_expected <= 1.0 / _LEAST_MISFIT
-    is_too_large = written.times_expected >= _LEAST_MISFIT
+    least_misfit = _LEAST_MISFIT[fit.reading]
+    is_too_small = written.times_expected <= 1.0 / least_misfit
+    is_too_large = written.times_expected >= least_misfit
     return is_too_small or (is_too_large and fit.reading is Reading.TORO_ORDER)
 
 

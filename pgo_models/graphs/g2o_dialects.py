@@ -56,18 +56,13 @@ def order_of_edge_se2(lines: Sequence[Array]) -> MatrixOrder:
     positive definite in TORO's order.
     """
     numbers = np.concatenate(lines)
-    if _have_positive_minors(numbers) or are_definite(_matrices(numbers), _NEGATIVE).all():
+    # The second entry on the diagonal, which is the coupling of x and theta by rows.
+    may_be_toro = bool((numbers[:, 5] > 0.0).all())
+    if not may_be_toro or not _all_are_definite(from_toro_order(numbers)):
         return MatrixOrder.ROWS
-    is_toro = _all_are_definite(from_toro_order(numbers))
-    return MatrixOrder.TORO if is_toro else MatrixOrder.ROWS
-
-
-def _have_positive_minors(numbers: Array) -> bool:
-    """Whether the leading minors of all matrices by rows are positive: a quick test."""
-    xx, xy, xt, yy, yt, tt = numbers[:, 3:].T
-    of_block = xx * yy - xy * xy
-    of_whole = tt * of_block + xt * (xy * yt - xt * yy) + yt * (xy * xt - xx * yt)
-    return bool(((xx > 0.0) & (of_block > 0.0) & (of_whole > 0.0)).all())
+    matrices = _matrices(numbers)
+    is_by_rows = _have_minors(matrices) and bool(are_definite(matrices, _NEGATIVE).all())
+    return MatrixOrder.EITHER if is_by_rows else MatrixOrder.TORO
 
 
 def from_toro_order(numbers: Array) -> Array:
@@ -84,7 +79,18 @@ def _all_are_definite(rows: Array) -> bool:
     """Whether the whole matrices on EDGE rows in the plane, (n, 9), are positive definite."""
     matrices = _matrices(rows)
     diagonals = np.einsum("mkk->mk", matrices)
-    return bool((diagonals > 0.0).all()) and bool(are_definite(matrices, SINGULAR).all())
+    may_be_definite = bool((diagonals > 0.0).all()) and _have_minors(matrices)
+    return may_be_definite and bool(are_definite(matrices, SINGULAR).all())
+
+
+def _have_minors(matrices: Array) -> bool:
+    """Whether no entry is larger than those on the diagonal allow: |a_ij|^2 <= a_ii a_jj.
+
+    Nothing overflows then where the matrices are scaled to ones on their diagonals.
+    """
+    root = np.sqrt(np.maximum(np.einsum("mkk->mk", matrices), 0.0))
+    most = root[:, :, None] * root[:, None, :]
+    return bool((np.abs(matrices) <= (1.0 - _NEGATIVE) * most).all())
 
 
 def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> tuple[Array, Array]:

@@ -177,6 +177,8 @@ def _problems_of_unknown(source: Source, has_known: bool) -> list[Problem]:
     problems: list[Problem] = []
     for tag, (count, first) in source.unknown.items():
         problem = f"unknown tag {tag!r}"
+        if "," in tag:
+            problem += "; separate words by blanks, not by commas"
         if not has_known:
             problem += (
                 ", and no line has a tag of a pose graph, such as EDGE_SE2; images, IMU readings "
@@ -305,12 +307,19 @@ class _Assembly:
             return
         if self._reading is Reading.TORO_ORDER:
             self._reorder("EDGE_SE2")
-        elif order_of_edge_se2([part.numbers for part in parts]) is MatrixOrder.TORO:
+            return
+        order = order_of_edge_se2([part.numbers for part in parts])
+        if order is MatrixOrder.TORO:
             self.notes.append(
                 "EDGE_SE2 matrices are read in TORO's order, ff fs ss rr fr sr: all are positive "
                 "definite in it, and not in g2o's, xx xy xt yy yt tt"
             )
             self._reorder("EDGE_SE2")
+        elif order is MatrixOrder.EITHER:
+            self.notes.append(
+                "EDGE_SE2 matrices are read in g2o's order, xx xy xt yy yt tt; they are all "
+                "positive definite in TORO's, ff fs ss rr fr sr, too (--reading toro-order)"
+            )
 
     def _reorder(self, tag: str) -> None:
         """Put the matrices of a tag, which are in TORO's order, into the order of rows."""
@@ -392,8 +401,13 @@ class _Assembly:
             )
         if "LANDMARK2" in self._source.written_tags:
             self.notes.append(f"LANDMARK2 {_TAKEN_AS_INFORMATION}")
+        if {"EDGE_SE3", "EDGE_SE3:EULER"} & self._source.written_tags and parsed["EDGE3"]:
+            self.notes.append(
+                "EDGE_SE3 lines with three angles are read as TORO's EDGE3: roll, pitch and yaw, "
+                "and the information of a rotation vector"
+            )
         # TORO, whose matrices are information, writes vertices; iSAM does not.
-        if parsed["EDGE3"] and not parsed["VERTEX3"]:
+        if "EDGE3" in self._source.written_tags and parsed["EDGE3"] and not parsed["VERTEX3"]:
             self.notes.append(f"EDGE3 {_TAKEN_AS_INFORMATION}")
 
     def _digits(self) -> WrittenDigits:

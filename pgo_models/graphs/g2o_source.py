@@ -24,6 +24,7 @@ from pgo_models.graphs.g2o_tags import (
     SHORT_TAGS,
     SKIPPED_TAGS,
     TAGS,
+    WITH_ANGLES,
     Tag,
 )
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
@@ -129,7 +130,7 @@ class Source:
                 "EDGE2 lines hold several hypotheses of a measurement (MH-iSAM2), and a pose graph "
                 "has one measurement an edge; write the right one as EDGE_SE2",
             )
-        for line_tag, places in _places_by_length(tag, lines).items():
+        for line_tag, places in _places_by_length(tag, written_tag, lines).items():
             some_lines = [lines[place] for place in places]
             self._take_sound_lines(line_tag, written_tag, numbers[places], some_lines)
 
@@ -287,13 +288,13 @@ def _without_comment(line: str) -> str:
     return _COMMENT.sub("", line)
 
 
-def _places_by_length(tag: str, lines: list[str]) -> dict[str, list[int]]:
+def _places_by_length(tag: str, written_tag: str, lines: list[str]) -> dict[str, list[int]]:
     """Places of lines by the variant of their tag that has as many words, or the tag itself."""
     variants: dict[int, str] = {}
-    for names in (SHORT_TAGS, COMPLETE_TAGS):
-        if tag in names:
-            variant = TAGS[names[tag]]
-            variants[1 + variant.num_ids + variant.num_numbers] = names[tag]
+    for names, key in ((SHORT_TAGS, tag), (COMPLETE_TAGS, tag), (WITH_ANGLES, written_tag)):
+        if key in names:
+            variant = TAGS[names[key]]
+            variants[1 + variant.num_ids + variant.num_numbers] = names[key]
     places: dict[str, list[int]] = {}
     for place, line in enumerate(lines):
         name = variants.get(len(line.split()), tag)

@@ -320,6 +320,8 @@ ALIASES = {
     "LANDMARK2": "EDGE_SE2_XY",
     "VERTEX_SE3": "VERTEX_SE3:QUAT",
     "EDGE_SE3": "EDGE_SE3:QUAT",
+    "VERTEX_SE3:EULER": "VERTEX3",
+    "EDGE_SE3:EULER": "EDGE3",
     "ONLINE_VERTEX_SE2": "VERTEX_SE2",
     "ONLINE_EDGE_SE2": "EDGE_SE2",
     "ONLINE_VERTEX_SE3:QUAT": "VERTEX_SE3:QUAT",
@@ -332,12 +334,15 @@ ALIASES = {
     "EDGE_SE3:QUAT_SWITCHABLE": "EDGE_SE3_SWITCHABLE",
     "EDGE_SE3_PRIORXYZ": "EDGE_SE3_XYZ_PRIOR",
 }
+# What lines of these tags are if they have three angles, as many words tell.
+WITH_ANGLES = {"VERTEX_SE3": "VERTEX3", "EDGE_SE3": "EDGE3"}
 # Tags of the poses of sensors in the frames of their poses.
 OFFSET_TAGS = {2: "PARAMS_SE2OFFSET", 3: "PARAMS_SE3OFFSET"}
 # Tags of lines that are counted and skipped: what they hold is no measurement between poses.
 SKIPPED_TAGS = {
     **dict.fromkeys(("EQUIV",), "they name edges that TORO may contract, and measure nothing"),
     **dict.fromkeys(("VERTEX_SWITCH", "EDGE_SWITCH_PRIOR"), "switches are not used"),
+    **dict.fromkeys(("KERNEL", "ROBUST_KERNEL"), "robust kernels are not used"),
     **dict.fromkeys(
         (
             "ROBOTLASER1",

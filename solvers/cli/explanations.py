@@ -26,6 +26,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.memory import check_memory
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.cli.inputs import Dropped, GraphOptions, indefinite_matrices, kept_edges, load_graph
 from solvers.cli.shell import command_to_type, wrapped
 from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
@@ -141,30 +142,41 @@ def advice_on_reading(comparison: "ReadingComparison", graph: str) -> Advice:
 def advice_on_file(fit: EdgeFit, graph: PoseGraph, source: GraphOptions) -> list[Advice]:
     """Advice where the cost is far from what is expected: what the file may mean instead.
 
-    Small graphs are solved under the other readings; for large ones there is the command. Where all
-    matrices are the identity, the noise is estimated that they say nothing of.
+    Where all matrices are the identity, the noise is estimated that they say nothing of.
     """
     residuals = fit.suspected
-    is_far_above = residuals.overall > max(_FAR_ABOVE, residuals.overall_allowed)
-    is_below = 0.0 < residuals.overall < min(_BELOW, residuals.overall_least)
-    if not (is_far_above or is_below) or not source.is_as_written:
+    if not _is_far_off(residuals) or not source.is_as_written:
         return []
     doctor = shlex.join(["pgo", "doctor", source.graph])
-    is_small = len(residuals.cost) <= _FEW_EDGES
-    if is_small and _can_be_read_again(source.graph):
-        from solvers.readings import compare_readings
-
-        with suppress(PGOError):
-            comparison = compare_readings(source.graph, trust_folder=source.trust_folder)
-            if comparison.proposed:
-                return [advice_on_reading(comparison, source.graph)]
-    if is_far_above and not is_small:
+    if residuals.overall > _FAR_ABOVE:
         text = (
             f"{fit.cost} is {residuals.overall:.3g} times what is expected. Ask whether the file "
             "means something else than it says."
         )
-        return [Advice(text, doctor)]
+        return [Advice(text, doctor)] if len(residuals.cost) > _FEW_EDGES else []
     return _advice_on_noise(graph, source) or fit.advice_on_scale(doctor)
+
+
+def reading_that_is_meant(fit: EdgeFit, source: GraphOptions) -> list[Advice]:
+    """The other reading of a small file that is likely meant, where the cost is far off."""
+    is_small = len(fit.residuals.cost) <= _FEW_EDGES
+    if not (is_small and _is_far_off(fit.suspected) and source.is_as_written):
+        return []
+    if not _can_be_read_again(source.graph):
+        return []
+    from solvers.readings import compare_readings
+
+    with suppress(PGOError):  # the file may have changed since it was read
+        comparison = compare_readings(source.graph, trust_folder=source.trust_folder)
+        if comparison.proposed:
+            return [advice_on_reading(comparison, source.graph)]
+    return []
+
+
+def _is_far_off(residuals: EdgeResiduals) -> bool:
+    """Whether the cost is far above or below what is expected, beyond chance."""
+    is_far_above = residuals.overall > max(_FAR_ABOVE, residuals.overall_allowed)
+    return is_far_above or 0.0 < residuals.overall < min(_BELOW, residuals.overall_least)
 
 
 def _advice_on_noise(graph: PoseGraph, source: GraphOptions) -> list[Advice]:

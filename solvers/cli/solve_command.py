@@ -26,6 +26,7 @@ from solvers.cli.explanations import (
     advice_on_file,
     edge_fit_of_solution,
     explained_by_its_graph,
+    reading_that_is_meant,
     say_memory_of_solve,
     show_advice,
     warn_of_weights,
@@ -569,7 +570,10 @@ def _save_and_show(
         typer.echo(wrapped(_text_with_error(solution), _INDENT))
         is_robust = stages.robust is not None
         if not is_robust:
-            show_advice(advice_on_file(judged(), solution.problem.graph, source))
+            meant = reading_that_is_meant(judged(), source)
+            show_advice(meant or advice_on_file(judged(), solution.problem.graph, source))
+            if meant:  # then the edges need not be wrong
+                return
         show_advice(judged().advice(f"pgo solve {command_source}", is_robust=is_robust))
 
     record = solution.as_json if display.as_json else None

@@ -314,3 +314,33 @@ def test_an_infinite_matrix_is_that_of_a_covariance_of_zero(tmp_path: Path) -> N
         FileFormatError, match=r":2: inf is not finite, .* covariance of zero; give"
     ):
         read(tmp_path, [EDGE_2D, "EDGE_PRIOR_SE2_XY 0 5 6 inf 0 inf"])
+
+
+@pytest.mark.parametrize("suffix", ["", ":EULER"])
+def test_edges_in_space_with_three_angles_are_those_of_toro(tmp_path: Path, suffix: str) -> None:
+    lines = ["VERTEX3 0 0 0 0 0 0 0", "VERTEX3 1 1 2 3 0.1 0.2 0.3"]
+    lines.append(f"EDGE3 0 1 1 2 3 0.1 0.2 0.3 {TRIANGLE_3D}")
+    euler = [line.replace("3", f"_SE3{suffix}", 1) for line in lines]
+    with pytest.warns(
+        GraphWarning, match="EDGE_SE3 lines with three angles .* roll, pitch and yaw"
+    ):
+        graph = read(tmp_path, euler)
+    assert_same(graph, read(tmp_path, lines))
+    np.testing.assert_array_equal(graph.initial.t, [[0, 0, 0], [1, 2, 3]])
+
+
+def test_matrices_of_edge_se2_that_fit_both_orders_are_said_to(tmp_path: Path) -> None:
+    with pytest.warns(GraphWarning, match="read in g2o's order, .* in TORO's, .*toro-order"):
+        graph = read(tmp_path, ["EDGE_SE2 0 1 1 2 0.5 10 1 2 20 3 5"])
+    np.testing.assert_array_equal(graph.information[0], [[10, 1, 2], [1, 20, 3], [2, 3, 5]])
+
+
+def test_words_that_commas_separate_are_told_so(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="separate words by blanks, not by commas"):
+        read(tmp_path, [EDGE_2D.replace(" ", ",")])
+
+
+@pytest.mark.parametrize("tiny", ["1e-99", "5e-324"])
+def test_no_order_overflows_by_tiny_entries(tmp_path: Path, tiny: str) -> None:
+    graph = read(tmp_path, [f"EDGE_SE2 0 1 1 2 0.5 4 0 {tiny} 4 1e9 9e99"])
+    assert graph.information[0, 2, 2] == 9e99
