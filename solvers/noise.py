@@ -29,10 +29,11 @@ from pgo_models.graphs.residuals import edge_errors
 from pgo_models.problem.cholesky import factorize
 from pgo_models.problem.hessian import riemannian_hessian, unknowns_of
 from pgo_models.problem.matrices import entry_positions
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.selected_inversion import selected_inverse
 from pgo_models.problem.weighting import Weighting
 from solvers.pipeline import solve
+from solvers.request import Pipeline
 from solvers.riemannian.polish import polish
 from solvers.robust.consistency import odometry
 
@@ -91,7 +92,7 @@ class NoiseEstimate:
         return "; ".join(map(str, self.levels))
 
 
-def estimate_noise(graph: PoseGraph) -> NoiseEstimate:
+def estimate_noise(graph: PoseGraph | PGOProblem) -> NoiseEstimate:
     """Estimate the noise of odometry and closures from how well they fit each other.
 
     The weights of a kind of edges keep their ratios and get a common scale, one for translations
@@ -101,8 +102,8 @@ def estimate_noise(graph: PoseGraph) -> NoiseEstimate:
 
     Parameters
     ----------
-    graph : PoseGraph
-        A connected graph; its kappa and tau are where the iteration begins.
+    graph : PoseGraph or PGOProblem
+        A connected graph, or the problem of one; its kappa and tau are where the iteration begins.
 
     Returns
     -------
@@ -114,6 +115,8 @@ def estimate_noise(graph: PoseGraph) -> NoiseEstimate:
     GraphError
         When the graph is not connected, or has no loops that tell of noise, or some edges fit
         exactly.
+    SettingError
+        When something else is given.
 
     References
     ----------
@@ -129,6 +132,8 @@ def estimate_noise(graph: PoseGraph) -> NoiseEstimate:
     >>> print(estimate_noise(graph).levels[0].name)
     odometry
     """
+    if not isinstance(graph, PoseGraph):
+        graph = as_problem(graph).graph
     graph.check_connected()
     kinds = _kinds(graph)
     for chosen in (kinds, {"all edges": np.ones(graph.num_edges, dtype=bool)}):
@@ -187,7 +192,7 @@ def _iterated(graph: PoseGraph, components: Sequence[_Component]) -> tuple[Array
     kappa = graph.kappa.copy()
     tau = graph.tau.copy()
     first = PGOProblem(graph.with_weights(kappa, tau), weighting=Weighting.ISOTROPIC)
-    poses = solve(first).poses
+    poses = solve(first, Pipeline(staircase=None, handedness=None)).poses
     for _ in range(_MOST_ROUNDS):
         problem = PGOProblem(graph.with_weights(kappa, tau), weighting=Weighting.ISOTROPIC)
         poses = polish(problem, poses)

@@ -17,7 +17,7 @@ import numpy as np
 
 from pgo_models.certificates.fit import Fit
 from pgo_models.errors import FAILURES, FileFormatError
-from pgo_models.geometry.rotations import BoolArray, tangent_dimension
+from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import g2o_files
 from pgo_models.graphs.g2o_parser import read_lines
@@ -205,27 +205,16 @@ def compare_readings(
     graph = read(Reading.AS_WRITTEN)
     problem = PGOProblem(graph)
     solution = solve(problem, _PLAIN)
-    overall = edge_residuals(problem, solution.poses).overall
-    written = ReadingFit(Reading.AS_WRITTEN, 0, solution.objective, overall, 0.0)
-    trial = _Trial(graph, written, read, has_large_angles=_has_large_angles(name_or_path, graph.d))
+    residuals = edge_residuals(problem, solution.poses)
+    written = ReadingFit(Reading.AS_WRITTEN, 0, solution.objective, residuals.overall, 0.0)
+    has_large_angles = _has_large_angles(name_or_path, graph.d)
+    trial = _Trial(graph, written, residuals.freedom, read, has_large_angles)
     with warnings.catch_warnings(action="ignore"):  # of the reader, once more
         fits = [trial.fit(reading) for reading in Reading if reading is not Reading.AS_WRITTEN]
     others = tuple(fit for fit in fits if fit is not None)
-    has_noise = overall > 0.0 and solution.certificate.fit is Fit.NONE
+    has_noise = residuals.overall > 0.0 and solution.certificate.fit is Fit.NONE
     proposed = _proposed(others, written) if has_noise else ()
     return ReadingComparison(problem.cost_name, written, others, proposed)
-
-
-def degrees_of_freedom(graph: PoseGraph) -> int:
-    """How many more numbers the edges of a connected graph measure than the poses have."""
-    d = graph.d
-    p = tangent_dimension(d)
-    has_rotation = graph.kappa > 0
-    has_rotation[graph.first_sights] = False  # that of a landmark, which has none
-    measured = d * int((graph.tau > 0).sum()) + p * int(has_rotation.sum())
-    num_points = len(graph.landmarks)
-    size = d + p if graph.has_translations else p
-    return measured - size * (graph.num_poses - num_points - 1) - d * num_points
 
 
 @dataclass(frozen=True)
@@ -234,6 +223,7 @@ class _Trial:
 
     graph: PoseGraph
     written: ReadingFit
+    freedom: float
     read: Callable[[Reading], PoseGraph]
     has_large_angles: bool
 
@@ -260,8 +250,8 @@ class _Trial:
 
     def _evidence(self, reading: Reading, cost: float, times_expected: float) -> float:
         """Log-odds, see `ReadingFit`."""
-        half_freedom = 0.5 * degrees_of_freedom(self.graph)
-        if not (half_freedom > 0 and cost > 0 and self.written.cost > 0):
+        half_freedom = 0.5 * self.freedom
+        if not (cost > 0 and times_expected > 0 and self.written.cost > 0):
             return -math.inf
         if reading in _LEAST_MISFIT:
             misfit = _misfit(self.written.times_expected) - _misfit(times_expected)

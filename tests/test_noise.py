@@ -8,7 +8,7 @@ import pytest
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import spanning_tree
@@ -115,3 +115,10 @@ def test_the_command_solves_with_the_noise_and_says_it(tmp_path: Path, pgo_comma
     code, _, err = pgo_command("solve", bare, "--estimate-noise", "--cost", "unit")
     assert code == 1
     assert "--estimate-noise and --cost ask for different weights; leave out one" in err
+
+
+def test_noise_of_a_problem_is_that_of_its_graph() -> None:
+    walk = noisy_walk(2, 0, 1.0)
+    assert str(estimate_noise(pgo.PGOProblem(walk))) == str(estimate_noise(walk))
+    with pytest.raises(SettingError, match="the problem is 3"):
+        estimate_noise(3)

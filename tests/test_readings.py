@@ -12,7 +12,7 @@ from pgo_models.graphs.g2o import write_g2o
 from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
-from solvers.readings import compare_readings, degrees_of_freedom
+from solvers.readings import compare_readings
 
 Change = Callable[[list[str]], list[str]]
 
@@ -166,17 +166,6 @@ def test_unit_weights_leave_out_readings_of_matrices(tmp_path: Path) -> None:
     assert comparison.cost_name == "F"
     assert [fit.reading for fit in comparison.proposed] == [Reading.CLOSURES_REVERSED]
     assert Reading.COVARIANCES not in [fit.reading for fit in comparison.others]
-
-
-def test_degrees_of_freedom_are_measurements_less_unknowns() -> None:
-    grid = pgo.load("grid")
-    assert degrees_of_freedom(grid) == 6 * (108 - 26)
-    rotations = dataclasses.replace(grid, tau=np.zeros(108), information=None)
-    assert degrees_of_freedom(rotations) == 3 * (108 - 26)
-    park = pgo.victoria_park(np.random.default_rng(0), num_poses=30)
-    num_sights = int(np.isin(park.j, park.landmarks).sum())
-    odometry = 3 * (park.num_edges - num_sights)
-    assert degrees_of_freedom(park) == odometry + 2 * num_sights - 3 * 29 - 2 * len(park.landmarks)
 
 
 SMALL = ("tinyGrid3D", "kitti_07", "MIT", "FR079")

@@ -128,6 +128,7 @@ def load(
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
     path = locate(name_or_path, registry, download=download)
+    reading = Reading.of(reading)
     if path.suffix != SUFFIX:
         graph = read_g2o(
             path,

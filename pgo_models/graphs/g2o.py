@@ -146,6 +146,7 @@ def read_g2o(
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
+    reading = Reading.of(reading)
     files = [
         read_lines(file, skip_unknown, reading, needs_matrices=not unit_weights)
         for file in g2o_files(path)

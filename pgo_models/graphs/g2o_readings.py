@@ -8,6 +8,7 @@ import enum
 
 import numpy as np
 
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
@@ -35,6 +36,27 @@ class Reading(enum.Enum):
     SQUARE_ROOTS = "square-roots"
     CLOSURES_IN_MILLIMETRES = "closures-in-millimetres"
     ODOMETRY_IN_MILLIMETRES = "odometry-in-millimetres"
+
+    @classmethod
+    def of(cls, given: object) -> "Reading":
+        """Return a reading that is given itself, or by its value or name in any case.
+
+        Parameters
+        ----------
+        given : object
+            A Reading, or a word such as "w-first".
+
+        Returns
+        -------
+        Reading
+            The reading; a SettingError is raised where there is no such one.
+        """
+        word = given.lower().replace("_", "-") if isinstance(given, str) else given
+        try:
+            return cls(word)
+        except ValueError:
+            words = ", ".join(reading.value for reading in cls)
+            raise SettingError(f"the reading is {given!r:.60}; give one of {words}") from None
 
     @property
     def text(self) -> str:

@@ -144,9 +144,12 @@ def advice_on_file(fit: EdgeFit, graph: PoseGraph, source: GraphOptions) -> list
 
     Where all matrices are the identity, the noise is estimated that they say nothing of.
     """
-    residuals = fit.suspected
-    if not _is_far_off(residuals) or not source.is_as_written:
+    if not source.is_as_written:
         return []
+    advice = _advice_on_noise(graph, source)
+    residuals = fit.suspected
+    if advice or not _is_far_off(residuals):
+        return advice
     doctor = shlex.join(["pgo", "doctor", source.graph])
     if residuals.overall > _FAR_ABOVE:
         text = (
@@ -154,7 +157,7 @@ def advice_on_file(fit: EdgeFit, graph: PoseGraph, source: GraphOptions) -> list
             "means something else than it says."
         )
         return [Advice(text, doctor)] if len(residuals.cost) > _FEW_EDGES else []
-    return _advice_on_noise(graph, source) or fit.advice_on_scale(doctor)
+    return fit.advice_on_scale(doctor)
 
 
 def reading_that_is_meant(fit: EdgeFit, source: GraphOptions) -> list[Advice]:

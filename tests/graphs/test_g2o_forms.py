@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from graphs import assert_says
 
-from pgo_models.errors import FileFormatError, GraphWarning
+from pgo_models.errors import FileFormatError, GraphWarning, SettingError
 from pgo_models.geometry.rotations import log_map
 from pgo_models.graphs.datasets import load
 from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
@@ -344,3 +344,13 @@ def test_words_that_commas_separate_are_told_so(tmp_path: Path) -> None:
 def test_no_order_overflows_by_tiny_entries(tmp_path: Path, tiny: str) -> None:
     graph = read(tmp_path, [f"EDGE_SE2 0 1 1 2 0.5 4 0 {tiny} 4 1e9 9e99"])
     assert graph.information[0, 2, 2] == 9e99
+
+
+def test_a_reading_is_given_by_its_word_or_name_too(tmp_path: Path) -> None:
+    (tmp_path / "a.g2o").write_text(EDGE_2D.replace("0.5", "90"))
+    for given in ("degrees", "DEGREES", Reading.DEGREES):
+        angle = log_map(load(tmp_path / "a.g2o", reading=given).R_ij)
+        np.testing.assert_allclose(angle, np.pi / 2, rtol=1e-12, atol=0)
+    for given in ("upside-down", 3):
+        with pytest.raises(SettingError, match="give one of as-written, closures-reversed"):
+            read_g2o(tmp_path / "a.g2o", reading=given)
