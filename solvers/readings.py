@@ -42,12 +42,12 @@ _OF_SOME_EDGES = (
     Reading.CLOSURES_IN_MILLIMETRES,
     Reading.ODOMETRY_IN_MILLIMETRES,
 )
-# A reading is proposed from this evidence on, odds of 100,000 to one. It also has to be clearly
+# A reading is proposed from this evidence on, odds of 10,000 to one. It also has to be clearly
 # better: its cost is smaller by the next factor. Where the weights are others, so that the costs
 # cannot be compared, the cost is off by a factor of _LEAST_MISFIT from what is expected as written,
 # and by _MOST_MISFIT at most as proposed. Many files claim a hundredth of the information that they
 # have, and mean no square roots.
-_LEAST_EVIDENCE = math.log(1e5)
+_LEAST_EVIDENCE = math.log(1e4)
 _LEAST_RATIO = 10.0
 _LEAST_MISFIT = {
     Reading.COVARIANCES: 30.0,
@@ -113,7 +113,14 @@ class ReadingFit:
     def text(self) -> str:
         """The reading in words, with the number of edges if it is about some of them."""
         words = self.reading.text
-        return words.replace("the closures", f"the {self.num_changed} closures")
+        closures = "closure" if self.num_changed == 1 else "closures"
+        return words.replace("the closures", f"the {self.num_changed} {closures}")
+
+    @property
+    def question(self) -> str:
+        """What to ask whoever wrote the file."""
+        question = _QUESTIONS[self.reading]
+        return question.replace("were they", "was it") if self.num_changed == 1 else question
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,7 @@ class ReadingComparison:
         if not self.proposed:
             return f"{self.cost_name} {written}: no other reading fits better beyond chance."
         best, *others = self.proposed
-        text = f"{self.cost_name} {written}, {_with_share(best)}: {_QUESTIONS[best.reading]}"
+        text = f"{self.cost_name} {written}, {_with_share(best)}: {best.question}"
         if others:
             text += f" Nearly as likely: {' or '.join(fit.text for fit in others)}."
         return text

@@ -32,7 +32,7 @@ from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 _LONG_RUN = 16  # lines of one tag in a row, from which on they need not be sorted by tag
 _SHOWN = 40  # characters of a wrong word that a message shows
 _COMMENT_SIGNS = ("#", "//", "%")
-_COMMENT = re.compile(r"\s*(#|//|%).*")
+_COMMENT = re.compile(r"(#|//|%).*")
 # Fortran writes 1.5e-3 as 1.5D-03.
 _FORTRAN_EXPONENT = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
 _INFINITE = re.compile(r"[+-]?(inf|infinity|nan)", re.IGNORECASE)
