@@ -236,13 +236,17 @@ class SolveRequest:
     def _check_one_fixed(self) -> None:
         """Raise a SettingError where FIX lines hold several poses, which the cost leaves free."""
         graph = self.problem.graph
-        if graph.world is None and len(graph.fixed) > 1:
-            first, second = (graph.pose_name(int(pose)) for pose in graph.fixed[:2])
-            raise SettingError(
-                f"FIX lines hold {len(graph.fixed)} poses, {first} and {second} the first, and a "
-                f"solve holds one: choose it, --anchor {first} (anchor=..), or measure their "
-                "places by priors, EDGE_PRIOR_SE2 or EDGE_SE3_PRIOR lines, instead"
-            )
+        if len(graph.fixed) <= 1:
+            return
+        first, second = (graph.pose_name(int(pose)) for pose in graph.fixed[:2])
+        choice = f"choose it, --anchor {first} (anchor=..)"
+        if graph.world is not None:
+            choice = "remove them, as the priors hold the frame"
+        raise SettingError(
+            f"FIX lines hold {len(graph.fixed)} poses, {first} and {second} the first, and a solve "
+            f"holds one: {choice}, or measure their places by priors, EDGE_PRIOR_SE2 or "
+            "EDGE_SE3_PRIOR lines, instead"
+        )
 
     def _check_in_one_place(self) -> None:
         """Raise a SettingError for what only a solve by robots has."""

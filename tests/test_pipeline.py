@@ -310,6 +310,9 @@ def test_several_fixed_poses_are_refused_unless_one_is_chosen():
     with pytest.raises(SettingError, match=r"FIX lines hold 2 poses, 7 and 3 .*--anchor 7"):
         solvers.solve(graph)
     assert solvers.solve(graph, anchor=3).anchor == 3
+    beside_priors = graph.with_position_prior(np.arange(5), graph.truth.t[:5], tau=1.0)
+    with pytest.raises(SettingError, match="remove them, as the priors hold the frame"):
+        solvers.solve(beside_priors)
 
 
 def test_a_solution_says_in_which_frame_it_is():

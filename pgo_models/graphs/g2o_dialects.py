@@ -26,6 +26,7 @@ NO_OFFSET = -(2**63)
 _TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 # An eigenvalue below this, of a matrix with ones on its diagonal, is negative beyond rounding.
 _NEGATIVE = -1e-10
+_NO_CHANCE = 8  # lines in g2o's order that are hardly all definite in TORO's, too
 
 
 class MatrixOrder(enum.Enum):
@@ -53,7 +54,7 @@ def order_of_edge_se2(lines: Sequence[Array]) -> MatrixOrder:
     """Order of the matrices on EDGE_SE2 lines, arrays (n, 9): by rows, as g2o has them, or TORO's.
 
     It is TORO's where some matrix has a negative eigenvalue by rows, beyond rounding, and all are
-    positive definite in TORO's order.
+    positive definite in TORO's order. A few matrices may be definite in both by chance.
     """
     numbers = np.concatenate(lines)
     # The second entry on the diagonal, which is the coupling of x and theta by rows.
@@ -62,7 +63,9 @@ def order_of_edge_se2(lines: Sequence[Array]) -> MatrixOrder:
         return MatrixOrder.ROWS
     matrices = _matrices(numbers)
     is_by_rows = _have_minors(matrices) and bool(are_definite(matrices, _NEGATIVE).all())
-    return MatrixOrder.EITHER if is_by_rows else MatrixOrder.TORO
+    if not is_by_rows:
+        return MatrixOrder.TORO
+    return MatrixOrder.EITHER if len(numbers) >= _NO_CHANCE else MatrixOrder.ROWS
 
 
 def from_toro_order(numbers: Array) -> Array:

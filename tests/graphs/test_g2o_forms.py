@@ -331,7 +331,10 @@ def test_edges_in_space_with_three_angles_are_those_of_toro(tmp_path: Path, suff
 
 def test_matrices_of_edge_se2_that_fit_both_orders_are_said_to(tmp_path: Path) -> None:
     with pytest.warns(GraphWarning, match="read in g2o's order, .* in TORO's, .*toro-order"):
-        graph = read(tmp_path, ["EDGE_SE2 0 1 1 2 0.5 10 1 2 20 3 5"])
+        graph = read(tmp_path, ["EDGE_SE2 0 1 1 2 0.5 10 1 2 20 3 5"] * 8)
+    assert_same(
+        read(tmp_path, ["EDGE_SE2 0 1 1 2 0.5 10 1 2 20 3 5"]), graph.edge_subgraph(np.array([0]))
+    )
     np.testing.assert_array_equal(graph.information[0], [[10, 1, 2], [1, 20, 3], [2, 3, 5]])
 
 
