@@ -44,6 +44,7 @@ from pgo_models.graphs.datasets import (
     load as load,
 )
 from pgo_models.graphs.g2o import read_g2o as read_g2o, write_g2o as write_g2o
+from pgo_models.graphs.g2o_readings import Reading as Reading
 from pgo_models.graphs.grid_worlds import grid_world as grid_world
 from pgo_models.graphs.gtsam_graphs import from_gtsam as from_gtsam, to_gtsam as to_gtsam
 from pgo_models.graphs.jrl import read_jrl as read_jrl
@@ -113,7 +114,7 @@ __all__ += [
 ]
 __all__ += ["indefinite_edges", "without_indefinite_coupling"]
 __all__ += ["Partition", "PartitionMethod", "partition"]
-__all__ += ["known_datasets", "load", "read_g2o", "read_jrl", "write_g2o"]
+__all__ += ["Reading", "known_datasets", "load", "read_g2o", "read_jrl", "write_g2o"]
 __all__ += ["read_kitti", "read_tum", "write_tum"]
 __all__ += ["from_gtsam", "to_gtsam"]
 __all__ += ["circle", "grid", "grid_world", "random_geometric", "sphere", "victoria_park"]

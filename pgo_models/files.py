@@ -1,13 +1,16 @@
 """Text and tables that are read with our errors, and files that are written whole or not at all."""
 
+import gzip
+import io
 import os
 import secrets
 import stat
 import warnings
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +26,7 @@ _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold abou
 BLOCK = 2**24  # bytes of a file that are split into lines at a time
 _SHOWN = 40  # characters of a wrong word that a message shows
 _LF, _CR = b"\n\r"
+_GZIP = b"\x1f\x8b"  # first bytes of a file that is compressed by gzip
 
 Problem = tuple[int, str]  # a line of a file, from 1, and what is wrong with it
 Lines = Sequence[int] | NDArray[np.integer[Any]]
@@ -40,15 +44,16 @@ def read_text(path: Path | str, block: int = BLOCK) -> str:
 def read_blocks(path: Path | str, block: int = BLOCK) -> Iterator[str]:
     """Yield what `read_text` reads in blocks of whole lines, so that no large file is held as text.
 
-    Errors are those of `read_text`. A FileFormatError, too, where a line is longer than
-    `LONGEST_OF_ALL`, as no line of a text file is.
+    A file that is compressed by gzip is unpacked. Errors are those of `read_text`. A
+    FileFormatError, too, where a line is longer than `LONGEST_OF_ALL`, as no line of a text file
+    is.
     """
     path = Path(path)
     encoding = "utf-8-sig"  # the first block may open with a byte order mark
     num_lines = 0  # lines of the blocks so far
     try:
         with path.open("rb") as file:
-            for data in _whole_lines(file, path, block):
+            for data in _whole_lines(_unpacked(file), path, block):
                 _check_lines(path, num_lines, data)
                 try:
                     text = data.decode(encoding)
@@ -61,10 +66,19 @@ def read_blocks(path: Path | str, block: int = BLOCK) -> Iterator[str]:
                 yield text
     except FileNotFoundError:
         raise FileFormatError(path, None, "no such file; check the path") from None
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        problem = "gzip cannot unpack it, as it is cut off or damaged; compress it again"
+        raise FileFormatError(path, None, problem) from error
     except OSError as error:
         raise FileFormatError(
             path, None, f"cannot be read: {error.strerror}; give a readable file"
         ) from error
+
+
+def _unpacked(file: io.BufferedReader) -> BinaryIO:
+    """The file itself, or what it unpacks to if it is compressed by gzip."""
+    is_compressed = file.peek(len(_GZIP)).startswith(_GZIP)
+    return cast(BinaryIO, gzip.GzipFile(fileobj=file)) if is_compressed else file
 
 
 def _whole_lines(file: BinaryIO, path: Path, block: int) -> Iterator[bytes]:
@@ -125,11 +139,14 @@ def _count_lines(data: bytes) -> int:
     return num_lines
 
 
-def check_lines(path: Path | str, problems: Sequence[Problem], unit: str = "lines") -> None:
+def check_lines(
+    path: Path | str, problems: Sequence[Problem], unit: str = "lines", hint: str = ""
+) -> None:
     """Raise a FileFormatError when there are problems in the lines of a file.
 
     It has `file:line: problem` for each of the first 20 wrong lines, and their number. Of several
-    problems of a line the first is named. `unit` is what is counted in place of lines.
+    problems of a line the first is named. `unit` is what is counted in place of lines, and `hint`
+    ends the message.
     """
     if not problems:
         return
@@ -145,6 +162,7 @@ def check_lines(path: Path | str, problems: Sequence[Problem], unit: str = "line
     elif len(lines) > 1:
         texts.append(f"{len(lines)} {unit} are wrong")
     texts[0] = problem_of_line[named[0]]  # FileFormatError names the place of the first
+    texts[-1] += hint
     raise FileFormatError(path, named[0], "\n".join(texts))
 
 
@@ -194,6 +212,8 @@ def finite_number(path: Path | str, line: int, word: str) -> float:
         # float() also takes 1_000 and the digits of other scripts; number files do not.
         value = float(word if word.isascii() and "_" not in word else "")
     except ValueError:
+        if "," in word:
+            way_out = "write it with a decimal point, and separate numbers by blanks, not by commas"
         raise FileFormatError(path, line, f"{shown!r} is no number; {way_out}") from None
     if not np.isfinite(value):
         raise FileFormatError(path, line, f"{shown} is not finite; {way_out}")

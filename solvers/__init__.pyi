@@ -30,8 +30,18 @@ from solvers.network.ledger import Ledger as Ledger, Traffic as Traffic
 from solvers.network.messages import Worker as Worker
 from solvers.network.ray_engine import RayEngine as RayEngine
 from solvers.network.recovery import Recovery as Recovery
+from solvers.noise import (
+    NoiseEstimate as NoiseEstimate,
+    NoiseLevel as NoiseLevel,
+    estimate_noise as estimate_noise,
+)
 from solvers.pipeline import solve as solve
 from solvers.place import Automatic as Automatic
+from solvers.readings import (
+    ReadingComparison as ReadingComparison,
+    ReadingFit as ReadingFit,
+    compare_readings as compare_readings,
+)
 from solvers.reporting.edge_fit import EdgeFit as EdgeFit
 from solvers.reporting.film import film as film
 from solvers.reporting.report import write_report as write_report
@@ -128,6 +138,8 @@ __all__ += [
     "solve_folder",
     "write_report",
 ]
+__all__ += ["ReadingComparison", "ReadingFit", "compare_readings"]
+__all__ += ["NoiseEstimate", "NoiseLevel", "estimate_noise"]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
 __all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]

@@ -19,9 +19,6 @@ def choose_gauge(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Po
     if anchor is None and len(graph.fixed):
         held = int(graph.fixed[0])
         why = "by its FIX line"
-        num_others = len(graph.fixed) - 1
-        if num_others:
-            why += f"; those of {num_others} other poses are ignored, F leaves one frame open"
     if held is None:
         if reference is not None:
             frame = "aligned with the estimate that came with the graph"

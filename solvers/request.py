@@ -167,6 +167,8 @@ class SolveRequest:
     def __post_init__(self) -> None:
         if self.anchor is not None:
             self._check_anchor(self.anchor)
+        else:
+            self._check_one_fixed()
         if not isinstance(self.pipeline, Pipeline):
             raise SettingError(
                 f"the pipeline is a {type(self.pipeline).__name__}; "
@@ -190,6 +192,21 @@ class SolveRequest:
             )
         if graph.world is not None:
             raise SettingError("an anchor cannot be combined with priors; leave out the anchor")
+
+    def _check_one_fixed(self) -> None:
+        """Raise a SettingError where FIX lines hold several poses, which the cost leaves free."""
+        graph = self.problem.graph
+        if len(graph.fixed) <= 1:
+            return
+        first, second = (graph.pose_name(int(pose)) for pose in graph.fixed[:2])
+        choice = f"choose it, --anchor {first} (anchor=..)"
+        if graph.world is not None:
+            choice = "remove them, as the priors hold the frame"
+        raise SettingError(
+            f"FIX lines hold {len(graph.fixed)} poses, {first} and {second} the first, and a solve "
+            f"holds one: {choice}, or measure their places by priors, EDGE_PRIOR_SE2 or "
+            "EDGE_SE3_PRIOR lines, instead"
+        )
 
     def _check_robots(self, robots: Robots) -> None:
         """Raise a SettingError for what these robots cannot do with this cost and pipeline."""

@@ -43,6 +43,8 @@ def test_there_is_a_page_for_every_task():
     assert {page.stem for page in PAGES} >= {
         "install",
         "my_file",
+        "looks_wrong",
+        "readings",
         "own_cost",
         "certify",
         "outliers",

@@ -61,6 +61,8 @@ ORDER = {
         "pipeline",
         "folder_solve",
         "growing",
+        "readings",
+        "noise",
         "studies",
         "cli",
     ),

@@ -179,6 +179,10 @@ def verification() -> object:
 
 
 MADE["Verification"] = verification
+MADE["NoiseEstimate"] = lambda: solvers.estimate_noise(GRAPH)
+MADE["NoiseLevel"] = lambda: solvers.estimate_noise(GRAPH).levels[0]
+MADE["ReadingComparison"] = lambda: solvers.compare_readings("grid")
+MADE["ReadingFit"] = lambda: solvers.compare_readings("grid").written
 SETTINGS = (
     "Anderson",
     "CvxpyStep",

@@ -305,6 +305,16 @@ def test_units_change_nothing_of_chi2_either(seed, weights, metres, d, coupled, 
     assert abs(other.certificate.digits - one.certificate.digits) <= 1
 
 
+def test_several_fixed_poses_are_refused_unless_one_is_chosen():
+    graph = replace(pgo.grid(np.random.default_rng(0)), fixed=np.array([7, 3]))
+    with pytest.raises(SettingError, match=r"FIX lines hold 2 poses, 7 and 3 .*--anchor 7"):
+        solvers.solve(graph)
+    assert solvers.solve(graph, anchor=3).anchor == 3
+    beside_priors = graph.with_position_prior(np.arange(5), graph.truth.t[:5], tau=1.0)
+    with pytest.raises(SettingError, match="remove them, as the priors hold the frame"):
+        solvers.solve(beside_priors)
+
+
 def test_a_solution_says_in_which_frame_it_is():
     graph = pgo.grid(np.random.default_rng(0))
     bare = replace(graph, initial=None)
@@ -326,12 +336,9 @@ def test_a_solution_says_in_which_frame_it_is():
         ),
         (
             replace(known, fixed=np.array([7, 3])),
-            None,
-            (
-                "pose 7 where the estimate has it, by its FIX line; those of 1 other poses are"
-                " ignored, F leaves one frame open"
-            ),
-            7,
+            3,
+            "pose 3 where the estimate has it, as asked for",
+            3,
         ),
     ):
         solution = solvers.solve(start, anchor=anchor)

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from pgo_models.errors import DatasetError, FileFormatError, SettingError
 from pgo_models.files import replace_when_done
-from pgo_models.graphs.g2o import edge_places, name_of, read_g2o
+from pgo_models.graphs.g2o import COMPRESSED, edge_places, name_of, read_g2o
+from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.jrl import SUFFIX, jrl_edge_places, read_jrl
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
@@ -70,8 +71,9 @@ def load(
     *,
     download: bool = True,
     weights: RotationWeight = RotationWeight.SE_SYNC,
+    reading: Reading = Reading.AS_WRITTEN,
+    unit_weights: bool = False,
     skip_unknown: bool = False,
-    square_roots: bool = False,
     trust_folder: bool = False,
 ) -> PoseGraph:
     """Load a pose graph by the name of a data set, or from a file or folder.
@@ -92,10 +94,12 @@ def load(
         Whether a data set that is not there is downloaded.
     weights : RotationWeight
         As for `read_g2o`.
+    reading : Reading
+        As for `read_g2o`; a JSON robot log leaves no choice.
+    unit_weights : bool
+        As for `read_g2o`.
     skip_unknown : bool
         As for `read_g2o`.
-    square_roots : bool
-        As for `read_g2o`; a JSON robot log has none.
     trust_folder : bool
         As for `read_g2o`.
 
@@ -109,7 +113,7 @@ def load(
     DatasetError
         When the name is unknown, the download fails or is not wanted, or its checksum is wrong.
     SettingError
-        When square roots are asked for of a JSON robot log, which has covariances.
+        When a JSON robot log is to be read in another way than it is written.
     FileFormatError
         As for `read_g2o`; also when the truth has not one pose for each of the graph.
 
@@ -124,18 +128,21 @@ def load(
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
     path = locate(name_or_path, registry, download=download)
+    reading = Reading.of(reading)
     if path.suffix != SUFFIX:
         graph = read_g2o(
             path,
             weights,
+            reading=reading,
+            unit_weights=unit_weights,
             skip_unknown=skip_unknown,
-            square_roots=square_roots,
             trust_folder=trust_folder,
         )
-    elif square_roots:
-        raise SettingError(f"{path} has covariances, and no square roots; leave square_roots out")
+    elif reading is not Reading.AS_WRITTEN:
+        raise SettingError(f"{path} says what it has, covariances; leave {reading.value} out")
     else:
         graph = read_jrl(path, weights, skip_unknown=skip_unknown)
+        graph = graph.unit_weights() if unit_weights else graph
     truth_path = path.absolute().parent / f"{name_of(path)}.truth.tum"
     if not os.path.isfile(truth_path):
         return graph
@@ -167,7 +174,7 @@ def locate(
         return path
     if name == path.name and path.suffix == ".g2o" and path.stem in known_datasets(registry):
         name = path.stem  # the file that a data set is kept in
-    is_file_name = name.endswith((".g2o", SUFFIX))
+    is_file_name = name.endswith((".g2o", SUFFIX, COMPRESSED))
     if isinstance(name_or_path, Path) or is_file_name or name != Path(name).name:
         raise FileFormatError(
             path, None, "no such file or folder; check the path, or give a data set's name"

@@ -25,13 +25,16 @@ from pgo_models.graphs.g2o_folder import (
     check_one_graph,
 )
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
+from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.g2o_rows import information_of, measurements_of, numbers_of, poses_of
 from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
+from pgo_models.graphs.missing_poses import with_missing_poses
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 from pgo_models.graphs.written_digits import most_digits, written_errors
 
 MOST_SYMBOLS = len(LETTERS)  # robots whose poses can be named by GTSAM symbols
+COMPRESSED = ".gz"  # suffix of a file that is compressed by gzip
 _ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
 # Entries of two rotations that may differ by normalisation of their quaternions.
 _SAME_ROTATION = 1e-9
@@ -41,27 +44,33 @@ def read_g2o(
     path: Path | str,
     weights: RotationWeight = RotationWeight.SE_SYNC,
     *,
+    reading: Reading = Reading.AS_WRITTEN,
+    unit_weights: bool = False,
     skip_unknown: bool = False,
-    square_roots: bool = False,
     trust_folder: bool = False,
 ) -> PoseGraph:
     """Read a g2o file, or a folder with one g2o file for each robot.
 
-    The reader takes FIX lines, and the lines of poses, landmarks and priors that g2o, GTSAM, TORO
-    and iSAM write. It numbers the poses by ascending id; the world pose of priors comes last. It
-    normalises quaternions, and counts every copy of an edge that a file repeats. An edge may lead
-    to a pose that has no VERTEX line. `PoseGraph.initial` is set if every pose has a VERTEX line,
-    and is None otherwise.
+    The reader takes FIX lines, and the lines of poses, landmarks and priors that g2o, GTSAM, TORO,
+    iSAM, Vertigo and hdl_graph_slam write, also from files that are compressed by gzip. It numbers
+    the poses by ascending id; the world pose of priors comes last. It normalises quaternions, and
+    counts every copy of an edge that a file repeats. A matrix is the upper triangle, row by row, or
+    complete. An edge may lead to a pose that has no VERTEX line. `PoseGraph.initial` is set if
+    every pose has a VERTEX line. Where at least half of the poses of one file have one, the others
+    are placed along edges, with a warning; it is None otherwise.
 
     Where the lines leave a choice, a `GraphWarning` says what was assumed:
 
     - EDGE2, EDGE3 and LANDMARK2 have information matrices, although iSAM's files have square roots
-      of them (`square_roots`). The matrices of EDGE2 are in TORO's order, unless all are positive
-      definite in iSAM's, and not in TORO's.
+      of them (`Reading.SQUARE_ROOTS`). The matrices of EDGE2 are in TORO's order, unless all are
+      positive definite in iSAM's, and not in TORO's. Those of EDGE_SE2 are in g2o's order, unless
+      one is indefinite in it, and all are positive definite in TORO's.
     - EDGE3 without a matrix has the identity.
     - ODOMETRY and LANDMARK have covariance matrices, as in GTSAM.
     - BR, a point by bearing and range with their standard deviations, becomes a point with the
       covariance to first order, an approximation.
+    - EDGE_SE3_PRIORQUAT, a rotation with its w first, has the information of a rotation vector.
+    - Switchable edges hold always. Switches, robust kernels and data of sensors are not used.
     - EQUIV, which names edges that TORO may contract, is skipped.
     - An id of a pose that is a landmark's, too, names two things; a power of ten is added to the
       ids of all landmarks.
@@ -101,11 +110,14 @@ def read_g2o(
     weights : RotationWeight
         How the information I_theta of the heading, in the matrix of a 2D edge, becomes kappa: as
         kappa = I_theta (SE_SYNC) or kappa = I_theta / 2 (GAUSSIAN). It has no effect on 3D edges.
+    reading : Reading
+        What the lines mean, if it is not what g2o's format says: for example that closures are
+        reversed, or that matrices, of all tags, are square roots, as iSAM writes them.
+    unit_weights : bool
+        Whether the graph has the weights of the paper, kappa = tau = 1, and no information
+        matrices. Edges of the file then need none.
     skip_unknown : bool
         Whether lines with other tags are skipped with a warning.
-    square_roots : bool
-        Whether matrices, of all tags, are upper triangular square roots U of the information U^T U,
-        by rows, as iSAM writes them.
     trust_folder : bool
         Whether the files of a folder are of one graph whatever speaks against it: the same id is
         the same pose, and edges count unless all their numbers are the same.
@@ -118,9 +130,10 @@ def read_g2o(
     Raises
     ------
     FileFormatError
-        With file:line of the first 20 lines that cannot be read or measure nothing, and for FIX of
-        unknown poses. Also for a folder with a 2D file and a 3D file, and if there are no edges or
-        no files; and with file:line of both lines for files that speak against being of one graph.
+        With file:line of the first 20 lines that cannot be read or measure nothing, for edges
+        without a matrix unless `unit_weights`, and for FIX of unknown poses. Also for a folder with
+        a 2D file and a 3D file, and if there are no edges or no files; and with file:line of both
+        lines for files that speak against being of one graph.
 
     References
     ----------
@@ -133,13 +146,19 @@ def read_g2o(
     PoseGraph('grid', d=3, poses=27, edges=108, robots=1)
     """
     path = Path(path)
-    files = [read_lines(file, skip_unknown, square_roots) for file in g2o_files(path)]
+    reading = Reading.of(reading)
+    files = [
+        read_lines(file, skip_unknown, reading, needs_matrices=not unit_weights)
+        for file in g2o_files(path)
+    ]
     files = _files_of_robots(files)
     _check_ids_of_landmarks(files)
     _common_dimension(files)
     if not trust_folder:
         check_one_graph(files)
     graph = graph_of_files(path, files, weights)
+    if unit_weights:
+        graph = graph.unit_weights()
     if not path.is_dir():
         return graph
     absent = absent_ids(files)
@@ -171,7 +190,10 @@ def graph_of_files(
     file_ids = ids[ids != WORLD_ID]  # the world pose, if there is one, has the largest id
     edges = np.searchsorted(ids, edge_ids)
     robot = _robots(file_ids, files, letters)
-    initial = _initial(file_ids, robot, files)
+    estimate, is_known = _estimate(file_ids, robot, files)
+    R_ij, t_ij = poses_of(d, rows)
+    landmark_ids = np.concatenate([file.landmarks for file in files])
+    is_landmark = np.isin(ids, landmark_ids)
     world = None
     if len(file_ids) < len(ids):
         world = len(file_ids)
@@ -183,11 +205,8 @@ def graph_of_files(
             robot = np.append(robot, robot[measured_pose])
     information = information_of(d, rows)
     kappa, tau = edge_precisions(information, weights)
-    R_ij, t_ij = poses_of(d, rows)
     digits = most_digits(file.digits for file in files)
-    landmark_ids = np.concatenate([file.landmarks for file in files])
-    is_landmark = np.isin(ids, landmark_ids)
-    return PoseGraph(
+    graph = PoseGraph(
         len(ids),
         i=edges[:, 0],
         j=edges[:, 1],
@@ -198,7 +217,7 @@ def graph_of_files(
         information=information,
         ids=ids,
         robot=robot,
-        initial=initial,
+        initial=estimate if is_known.all() else None,
         fixed=_fixed(ids, files),
         name=printable(name_of(path)),
         world=world,
@@ -206,6 +225,9 @@ def graph_of_files(
         written_error=written_errors(measurements_of(d, rows), digits),
         weights_error=max(file.weights_error for file in files),
     )
+    if not path.is_dir() and len(files) == 1 and is_known.any() and not is_known.all():
+        return with_missing_poses(graph, estimate, is_known, printable(str(path)))
+    return graph
 
 
 def _common_dimension(files: list[G2OLines]) -> int:
@@ -241,7 +263,9 @@ def _distinct(ids: list[IntArray]) -> IntArray:
 
 def edge_places(path: Path | str) -> list[str]:
     """`file:line` of every edge of the graph that `read_g2o` reads from a file or folder."""
-    files = [read_lines(file, skip_unknown=True) for file in g2o_files(Path(path))]
+    files = [
+        read_lines(file, skip_unknown=True, needs_matrices=False) for file in g2o_files(Path(path))
+    ]
     files = _files_of_robots(files)
     kept_rows = _rows_to_keep(files)
     places = []
@@ -258,7 +282,7 @@ def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
     others: poses of another graph are no estimate of this one. A FileFormatError if they are not,
     if the file has another dimension, and for the faults that `read_lines` finds.
     """
-    file = read_lines(path)
+    file = read_lines(path, needs_matrices=False)
     if file.d != graph.d:
         problem = f"{file.d}D, but {graph.name} is {graph.d}D; give poses of this graph"
         raise FileFormatError(path, None, problem)
@@ -452,7 +476,8 @@ def name_of(path: Path) -> str:
     if path.is_dir():
         return path.resolve().name
     # The resolved path of a pipe is no name. What is no regular file has the name that was given.
-    return path.resolve().stem if path.is_file() else path.stem
+    name = path.resolve().stem if path.is_file() else path.stem
+    return name.removesuffix(".g2o") if path.suffix == COMPRESSED else name
 
 
 def g2o_files(path: Path) -> list[Path]:
@@ -644,8 +669,10 @@ def _ranks(values: IntArray) -> IntArray:
     return np.asarray(rank, dtype=np.int64)
 
 
-def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Poses | None:
-    """Estimate of the VERTEX lines; None unless every pose has one.
+def _estimate(
+    ids: IntArray, robot: IntArray | None, files: list[G2OLines]
+) -> tuple[Poses, BoolArray]:
+    """Estimate of the VERTEX lines, and which poses have one, (n,); the others are anything.
 
     Of several VERTEX lines of a pose, the first in a file of its own robot counts; if there is no
     such line, the first in any file.
@@ -653,6 +680,7 @@ def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Po
     d = files[0].d
     num_columns = files[0].vertices.shape[1]
     numbers = np.zeros((len(ids), num_columns))
+    numbers[:, -1] = d - 2  # the angle 0, or the w of the quaternion 0 0 0 1
     is_known = np.zeros(len(ids), dtype=bool)
     is_from_owner = np.zeros(len(ids), dtype=bool)
     for file in files:
@@ -673,10 +701,8 @@ def _initial(ids: IntArray, robot: IntArray | None, files: list[G2OLines]) -> Po
         numbers[replaced] = file.vertices[is_better]
         is_known[poses] = True
         is_from_owner[replaced] = is_own[is_better]
-    if not is_known.all():
-        return None
     R, t = poses_of(d, numbers)
-    return Poses(R, t)
+    return Poses(R, t), is_known
 
 
 def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:

@@ -1,7 +1,7 @@
 """What g2o files leave open line by line: decided, or put into common axes, with all lines in view.
 
-The order of the matrix on EDGE2 lines, sensors that are not at their poses, and ids that stand for
-a pose and a landmark.
+The order of the matrix on lines in the plane, sensors that are not at their poses, and ids that
+stand for a pose and a landmark.
 """
 
 import enum
@@ -13,7 +13,7 @@ from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_rows import information_of, numbers_of, poses_of
-from pgo_models.graphs.g2o_tags import TAGS, Tag
+from pgo_models.graphs.g2o_tags import Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.precisions import are_definite
 from pgo_models.graphs.weight_errors import SINGULAR, congruence_error, entry_error
@@ -22,8 +22,15 @@ from pgo_models.graphs.weight_errors import SINGULAR, congruence_error, entry_er
 NO_OFFSET = -(2**63)
 
 
+# Places of the numbers of a line in TORO's order: x y theta, then the triangle, ff fs ss rr fr sr.
+_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
+# An eigenvalue below this, of a matrix with ones on its diagonal, is negative beyond rounding.
+_NEGATIVE = -1e-10
+_NO_CHANCE = 8  # lines in g2o's order that are hardly all definite in TORO's, too
+
+
 class MatrixOrder(enum.Enum):
-    """Order of the matrix on EDGE2 lines."""
+    """Order of the matrices on EDGE2 lines, and on those of EDGE_SE2."""
 
     TORO = "ff fs ss rr fr sr"
     ROWS = "xx xy xt yy yt tt, as iSAM writes them"
@@ -36,18 +43,57 @@ def order_of_edge2(lines: Sequence[Array]) -> MatrixOrder:
     TORO's page defines this tag, so that TORO is returned, too, where neither order fits.
     """
     numbers = np.concatenate(lines)
-    is_toro = _all_are_definite(TAGS["EDGE2"].rows(numbers))
-    is_by_rows = _all_are_definite(TAGS["EDGE_SE2"].rows(numbers))
+    is_toro = _all_are_definite(from_toro_order(numbers))
+    is_by_rows = _all_are_definite(numbers)
     if is_toro and is_by_rows:
         return MatrixOrder.EITHER
     return MatrixOrder.ROWS if is_by_rows else MatrixOrder.TORO
 
 
+def order_of_edge_se2(lines: Sequence[Array]) -> MatrixOrder:
+    """Order of the matrices on EDGE_SE2 lines, arrays (n, 9): by rows, as g2o has them, or TORO's.
+
+    It is TORO's where some matrix has a negative eigenvalue by rows, beyond rounding, and all are
+    positive definite in TORO's order. A few matrices may be definite in both by chance.
+    """
+    numbers = np.concatenate(lines)
+    # The second entry on the diagonal, which is the coupling of x and theta by rows.
+    may_be_toro = bool((numbers[:, 5] > 0.0).all())
+    if not may_be_toro or not _all_are_definite(from_toro_order(numbers)):
+        return MatrixOrder.ROWS
+    matrices = _matrices(numbers)
+    is_by_rows = _have_minors(matrices) and bool(are_definite(matrices, _NEGATIVE).all())
+    if not is_by_rows:
+        return MatrixOrder.TORO
+    return MatrixOrder.EITHER if len(numbers) >= _NO_CHANCE else MatrixOrder.ROWS
+
+
+def from_toro_order(numbers: Array) -> Array:
+    """Numbers of lines in the plane, (n, 9), their matrices by rows instead of in TORO's order."""
+    return np.asarray(numbers[:, _TORO])
+
+
+def _matrices(rows: Array) -> Array:
+    """The matrices on EDGE rows in the plane, (n, 9)."""
+    return np.asarray(rows[:, 3 + triangle_places(3)])
+
+
 def _all_are_definite(rows: Array) -> bool:
     """Whether the whole matrices on EDGE rows in the plane, (n, 9), are positive definite."""
-    matrices = rows[:, 3 + triangle_places(3)]
+    matrices = _matrices(rows)
     diagonals = np.einsum("mkk->mk", matrices)
-    return bool((diagonals > 0.0).all()) and bool(are_definite(matrices, SINGULAR).all())
+    may_be_definite = bool((diagonals > 0.0).all()) and _have_minors(matrices)
+    return may_be_definite and bool(are_definite(matrices, SINGULAR).all())
+
+
+def _have_minors(matrices: Array) -> bool:
+    """Whether no entry is larger than those on the diagonal allow: |a_ij|^2 <= a_ii a_jj.
+
+    Nothing overflows then where the matrices are scaled to ones on their diagonals.
+    """
+    root = np.sqrt(np.maximum(np.einsum("mkk->mk", matrices), 0.0))
+    most = root[:, :, None] * root[:, None, :]
+    return bool((np.abs(matrices) <= (1.0 - _NEGATIVE) * most).all())
 
 
 def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> tuple[Array, Array]:

@@ -26,29 +26,35 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_dialects import (
     NO_OFFSET,
     MatrixOrder,
+    from_toro_order,
     in_frames_of_poses,
     landmark_shift,
     offsets_named,
     order_of_edge2,
+    order_of_edge_se2,
 )
+from pgo_models.graphs.g2o_readings import Reading, edges_as, noise_as, numbers_as
 from pgo_models.graphs.g2o_rows import information_of
 from pgo_models.graphs.g2o_source import ParsedLines, Source
 from pgo_models.graphs.g2o_tags import (
+    COMPLETE_TAGS,
     OFFSET_TAGS,
     SHORT_TAGS,
+    SKIPPED_TAGS,
     TAGS,
-    TAGS_IN_FILES,
     Noise,
     Tag,
+    supported_tags,
 )
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.precisions import are_definite
 from pgo_models.graphs.weight_errors import MOST, SINGULAR
-from pgo_models.graphs.written_digits import WrittenDigits, digits_of
+from pgo_models.graphs.written_digits import ALL_DIGITS, WrittenDigits, digits_of
 
 _NAMED_TAGS = 10  # unknown tags that a warning names
-_KNOWN_TAGS = ", ".join(TAGS_IN_FILES)
-_SQUARE_ROOTS = "iSAM's own files have square roots of information (pgo info --square-roots --out)"
+_SQUARE_ROOTS = (
+    "iSAM's own files have square roots of information (pgo info --reading square-roots --out)"
+)
 HIDDEN_INFORMATION = (
     "doubles cannot hold the information matrix, as its condition is too large; give a larger "
     "smallest deviation, or an EDGE line with the information matrix itself"
@@ -88,23 +94,28 @@ class _Rows(NamedTuple):
 
 
 def read_lines(
-    path: Path | str, skip_unknown: bool = False, square_roots: bool = False
+    path: Path | str,
+    skip_unknown: bool = False,
+    reading: Reading = Reading.AS_WRITTEN,
+    needs_matrices: bool = True,
 ) -> G2OLines:
-    """Read and check the lines of one g2o file.
+    """Read and check the lines of one g2o file, which may be compressed by gzip.
 
-    Blank lines, comments (#), EQUIV lines and PARAMS_ lines that nothing uses are skipped. With
-    `skip_unknown`, so are lines with unknown tags. With `square_roots`, all matrices are square
-    roots U of the information U^T U, by rows. A `GraphWarning` gives the number of each
-    unknown tag, and another one says what was assumed where the tags leave a choice: see the page
-    "My g2o file" of the guide.
+    Blank lines, comments (#, // and %), data of sensors, switches, EQUIV lines and PARAMS_ lines
+    that nothing uses are skipped. With `skip_unknown`, so are lines with unknown tags. The
+    `reading` says what the lines mean. Unless `needs_matrices`, edges may have no matrix: theirs
+    are the identity. A `GraphWarning` gives the number of each unknown tag, and another one says
+    what was assumed where the tags leave a choice: see the page "My g2o file" of the guide.
 
     A FileFormatError names the wrong lines, the first 20 as file:line, for: a file that is missing,
     binary or without VERTEX and EDGE lines; an unknown tag; too few or too many numbers on a line,
     or thousands of them; a word, nan or inf where a number belongs; an id that is no integer of 64
-    bits; a zero quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
+    bits; an edge without a matrix, if it needs one, or with one that is not symmetric; a zero
+    quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
     rotation block is neither positive definite nor zero, or both of whose blocks are zero; a
-    covariance matrix that is not positive definite; an edge to itself; a second VERTEX line of an
-    id; an offset without a PARAMS_ line, or of a position prior; lines in 2D beside lines in 3D.
+    covariance matrix that is not positive definite; an edge to itself; a VERTEX line of an id that
+    another one has elsewhere; an offset without a PARAMS_ line, or of a position prior; lines in 2D
+    beside lines in 3D.
     """
     path = Path(path)
     source = Source(path, skip_unknown)
@@ -116,9 +127,16 @@ def read_lines(
     if skip_unknown and source.unknown:
         warnings.warn(_text_of_unknown(source), GraphWarning, stacklevel=2)
     d = _dimension(source)
-    assembly = _Assembly(source, d, square_roots)
+    if reading.dimension not in (None, d):
+        problem = f"{d}D, and only {reading.dimension}D files can be read {reading.text}"
+        raise FileFormatError(path, None, f"{problem}; leave this reading out")
+    if needs_matrices:
+        source.problems += _problems_of_missing_matrices(source)
+    assembly = _Assembly(source, d, reading)
     file = assembly.lines()
-    check_lines(path, [*source.problems, *problems_of(file)])
+    has_unknown = bool(source.unknown) and not skip_unknown
+    hint = f"; supported tags are {supported_tags()}" if has_unknown else ""
+    check_lines(path, [*source.problems, *problems_of(file)], hint=hint)
     if assembly.notes:
         text = f"{printable(str(path))}: {'; '.join(assembly.notes)}"
         warnings.warn(text, GraphWarning, stacklevel=2)
@@ -148,8 +166,8 @@ def _dimension(source: Source) -> int:
         source.problems.append((later, problem))
     if len(first_line) != 1:
         check_lines(source.path, source.problems)
-        problem = f"no measurement in it; a pose graph needs lines of {_KNOWN_TAGS}"
-        raise FileFormatError(source.path, None, problem)
+        problem = "no measurement in it; a pose graph needs lines with one of the supported tags"
+        raise FileFormatError(source.path, None, f"{problem} ({supported_tags()})")
     (d,) = first_line
     return d
 
@@ -159,6 +177,8 @@ def _problems_of_unknown(source: Source, has_known: bool) -> list[Problem]:
     problems: list[Problem] = []
     for tag, (count, first) in source.unknown.items():
         problem = f"unknown tag {tag!r}"
+        if "," in tag:
+            problem += "; separate words by blanks, not by commas"
         if not has_known:
             problem += (
                 ", and no line has a tag of a pose graph, such as EDGE_SE2; images, IMU readings "
@@ -167,10 +187,24 @@ def _problems_of_unknown(source: Source, has_known: bool) -> list[Problem]:
             return [(first, problem)]
         if count > 1:
             problem += f" ({count} lines)"
-        if not problems:
-            problem += f"; supported are {_KNOWN_TAGS}"
         way_out = "remove the line, or have such lines skipped with --skip-unknown"
         problems.append((first, f"{problem}: {way_out}"))
+    return problems
+
+
+def _problems_of_missing_matrices(source: Source) -> list[Problem]:
+    """A problem for every tag of lines without a matrix; EDGE3 has the identity, as in iSAM."""
+    problems = []
+    for tag, short_tag in SHORT_TAGS.items():
+        parts = source.parsed[short_tag]
+        if parts and tag != "EDGE3":
+            num_lines = sum(len(part.lines) for part in parts)
+            problem = (
+                f"no information matrix on {num_lines} {tag} lines, the first of them here; choose "
+                "the weights: --cost unit or --unit-weights (unit_weights=True) takes those of the "
+                "paper, and --estimate-noise finds them from the measurements"
+            )
+            problems.append((int(parts[0].lines[0]), problem))
     return problems
 
 
@@ -193,20 +227,26 @@ class _Assembly:
     be from those of the file (`weight_errors`).
     """
 
-    def __init__(self, source: Source, d: int, square_roots: bool) -> None:
+    def __init__(self, source: Source, d: int, reading: Reading) -> None:
         self.notes: list[str] = []
         self.weights_error = 0.0
         self._source = source
         self._d = d
-        self._square_roots = square_roots
+        self._reading = reading
 
     def lines(self) -> G2OLines:
         """What the file holds. Lines with problems are left out, and noted in the source."""
-        self._settle_edge2()
+        self._settle_complete()
+        if self._reading is not Reading.SQUARE_ROOTS:
+            self._settle_edge2()
+        self._settle_edge_se2()
         self._note_noise()
         digits = self._digits()
-        vertices = self._joined(is_edge=False)
+        vertices = self._without_repetitions(self._joined(is_edge=False))
         edges = self._joined(is_edge=True)
+        edge_ids, edge_rows = edges_as(
+            self._reading, edges.ids, edges.numbers, self._d, edges.is_point
+        )
         fixed_rows = np.array(self._source.fixed, dtype=np.int64).reshape(-1, 2)
         fixed, fixed_lines = fixed_rows.T
         file = G2OLines(
@@ -215,8 +255,8 @@ class _Assembly:
             vertex_ids=vertices.ids[:, 1],
             vertex_lines=vertices.lines,
             vertices=vertices.numbers,
-            edge_ids=edges.ids,
-            edges=edges.numbers,
+            edge_ids=edge_ids,
+            edges=edge_rows,
             edge_lines=edges.lines,
             fixed=fixed,
             fixed_lines=fixed_lines,
@@ -228,49 +268,126 @@ class _Assembly:
             return self._with_landmarks(file, vertices.is_point, edges.is_point)
         return file
 
-    def _settle_edge2(self) -> None:
-        """Settle the order of the matrices on EDGE2 lines.
-
-        Where it is that of rows, they are lines of EDGE_SE2. Square roots are iSAM's, by rows.
-        """
+    def _settle_complete(self) -> None:
+        """Put the upper triangles of complete matrices in their place."""
         parsed = self._source.parsed
-        if not parsed["EDGE2"]:
+        for tag, complete_tag in COMPLETE_TAGS.items():
+            for part in parsed[complete_tag]:
+                numbers, is_symmetric = TAGS[complete_tag].triangles_of_complete(part.numbers)
+                with_triangles = ParsedLines(part.lines, part.ids, numbers)
+                problem = (
+                    "the matrix is not symmetric; correct it, or give its upper triangle row by row"
+                )
+                parsed[tag].append(self._without(with_triangles, ~is_symmetric, problem))
+            parsed[complete_tag] = []
+
+    def _settle_edge2(self) -> None:
+        """Settle the order of the matrices on EDGE2 lines, which is by rows afterwards."""
+        parts = self._source.parsed["EDGE2"]
+        if not parts:
             return
-        if self._square_roots:
-            parsed["EDGE_SE2"] += parsed["EDGE2"]
-            parsed["EDGE2"] = []
-            return
-        order = order_of_edge2([part.numbers for part in parsed["EDGE2"]])
+        order = order_of_edge2([part.numbers for part in parts])
         if order is MatrixOrder.ROWS:
             self.notes.append(
                 "EDGE2 matrices are read in iSAM's order, xx xy xt yy yt tt: all are positive "
                 f"definite in it, and not in TORO's; {_TAKEN_AS_INFORMATION}"
             )
-            parsed["EDGE_SE2"] += parsed["EDGE2"]
-            parsed["EDGE2"] = []
-        elif order is MatrixOrder.EITHER:
+            return
+        if order is MatrixOrder.EITHER:
             self.notes.append(
                 "EDGE2 matrices are read in TORO's order, ff fs ss rr fr sr; they are all positive "
                 "definite in iSAM's, xx xy xt yy yt tt, too"
             )
+        self._reorder("EDGE2")
+
+    def _settle_edge_se2(self) -> None:
+        """Settle the order of the matrices on EDGE_SE2 lines, which is by rows afterwards."""
+        parts = self._source.parsed["EDGE_SE2"]
+        if not parts or noise_as(self._reading, TAGS["EDGE_SE2"]) is Noise.SQUARE_ROOT:
+            return
+        if self._reading is Reading.TORO_ORDER:
+            self._reorder("EDGE_SE2")
+            return
+        order = order_of_edge_se2([part.numbers for part in parts])
+        if order is MatrixOrder.TORO:
+            self.notes.append(
+                "EDGE_SE2 matrices are read in TORO's order, ff fs ss rr fr sr: all are positive "
+                "definite in it, and not in g2o's, xx xy xt yy yt tt"
+            )
+            self._reorder("EDGE_SE2")
+        elif order is MatrixOrder.EITHER:
+            self.notes.append(
+                "EDGE_SE2 matrices are read in g2o's order, xx xy xt yy yt tt; they are all "
+                "positive definite in TORO's, ff fs ss rr fr sr, too (--reading toro-order)"
+            )
+
+    def _reorder(self, tag: str) -> None:
+        """Put the matrices of a tag, which are in TORO's order, into the order of rows."""
+        parts = self._source.parsed[tag]
+        self._source.parsed[tag] = [
+            part._replace(numbers=from_toro_order(part.numbers)) for part in parts
+        ]
+
+    def _without_repetitions(self, vertices: _Rows) -> _Rows:
+        """VERTEX lines without those that repeat another one, number by number."""
+        ids = vertices.ids[:, 1]
+        if (np.diff(ids) > 0).all():  # as in most files
+            return vertices
+        order = np.argsort(ids, kind="stable")
+        is_same_id = np.diff(ids[order]) == 0
+        numbers = vertices.numbers[order]
+        is_same = is_same_id & (numbers[1:] == numbers[:-1]).all(axis=1)
+        is_same &= vertices.is_point[order][1:] == vertices.is_point[order][:-1]
+        is_kept = np.ones(len(ids), dtype=bool)
+        is_kept[order[1:][is_same]] = False
+        if is_same.any():
+            self.notes.append(f"{int(is_same.sum())} VERTEX lines repeat others, and are left out")
+        return _Rows(
+            vertices.ids[is_kept],
+            vertices.numbers[is_kept],
+            vertices.lines[is_kept],
+            vertices.is_point[is_kept],
+        )
 
     def _note_noise(self) -> None:
         """Note what is taken for the noise of measurements, where files differ or have none."""
         parsed = self._source.parsed
-        if not self._square_roots:
+        if self._reading is not Reading.SQUARE_ROOTS:
             self._note_matrices()
         num_short = sum(len(part.lines) for part in parsed[SHORT_TAGS["EDGE3"]])
         if num_short:
             self.notes.append(f"{num_short} EDGE3 lines have no matrix; the identity is taken")
+        if parsed["EDGE_SE3_PRIORQUAT"]:
+            self.notes.append(
+                "EDGE_SE3_PRIORQUAT has w first, and its matrix is taken as that of a rotation "
+                "vector, as with EDGE_SE3:QUAT"
+            )
         if parsed["BR"]:
             self.notes.append(
                 "BR measurements, bearing and range, are taken as points with the covariance to "
                 "first order"
             )
-        if self._source.num_equivalences:
+        self._note_skipped()
+
+    def _note_skipped(self) -> None:
+        """Note what lines hold that is not used, and how many there are."""
+        source = self._source
+        counts: dict[str, list[str]] = {}  # by the reason
+        for tag, count in source.skipped.items():
+            counts.setdefault(SKIPPED_TAGS[tag], []).append(f"{count} {tag}")
+        for reason, of_tags in counts.items():
+            self.notes.append(f"{' and '.join(of_tags)} lines are skipped: {reason}")
+        tags = ("EDGE_SE2_SWITCHABLE", "EDGE_SE3_SWITCHABLE")
+        num_switchable = sum(len(part.lines) for tag in tags for part in source.parsed[tag])
+        if num_switchable:
             self.notes.append(
-                f"{self._source.num_equivalences} EQUIV lines are skipped: they name edges that "
-                "TORO may contract, and measure nothing"
+                f"{num_switchable} switchable edges are read as edges that hold always; --robust "
+                "finds wrong ones"
+            )
+        if source.num_kernels:
+            self.notes.append(
+                f"robust kernels of {source.num_kernels} edges are not used; --robust finds wrong "
+                "edges"
             )
 
     def _note_matrices(self) -> None:
@@ -284,12 +401,19 @@ class _Assembly:
             )
         if "LANDMARK2" in self._source.written_tags:
             self.notes.append(f"LANDMARK2 {_TAKEN_AS_INFORMATION}")
+        if {"EDGE_SE3", "EDGE_SE3:EULER"} & self._source.written_tags and parsed["EDGE3"]:
+            self.notes.append(
+                "EDGE_SE3 lines with three angles are read as TORO's EDGE3: roll, pitch and yaw, "
+                "and the information of a rotation vector"
+            )
         # TORO, whose matrices are information, writes vertices; iSAM does not.
-        if parsed["EDGE3"] and not parsed["VERTEX3"]:
+        if "EDGE3" in self._source.written_tags and parsed["EDGE3"] and not parsed["VERTEX3"]:
             self.notes.append(f"EDGE3 {_TAKEN_AS_INFORMATION}")
 
     def _digits(self) -> WrittenDigits:
-        """Digits with which the measurements are written."""
+        """Digits with which the measurements are written, all where their units are changed."""
+        if self._reading.converts_units:
+            return ALL_DIGITS
         measured = [np.zeros(0)]
         for tag, kind in TAGS.items():
             if kind.is_edge:
@@ -329,8 +453,10 @@ class _Assembly:
 
         Lines with a noise or an offset that is none are left out; their problems are noted.
         """
-        if self._square_roots and kind.has_matrix:
-            kind = replace(kind, noise=Noise.SQUARE_ROOT)
+        noise = noise_as(self._reading, kind)
+        if noise is not kind.noise:
+            kind = replace(kind, noise=noise)
+        part = part._replace(numbers=numbers_as(self._reading, kind, part.numbers))
         part = self._without(part, *kind.problem(part.numbers))
         part = self._with_known_weights(part, kind.weights_error(part.numbers))
         numbers = kind.rows(part.numbers)

@@ -4,6 +4,7 @@ A sound file takes a short way: blocks of some megabytes, in which all lines of 
 one call. Only when that call fails are the lines looked at one by one, to name the wrong ones.
 """
 
+import re
 import warnings
 from bisect import bisect_left
 from pathlib import Path
@@ -15,18 +16,38 @@ from pgo_models.errors import FileFormatError
 from pgo_models.files import LARGEST, LONGEST, Problem, check_length, finite_number
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_dialects import NO_OFFSET
-from pgo_models.graphs.g2o_tags import ALIASES, OFFSET_TAGS, REFUSED_TAGS, SHORT_TAGS, TAGS, Tag
+from pgo_models.graphs.g2o_tags import (
+    ALIASES,
+    COMPLETE_TAGS,
+    OFFSET_TAGS,
+    REFUSED_TAGS,
+    SHORT_TAGS,
+    SKIPPED_TAGS,
+    TAGS,
+    WITH_ANGLES,
+    Tag,
+)
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 
 _LONG_RUN = 16  # lines of one tag in a row, from which on they need not be sorted by tag
 _SHOWN = 40  # characters of a wrong word that a message shows
+_COMMENT_SIGNS = ("#", "//", "%")
+_COMMENT = re.compile(r"(#|//|%).*")
+# Fortran writes 1.5e-3 as 1.5D-03.
+_FORTRAN_EXPONENT = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
+_INFINITE = re.compile(r"[+-]?(inf|infinity|nan)", re.IGNORECASE)
+# A robust kernel, with or without its width, behind the numbers of an edge.
+_KERNEL = re.compile(
+    r"\s((ROBUST_)?KERNEL|(RobustKernel)?(Huber|PseudoHuber|Cauchy|DCS|Fair|GemanMcClure|Saturated"
+    r"|Tukey|Welsch))\b.*"
+)
 
 
 class ParsedLines(NamedTuple):
     """Lines of one tag: their numbers in the file, and what stands on them."""
 
     lines: IntArray  # (n,)
-    ids: IntArray  # (n, num_ids + num_offsets)
+    ids: IntArray  # (n, num_ids + num_other_ids)
     numbers: Array  # (n, num_numbers)
 
 
@@ -44,7 +65,8 @@ class Source:
         self.fixed: list[tuple[int, int]] = []  # a pose and its line
         self.problems: list[Problem] = []
         self.unknown: dict[str, tuple[int, int]] = {}  # tag: how many lines, and the first
-        self.num_equivalences = 0
+        self.skipped: dict[str, int] = {}  # tags that are skipped by their nature: how many lines
+        self.num_kernels = 0
         # Poses of sensors: dimension and id, as it is written, to lines and words behind the id.
         self.offsets: dict[tuple[int, str], list[tuple[int, list[str]]]] = {}
 
@@ -67,7 +89,7 @@ class Source:
             # Bisection takes for granted that all lines of a tag follow each other. Where other
             # lines stand between them, parsing fails, and the lines are sorted by their tags.
             end = bisect_left(lines, True, start, key=lambda line: not line.startswith(tag))
-            is_simple = tag in TAGS and not TAGS[tag].num_offsets
+            is_simple = tag in TAGS and not TAGS[tag].num_other_ids
             if not is_simple or end - start < _LONG_RUN:
                 break
             is_sound = self._parse(tag, tag, numbers[start:end], lines[start:end])
@@ -88,16 +110,18 @@ class Source:
             tag = ALIASES.get(written_tag, written_tag)
             if tag in TAGS:
                 self._take_measurements(tag, written_tag, numbers_of_tag, lines_of_tag)
-            elif not written_tag.startswith("#"):
-                self._take_others(written_tag, numbers_of_tag.tolist(), lines_of_tag)
+            elif not written_tag.startswith(_COMMENT_SIGNS):
+                plain_lines = [_without_comment(line) for line in lines_of_tag]
+                self._take_others(tag, numbers_of_tag.tolist(), plain_lines)
 
     def _take_measurements(
         self, tag: str, written_tag: str, numbers: IntArray, lines: list[str]
     ) -> None:
         """Take VERTEX or EDGE lines, whose tag may be written as an alias."""
         kind = TAGS[tag]
-        if kind.num_offsets:
-            lines = [_with_offset_ids(kind, line) for line in lines]
+        if self._parse(tag, written_tag, numbers, _with_all_ids(kind, lines)):
+            return
+        lines = _with_all_ids(kind, [self._plain(line) for line in lines])
         if self._parse(tag, written_tag, numbers, lines):
             return
         if tag == "EDGE2" and all(map(_has_hypotheses, lines)):
@@ -106,16 +130,15 @@ class Source:
                 "EDGE2 lines hold several hypotheses of a measurement (MH-iSAM2), and a pose graph "
                 "has one measurement an edge; write the right one as EDGE_SE2",
             )
-        if tag not in SHORT_TAGS:
-            self._take_sound_lines(tag, written_tag, numbers, lines)
-            return
-        short_tag = SHORT_TAGS[tag]
-        num_words = 1 + TAGS[short_tag].num_ids + TAGS[short_tag].num_numbers
-        is_short = np.array([len(line.split()) == num_words for line in lines])
-        for line_tag, chosen in ((short_tag, is_short), (tag, ~is_short)):
-            some_lines = [line for line, is_chosen in zip(lines, chosen, strict=True) if is_chosen]
-            if some_lines:
-                self._take_sound_lines(line_tag, written_tag, numbers[chosen], some_lines)
+        for line_tag, places in _places_by_length(tag, written_tag, lines).items():
+            some_lines = [lines[place] for place in places]
+            self._take_sound_lines(line_tag, written_tag, numbers[places], some_lines)
+
+    def _plain(self, line: str) -> str:
+        """A line without comment and robust kernel, its exponents written with e."""
+        line, num_kernels = _KERNEL.subn("", _without_comment(line))
+        self.num_kernels += num_kernels
+        return _FORTRAN_EXPONENT.sub("e", line)
 
     def _take_sound_lines(
         self, tag: str, written_tag: str, numbers: IntArray, lines: list[str]
@@ -144,8 +167,8 @@ class Source:
         """Take lines of a tag that is no measurement's."""
         if tag == "FIX":
             self._take_fixed(numbers, lines)
-        elif tag == "EQUIV":
-            self.num_equivalences += len(lines)
+        elif tag in SKIPPED_TAGS:
+            self.skipped[tag] = self.skipped.get(tag, 0) + len(lines)
         elif tag in OFFSET_TAGS.values():
             d = 2 if tag == OFFSET_TAGS[2] else 3
             for number, line in zip(numbers, lines, strict=True):
@@ -155,8 +178,9 @@ class Source:
         elif tag.startswith("PARAMS_"):
             return
         elif tag in REFUSED_TAGS and not self.skip_unknown:
-            problem = f"{tag} measures {REFUSED_TAGS[tag]}; remove such lines, or skip them"
-            raise self._error(numbers[0], f"{problem} with --skip-unknown")
+            problem = f"{tag} measures {REFUSED_TAGS[tag]}, which no edge of a pose graph has"
+            way_out = "remove such lines, or skip them with --skip-unknown"
+            raise self._error(numbers[0], f"{problem}; {way_out}")
         else:
             shown_tag = tag[:_SHOWN]
             count, first = self.unknown.get(shown_tag, (0, numbers[0]))
@@ -183,7 +207,7 @@ class Source:
         shared_end = _shared_end(lines, kind.num_numbers - 1)
         num_shared = len(shared_end.split())
         num_own = kind.num_numbers - num_shared
-        ids_field = ("ids", "i8", (kind.num_ids + kind.num_offsets,))
+        ids_field = ("ids", "i8", (kind.num_ids + kind.num_other_ids,))
         numbers_field = ("numbers", "f8", (num_own,))
         row_type = np.dtype([("tag", f"S{len(written_tag) + 1}"), ids_field, numbers_field])
         own_ends = lines
@@ -215,12 +239,18 @@ class Source:
     def _check_line(self, tag: str, number: int, line: str) -> None:
         """Raise a FileFormatError when a word of a line is wrong, or there are not enough."""
         kind = TAGS[tag]
-        words, words_of_offsets = _words(kind, line)
+        words, other_ids = _words(kind, line)
         words_of_ids = words[: kind.num_ids]
         words_of_numbers = words[kind.num_ids :]
-        for word in [*words_of_ids, *words_of_offsets]:
+        for word in [*words_of_ids, *other_ids]:
             self._id(number, word)
-        for word in words_of_numbers:
+        for place, word in enumerate(words_of_numbers):
+            if kind.is_edge and place >= kind.num_measured and _INFINITE.fullmatch(word):
+                problem = (
+                    f"{word} is not finite, like the information of a covariance of zero; give the "
+                    "variances of the sensor, or remove the line"
+                )
+                raise self._error(number, problem)
             finite_number(self.path, number, word)
         expected = kind.num_ids + kind.num_numbers
         if len(words) == expected:
@@ -254,23 +284,47 @@ class Source:
         return FileFormatError(self.path, line, problem)
 
 
+def _without_comment(line: str) -> str:
+    return _COMMENT.sub("", line)
+
+
+def _places_by_length(tag: str, written_tag: str, lines: list[str]) -> dict[str, list[int]]:
+    """Places of lines by the variant of their tag that has as many words, or the tag itself."""
+    variants: dict[int, str] = {}
+    for names, key in ((SHORT_TAGS, tag), (COMPLETE_TAGS, tag), (WITH_ANGLES, written_tag)):
+        if key in names:
+            variant = TAGS[names[key]]
+            variants[1 + variant.num_ids + variant.num_numbers] = names[key]
+    places: dict[str, list[int]] = {}
+    for place, line in enumerate(lines):
+        name = variants.get(len(line.split()), tag)
+        places.setdefault(name, []).append(place)
+    return places
+
+
 def _words(kind: Tag, line: str) -> tuple[list[str], list[str]]:
-    """Ids and numbers on a line; and the ids of offsets, which may stand between them."""
+    """Ids and numbers on a line; and ids of offsets or switches, which may stand between them."""
     words = line.split()[1:]
-    num_words = kind.num_ids + kind.num_offsets + kind.num_numbers
-    if not kind.num_offsets or len(words) != num_words:
+    num_words = kind.num_ids + kind.num_other_ids + kind.num_numbers
+    if not kind.num_other_ids or len(words) != num_words:
         return words, []
-    behind = kind.num_ids + kind.num_offsets
+    behind = kind.num_ids + kind.num_other_ids
     return words[: kind.num_ids] + words[behind:], words[kind.num_ids : behind]
 
 
-def _with_offset_ids(kind: Tag, line: str) -> str:
-    """A line of a tag with offsets, with ids that stand for none where it has no such ids."""
+def _with_all_ids(kind: Tag, lines: list[str]) -> list[str]:
+    """Lines of a tag, with ids that stand for none where one of an offset or switch is missing."""
+    if not kind.num_other_ids:
+        return lines
+    return [_with_other_ids(kind, line) for line in lines]
+
+
+def _with_other_ids(kind: Tag, line: str) -> str:
     tag, *_ = line.split(None, 1)
-    words, offsets = _words(kind, line)
+    words, other_ids = _words(kind, line)
     if len(words) == kind.num_ids + kind.num_numbers:
-        no_offsets = [str(NO_OFFSET)] * kind.num_offsets
-        words[kind.num_ids : kind.num_ids] = offsets or no_offsets
+        none = [str(NO_OFFSET)] * kind.num_other_ids
+        words[kind.num_ids : kind.num_ids] = other_ids or none
     return " ".join([tag, *words])
 
 

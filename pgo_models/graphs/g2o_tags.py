@@ -1,5 +1,7 @@
 """The tags of g2o files, as g2o, GTSAM, TORO and iSAM write them, and what stands on their lines.
 
+Besides them, those of packages that extend g2o: Vertigo and hdl_graph_slam.
+
 Numbers are brought into the order of EDGE_SE2 and EDGE_SE3:QUAT.
 
 Sources: `types_slam2d.cpp`, `types_slam3d.cpp` and every `read` and `computeError` there, in g2o
@@ -8,11 +10,14 @@ the frame that was measured, that of a position in the frame of the world, and t
 the frame of the pose. TORO's page (Grisetti et al. 2007), except that its code and GTSAM take the
 first vertex of an edge for the one that observes. `load2D` of GTSAM, for ODOMETRY, LANDMARK and BR.
 `Loader.cpp` of iSAM (Kaess et al. 2012), whose matrices are upper triangular square roots U of the
-information U^T U, by rows, and which takes the identity where EDGE3 has none.
+information U^T U, by rows, and which takes the identity where EDGE3 has none. Vertigo (Suenderhauf
+& Protzel 2012), for switches. `edge_se3_priorquat.hpp` of hdl_graph_slam (Koide et al. 2019), whose
+error is the difference of the vector parts of two quaternions: to first order half the rotation
+vector, like that of EDGE_SE3:QUAT.
 """
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,8 +35,8 @@ from pgo_models.graphs.weight_errors import (
     scaled_inverse,
 )
 
-# Places of the numbers of an EDGE2 line of TORO: x y theta, then the triangle as ff fs ss rr fr sr.
-_TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
+# Difference of two entries, beside the largest, by which a complete matrix is not symmetric.
+_ASYMMETRY = 1e-6
 
 
 class Noise(enum.Enum):
@@ -49,9 +54,12 @@ class Tag:
     """What stands on a line behind its tag: ids, a measurement and, on EDGE lines, its noise.
 
     The noise is the upper triangle of an information matrix, row by row, unless `noise` says
-    otherwise. A point has d numbers, or bearing and range with DEVIATIONS, and its matrix is d x d.
-    The ids of PARAMS_SE2OFFSET or PARAMS_SE3OFFSET lines, `num_offsets` of them, may stand between
-    ids and numbers. Poses of TORO in space have roll, pitch and yaw in place of a quaternion.
+    otherwise; with `is_complete` it is the whole matrix. A point has d numbers, or bearing and
+    range with DEVIATIONS, and its matrix is d x d. A rotation in space is a quaternion, its w
+    first, and its matrix is 3 x 3. The ids of PARAMS_SE2OFFSET or PARAMS_SE3OFFSET lines,
+    `num_offsets` of them, or those of switches, `num_switches`, may stand between ids and numbers.
+    Poses of TORO in space have roll, pitch and yaw in place of a quaternion. The triangle of EDGE2
+    is in another order, which `g2o_dialects` settles.
     """
 
     d: int
@@ -60,7 +68,10 @@ class Tag:
     is_point: bool = False
     to_landmark: bool = False
     num_offsets: int = 0
+    num_switches: int = 0
     is_toro: bool = False
+    is_rotation: bool = False
+    is_complete: bool = False
     noise: Noise = Noise.INFORMATION
 
     @property
@@ -68,9 +79,15 @@ class Tag:
         """How many numbers stand behind the ids."""
         if self.noise is Noise.DEVIATIONS:
             return 4
-        has_triangle = self.is_edge and self.noise is not Noise.MISSING
-        num_in_triangle = self._side * (self._side + 1) // 2 if has_triangle else 0
-        return self.num_measured + num_in_triangle
+        if not self.is_edge or self.noise is Noise.MISSING:
+            return self.num_measured
+        size = self._side**2 if self.is_complete else self._side * (self._side + 1) // 2
+        return self.num_measured + size
+
+    @property
+    def num_other_ids(self) -> int:
+        """How many ids may stand behind those of the poses."""
+        return self.num_offsets + self.num_switches
 
     @property
     def has_matrix(self) -> bool:
@@ -91,7 +108,10 @@ class Tag:
         if self.noise is Noise.COVARIANCE:
             covariances = numbers[:, self.num_measured + triangle_places(self._side)]
             is_covariance = are_definite(covariances, SINGULAR)
-            problem = "the covariance matrix is not positive definite; correct or remove it"
+            problem = (
+                "the covariance matrix is not positive definite, and no sensor is without error: "
+                "give its variances, or remove it"
+            )
             return ~is_covariance, problem
         return np.zeros(len(numbers), dtype=bool), ""
 
@@ -118,29 +138,43 @@ class Tag:
             error = entry_error(information, congruence_error(everywhere, largest))
         return both(error, precision_error(information, self.d))
 
+    def triangles_of_complete(self, numbers: Array) -> tuple[Array, BoolArray]:
+        """Numbers with the upper triangle of a complete matrix, and whether that is symmetric."""
+        side = self._side
+        matrices = numbers[:, self.num_measured :].reshape(-1, side, side)
+        largest = np.abs(matrices).max(axis=(1, 2), keepdims=True)
+        is_same = np.abs(matrices - matrices.mT) <= _ASYMMETRY * largest
+        triangles = matrices[:, *np.triu_indices(side)]
+        with_triangles = np.concatenate([numbers[:, : self.num_measured], triangles], axis=1)
+        return with_triangles, np.asarray(is_same.all(axis=(1, 2)))
+
     def rows(self, numbers: Array) -> Array:
         """Numbers of lines, (n, num_numbers), as rows of `G2OLines`."""
         numbers = self._with_information(numbers)
         if self.is_point:
             return self._rows_of_points(numbers)
+        if self.is_rotation:
+            return _rows_of_rotations(numbers)
         if not self.is_toro:
             return numbers
-        if self.d == 3:
-            return _with_quaternions(numbers)
-        if self.is_edge:
-            return numbers[:, _TORO]
-        return numbers
+        return _with_quaternions(numbers) if self.d == 3 else numbers
 
     @property
     def _side(self) -> int:
         """Rows of the information matrix."""
-        return self.d if self.is_point else 3 * self.d - 3
+        return self.d if self.is_point or self.is_rotation else 3 * self.d - 3
 
     @property
     def num_measured(self) -> int:
         """How many numbers the measurement has."""
-        has_quaternion = self._side == 6 and not self.is_toro
-        return 7 if has_quaternion else self._side
+        if self.is_rotation:
+            return 4
+        return 7 if self.has_quaternion else self._side
+
+    @property
+    def has_quaternion(self) -> bool:
+        """Whether a position and a quaternion, its w last, are measured."""
+        return self._side == 6 and not self.is_toro
 
     def _with_information(self, numbers: Array) -> Array:
         """Numbers with the triangle of an information matrix in place of another noise."""
@@ -189,6 +223,16 @@ def _with_quaternions(numbers: Array) -> Array:
     translations = numbers[:, :3]
     triangles = numbers[:, 6:]
     return np.concatenate([translations, quaternions, triangles], axis=1)
+
+
+def _rows_of_rotations(numbers: Array) -> Array:
+    """Rotations w x y z as rows of poses, with no information on their positions."""
+    rows = np.zeros((len(numbers), 28))
+    rows[:, 3:7] = numbers[:, [1, 2, 3, 0]]
+    row_of_triangle, _ = np.triu_indices(6)
+    in_block = np.flatnonzero(row_of_triangle >= 3)
+    rows[:, 7 + in_block] = numbers[:, 4:]
+    return rows
 
 
 def _cartesian(numbers: Array) -> Array:
@@ -245,22 +289,97 @@ OTHER_TAGS = {
     "ODOMETRY": Tag(2, 2, noise=Noise.COVARIANCE),
     "LANDMARK": Tag(2, 2, is_point=True, to_landmark=True, noise=Noise.COVARIANCE),
     "BR": Tag(2, 2, is_point=True, to_landmark=True, noise=Noise.DEVIATIONS),
+    "EDGE_SE2_SWITCHABLE": Tag(2, 2, num_switches=1),
+    "EDGE_SE3_SWITCHABLE": Tag(3, 2, num_switches=1),
+    "EDGE_SE3_PRIORQUAT": Tag(3, 1, is_rotation=True),
 }
-# What a line of the tag is when it ends behind the measurement. The blanks keep these names apart
-# from all tags in files.
-SHORT_TAGS = {"EDGE3": "EDGE3 without a matrix"}
+_PLAIN_TAGS = {**G2O_TAGS, **OTHER_TAGS}
+
+
+def _with_variants() -> list[str]:
+    """Tags whose lines may end behind the measurement, or have the complete matrix."""
+    names = []
+    for name, tag in _PLAIN_TAGS.items():
+        is_plain = tag.is_edge and tag.noise is Noise.INFORMATION and tag.num_other_ids == 0
+        if is_plain and (name == "EDGE3" or not tag.is_toro):
+            names.append(name)
+    return names
+
+
+# What such a line is. The blanks keep these names apart from all tags in files.
+SHORT_TAGS = {name: f"{name} without a matrix" for name in _with_variants()}
+COMPLETE_TAGS = {name: f"{name} with a complete matrix" for name in _with_variants()}
 TAGS = {
-    **G2O_TAGS,
-    **OTHER_TAGS,
-    SHORT_TAGS["EDGE3"]: Tag(3, 2, is_toro=True, noise=Noise.MISSING),
+    **_PLAIN_TAGS,
+    **{SHORT_TAGS[name]: replace(_PLAIN_TAGS[name], noise=Noise.MISSING) for name in SHORT_TAGS},
+    **{COMPLETE_TAGS[name]: replace(_PLAIN_TAGS[name], is_complete=True) for name in COMPLETE_TAGS},
 }
 ALIASES = {
     "EDGE_SE2_PRIOR": "EDGE_PRIOR_SE2",
     "EDGE_PRIOR_SE3": "EDGE_SE3_PRIOR",
     "LANDMARK2": "EDGE_SE2_XY",
+    "VERTEX_SE3": "VERTEX_SE3:QUAT",
+    "EDGE_SE3": "EDGE_SE3:QUAT",
+    "VERTEX_SE3:EULER": "VERTEX3",
+    "EDGE_SE3:EULER": "EDGE3",
+    "ONLINE_VERTEX_SE2": "VERTEX_SE2",
+    "ONLINE_EDGE_SE2": "EDGE_SE2",
+    "ONLINE_VERTEX_SE3:QUAT": "VERTEX_SE3:QUAT",
+    "ONLINE_EDGE_SE3:QUAT": "EDGE_SE3:QUAT",
+    "TUTORIAL_VERTEX_SE2": "VERTEX_SE2",
+    "TUTORIAL_EDGE_SE2": "EDGE_SE2",
+    "TUTORIAL_VERTEX_POINT_XY": "VERTEX_XY",
+    "TUTORIAL_EDGE_SE2_POINT_XY": "EDGE_SE2_POINTXY_OFFSET",
+    "TUTORIAL_PARAMS_SE2_OFFSET": "PARAMS_SE2OFFSET",
+    "EDGE_SE3:QUAT_SWITCHABLE": "EDGE_SE3_SWITCHABLE",
+    "EDGE_SE3_PRIORXYZ": "EDGE_SE3_XYZ_PRIOR",
 }
-TAGS_IN_FILES = (*G2O_TAGS, *OTHER_TAGS, *ALIASES, "FIX", "EQUIV")
+# What lines of these tags are if they have three angles, as many words tell.
+WITH_ANGLES = {"VERTEX_SE3": "VERTEX3", "EDGE_SE3": "EDGE3"}
 # Tags of the poses of sensors in the frames of their poses.
 OFFSET_TAGS = {2: "PARAMS_SE2OFFSET", 3: "PARAMS_SE3OFFSET"}
-# Tags of measurements that are neither poses nor points relative to a pose.
-REFUSED_TAGS = {"EDGE_RANGE": "a range without a bearing, which no edge of a pose graph has"}
+# Tags of lines that are counted and skipped: what they hold is no measurement between poses.
+SKIPPED_TAGS = {
+    **dict.fromkeys(("EQUIV",), "they name edges that TORO may contract, and measure nothing"),
+    **dict.fromkeys(("VERTEX_SWITCH", "EDGE_SWITCH_PRIOR"), "switches are not used"),
+    **dict.fromkeys(("KERNEL", "ROBUST_KERNEL"), "robust kernels are not used"),
+    **dict.fromkeys(
+        (
+            "ROBOTLASER1",
+            "ROBOTLASER2",
+            "RAWLASER1",
+            "FLASER",
+            "RLASER",
+            "ODOM",
+            "PARAM",
+            "SYNC",
+            "VERTEX_TAG",
+            "VERTEX_ELLIPSE",
+        ),
+        "the data of sensors are not used",
+    ),
+}
+# Tags of measurements that no edge of a pose graph has.
+REFUSED_TAGS = {
+    "EDGE_RANGE": "a range without a bearing",
+    "EDGE_SE3_PRIORXY": "a position without its height",
+    "EDGE_SE3_PRIORVEC": "a direction, such as that of gravity,",
+    "EDGE_SE3_PLANE": "a plane",
+}
+
+
+def supported_tags() -> str:
+    """All tags that are read, in groups and without their aliases, for messages."""
+    groups: dict[str, list[str]] = {}
+    for name, tag in _PLAIN_TAGS.items():
+        groups.setdefault(_group(tag), []).append(name)
+    groups["other"] = ["FIX"]
+    return "; ".join(f"{group}: {', '.join(names)}" for group, names in groups.items())
+
+
+def _group(tag: Tag) -> str:
+    if not tag.is_edge:
+        return "landmarks" if tag.to_landmark else "poses"
+    if tag.num_ids == 1:
+        return "priors"
+    return "edges to landmarks" if tag.to_landmark else "edges"

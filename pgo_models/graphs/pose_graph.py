@@ -605,12 +605,15 @@ class PoseGraph(ReadOnly):
         GraphError
             When the graph has several components, which the message names; when no edge with a
             positive precision ties the positions or rotations of some poses to those of the
-            others; or when priors of positions do not fix the rotation of the world.
+            others; when there are priors of positions alone, and no edges between poses, or of
+            rotations alone; or when priors of positions do not fix the rotation of the world.
         """
         if not self.has_translations:
             self.check_rotations_connected()
             return
         self._check_one_component()
+        if self.world is not None:
+            self._check_kinds_of_priors()
         self._check_tied("tau", "position")
         self._check_tied("kappa", "rotation")
         if self.is_world_loose:
@@ -642,6 +645,16 @@ class PoseGraph(ReadOnly):
     def _check_one_component(self) -> None:
         """Raise a GraphError that names the components where there are several."""
         parts = self.components()
+        alone = [part[0] for part in parts[1:] if len(part) == 1]
+        if alone and len(alone) == len(parts) - 1:
+            first = self.pose_name(alone[0])
+            poses = f"{len(alone)} poses have no edges (the first is {first})"
+            if len(alone) == 1:
+                poses = f"pose {first} has no edges"
+            raise GraphError(
+                f"{poses}; leave out what is not connected with --largest-component "
+                "(PoseGraph.components and subgraph), or add edges"
+            )
         if len(parts) > 1:
             named = parts[:_NAMED_COMPONENTS]
             num_unnamed = len(parts) - len(named)
@@ -651,7 +664,8 @@ class PoseGraph(ReadOnly):
             raise GraphError(
                 f"pose graph has {len(parts)} components "
                 f"(sizes {sizes}{rest}; with poses {firsts}{rest}); add edges between them, "
-                "or solve each on its own (PoseGraph.components, PoseGraph.subgraph)"
+                "or solve the first with --largest-component, and each with PoseGraph.components "
+                "and PoseGraph.subgraph"
             )
 
     def _check_tied(self, precision: str, quantity: str) -> None:
@@ -669,6 +683,20 @@ class PoseGraph(ReadOnly):
             raise GraphError(
                 f"the {quantity} of {poses} is not tied to that of the others: "
                 f"no edge between has {precision} > 0; add one, or leave these out"
+            )
+
+    def _check_kinds_of_priors(self) -> None:
+        """Raise a GraphError where positions are all that is measured, or priors have none."""
+        if self.is_prior.all() and self.is_world_loose:
+            raise GraphError(
+                f"{self.name} has {self.num_edges} positions of single poses (GPS) and no edges "
+                "between poses: nothing says how the poses are turned; add odometry"
+            )
+        if not self.tau[self.is_prior].any():
+            raise GraphError(
+                f"the priors of {self.name} measure rotations alone, and nothing says where the "
+                "origin of their frame is; add the position of a pose "
+                "(EDGE_SE3_PRIORXYZ, EDGE_PRIOR_SE2_XY), or leave these priors out"
             )
 
     def is_world_fixed(self, kept: BoolArray) -> bool:
@@ -704,10 +732,11 @@ class PoseGraph(ReadOnly):
         """Raise a GraphError when priors of positions lie in a point or, in space, on a line."""
         if not self.is_world_fixed(self.is_prior):
             measured = self._first_positions(self.is_prior)
+            needed = "two poses apart" if self.d == 2 else "three poses that are not on a line"
             raise GraphError(
                 f"the priors do not fix the gauge: positions of {len(measured)} poses, in a point "
-                "or on a line, leave turns of the world open; "
-                "give more, or a prior with a rotation"
+                "or on a line, leave turns of the world open; give positions of "
+                f"{needed}, a prior with a rotation, or no priors"
             )
 
     # Other graphs made of this one

@@ -346,10 +346,10 @@ def _extreme_weight_of(graph: PoseGraph, kind: str, weight: Array) -> tuple[floa
     heaviest = int(np.argmax(weight))
     lightest = int(maximum_tree[np.argmin(weight[maximum_tree])])
     e = max(heaviest, lightest, key=lambda edge: abs(np.log(ratio_to_median[edge])))
-    id_i = graph.pose_ids[graph.i[e]]
-    id_j = graph.pose_ids[graph.j[e]]
+    name_i = graph.pose_name(int(graph.i[e]))
+    name_j = graph.pose_name(int(graph.j[e]))
     size = f"{weight[e]:.3g}, {ratio_to_median[e]:.3g} times the median"
-    text = f"{kind} of edge {id_i} -> {id_j} is {size}"
+    text = f"{kind} of edge {name_i} -> {name_j} is {size}"
     return float(weight[heaviest] / weight[lightest]), e, text
 
 

@@ -52,6 +52,10 @@ class WrittenDigits(NamedTuple):
         return np.maximum(of_decimals, _units_of_significant(numbers, self.significant))
 
 
+# Of numbers of which it is not known with how many digits they are written.
+ALL_DIGITS = WrittenDigits(_ALL_DECIMALS, _ALL_SIGNIFICANT)
+
+
 def digits_of(numbers: Array) -> WrittenDigits:
     """The digits with which numbers are written, so many that they are enough for each of them.
 
@@ -74,7 +78,7 @@ def digits_of(numbers: Array) -> WrittenDigits:
     """
     numbers = numbers[numbers != 0.0]
     if not (_have_decimals(numbers, MOST_DECIMALS) or _have_significant(numbers, MOST_SIGNIFICANT)):
-        return WrittenDigits(_ALL_DECIMALS, _ALL_SIGNIFICANT)
+        return ALL_DIGITS
     decimals = (k for k in range(_ALL_DECIMALS) if _have_decimals(numbers, k))
     significant = (k for k in range(1, MOST_SIGNIFICANT + 1) if _have_significant(numbers, k))
     return WrittenDigits(next(decimals, _ALL_DECIMALS), next(significant, _ALL_SIGNIFICANT))

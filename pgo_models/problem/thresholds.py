@@ -48,6 +48,8 @@ class EdgeResiduals:
         the odometry, so that no edge exceeds its own threshold.
     overall_allowed : float
         Bound that `overall` exceeds with probability FALSE_ALARM.
+    freedom : float
+        Degrees of freedom of the chi-square distribution that is taken for `overall`.
     """
 
     translation: Array
@@ -57,6 +59,7 @@ class EdgeResiduals:
     scale: float
     overall: float
     overall_allowed: float
+    freedom: float
 
     @property
     def share(self) -> Array:
@@ -73,6 +76,11 @@ class EdgeResiduals:
     def is_overall_misfit(self) -> bool:
         """Whether the sum of the costs exceeds its threshold."""
         return self.overall > self.overall_allowed
+
+    @property
+    def overall_least(self) -> float:
+        """Bound that `overall` falls below with probability FALSE_ALARM."""
+        return float(scipy.special.chdtri(self.freedom, 1.0 - FALSE_ALARM) / self.freedom)
 
     @property
     def is_doubtful(self) -> bool:
@@ -134,7 +142,9 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
         overall = float(cost.sum() / mean)
         dof = mean**2 / half_variance
     overall_allowed = float(scipy.special.chdtri(dof, FALSE_ALARM) / dof)
-    return EdgeResiduals(translation, rotation, cost, allowed, scale, overall, overall_allowed)
+    return EdgeResiduals(
+        translation, rotation, cost, allowed, scale, overall, overall_allowed, float(dof)
+    )
 
 
 def _median_ratio(cost: Array, w: Array) -> float:

@@ -9,6 +9,7 @@ pose's.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 from pgo_models.errors import FileFormatError
@@ -79,7 +80,9 @@ TAGS = {
 LANDMARK_TAGS = ("VERTEX_XY", "VERTEX_TRACKXYZ")
 POSE_TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "VERTEX2", "VERTEX3")
 # They are no part of the cost.
-IGNORED_TAGS = (*POSE_TAGS, "FIX", "EQUIV")
+DATA_TAGS = ("ROBOTLASER1", "ROBOTLASER2", "RAWLASER1", "VERTEX_TAG", "VERTEX_ELLIPSE")
+IGNORED_TAGS = (*POSE_TAGS, *DATA_TAGS, "FIX", "EQUIV")
+COMMENT = re.compile(r"(#|//|%).*")
 # Places of xx xy xr yy yr rr in TORO's order of the plane, xx xy yy rr xr yr.
 TORO_TRIANGLE = (0, 1, 4, 2, 5, 3)
 WRITTEN_FILE = "verify the proof of the file that pgo solve --out one.g2o writes"
@@ -147,7 +150,7 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
     offset_line = 0  # of a sensor that is not at its pose
     lines = read_text(path).split("\n")
     for number, line in enumerate(lines, 1):
-        tag, *words = line.split() or ["#"]
+        tag, *words = COMMENT.sub("", line).split() or ["FIX"]
         if tag in TAGS:
             edge = read_edge(path, number, TAGS[tag], words)
             edges.append(edge)
@@ -163,7 +166,8 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
         elif not skip_unknown:
             check_ignored_tag(path, number, tag)
     check_offset(path, edges, offset_line)
-    edges, landmarks = apart_from_poses(in_order_of_isam(edges), landmarks, pose_vertices)
+    edges = in_order_of_toro(in_order_of_isam(edges))
+    edges, landmarks = apart_from_poses(edges, landmarks, pose_vertices)
     return checked_graph(path, edges, landmarks)
 
 
@@ -219,6 +223,37 @@ def in_order_of_isam(edges: list[Edge]) -> list[Edge]:
     return [by_rows.get(place, edge) for place, edge in enumerate(edges)]
 
 
+def in_order_of_toro(edges: list[Edge]) -> list[Edge]:
+    """Edges with the matrices of EDGE_SE2 lines in TORO's order, if that is their order.
+
+    It is where one of them is indefinite by rows, and all are positive definite in TORO's order.
+    """
+    in_toro_order = {
+        place: replace(edge, triangle=tuple(edge.triangle[k] for k in TORO_TRIANGLE))
+        for place, edge in enumerate(edges)
+        if edge.tag == TAGS["EDGE_SE2"]
+    }
+    if all(is_semidefinite(edges[place]) for place in in_toro_order):
+        return edges
+    if not all(map(is_definite, in_toro_order.values())):
+        return edges
+    return [in_toro_order.get(place, edge) for place, edge in enumerate(edges)]
+
+
+def is_semidefinite(edge: Edge) -> bool:
+    """Whether no eigenvalue of the information matrix is negative: no principal minor is."""
+    rows = symmetric(edge.triangle, edge.tag.side)
+    if first_bad_pivot(rows) is None:
+        return True
+    side = edge.tag.side
+    minors = (
+        fmpq_mat([[rows[a][b] for b in places] for a in places]).det()
+        for size in range(1, side + 1)
+        for places in combinations(range(side), size)
+    )
+    return all(minor >= 0 for minor in minors)
+
+
 def is_definite(edge: Edge) -> bool:
     """Whether the information matrix is positive definite: its leading minors are positive."""
     sizes = range(1, edge.tag.side + 1)
@@ -227,7 +262,7 @@ def is_definite(edge: Edge) -> bool:
 
 def check_ignored_tag(path: Path, line: int, tag: str) -> None:
     """Raise a FileFormatError unless a tag is one of those whose lines say nothing of edges."""
-    if tag in IGNORED_TAGS or tag.startswith(("#", "PARAMS_")):
+    if tag in IGNORED_TAGS or tag.startswith("PARAMS_"):
         return
     known = ", ".join([*TAGS, *LANDMARK_TAGS, *IGNORED_TAGS])
     problem = f"unknown tag {tag[:40]!r}; known are {known}; use --skip-unknown, or {WRITTEN_FILE}"

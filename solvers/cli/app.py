@@ -65,6 +65,10 @@ COMMANDS = {
         "solvers.cli.info_command:info_command",
         "Show what a pose graph is made of, or what this installation has.",
     ),
+    "doctor": CommandOfModule(
+        "solvers.cli.doctor_command:doctor_command",
+        "Ask whether a g2o file means something else than it says: other ends, units, matrices.",
+    ),
     "generate": CommandOfModule(
         "solvers.cli.generate_command:generate_command",
         "Generate a scene with known truth, written beside it as NAME.truth.tum.",

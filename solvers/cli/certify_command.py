@@ -21,6 +21,7 @@ from solvers.cli.options import (
     GapOption,
     GraphArgument,
     InformationOption,
+    LargestComponentOption,
     ProofOption,
     RotationsOption,
     SkipUnknownOption,
@@ -72,6 +73,7 @@ def certify_command(
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
+    largest_component: LargestComponentOption = False,
     drop_edge: DropEdgeOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -92,6 +94,7 @@ def certify_command(
         drop_edge,
         rotations,
         trust_folder,
+        largest_component,
     )
     problem = source.problem(source.loaded())
     poses = estimated_poses(problem.graph, estimate)

@@ -5,12 +5,14 @@ file and line, and so are edges that do not fit.
 """
 
 import functools
+import shlex
 import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import ParamSpec, TypeVar, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 
 import numpy as np
 import typer
@@ -19,11 +21,13 @@ from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError, is_out_of_memory
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.datasets import locate
+from pgo_models.graphs.g2o import name_of
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.memory import check_memory
 from pgo_models.problem.problem import PGOProblem
-from solvers.cli.inputs import Dropped, indefinite_matrices, kept_edges, load_graph
+from pgo_models.problem.thresholds import EdgeResiduals
+from solvers.cli.inputs import Dropped, GraphOptions, indefinite_matrices, kept_edges, load_graph
 from solvers.cli.shell import command_to_type, wrapped
 from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
 from solvers.reporting.graph_facts import memory_note, memory_of_a_solve
@@ -32,6 +36,14 @@ from solvers.solution import Solution, note_of_weights
 MORE_MEMORY = (
     "raise the limit, or share it among machines: pgo solve --robots K --address HOST:PORT"
 )
+if TYPE_CHECKING:  # what commands that solve nothing do not need
+    from solvers.readings import ReadingComparison
+
+# Ratios of the cost to the expected one beyond which other readings of a file are tried,
+_FAR_ABOVE = 10.0
+_BELOW = 0.1
+_FEW_EDGES = 500  # up to which that takes hardly longer than the solve
+_FEW_FOR_NOISE = 5000  # edges up to which the noise is estimated in a few seconds
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -117,6 +129,77 @@ def edge_fit_of_solution(solution: Solution, graph: str, dropped: Dropped) -> Ed
         return fit
     num_edges = len(fit.residuals.cost)
     return replace(fit, places=places_of_edges(graph, dropped, num_edges))
+
+
+def advice_on_reading(comparison: "ReadingComparison", graph: str) -> Advice:
+    """What a file seems to mean, and the command that writes it so."""
+    reading = comparison.proposed[0].reading.value
+    name = name_of(Path(graph))
+    command = ["pgo", "info", graph, "--reading", reading, "--out", f"{name}.{reading}.g2o"]
+    return Advice(comparison.sentence(), shlex.join(command))
+
+
+def advice_on_file(fit: EdgeFit, graph: PoseGraph, source: GraphOptions) -> list[Advice]:
+    """Advice where the cost is far from what is expected: what the file may mean instead.
+
+    Where all matrices are the identity, the noise is estimated that they say nothing of.
+    """
+    if not source.is_as_written:
+        return []
+    advice = _advice_on_noise(graph, source)
+    residuals = fit.suspected
+    if advice or not _is_far_off(residuals):
+        return advice
+    doctor = shlex.join(["pgo", "doctor", source.graph])
+    if residuals.overall > _FAR_ABOVE:
+        text = (
+            f"{fit.cost} is {residuals.overall:.3g} times what is expected. Ask whether the file "
+            "means something else than it says."
+        )
+        return [Advice(text, doctor)] if len(residuals.cost) > _FEW_EDGES else []
+    return fit.advice_on_scale(doctor)
+
+
+def reading_that_is_meant(fit: EdgeFit, source: GraphOptions) -> list[Advice]:
+    """The other reading of a small file that is likely meant, where the cost is far off."""
+    is_small = len(fit.residuals.cost) <= _FEW_EDGES
+    if not (is_small and _is_far_off(fit.suspected) and source.is_as_written):
+        return []
+    if not _can_be_read_again(source.graph):
+        return []
+    from solvers.readings import compare_readings
+
+    with suppress(PGOError):  # the file may have changed since it was read
+        comparison = compare_readings(source.graph, trust_folder=source.trust_folder)
+        if comparison.proposed:
+            return [advice_on_reading(comparison, source.graph)]
+    return []
+
+
+def _is_far_off(residuals: EdgeResiduals) -> bool:
+    """Whether the cost is far above or below what is expected, beyond chance."""
+    is_far_above = residuals.overall > max(_FAR_ABOVE, residuals.overall_allowed)
+    return is_far_above or 0.0 < residuals.overall < min(_BELOW, residuals.overall_least)
+
+
+def _advice_on_noise(graph: PoseGraph, source: GraphOptions) -> list[Advice]:
+    """Advice to take the noise of the edges for weights, where the file has no other ones."""
+    information = graph.information
+    if information is None or len(information) > _FEW_FOR_NOISE:
+        return []
+    if not (information == np.eye(information.shape[1])).all():
+        return []
+    from solvers.noise import estimate_noise
+
+    try:
+        estimate = estimate_noise(graph.unit_weights())
+    except PGOError:  # nothing tells the noise
+        return []
+    text = (
+        "All information matrices are the identity. The errors are another noise: of "
+        f"{estimate}. Solve with it."
+    )
+    return [Advice(text, f"pgo solve {source.in_commands} --estimate-noise")]
 
 
 def show_advice(advice: list[Advice]) -> None:

@@ -11,12 +11,26 @@ from pgo_models.errors import SettingError
 from pgo_models.files import check_writable
 from pgo_models.graphs.datasets import known_datasets
 from pgo_models.graphs.g2o import write_g2o
+from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.separators import report_partition
 from solvers.cli.explanations import explained_by_its_graph
-from solvers.cli.inputs import chosen_partition, indefinite_matrices, load_graph
-from solvers.cli.options import SkipUnknownOption, Split, SplitOption, TrustFolderOption
+from solvers.cli.inputs import (
+    chosen_partition,
+    indefinite_matrices,
+    load_graph,
+    with_estimated_noise,
+)
+from solvers.cli.options import (
+    EstimateNoiseOption,
+    LargestComponentOption,
+    SkipUnknownOption,
+    Split,
+    SplitOption,
+    TrustFolderOption,
+    UnitWeightsOption,
+)
 from solvers.cli.shell import JsonOption, figures_of_facts, save_then_show, wrapped
 from solvers.reporting.graph_facts import describe_graph
 from solvers.reporting.versions import installation
@@ -38,13 +52,17 @@ def info_command(
     split: SplitOption = None,
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
-    square_roots: Annotated[
-        bool,
+    largest_component: LargestComponentOption = False,
+    unit_weights: UnitWeightsOption = False,
+    estimate_noise: EstimateNoiseOption = False,
+    reading: Annotated[
+        Reading,
         typer.Option(
-            "--square-roots",
-            help="The matrices of a g2o file are square roots of information, as iSAM writes them.",
+            metavar="READING",
+            help="What the lines of a g2o file mean, if not what its format says (see pgo doctor): "
+            f"{', '.join(reading.value for reading in Reading)}.",
         ),
-    ] = False,
+    ] = Reading.AS_WRITTEN,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -67,11 +85,14 @@ def info_command(
             _check_out(out)
         loaded = load_graph(
             graph,
-            False,
+            unit_weights or estimate_noise,
             skip_unknown,
-            square_roots=square_roots,
+            reading=reading,
             trust_folder=trust_folder,
+            largest_component=largest_component,
         )
+        if estimate_noise:
+            loaded = with_estimated_noise(loaded)
         facts, record = _describe_graph(graph, loaded, robots, split)
         if out is not None:
             targets = [(out, partial(write_g2o, loaded))]

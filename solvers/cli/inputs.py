@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate, places_of_edges
 from pgo_models.graphs.g2o import read_g2o_poses
+from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition, suited_partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
@@ -49,9 +51,16 @@ class GraphOptions:
     drop_edge: Dropped = None
     rotations: bool = False
     trust_folder: bool = False
+    largest_component: bool = False
+    estimate_noise: bool = False
 
     def __post_init__(self) -> None:
         asked = self._asked
+        if self.estimate_noise and self.chosen_cost is Cost.UNIT:
+            (option,) = list(asked)[:1]
+            raise SettingError(
+                f"--estimate-noise and {option} ask for different weights; leave out one"
+            )
         if len(set(asked.values())) > 1:
             first, second = list(asked)[:2]
             raise SettingError(f"{first} and {second} ask for different costs; leave out one")
@@ -77,14 +86,16 @@ class GraphOptions:
 
     def loaded(self) -> PoseGraph:
         """The graph, without the edges to leave out."""
-        has_unit_weights = self.chosen_cost is Cost.UNIT
-        return load_graph(
+        has_unit_weights = self.chosen_cost is Cost.UNIT or self.estimate_noise
+        loaded = load_graph(
             self.graph,
             has_unit_weights,
             self.skip_unknown,
             self.drop_edge,
             trust_folder=self.trust_folder,
+            largest_component=self.largest_component,
         )
+        return with_estimated_noise(loaded) if self.estimate_noise else loaded
 
     def problem(self, loaded: PoseGraph) -> PGOProblem:
         """Problem of the loaded graph, with the cost that was asked for, or its own.
@@ -116,6 +127,13 @@ class GraphOptions:
         return PGOProblem(loaded, weighting=Weighting.INFORMATION)
 
     @property
+    def is_as_written(self) -> bool:
+        """Whether the whole graph is solved, with the weights of its file."""
+        is_whole = not (self.drop_edge or self.rotations or self.largest_component)
+        has_own_weights = self.chosen_cost is not Cost.UNIT and not self.estimate_noise
+        return is_whole and has_own_weights and not self.skip_unknown
+
+    @property
     def in_commands(self) -> str:
         """The name of the graph with all these options, as one types them."""
         options = {
@@ -123,6 +141,8 @@ class GraphOptions:
             "--drop-coupling": self.drop_coupling,
             "--skip-unknown": self.skip_unknown,
             "--trust-folder": self.trust_folder,
+            "--largest-component": self.largest_component,
+            "--estimate-noise": self.estimate_noise,
         }
         cost = self.chosen_cost
         if cost in (Cost.ISOTROPIC, Cost.UNIT):
@@ -170,13 +190,14 @@ def load_graph(
     unit_weights: bool,
     skip_unknown: bool = False,
     dropped: Dropped = None,
-    square_roots: bool = False,
+    reading: Reading = Reading.AS_WRITTEN,
     trust_folder: bool = False,
+    largest_component: bool = False,
 ) -> PoseGraph:
     """Graph of a file, folder or data set, without the edges to leave out.
 
-    Its weights are its own, or with `unit_weights` those of the paper. With `square_roots`, its
-    file has square roots of information matrices. The rest is as for `read_g2o`.
+    With `largest_component`, the poses and edges of other components are left out, too. The rest is
+    as for `read_g2o`.
     """
     # Both need memory, which the graph might leave none of.
     take_buffers()
@@ -184,14 +205,37 @@ def load_graph(
         import_cvxopt()
     loaded = load(
         graph,
+        reading=reading,
+        unit_weights=unit_weights,
         skip_unknown=skip_unknown,
-        square_roots=square_roots,
         trust_folder=trust_folder,
     )
     if dropped:
         kept, _ = kept_edges(graph, dropped)
         loaded = loaded.without_edges(~kept)
-    return loaded.unit_weights() if unit_weights else loaded
+    return _largest_component(loaded) if largest_component else loaded
+
+
+def with_estimated_noise(graph: PoseGraph) -> PoseGraph:
+    """The graph with weights of the noise that its edges have; what that is goes to stderr."""
+    from solvers.noise import estimate_noise
+
+    estimate = estimate_noise(graph)
+    print(f"pgo: noise of {estimate}, estimated from the measurements", file=sys.stderr)
+    return estimate.graph
+
+
+def _largest_component(graph: PoseGraph) -> PoseGraph:
+    """The largest component of a graph; a GraphWarning says what is left out."""
+    largest, *others = graph.components()
+    if not others:
+        return graph
+    part = graph.subgraph(largest)
+    poses = f"{graph.num_poses - part.num_poses} poses (with {graph.pose_name(others[0][0])})"
+    edges = f"{graph.num_edges - part.num_edges} edges"
+    kept = f"the largest of {len(others) + 1} components is taken"
+    warnings.warn(f"{graph.name}: {kept}, without {poses} and {edges}", GraphWarning, stacklevel=2)
+    return part
 
 
 def kept_edges(graph: str, dropped: Dropped) -> tuple[BoolArray, list[str]]:

@@ -92,6 +92,22 @@ SkipUnknownOption = Annotated[
         "--skip-unknown", help="Skip lines of a g2o file with unknown tags, and say which."
     ),
 ]
+LargestComponentOption = Annotated[
+    bool,
+    typer.Option(
+        "--largest-component",
+        help="Take the largest component of a graph in parts, and say what is left out: other "
+        "parts, and poses without edges.",
+    ),
+]
+EstimateNoiseOption = Annotated[
+    bool,
+    typer.Option(
+        "--estimate-noise",
+        help="Find the noise of odometry and closures from how well they fit each other, say what "
+        "it is, and take the weights of it, whatever matrices the file has.",
+    ),
+]
 TrustFolderOption = Annotated[
     bool,
     typer.Option(

@@ -23,8 +23,10 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.cli import choices
 from solvers.cli.explanations import (
+    advice_on_file,
     edge_fit_of_solution,
     explained_by_its_graph,
+    reading_that_is_meant,
     say_memory_of_solve,
     show_advice,
     warn_of_weights,
@@ -45,10 +47,12 @@ from solvers.cli.options import (
     CostOption,
     DropCouplingOption,
     DropEdgeOption,
+    EstimateNoiseOption,
     FirstStage,
     GapOption,
     GraphArgument,
     InformationOption,
+    LargestComponentOption,
     ProofOption,
     Robust,
     RotationsOption,
@@ -164,6 +168,8 @@ def solve_command(
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
+    largest_component: LargestComponentOption = False,
+    estimate_noise: EstimateNoiseOption = False,
     anchor: Annotated[
         int | None,
         typer.Option(
@@ -227,6 +233,8 @@ def solve_command(
         drop_edge,
         rotations,
         trust_folder,
+        largest_component,
+        estimate_noise,
     )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
@@ -577,6 +585,11 @@ def _save_and_show(
     def show() -> None:
         typer.echo(wrapped(_text_with_error(solution), _INDENT))
         is_robust = stages.robust is not None
+        if not is_robust:
+            meant = reading_that_is_meant(judged(), source)
+            show_advice(meant or advice_on_file(judged(), solution.problem.graph, source))
+            if meant:  # then the edges need not be wrong
+                return
         show_advice(judged().advice(f"pgo solve {command_source}", is_robust=is_robust))
 
     record = solution.as_json if display.as_json else None

@@ -22,6 +22,7 @@ _POLISHING_STEPS = 20  # factorisations towards the minimum of chi2, before edge
 # Ratio of the cost to the expected one below which the standard deviations in the file are at least
 # twice too large.
 _PESSIMISTIC = 0.25
+_FAR_BELOW = 0.01  # ratio below which matrices are hardly those of the errors
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,29 @@ class EdgeFit:
             text = f"The worst edge is {worst}: solve without it."
             suggestions.append(Advice(text, f"{solve} --drop-edge {name}"))
         return suggestions
+
+    def advice_on_scale(self, doctor: str) -> list[Advice]:
+        """Return the advice to look at the information matrices, if they claim far too little.
+
+        Parameters
+        ----------
+        doctor : str
+            Command that tries other readings of the graph.
+
+        Returns
+        -------
+        list of Advice
+            At most one piece.
+        """
+        residuals = self.suspected
+        overall = residuals.overall
+        if not 0.0 < overall < min(_FAR_BELOW, residuals.overall_least):
+            return []
+        text = (
+            f"{self.cost} is {overall:.2g} times what is expected: the information matrices claim "
+            f"too little, as errors are {overall**-0.5:.2g} times smaller, or they are covariances."
+        )
+        return [Advice(text, doctor)]
 
     def advice(self, solve: str, is_robust: bool) -> list[Advice]:
         """Return all advice; on edges only if the solve was not robust, else it has tried that.

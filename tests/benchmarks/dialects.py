@@ -1,35 +1,44 @@
-"""What pgo makes of the data files that GTSAM comes with: every dialect of pose graphs, and files
-that are none (extra `peers`).
+"""What pgo makes of pose graphs as people have them: every form in which lines are written, in
+files that this script writes itself, and the data files that GTSAM comes with (extra `peers`).
 
-    python tests/benchmarks/dialects.py [--seconds 60] [FILE ..]
+    python tests/benchmarks/dialects.py [--seconds 60] [--gtsam] [FILE ..]
 
-All files of GTSAM's folder `Data`, or those that are named. A row has what the file holds, the
-verdict of `solve` with F and the proven gap, its CPU seconds, and what was assumed in reading, or
-why the file is refused. A solve ends after so many seconds at its best poses.
+Without arguments, small files of every form. With `--gtsam`, all files of GTSAM's folder `Data`;
+else those that are named. A row has what the file holds, the verdict of `solve` and the proven gap,
+its CPU seconds, and what was assumed in reading, or why the file is refused. Of the files of this
+script it also has the reading that `pgo doctor` names. A solve ends after so many seconds at its
+best poses.
 """
 
 from __future__ import annotations
 
 import argparse
+import gzip
 import importlib.util
 import os
+import tempfile
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"
 
+import numpy as np
+
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import PGOError
 from pgo_models.figures import rounded_up
+from solvers.readings import compare_readings
 
 HEAD = (
-    "| file | poses | points | edges | F | gap | verdict | CPU s | assumed, or refused because |\n"
+    "| file | poses | points | edges | cost | gap | verdict | CPU s | assumed, or why refused |\n"
     "|---|---|---|---|---|---|---|---|---|"
 )
 SHOWN = 300  # characters of a reason
+STD = 0.02  # noise of the files of this script, metres and half of it in radians
 
 
 def folder_of_gtsam() -> Path:
@@ -40,13 +49,98 @@ def folder_of_gtsam() -> Path:
     return Path(spec.origin).parent / "Data"
 
 
+def walk(d: int, folder: Path) -> list[str]:
+    """Lines of a walk on a lattice, as g2o writes them."""
+    noise = pgo.NoiseModel(translation_std=STD, rotation_std=0.5 * STD)
+    graph = pgo.grid_world(1, 60, np.random.default_rng(d), d=d, noise=noise)
+    pgo.write_g2o(graph, folder / "walk.g2o")
+    return (folder / "walk.g2o").read_text().splitlines()
+
+
+def changed(lines: list[str], change, which: str = "EDGE") -> list[str]:
+    """Lines of which some have other words behind the tag."""
+    result = []
+    for line in lines:
+        tag, *words = line.split()
+        if not tag.startswith(which):
+            result.append(line)
+            continue
+        result.append(" ".join(change([tag, *words])))
+    return result
+
+
+def is_closure(words: list[str]) -> bool:
+    return abs(int(words[1]) - int(words[2])) > 1
+
+
+def swapped(words: list[str]) -> list[str]:
+    return [words[0], words[2], words[1], *words[3:]] if is_closure(words) else words
+
+
+def in_degrees(words: list[str]) -> list[str]:
+    return [*words[:5], repr(float(np.rad2deg(float(words[5])))), *words[6:]]
+
+
+def in_toro_order(words: list[str]) -> list[str]:
+    xx, xy, xt, yy, yt, tt = words[6:]
+    return [*words[:6], xx, xy, yy, tt, xt, yt]
+
+
+def inverted(words: list[str]) -> list[str]:
+    """Diagonal matrices as covariances."""
+    return [*words[:6], *(repr(1.0 / float(word)) if float(word) else word for word in words[6:])]
+
+
+def complete(words: list[str]) -> list[str]:
+    xx, xy, xt, yy, yt, tt = words[6:]
+    return [*words[:6], xx, xy, xt, xy, yy, yt, xt, yt, tt]
+
+
+def switchable(words: list[str]) -> list[str]:
+    if not is_closure(words):
+        return words
+    return ["EDGE_SE2_SWITCHABLE", *words[1:3], "9999", *words[3:]]
+
+
+def forms(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Names and lines of small files, one of every form."""
+    plane = walk(2, folder)
+    space = walk(3, folder)
+    yield "plain_2d", plane
+    yield "plain_3d", space
+    yield "no_information", changed(plane, lambda words: words[:6])
+    yield "complete_matrices", changed(plane, complete)
+    yield "tutorial", [f"TUTORIAL_{line}" for line in plane]
+    yield "online", [f"ONLINE_{line}" for line in space]
+    yield "without_quat", [line.replace(":QUAT", "") for line in space]
+    switches = ["VERTEX_SWITCH 9999 1", "EDGE_SWITCH_PRIOR 9999 1 1.0"]
+    yield "switchable", switches + changed(plane, switchable)
+    fixes = [f"EDGE_SE3_PRIORXYZ {k} {k} {k % 3} {k % 5} 1 0 0 1 0 1" for k in range(0, 60, 7)]
+    yield "hdl_priors", [*space, *fixes, "EDGE_SE3_PRIORQUAT 0 1 0 0 0 9 0 0 9 0 9"]
+    laser = ["ROBOTLASER1 0 -1.57 3.14 0.01 30 0.1 0 2 1.0 2.0"]
+    yield "kernels_and_data", laser + changed(plane, lambda words: [*words, "Huber", "1.0"])
+    yield "comments", ["// a walk", *(f"{line} # line" for line in plane)]
+    yield "fortran", [line.replace("e-", "D-") for line in plane]
+    yield "decimal_comma", [line.replace(".", ",") for line in plane]
+    yield "repeated_vertices", plane + [line for line in plane if line.startswith("VERTEX")]
+    yield "several_fix", ["FIX 0", "FIX 7", *plane]
+    yield "missing_vertex", plane[1:]
+    yield "isolated_vertex", ["VERTEX_SE2 777 0 0 0", *plane]
+    yield "toro_order", changed(plane, in_toro_order)
+    yield "closures_reversed", changed(plane, swapped)
+    yield "degrees", changed(plane, in_degrees)
+    yield "covariances", changed(plane, inverted)
+    gps = [f"EDGE_PRIOR_SE2_XY {k} {k} 0 1 0 1" for k in range(5)]
+    yield "gps_alone", gps
+
+
 def without_path(text: str, path: Path) -> str:
     """A message without the path of the file, on one line that fits a table."""
     on_one_line = text.replace(str(path), "").replace("\n", "; ").lstrip(": ")
     return on_one_line.replace("|", "/")[:SHOWN]
 
 
-def row(path: Path, seconds: float) -> str:
+def row(path: Path, seconds: float, with_readings: bool) -> str:
     """Row of the table for one file."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -58,14 +152,17 @@ def row(path: Path, seconds: float) -> str:
             reason = without_path(str(error), path)
             return f"| {path.name} | - | - | - | - | - | refused | - | {reason} |"
     spent = time.process_time() - began
-    notes = dict.fromkeys(without_path(str(warning.message), path) for warning in caught)
+    notes = list(dict.fromkeys(without_path(str(warning.message), path) for warning in caught))
+    if with_readings:
+        with warnings.catch_warnings(action="ignore"):
+            notes += [f"read {fit.text}?" for fit in compare_readings(path).proposed]
     certificate = solution.certificate
     cells = [
         path.name,
         len(graph.bodies),
         len(graph.landmarks),
         graph.num_edges,
-        rounded_up(certificate.objective_at_most, 7),
+        f"{solution.problem.cost_name} {rounded_up(certificate.objective_at_most, 7)}",
         rounded_up(certificate.proven_gap, 2),
         solution.verdict.name,
         f"{spent:.2f}",
@@ -74,17 +171,33 @@ def row(path: Path, seconds: float) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
+def show(paths: list[Path], seconds: float, with_readings: bool) -> None:
+    print(HEAD)
+    for path in sorted(paths, key=lambda path: path.name.lower()):
+        print(row(path, seconds, with_readings), flush=True)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description="GTSAM's data files, read and solved")
+    parser = argparse.ArgumentParser(description="pose graphs as people have them, and GTSAM's")
     parser.add_argument("files", nargs="*", type=Path)
+    parser.add_argument("--gtsam", action="store_true")
     parser.add_argument("--seconds", type=float, default=60.0)
     arguments = parser.parse_args()
-    files = arguments.files
-    if not files:
-        files = [path for path in folder_of_gtsam().iterdir() if path.is_file()]
-    print(HEAD)
-    for path in sorted(files, key=lambda path: path.name.lower()):
-        print(row(path, arguments.seconds), flush=True)
+    if arguments.files or arguments.gtsam:
+        gtsam = folder_of_gtsam().iterdir() if arguments.gtsam else []
+        files = [*arguments.files, *(path for path in gtsam if path.is_file())]
+        show(files, arguments.seconds, with_readings=False)
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        paths = []
+        for form, lines in forms(folder):
+            path = folder / f"{form}.g2o"
+            path.write_text("\n".join(lines) + "\n")
+            paths.append(path)
+        packed = folder / "compressed.g2o.gz"
+        packed.write_bytes(gzip.compress((folder / "plain_2d.g2o").read_bytes()))
+        show([*paths, packed], arguments.seconds, with_readings=True)
 
 
 if __name__ == "__main__":

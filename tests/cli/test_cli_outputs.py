@@ -173,7 +173,7 @@ def test_info_writes_another_dialect_as_g2o(pgo_command, tmp_path):
     assert "taken as covariances" in err
     assert "10 is added to the ids of landmarks" in err
     roots = tmp_path / "roots.g2o"
-    code, _, err = pgo_command("info", path, "--square-roots", "--out", roots, "--json")
+    code, _, err = pgo_command("info", path, "--reading", "square-roots", "--out", roots, "--json")
     assert code == 0
     assert "covariances" not in err
     written = [pgo.read_g2o(out) for out in (information, roots)]

@@ -13,6 +13,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, log_map, random_rotations
 from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
 from pgo_models.graphs.g2o_dialects import landmark_shift
+from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.g2o_rows import numbers_of
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import Chi2Convention, chi2
@@ -111,12 +112,12 @@ def test_edge3_without_a_matrix_has_the_identity(folder: Path) -> None:
     identity = triangle(np.eye(6))
     measured = ["1 2 3 0.1 0.2 0.3", "0 1 0 -0.1 0.5 0.7", "3 1 2 0.3 0.2 0.1"]
     whole = [f"EDGE3 {e} {e + 1} {text} {identity}" for e, text in enumerate(measured)]
-    vertex = "VERTEX3 0 0 0 0 0 0 0"
-    expected = read(folder, [vertex, *whole])
+    vertices = [f"VERTEX3 {k} 0 0 0 0 0 0" for k in range(4)]
+    expected = read(folder, [*vertices, *whole])
     short = [f"EDGE3 {e} {e + 1} {text}" for e, text in enumerate(measured)]
-    graph = read_with_notes(folder, [vertex, *short], "3 EDGE3 lines have no matrix", "identity")
+    graph = read_with_notes(folder, [*vertices, *short], "3 EDGE3 lines have no matrix", "identity")
     assert_same_edges(graph, expected, rtol=0)
-    mixed = [vertex, whole[0], short[1], whole[2]]
+    mixed = [*vertices, whole[0], short[1], whole[2]]
     graph = read_with_notes(folder, mixed, "1 EDGE3 lines have no matrix")
     assert_same_edges(graph, expected, rtol=0)
     with pytest.raises(FileFormatError, match=r":2: EDGE3 needs 2 ids and 27 numbers"):
@@ -126,7 +127,8 @@ def test_edge3_without_a_matrix_has_the_identity(folder: Path) -> None:
 def test_edge3_of_isam_is_taken_as_information_and_said(folder: Path) -> None:
     line = f"EDGE3 0 1 1 2 3 0.1 0.2 0.3 {triangle(np.eye(6))}"
     read_with_notes(folder, [line], "EDGE3 matrices are taken as information", "square roots")
-    read(folder, ["VERTEX3 0 0 0 0 0 0 0", line])  # TORO's, without a warning
+    vertices = ["VERTEX3 0 0 0 0 0 0 0", "VERTEX3 1 1 2 3 0 0 0"]
+    read(folder, [*vertices, line])  # TORO's, without a warning
 
 
 @given(seed=SEEDS)
@@ -465,7 +467,7 @@ def test_square_roots_are_those_of_the_information(
             spellings.append([line.replace(tag, name) for line in roots])
     for lines in spellings:
         path.write_text("\n".join(lines))
-        assert_same_edges(read_g2o(path, square_roots=True), expected, rtol=1e-9)
+        assert_same_edges(read_g2o(path, reading=Reading.SQUARE_ROOTS), expected, rtol=1e-9)
 
 
 PLANE = [
@@ -508,7 +510,8 @@ def test_damaged_lines_are_read_or_refused_with_their_place(
     path.write_text(" ".join(parts))
     problem = str(path)
     try:
-        graph = read_g2o(path, square_roots=roots)
+        reading = Reading.SQUARE_ROOTS if roots else Reading.AS_WRITTEN
+        graph = read_g2o(path, reading=reading)
         for values in (graph.kappa, graph.tau, graph.information):
             assert np.isfinite(values).all()
     except FileFormatError as error:

@@ -84,7 +84,7 @@ def write(folder: Path, *lines: str) -> Path:
             ["translation block"],
         ),
         ([EDGE_3D, EDGE_3D[:-5] + "1 1 1.0000000000000004"], ":2", ["rotation block"]),
-        ([VERTEX_3D, EDGE_3D, VERTEX_3D], ":3", ["second VERTEX line of pose 0", "line 1"]),
+        ([VERTEX_3D, EDGE_3D, f"{VERTEX_3D}2"], ":3", ["second VERTEX line of pose 0", "line 1"]),
         ([EDGE_3D, EDGE_3D, EDGE_2D], ":3", ["2D and 3D", "line 1"]),
         ([EDGE_3D, "FIX first"], ":2", ["id 'first' is no integer"]),
         (
@@ -186,7 +186,7 @@ def test_information_is_the_upper_triangle_by_rows(tmp_path: Path) -> None:
 
 
 def test_coupling_blocks_may_be_anything(tmp_path: Path) -> None:
-    path = write(tmp_path, "EDGE_SE2 0 1 1 2 0.5 1 0 100 1 0 1")
+    path = write(tmp_path, "EDGE_SE2 0 1 1 2 0.5 1 0 -100 1 0 1")
     assert np.linalg.eigvalsh(information_of(2, read_lines(path).edges))[0, 0] < 0
 
 

@@ -127,7 +127,7 @@ def test_landmarks_in_the_plane_are_seen_in_the_frame_of_the_pose(tmp_path: Path
 @pytest.mark.parametrize("offset", ["", "0 "])
 def test_landmarks_in_space(tmp_path: Path, offset: str) -> None:
     lines = (f"EDGE_SE3_TRACKXYZ {k} 9 {offset}1 2 3 10 1 2 20 3 30" for k in (0, 1))
-    graph = read(tmp_path, ODOMETRY_3D, *lines, "VERTEX_TRACKXYZ 9 1 1 1")
+    graph = read(tmp_path, ODOMETRY_3D, *lines)
     assert graph.landmarks.tolist() == [2]
     np.testing.assert_array_equal(
         graph.information[2][:3, :3], [[10, 1, 2], [1, 20, 3], [2, 3, 30]]

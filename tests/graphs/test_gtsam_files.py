@@ -11,6 +11,7 @@ from graphs import random_poses
 import pgo_models as pgo
 from pgo_models.errors import FileFormatError
 from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import Chi2Convention, chi2
 
@@ -23,7 +24,7 @@ LOADED = {
     "Klaus3.g2o": (3, 0, 3, ""),
     "cityTrees_reduced_1k.g2o": (1000, 66, 1405, "LANDMARK2"),
     "edge_se3_trackxyz_example.g2o": (1, 1, 1, ""),
-    "edge_se3_trackxyz_missing_vertex.g2o": (1, 1, 1, ""),
+    "edge_se3_trackxyz_missing_vertex.g2o": (1, 1, 1, "they are placed along edges"),
     "edge_se3_trackxyz_nonidentity_offset.g2o": (1, 1, 1, ""),
     "edge_se3_trackxyz_zero_range.g2o": (1, 1, 1, ""),
     "example.graph": (95, 24, 516, "BR"),
@@ -135,3 +136,61 @@ def test_odometry_of_victoria_park_is_that_of_its_loader() -> None:
     information = graph.information[np.flatnonzero(~to_landmark)]
     first = factors.at(0).noiseModel()
     np.testing.assert_allclose(information[0], first.information(), rtol=1e-9, atol=0)
+
+
+AS_WRITTEN = Reading.AS_WRITTEN
+ROUND_TRIPS = [
+    ("full_3x3", AS_WRITTEN),
+    ("comments", AS_WRITTEN),
+    ("tutorial_tags", AS_WRITTEN),
+    ("switchable", AS_WRITTEN),
+    ("toro_order", AS_WRITTEN),
+    ("kernel_and_data", AS_WRITTEN),
+    ("closures_reversed", Reading.CLOSURES_REVERSED),
+    ("degrees", Reading.DEGREES),
+    ("covariances_for_information", Reading.COVARIANCES),
+]
+
+
+def assert_gtsam_reads_the_same(graph: PoseGraph, path: Path) -> None:
+    import gtsam
+
+    factors, _ = gtsam.readG2o(str(path), graph.d == 3)
+    assert factors.size() == graph.num_edges
+    for seed in range(3):
+        poses = random_poses(graph.num_poses, graph.d, seed)
+        ours = chi2(graph, poses, Chi2Convention.GTSAM)
+        np.testing.assert_allclose(2 * factors.error(values_of(poses)), ours, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize(("name", "reading"), ROUND_TRIPS)
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+def test_what_is_read_is_written_as_gtsam_reads_it(
+    name: str, reading: Reading, pgo_command, tmp_path: Path
+) -> None:
+    case = Path(__file__).parents[1] / "cases" / f"{name}.g2o"
+    plain = tmp_path / "plain.g2o"
+    code, _, err = pgo_command("info", case, "--reading", reading.value, "--out", plain)
+    assert code == 0, err
+    assert_gtsam_reads_the_same(pgo.load(case, reading=reading), plain)
+
+
+TRIANGLE = "9 1 0 0 2 0 8 0 1 0 0 7 0 0 1 30 1 2 40 3 50"
+IN_SPACE = {
+    "EDGE3": "EDGE3 {} 1 2 3 0.1 0.2 0.3 " + TRIANGLE,
+    "EDGE_SE3": "EDGE_SE3 {} 1 2 3 0.1 0.2 0.3 0.9 " + TRIANGLE,
+    "w first": "EDGE_SE3:QUAT {} 1 2 3 0.9 0.1 0.2 0.3 " + TRIANGLE,
+    "switchable": "EDGE_SE3_SWITCHABLE {} 77 1 2 3 0.1 0.2 0.3 0.9 " + TRIANGLE,
+    "no matrix": "EDGE_SE3:QUAT {} 1 2 3 0.1 0.2 0.3 0.9",
+}
+
+
+@pytest.mark.parametrize("kind", IN_SPACE)
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+def test_lines_in_space_are_written_as_gtsam_reads_them(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "space.g2o"
+    path.write_text("\n".join(IN_SPACE[kind].format(ends) for ends in ("0 1", "1 2", "0 2")))
+    reading = Reading.W_FIRST if kind == "w first" else AS_WRITTEN
+    graph = pgo.read_g2o(path, reading=reading, unit_weights=kind == "no matrix")
+    pgo.write_g2o(graph, tmp_path / "plain.g2o")
+    assert_gtsam_reads_the_same(graph, tmp_path / "plain.g2o")

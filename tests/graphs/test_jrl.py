@@ -17,6 +17,7 @@ from pgo_models.errors import FileFormatError, GraphWarning, SettingError
 from pgo_models.geometry.rotations import log_map, quaternions_from_rotations
 from pgo_models.graphs.datasets import places_of_edges
 from pgo_models.graphs.g2o import read_g2o, symbol_ids, write_g2o
+from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.jrl import read_jrl
 from pgo_models.graphs.pose_graph import PoseGraph
 
@@ -321,8 +322,8 @@ def test_files_that_are_no_logs_are_refused(tmp_path: Path, data: bytes, words: 
 
 
 def test_square_roots_are_refused_of_a_log_which_has_covariances(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="has covariances, and no square roots; leave"):
-        pgo.load(write(tmp_path, LOG), square_roots=True)
+    with pytest.raises(SettingError, match="says what it has, covariances; leave square-roots out"):
+        pgo.load(write(tmp_path, LOG), reading=Reading.SQUARE_ROOTS)
 
 
 def test_2d_and_3d_measurements_do_not_go_together(tmp_path: Path) -> None:

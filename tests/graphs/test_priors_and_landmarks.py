@@ -165,7 +165,7 @@ def line(k: int, d: int) -> np.ndarray:
         ),
         (
             chain().with_prior(np.array([1]), Poses.identity(1, 3), 1.0, 0.0),
-            r"position of 1 poses \(with the world\)",
+            "the priors of chain measure rotations alone",
         ),
         (
             chain().with_weights(np.array([1.0, 0, 1]), np.ones(3)),

@@ -213,7 +213,7 @@ def test_unit_weights_are_the_paper_s_equation() -> None:
 def test_a_graph_in_pieces_is_no_problem() -> None:
     graph = random_geometric(6, np.random.default_rng(0))
     apart = replace(graph, num_poses=7, initial=None, truth=None)
-    with pytest.raises(GraphError, match=r"pose graph has 2 components \(sizes 6, 1"):
+    with pytest.raises(GraphError, match="pose 6 has no edges; leave out"):
         PGOProblem(apart)
 
 

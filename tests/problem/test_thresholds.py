@@ -13,6 +13,7 @@ from scipy.stats import chi2
 import pgo_models as pgo
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import exp_map
+from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 from pgo_models.problem.initialization import chordal_start, spanning_tree
 from pgo_models.problem.thresholds import EdgeResiduals, chi2_thresholds, edge_residuals
@@ -177,10 +178,21 @@ def test_a_tree_has_nothing_to_test_by():
     assert not found.is_doubtful
 
 
+def test_degrees_of_freedom_of_chi2_are_measurements_less_unknowns():
+    grid = pgo.load("grid")
+    information = isotropic_information(grid.kappa, grid.tau, grid.d)
+    problem = pgo.PGOProblem(
+        replace(grid, information=information), weighting=Weighting.INFORMATION
+    )
+    found = edge_residuals(problem, grid.truth)
+    assert found.freedom == pytest.approx(6 * (108 - 26), rel=1e-12)
+    assert 0.0 < found.overall_least < 1.0 < found.overall_allowed
+
+
 def test_where_nothing_costs_anything_no_edge_has_a_share():
     def of(cost):
         return EdgeResiduals(
-            np.zeros(2), np.zeros(2), np.array(cost), np.full(2, 12.0), 1.0, 0.0, 2.0
+            np.zeros(2), np.zeros(2), np.array(cost), np.full(2, 12.0), 1.0, 0.0, 2.0, 1.0
         )
 
     assert of([0.0, 0.0]).share.tolist() == [0.0, 0.0]

@@ -434,7 +434,7 @@ def test_semidefinite_matrices_are_verified_whole_and_indefinite_ones_refused(
     # The poses 1.73, 0.13, -0.69 cost 10.735.
     assert found.bound is not None
     assert 10.72 < float(found.bound) < 10.735
-    path.write_text(SEMIDEFINITE.replace("100 0 100 100", "100 0 101 100"))
+    path.write_text(SEMIDEFINITE.replace("100 0 100 100", "100 0 -101 100"))
     assert "an information matrix is indefinite" in verify_proof(path, proof).failure
 
 

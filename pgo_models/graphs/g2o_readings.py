@@ -1,0 +1,142 @@
+"""Other meanings that the lines of a g2o file may have, as people write them.
+
+Nothing in a file says from which end an edge is measured, where the w of a quaternion stands, or
+what the unit of an angle is. A `Reading` is one such meaning for all lines of a file.
+"""
+
+import enum
+
+import numpy as np
+
+from pgo_models.errors import SettingError
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.g2o_tags import Noise, Tag
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
+
+_MILLIMETRE = 1e-3  # metres
+
+
+class Reading(enum.Enum):
+    """What the lines of a g2o file are taken to mean; all but the first differ from g2o's format.
+
+    Odometry are the edges between poses whose ids follow each other in the file; closures are all
+    other edges between poses. Priors and edges to landmarks are not reversed. Lengths in
+    millimetres and angles in degrees become metres and radians, and the information matrices are
+    then left as they are.
+    """
+
+    AS_WRITTEN = "as-written"
+    CLOSURES_REVERSED = "closures-reversed"
+    ODOMETRY_REVERSED = "odometry-reversed"
+    REVERSED = "reversed"
+    W_FIRST = "w-first"
+    DEGREES = "degrees"
+    TORO_ORDER = "toro-order"
+    COVARIANCES = "covariances"
+    SQUARE_ROOTS = "square-roots"
+    CLOSURES_IN_MILLIMETRES = "closures-in-millimetres"
+    ODOMETRY_IN_MILLIMETRES = "odometry-in-millimetres"
+
+    @classmethod
+    def of(cls, given: object) -> "Reading":
+        """Return a reading that is given itself, or by its value or name in any case.
+
+        Parameters
+        ----------
+        given : object
+            A Reading, or a word such as "w-first".
+
+        Returns
+        -------
+        Reading
+            The reading; a SettingError is raised where there is no such one.
+        """
+        word = given.lower().replace("_", "-") if isinstance(given, str) else given
+        try:
+            return cls(word)
+        except ValueError:
+            words = ", ".join(reading.value for reading in cls)
+            raise SettingError(f"the reading is {given!r:.60}; give one of {words}") from None
+
+    @property
+    def text(self) -> str:
+        """The reading in words."""
+        return _TEXTS[self]
+
+    @property
+    def dimension(self) -> int | None:
+        """The dimension, 2 or 3, of the files that can be read like this; None for both."""
+        of_one_dimension = {Reading.W_FIRST: 3, Reading.DEGREES: 2, Reading.TORO_ORDER: 2}
+        return of_one_dimension.get(self)
+
+    @property
+    def converts_units(self) -> bool:
+        """Whether measured numbers are multiplied, so that their last digits have other units."""
+        return self is Reading.DEGREES or self in _IN_MILLIMETRES
+
+
+_TEXTS = {
+    Reading.AS_WRITTEN: "as written",
+    Reading.CLOSURES_REVERSED: "with the closures reversed",
+    Reading.ODOMETRY_REVERSED: "with the odometry reversed",
+    Reading.REVERSED: "with all edges reversed",
+    Reading.W_FIRST: "with w first in quaternions",
+    Reading.DEGREES: "with angles in degrees",
+    Reading.TORO_ORDER: "with matrices in TORO's order, ff fs ss rr fr sr",
+    Reading.COVARIANCES: "with covariances in place of information matrices",
+    Reading.SQUARE_ROOTS: "with square roots U of information matrices U^T U",
+    Reading.CLOSURES_IN_MILLIMETRES: "with the closures in millimetres",
+    Reading.ODOMETRY_IN_MILLIMETRES: "with the odometry in millimetres",
+}
+_REVERSED = {Reading.CLOSURES_REVERSED, Reading.ODOMETRY_REVERSED, Reading.REVERSED}
+_IN_MILLIMETRES = {Reading.CLOSURES_IN_MILLIMETRES, Reading.ODOMETRY_IN_MILLIMETRES}
+_OF_CLOSURES = {Reading.CLOSURES_REVERSED, Reading.CLOSURES_IN_MILLIMETRES}
+
+
+def noise_as(reading: Reading, tag: Tag) -> Noise:
+    """What the matrices on lines of a tag are."""
+    if tag.has_matrix and reading is Reading.SQUARE_ROOTS:
+        return Noise.SQUARE_ROOT
+    if tag.has_matrix and reading is Reading.COVARIANCES:
+        return Noise.COVARIANCE
+    return tag.noise
+
+
+def numbers_as(reading: Reading, tag: Tag, numbers: Array) -> Array:
+    """Numbers on lines of a tag, (n, num_numbers), with quaternions and angles as g2o has them."""
+    if reading is Reading.W_FIRST and tag.has_quaternion:
+        w_last = [*range(3), 4, 5, 6, 3, *range(7, numbers.shape[1])]
+        return np.asarray(numbers[:, w_last])
+    has_heading = tag.d == 2 and not tag.is_point
+    if reading is Reading.DEGREES and has_heading:
+        numbers = numbers.copy()
+        numbers[:, 2] = np.deg2rad(numbers[:, 2])
+    return numbers
+
+
+def edges_as(
+    reading: Reading, ids: IntArray, rows: Array, d: int, to_landmark: BoolArray
+) -> tuple[IntArray, Array]:
+    """Ids, (m, 2), and rows of all EDGE lines of a file, read as `reading` says.
+
+    `to_landmark`, (m,), says which edges end at a landmark.
+    """
+    if reading not in _REVERSED | _IN_MILLIMETRES:
+        return ids, rows
+    between_poses = (ids[:, 0] != WORLD_ID) & ~to_landmark
+    chosen = between_poses
+    if reading is not Reading.REVERSED:
+        is_odometry = _joins_neighbours(ids, between_poses)
+        chosen = between_poses & (is_odometry != (reading in _OF_CLOSURES))
+    if reading in _REVERSED:
+        return np.where(chosen[:, None], ids[:, ::-1], ids), rows
+    rows = rows.copy()
+    rows[chosen, :d] *= _MILLIMETRE
+    return ids, rows
+
+
+def _joins_neighbours(ids: IntArray, between_poses: BoolArray) -> BoolArray:
+    """Whether edges join poses whose ids follow each other among those that edges name, (m,)."""
+    known = np.unique(ids[between_poses])
+    places = np.searchsorted(known, ids)
+    return np.asarray(np.abs(places[:, 0] - places[:, 1]) == 1)

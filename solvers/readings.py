@@ -1,0 +1,326 @@
+"""Which reading of a g2o file is meant: its edges, solved as written and under other readings.
+
+The right reading of consistent measurements leaves the residuals that their noise explains, and a
+wrong one leaves inconsistent loops. So the costs at the optima tell readings apart, but only as far
+as chance does not: see `ReadingFit`.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.certificates.fit import Fit
+from pgo_models.errors import FAILURES, FileFormatError
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.datasets import load, locate
+from pgo_models.graphs.g2o import g2o_files
+from pgo_models.graphs.g2o_parser import read_lines
+from pgo_models.graphs.g2o_readings import Reading
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import edge_residuals
+from solvers.pipeline import solve
+from solvers.request import Pipeline
+from solvers.riemannian.newton import Newton
+
+# Factors by which lengths, or angles of less than a turn, are made smaller.
+_SHRINKING = {
+    Reading.CLOSURES_IN_MILLIMETRES: 1e-3,
+    Reading.ODOMETRY_IN_MILLIMETRES: 1e-3,
+    Reading.DEGREES: math.pi / 180.0,
+}
+# Readings that are the same as another one, or change units alone, if they change all edges.
+_OF_SOME_EDGES = (
+    Reading.CLOSURES_REVERSED,
+    Reading.ODOMETRY_REVERSED,
+    Reading.CLOSURES_IN_MILLIMETRES,
+    Reading.ODOMETRY_IN_MILLIMETRES,
+)
+# A reading is proposed from this evidence on, odds of 10,000 to one. It also has to be clearly
+# better: its cost is smaller by the next factor. Where the weights are others, so that the costs
+# cannot be compared, the cost is off by a factor of _LEAST_MISFIT from what is expected as written,
+# and by _MOST_MISFIT at most as proposed. Many files claim a hundredth of the information that they
+# have, and mean no square roots.
+_LEAST_EVIDENCE = math.log(1e4)
+_LEAST_RATIO = 10.0
+_LEAST_MISFIT = {
+    Reading.COVARIANCES: 30.0,
+    Reading.SQUARE_ROOTS: 1000.0,
+    Reading.TORO_ORDER: 1000.0,
+}
+_MOST_MISFIT = 10.0
+_CLOSE = math.log(1e3)  # difference of evidence up to which a reading is named beside the best
+_TURN = 2.0 * math.pi  # no program writes larger angles in radians
+# There is nothing to gain from a second attempt or a better bound under a wrong reading.
+_PLAIN = Pipeline(
+    newton=Newton(max_iterations=30),
+    growing=None,
+    second_try=False,
+    staircase=None,
+    handedness=None,
+)
+_QUESTIONS = {
+    Reading.CLOSURES_REVERSED: "were they written from j to i?",
+    Reading.ODOMETRY_REVERSED: "was it written from j to i?",
+    Reading.REVERSED: "were they written from j to i?",
+    Reading.W_FIRST: "were they written as w x y z?",
+    Reading.DEGREES: "were they written in degrees?",
+    Reading.TORO_ORDER: "were they written in this order?",
+    Reading.COVARIANCES: "are they covariances?",
+    Reading.SQUARE_ROOTS: "are they square roots?",
+    Reading.CLOSURES_IN_MILLIMETRES: "were they written in millimetres?",
+    Reading.ODOMETRY_IN_MILLIMETRES: "was it written in millimetres?",
+}
+
+
+@dataclass(frozen=True)
+class ReadingFit:
+    """How well the measurements of a file fit each other under a reading.
+
+    Parameters
+    ----------
+    reading : Reading
+        The reading.
+    num_changed : int
+        How many edges of the graph it changes.
+    cost : float
+        Least cost that was found, nan if the file cannot be read or solved like this.
+    times_expected : float
+        The cost over its expectation, if errors have the covariances of the matrices; 0 if there is
+        no redundancy.
+    evidence : float
+        Log-odds for this reading against the file as written, natural logarithm. Let c and c' be
+        the costs and f the degrees of freedom. For readings with the same weights it is f / 2
+        log(c / c'), whatever the scale of the noise. Where lengths or angles are made smaller, c'
+        is divided by the square of the factor first, as noise becomes smaller, too. Readings of the
+        matrices have other weights: with x and x' the costs over their expectations, it is f / 2
+        (h(x) - h(x')), h(x) = x - 1 - log x, by which the likelihoods of the scale 1 differ.
+    """
+
+    reading: Reading
+    num_changed: int
+    cost: float = math.nan
+    times_expected: float = math.nan
+    evidence: float = -math.inf
+
+    @property
+    def text(self) -> str:
+        """The reading in words, with the number of edges if it is about some of them."""
+        words = self.reading.text
+        closures = "closure" if self.num_changed == 1 else "closures"
+        return words.replace("the closures", f"the {self.num_changed} {closures}")
+
+    @property
+    def question(self) -> str:
+        """What to ask whoever wrote the file."""
+        question = _QUESTIONS[self.reading]
+        return question.replace("were they", "was it") if self.num_changed == 1 else question
+
+
+@dataclass(frozen=True)
+class ReadingComparison:
+    """The readings of a file, and which of them fits it better than what is written.
+
+    Parameters
+    ----------
+    cost_name : str
+        Name of the cost: chi2, or F where the file has no chi2.
+    written : ReadingFit
+        The file as written.
+    others : tuple of ReadingFit
+        The file under the other readings that change it.
+    proposed : tuple of ReadingFit
+        Those that fit better beyond chance, the best first. It is empty for files that mean what
+        they say, and where nothing can be told.
+    """
+
+    cost_name: str
+    written: ReadingFit
+    others: tuple[ReadingFit, ...]
+    proposed: tuple[ReadingFit, ...]
+
+    def sentence(self) -> str:
+        """Return the costs as written and as proposed, and the question that they raise."""
+        written = _with_share(self.written)
+        if not self.proposed:
+            return f"{self.cost_name} {written}: no other reading fits better beyond chance."
+        best, *others = self.proposed
+        text = f"{self.cost_name} {written}, {_with_share(best)}: {best.question}"
+        if others:
+            text += f" Nearly as likely: {' or '.join(fit.text for fit in others)}."
+        return text
+
+    def __str__(self) -> str:
+        lines = [f"{'reading':<26}{self.cost_name:>12}{'times expected':>16}"]
+        for fit in (self.written, *self.others):
+            lines.append(f"{fit.reading.value:<26}{fit.cost:>12.4g}{fit.times_expected:>16.3g}")
+        return "\n".join(lines)
+
+
+def compare_readings(
+    name_or_path: str | Path,
+    *,
+    unit_weights: bool = False,
+    skip_unknown: bool = False,
+    trust_folder: bool = False,
+) -> ReadingComparison:
+    """Solve a g2o file as written and under every other `Reading`, and compare the costs.
+
+    Each reading is solved once, by Newton's method from its usual start: ten solves at most.
+    Nothing is claimed of a file whose edges all fit as closely as its numbers can tell, and nothing
+    that chance could explain.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        As for `load`; a JSON robot log leaves no choice.
+    unit_weights, skip_unknown, trust_folder : bool
+        As for `read_g2o`.
+
+    Returns
+    -------
+    ReadingComparison
+        Costs under all readings, and those that are proposed.
+
+    Raises
+    ------
+    PGOError
+        As for `load` and `solve`, when the file cannot be read or solved as written.
+
+    Examples
+    --------
+    >>> comparison = compare_readings("grid")
+    >>> comparison.written.reading.text, comparison.proposed
+    ('as written', ())
+    """
+
+    def read(reading: Reading) -> PoseGraph:
+        return load(
+            name_or_path,
+            reading=reading,
+            unit_weights=unit_weights,
+            skip_unknown=skip_unknown,
+            trust_folder=trust_folder,
+        )
+
+    graph = read(Reading.AS_WRITTEN)
+    problem = PGOProblem(graph)
+    solution = solve(problem, _PLAIN)
+    residuals = edge_residuals(problem, solution.poses)
+    written = ReadingFit(Reading.AS_WRITTEN, 0, solution.objective, residuals.overall, 0.0)
+    has_large_angles = _has_large_angles(name_or_path, graph.d)
+    trial = _Trial(graph, written, residuals.freedom, read, has_large_angles)
+    with warnings.catch_warnings(action="ignore"):  # of the reader, once more
+        fits = [trial.fit(reading) for reading in Reading if reading is not Reading.AS_WRITTEN]
+    others = tuple(fit for fit in fits if fit is not None)
+    has_noise = residuals.overall > 0.0 and solution.certificate.fit is Fit.NONE
+    proposed = _proposed(others, written) if has_noise else ()
+    return ReadingComparison(problem.cost_name, written, others, proposed)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A graph as written, and what is needed to solve it under another reading."""
+
+    graph: PoseGraph
+    written: ReadingFit
+    freedom: float
+    read: Callable[[Reading], PoseGraph]
+    has_large_angles: bool
+
+    def fit(self, reading: Reading) -> ReadingFit | None:
+        """The fit under a reading; None if it is not for this file, or changes nothing."""
+        if reading.dimension not in (None, self.graph.d):
+            return None
+        try:
+            graph = self.read(reading)
+        except FileFormatError:  # as of covariances that are not definite
+            return None
+        changed = _changed_edges(graph, self.graph)
+        num_changed = int(changed.sum())
+        if num_changed == 0 or (changed.all() and reading in _OF_SOME_EDGES):
+            return None
+        try:
+            problem = PGOProblem(graph)
+            solution = solve(problem, _PLAIN)
+            overall = edge_residuals(problem, solution.poses).overall
+        except FAILURES:  # of linear algebra, with numbers that mean nothing
+            return ReadingFit(reading, num_changed)
+        evidence = self._evidence(reading, solution.objective, overall)
+        return ReadingFit(reading, num_changed, solution.objective, overall, evidence)
+
+    def _evidence(self, reading: Reading, cost: float, times_expected: float) -> float:
+        """Log-odds, see `ReadingFit`."""
+        half_freedom = 0.5 * self.freedom
+        if not (cost > 0 and times_expected > 0 and self.written.cost > 0):
+            return -math.inf
+        if reading in _LEAST_MISFIT:
+            misfit = _misfit(self.written.times_expected) - _misfit(times_expected)
+            return half_freedom * misfit
+        return half_freedom * math.log(self.written.cost / self._comparable(reading, cost))
+
+    def _comparable(self, reading: Reading, cost: float) -> float:
+        """A cost as it were if lengths or angles had not been made smaller."""
+        if reading is Reading.DEGREES and self.has_large_angles:
+            return cost
+        return cost / _SHRINKING.get(reading, 1.0) ** 2
+
+
+def _misfit(times_expected: float) -> float:
+    """h(x) = x - 1 - log x, zero where the cost is what is expected."""
+    return times_expected - 1.0 - math.log(times_expected)
+
+
+def _proposed(fits: tuple[ReadingFit, ...], written: ReadingFit) -> tuple[ReadingFit, ...]:
+    """Readings that fit better beyond chance, and nearly as well as the best of them."""
+    better = [fit for fit in fits if fit.evidence >= _LEAST_EVIDENCE and _is_clear(fit, written)]
+    better.sort(key=lambda fit: -fit.evidence)
+    return tuple(fit for fit in better if fit.evidence >= better[0].evidence - _CLOSE)
+
+
+def _is_clear(fit: ReadingFit, written: ReadingFit) -> bool:
+    """Whether a reading fits not only beyond chance, but clearly better."""
+    if fit.reading not in _LEAST_MISFIT:
+        return fit.cost * _LEAST_RATIO <= written.cost
+    if not 1.0 / _MOST_MISFIT <= fit.times_expected <= _MOST_MISFIT:
+        return False
+    # Covariances and square roots of less than one make the cost too small. One that is too large
+    # is more often that of a wrong edge, which larger covariances would only hide.
+    least_misfit = _LEAST_MISFIT[fit.reading]
+    is_too_small = written.times_expected <= 1.0 / least_misfit
+    is_too_large = written.times_expected >= least_misfit
+    return is_too_small or (is_too_large and fit.reading is Reading.TORO_ORDER)
+
+
+def _changed_edges(graph: PoseGraph, other: PoseGraph) -> BoolArray:
+    """Whether edges of two readings of a file differ, (m,)."""
+    changed = graph.i != other.i
+    for name in ("R_ij", "t_ij", "kappa", "tau", "information"):
+        values = getattr(graph, name)
+        if values is not None:
+            differs = (values != getattr(other, name)).reshape(graph.num_edges, -1)
+            changed = changed | differs.any(axis=1)
+    return np.asarray(changed)
+
+
+def _has_large_angles(name_or_path: str | Path, d: int) -> bool:
+    """Whether files in the plane have angles of more than a turn."""
+    if d == 3:
+        return False
+    with warnings.catch_warnings(action="ignore"):
+        files = [
+            read_lines(path, skip_unknown=True, needs_matrices=False)
+            for path in g2o_files(locate(name_or_path))
+        ]
+    return any((np.abs(file.edges[:, 2]) > _TURN).any() for file in files)
+
+
+def _with_share(fit: ReadingFit) -> str:
+    """Cost and reading, and the cost over its expectation."""
+    return f"{fit.cost:.3g} {fit.text} ({fit.times_expected:.3g} times what is expected)"
