@@ -15,7 +15,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from pgo_models.errors import FAILURES, GraphError, SettingError
+from pgo_models.errors import FAILURES, GraphError, SettingError, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
@@ -277,6 +277,7 @@ class GrowingSolution:
         """Return the solution of a whole graph that has grown out of this one."""
         edges = _new_edges(self.graph, graph)
         if edges is None:
+            _check_grown(self.graph, graph)
             problem = PGOProblem(graph, self.backend, self.weighting)
             start = extended_poses(problem, self.graph.pose_ids, self.poses)
             return GrowingSolution._at(problem, start)._solved_afresh()
@@ -310,6 +311,7 @@ def extend(
 ) -> GrowingSolution: ...
 
 
+@door
 def extend(
     solution: Solution | GrowingSolution,
     graph: PoseGraph,
@@ -382,6 +384,7 @@ def extend(
         if isinstance(solution, Solution):
             solution = GrowingSolution.of(solution)
         return solution._with_whole(graph)
+    _check_grown(solution.problem.graph, graph)
     pipeline = pipeline if pipeline is not None else Pipeline()
     weighting = solution.problem.weighting
     if not isinstance(weighting, Weighting):
@@ -391,6 +394,27 @@ def extend(
     grown = _solve_from(problem, pipeline, start, robots, engine)
     before = solution.ledger if isinstance(solution, Solution) else None
     return replace(grown, ledger=_joined(before, grown.ledger))
+
+
+def _check_grown(before: PoseGraph, graph: PoseGraph) -> None:
+    """Raise a GraphError unless a graph has grown out of another one: measures what that does."""
+    if graph.d != before.d:
+        raise GraphError(
+            f"{graph.name} is in {graph.d} dimensions and {before.name}, which was solved, in "
+            f"{before.d}; solve it on its own"
+        )
+    if not _measurements(before) & _measurements(graph):
+        raise GraphError(
+            f"{graph.name} has none of the measurements of {before.name}, which was solved; "
+            "give the whole graph, earlier edges included, or solve it on its own"
+        )
+
+
+def _measurements(graph: PoseGraph) -> set[tuple[int, int, bytes]]:
+    """The edges of a graph: ids of their poses, and what is measured."""
+    ids = graph.pose_ids
+    edges = zip(ids[graph.i].tolist(), ids[graph.j].tolist(), graph.t_ij, graph.R_ij, strict=True)
+    return {(i, j, t_ij.tobytes() + R_ij.tobytes()) for i, j, t_ij, R_ij in edges}
 
 
 def _solve_from(

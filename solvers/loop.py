@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
 from pgo_models.activity import Activity
-from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.errors import NotPositiveDefiniteError, SettingError, door, fitted_arguments
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.problem import PGOProblem, as_problem
+from pgo_models.problem.problem import PGOProblem
 from solvers.progress import StageLine, Table, is_shown
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
 
@@ -105,6 +105,7 @@ class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
         """
 
 
+@door
 def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]:
     """Yield state 0, state 1, .. without end.
 
@@ -133,10 +134,24 @@ def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iter
     >>> [problem.objective(Newton().poses(problem, state)) < 200 for state in states]
     [True, True, True, True]
     """
+    problem, start = _fitted(method, problem, start)
+    return _states(method, problem, start)
+
+
+def _states(method: Method[P, X, S], problem: P, start: X | None) -> Iterator[S]:
     state = method.init(problem, start)
     while True:
         yield state
         state = method.step(problem, state)
+
+
+def _fitted(method: Method[Any, Any, Any], problem: object, start: object) -> tuple[Any, Any]:
+    """Problem and start as `init` of the method wants them, by its annotations."""
+    init = type(method).init
+    _, problem, start = fitted_arguments(
+        init, (method, problem, start), f"{type(method).__name__}: "
+    )
+    return problem, start
 
 
 @overload
@@ -162,6 +177,7 @@ def run(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> Outcome[S]: ...
+@door
 def run(
     method: Method[Any, Any, S],
     problem: Any,
@@ -221,6 +237,7 @@ def run(
     >>> run(Newton(), problem, callback=lambda state, record: record.k == 2).status.name
     'STOPPED'
     """
+    problem, start = _fitted(method, problem, start)
     return RunMonitor(time_limit, verbose, progress, callback).run(method, problem, start, earlier)
 
 
@@ -290,8 +307,6 @@ class RunMonitor:
     ) -> Outcome[S]:
         """Run a method on a problem of its kind: the loop."""
         solver = cast(Solver[S], method) if hasattr(method, "poses") else None
-        if solver is not None:
-            problem = as_problem(problem)
         name = type(method).__name__
         tolerance = getattr(method, "tolerance", 0.0)
         line = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
@@ -88,6 +88,8 @@ class Pipeline:
     >>> [stage.name for stage in solve(load("grid"), pipeline).stages]
     ['chordal start', 'SOC', 'Newton']
     """
+
+    _way_out: ClassVar[str] = "give Pipeline(soc=SOC(..)), or run(SOC(..))"
 
     soc: FirstStage = AUTO
     newton: Newton = field(default_factory=Newton)

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parent.parent
 ORDER = {
     "pgo_models": (
         "lazy_names",
+        "annotations",
         "errors",
         "activity",
         "figures",

@@ -74,7 +74,7 @@ from pgo_models.certificates.definiteness import (
 from pgo_models.certificates.dual_variables import check_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, door
 from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
@@ -136,6 +136,7 @@ class LowerBound:
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
 
 
+@door
 def prove_bound(
     problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Poses | None = None
 ) -> float | None:

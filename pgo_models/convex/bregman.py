@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import cvxpy as cp
 import numpy as np
@@ -81,6 +81,8 @@ class BregmanProblem(HoldsModel):
     >>> problem.residual(np.array([0.0, 0.0, 2.0])).tolist()
     [0.0]
     """
+
+    _way_out: ClassVar[str] = "BregmanProblem(J, variables, K, f) makes one: min J(x), K x = f"
 
     J: Any
     variables: Any
@@ -185,7 +187,10 @@ class BregmanProblem(HoldsModel):
 def _checked_variables(J: Any, given: Any) -> tuple[cp.Variable, ...]:  # noqa: ANN401 - checked here
     """The given variables as a tuple; a SettingError unless J is convex and has no others."""
     convex_solver.check_convex(J, "J")
-    variables = (given,) if isinstance(given, cp.Variable) else tuple(given)
+    listed = [given] if isinstance(given, cp.Variable) else given
+    if not isinstance(listed, Sequence):
+        raise SettingError(f"variables is a {type(given).__name__}; give a list of variables")
+    variables = tuple(listed)
     for position, variable in enumerate(variables):
         convex_solver.check_variable(variable, f"variables[{position}]")
     ids = {variable.id for variable in variables}

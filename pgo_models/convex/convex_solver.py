@@ -11,7 +11,7 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.lin_ops.lin_utils import get_id
 
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import PGOError, SettingError, check_settings
 from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.rotations import Array
 
@@ -97,7 +97,7 @@ def check_convex(expression: cp.Expression, name: str) -> None:
 def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constraint]) -> None:
     """Raise a SettingError unless they are lists of convex numbers, and of convex constraints."""
     for name, given in (("terms", terms), ("constraints", constraints)):
-        if isinstance(given, cp.Expression | cp.Constraint):
+        if not isinstance(given, Sequence):
             raise SettingError(f"{name} is one {type(given).__name__}; give a list: {name}=[..]")
     for position, term in enumerate(terms):
         check_convex(term, f"terms[{position}]")
@@ -127,7 +127,7 @@ class ConvexSolver:
     Parameters
     ----------
     name : str
-        One of `cp.installed_solvers()`: "CLARABEL", "MOSEK", "SCS", "OSQP", ..
+        One of `cp.installed_solvers()`, in any case: "CLARABEL", "MOSEK", "SCS", "OSQP", ..
     options : mapping
         Options of the solver. They win over those that a model sets: tolerances, of first-order
         methods no finer than 1e-7, and a limit of iterations for Clarabel, SCS and OSQP; none for
@@ -155,12 +155,15 @@ class ConvexSolver:
     warm_start: bool = True
 
     def __post_init__(self) -> None:
-        if self.name not in cp.installed_solvers():
+        check_settings(self)
+        name = self.name.upper()
+        if name not in cp.installed_solvers():
             installed = ", ".join(cp.installed_solvers())
             raise SettingError(
                 f"solver {self.name!r} is not installed; "
                 f"cvxpy finds {installed}; see cvxpy's manual"
             )
+        object.__setattr__(self, "name", name)
 
     @property
     def is_first_order(self) -> bool:

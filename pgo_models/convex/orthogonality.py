@@ -9,7 +9,7 @@ in solvers/convex/orthogonal.py.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import cvxpy as cp
 import numpy as np
@@ -116,6 +116,10 @@ class OrthogonalProblem(HoldsModel):
     >>> OrthogonalProblem(nearest, rotations=[X])
     OrthogonalProblem((3, 3) Rotations)
     """
+
+    _way_out: ClassVar[str] = (
+        "OrthogonalProblem(problem, rotations=[X]) makes one of a cvxpy Problem"
+    )
 
     problem: Any
     orthogonal: Sequence[Any] = ()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
-from pgo_models.errors import GraphError, PGOError
+from pgo_models.errors import GraphError, PGOError, SettingError
 from pgo_models.geometry.rotations import Array
 
 T = TypeVar("T", bound="NDArray[Any] | csc_array | csr_array")
@@ -81,6 +81,12 @@ def whole_array(values: object, name: str, error: type[PGOError] = GraphError) -
     if not _needs_copy(array, np.int64):
         return array
     return read_only(np.array(array, dtype=np.int64, order="C"))
+
+
+def check_shape(values: NDArray[Any], shape: tuple[int, ...], name: str) -> None:
+    """Raise a SettingError unless an array has this shape."""
+    if values.shape != shape:
+        raise SettingError(f"{name} has shape {values.shape}; give {shape}")
 
 
 def whole_number(value: object, name: str, error: type[PGOError] = GraphError) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 
 from pgo_models.convex import bregman as forms
 from pgo_models.convex.bregman import BregmanPoint, BregmanProblem, Subproblem
-from pgo_models.convex.convex_solver import COLD, TOLERANCE, ConvexSolver, finite_array
+from pgo_models.convex.convex_solver import COLD, TOLERANCE, ConvexSolver, as_solver, finite_array
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.result import Measurement, Status
@@ -96,6 +96,7 @@ class BregmanSettings:
             finite=["alpha", "tolerance", "subproblem_tolerance"],
             not_negative=["max_iterations"],
         )
+        as_solver(self.solver)  # raises unless it is installed
 
     def compiled(self, subproblem: Subproblem) -> Subproblem:
         """The subproblem with the solver of these settings."""

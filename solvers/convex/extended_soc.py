@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import cvxpy as cp
 import numpy as np
 
-from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
+from pgo_models.convex.convex_solver import ConvexSolver, as_solver, solve_compiled
 from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
 from pgo_models.errors import GraphError, PGOError, SettingError, check_settings
 from pgo_models.geometry.poses import Poses
@@ -14,7 +14,6 @@ from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_t
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.result import Measurement, Status
 from solvers.soc.joint import Joint, SOCState
 from solvers.soc.penalty import MultiplierPenalty
@@ -97,6 +96,7 @@ class ExtendedSOC:
 
     def __post_init__(self) -> None:
         check_settings(self)
+        as_solver(self.solver)  # raises unless it is installed
         coupling = self.soc.effective_coupling
         if coupling is not Coupling.JOINT:
             raise SettingError(
@@ -136,12 +136,7 @@ class ExtendedSOC:
         SettingError
             Unless the cost of the problem is F.
         """
-        if problem.weighting is not Weighting.ISOTROPIC:
-            raise SettingError(
-                "terms are added to F, with two precisions an edge; use Weighting.ISOTROPIC"
-            )
-        rho = np.ones(problem.num_poses)
-        return graph_qp(problem.graph, rho, changer=self.changer, solver=self.solver)
+        return graph_qp(problem, 1.0, changer=self.changer, solver=self.solver)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """Make one iteration of SOC."""

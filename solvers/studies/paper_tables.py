@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import PGOError, SettingError, check_settings
+from pgo_models.errors import PGOError, SettingError, check_settings, door
 from pgo_models.graphs.datasets import load
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, published_rows
@@ -188,6 +188,7 @@ class Reproduction:
     is_complete: bool
 
 
+@door
 def reproduce_tables(
     settings: ReproductionSettings | None = None,
     keep: Path | None = None,

@@ -378,7 +378,7 @@ def test_an_iterate_that_is_not_finite_is_said_to_be() -> None:
 
 def test_a_penalty_for_every_pose_is_not_the_paper_s() -> None:
     with pytest.raises(
-        SettingError, match="must be FixedPenalty or BalancedPenalty or BoydPenalty"
+        SettingError, match="must be a FixedPenalty or a BalancedPenalty or a BoydPenalty"
     ):
         paper(penalty=MultiplierPenalty()).init(varied_problem(0, 5, 2), None)
 
