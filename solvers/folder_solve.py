@@ -24,6 +24,7 @@ from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.own_files import READ_HERE, OpenedFiles, open_files, write_answer
 from solvers.distributed.robots_with_files import RobotsWithFiles
@@ -43,7 +44,7 @@ from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 
 
 @dataclass(frozen=True, eq=False)
-class FolderSolution:
+class FolderSolution(Summarised):
     """What the driver knows of a solve by robots that have their own files.
 
     The poses are in the files that the robots write, and not here.

@@ -105,17 +105,23 @@ class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
         """
 
 
+@overload
+def iterate(
+    method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None
+) -> Iterator[S]: ...
+@overload
+def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]: ...
 @door
-def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]:
+def iterate(method: Method[Any, Any, S], problem: Any, start: Any = None) -> Iterator[S]:
     """Yield state 0, state 1, .. without end.
 
     Parameters
     ----------
     method : Method
         Settings with `init` and `step`.
-    problem : P
-        A problem of the kind that the method solves.
-    start : X, optional
+    problem : PGOProblem, PoseGraph or P
+        A problem of the kind that the method solves; a PGOProblem or a PoseGraph for a Solver.
+    start : Poses or X, optional
         Where it starts; at its own start unless given.
 
     Yields

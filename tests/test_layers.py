@@ -22,6 +22,7 @@ ORDER = {
         "verification",
         "memory",
         "html_tables",
+        "summaries",
         "files",
         "geometry",
         "graphs",

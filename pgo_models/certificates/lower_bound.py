@@ -82,6 +82,7 @@ from pgo_models.graphs.pose_graph import IntArray, middle_pose
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum
 from pgo_models.problem.matrices import inner, rotation_columns
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 
 # Share of the wanted gap that eta may cost; the rest is for poses a little off the optimum.
 _ETA_SHARE = 0.5
@@ -98,7 +99,7 @@ NEGLIGIBLE = 0.01
 
 
 @dataclass(frozen=True)
-class LowerBound:
+class LowerBound(Summarised):
     """A proven lower bound on F over all poses.
 
     Parameters

@@ -24,6 +24,7 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.matrices import residual_matrix, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 
 
 class Unknowns(enum.Enum):
@@ -169,7 +170,7 @@ Changer = Callable[[PoseVariables], ModelChange]
 
 
 @dataclass(frozen=True, eq=False)
-class GraphQP:
+class GraphQP(Summarised):
     """A compiled R-subproblem on the poses of a graph.
 
     Parameters

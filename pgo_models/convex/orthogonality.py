@@ -33,6 +33,7 @@ from pgo_models.convex.convex_solver import (
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 
 _IN_SET = 1e-6  # distance from a set up to which a point counts as one of its points
 # The sets of the arguments of OrthogonalProblem; Sparse comes with a number for every variable.
@@ -45,7 +46,7 @@ _SETS: dict[str, ConstraintSet] = {
 
 
 @dataclass(frozen=True)
-class Term:
+class Term(Summarised):
     """One non-convex constraint: a variable is in a set.
 
     Parameters
@@ -435,7 +436,7 @@ class SplitProblem(HoldsModel):
 
 
 @dataclass(frozen=True, eq=False)
-class KKTResiduals:
+class KKTResiduals(Summarised):
     """How far a point is from satisfying the KKT conditions of the non-convex problem.
 
     Parameters

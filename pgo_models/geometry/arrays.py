@@ -12,6 +12,7 @@ from scipy.sparse import csc_array, csr_array
 
 from pgo_models.errors import GraphError, PGOError, SettingError
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 
 T = TypeVar("T", bound="NDArray[Any] | csc_array | csr_array")
 
@@ -19,7 +20,7 @@ T = TypeVar("T", bound="NDArray[Any] | csc_array | csr_array")
 _EXACT = 2.0**53
 
 
-class ReadOnly:
+class ReadOnly(Summarised):
     """Base of frozen objects with arrays, which stay read-only in a pickle or a deep copy.
 
     Cached properties are not copied: the copy computes them when they are asked for.

@@ -19,13 +19,14 @@ from pgo_models.graphs.residuals import edge_errors
 from pgo_models.problem.edge_cost import isotropic_cost
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 
 # Probability of any misfit when all measurement errors have the covariances of their matrices.
 FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeResiduals:
+class EdgeResiduals(Summarised):
     """Residuals and costs of every edge at some poses, with the thresholds of chi-square tests.
 
     Parameters

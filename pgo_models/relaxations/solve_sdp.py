@@ -33,6 +33,7 @@ from pgo_models.relaxations.primal_dual import (
     primal_relaxation,
 )
 from pgo_models.relaxations.rounding import RankReport
+from pgo_models.summaries import Summarised
 
 DEFAULT_RELAXATION_GAP = 1e-5
 TOLERANCE = 1e-10
@@ -56,7 +57,7 @@ class RelaxationStatus(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class RelaxationSolution:
+class RelaxationSolution(Summarised):
     """Rounded poses, a proven bound, and how the relaxation was solved.
 
     Parameters

@@ -22,13 +22,14 @@ from pgo_models.convex.bregman import BregmanPoint, BregmanProblem, Subproblem
 from pgo_models.convex.convex_solver import COLD, TOLERANCE, ConvexSolver, as_solver, finite_array
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 
 # States.
 
 
 @dataclass(frozen=True, eq=False)
-class _ExactState:
+class _ExactState(Summarised):
     """Iterate k of a form that minimises over the whole of x."""
 
     k: int
@@ -66,7 +67,7 @@ class MultiplierState(_ExactState):
 
 
 @dataclass(frozen=True, eq=False)
-class AlternatingState:
+class AlternatingState(Summarised):
     """Iterate k of `AlternatingBregman`."""
 
     k: int

@@ -27,6 +27,7 @@ from pgo_models.convex.orthogonality import (
 )
 from pgo_models.errors import SettingError, check_settings, door
 from pgo_models.geometry.rotations import Array, as_generator
+from pgo_models.summaries import Summarised
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
 from solvers.soc.anderson import over_relax
@@ -45,7 +46,7 @@ _BALANCE_RATIO = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class OrthogonalState:
+class OrthogonalState(Summarised):
     """Iterate k.
 
     Parameters
@@ -277,7 +278,7 @@ class OrthogonalSOC:
 
 
 @dataclass(frozen=True, eq=False)
-class OrthogonalSolution:
+class OrthogonalSolution(Summarised):
     """The best of several runs.
 
     Parameters

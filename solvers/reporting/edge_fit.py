@@ -14,6 +14,7 @@ from pgo_models.graphs.precisions import indefinite_edges, text_of_indefinite
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.riemannian.polish import polish
 
 _SAME_COST = 1e-9  # relative difference below which chi2 and F are one cost
@@ -33,7 +34,7 @@ class Advice:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeFit:
+class EdgeFit(Summarised):
     """Costs of the edges at some poses, in the cost that shows best whether the edges fit.
 
     That cost is chi2 wherever the file has information matrices. F has only two precisions for an

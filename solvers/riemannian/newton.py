@@ -10,6 +10,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton_step import NewtonFigures
 from solvers.riemannian.polish import (
@@ -22,7 +23,7 @@ SMALL = 1000  # poses in space up to which Newton alone is faster
 
 
 @dataclass(frozen=True, eq=False)
-class NewtonState:
+class NewtonState(Summarised):
     """State k: the poses and factorisations of `solvers.riemannian.polish`."""
 
     k: int

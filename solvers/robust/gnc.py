@@ -43,6 +43,7 @@ from pgo_models.errors import check_quantile, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 from solvers.robust.losses import HARD_CONTROL, RobustLoss
 from solvers.robust.value_equality import ValueEquality
@@ -251,7 +252,7 @@ E = TypeVar("E", bound=ReweightedEdges)
 
 
 @dataclass(frozen=True, eq=False)
-class ScheduleState(Generic[E]):
+class ScheduleState(Summarised, Generic[E]):
     """State k: position in the schedule, sums over the edges, and the edges with the poses."""
 
     k: int

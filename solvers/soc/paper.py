@@ -36,6 +36,7 @@ from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.matrices import assemble, block_entries, norm, rotation_columns
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty
 from solvers.soc.r_step import BackEnd, RotationStep, RStep, RSubproblem, prepare
@@ -72,7 +73,7 @@ class Blocks:
 
 
 @dataclass(frozen=True, eq=False)
-class PaperState:
+class PaperState(Summarised):
     """Iterate k of the paper's recursion; names as in Algorithm 1.
 
     Parameters

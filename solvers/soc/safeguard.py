@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement
 from solvers.soc.anderson import AndersonSums
 from solvers.soc.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule
@@ -43,7 +44,7 @@ class Due(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Steps:
+class Steps(Summarised):
     """Number and residuals of iterate k, with the history that decides on the penalty.
 
     The states of all couplings have these fields. The residuals are

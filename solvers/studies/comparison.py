@@ -21,6 +21,7 @@ from pgo_models.plots.interactive_plots import save_page
 from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.progress_bars import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
@@ -80,7 +81,7 @@ class ComparisonSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Summarised):
     """Methods compared on one graph.
 
     Parameters

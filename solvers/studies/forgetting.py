@@ -13,11 +13,12 @@ from pgo_models.convex.bregman import BregmanProblem
 from pgo_models.errors import SettingError, door
 from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.rotations import Array, as_generator
+from pgo_models.summaries import Summarised
 from solvers.convex.bregman import TwoLineBregman
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorForgetting:
+class ErrorForgetting(Summarised):
     """Distances ||x_k - x*|| of every iterate of three runs, from k = 0 on.
 
     Parameters

@@ -19,6 +19,7 @@ from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, 
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.progress_bars import JobBar
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
@@ -170,7 +171,7 @@ class ReproducedRow:
 
 
 @dataclass(frozen=True)
-class Reproduction:
+class Reproduction(Summarised):
     """The reproduced tables.
 
     Parameters

@@ -15,6 +15,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, as_generator, random_rotations
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
+from pgo_models.summaries import Summarised
 from solvers.request import Pipeline
 from solvers.studies.benchmark_runs import solve_whole
 
@@ -27,7 +28,7 @@ class SweptScene(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseSweep:
+class NoiseSweep(Summarised):
     """Result of a sweep: which graphs were certified at which noise.
 
     Parameters
