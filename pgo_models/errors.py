@@ -168,6 +168,8 @@ def check_settings(
     the annotations; what is clearly meant is converted, as at the doors (`pgo_models.doors`).
     """
     for field in dataclasses.fields(cast(Any, settings)):
+        if not field.init:
+            continue
         value = getattr(settings, field.name)
         default_types = (type(field.default), field.default_factory)
         if field.name not in of_any_type and type(value) not in default_types:

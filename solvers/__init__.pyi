@@ -61,6 +61,7 @@ from solvers.soc.penalty import (
     BoydPenalty as BoydPenalty,
     FixedPenalty as FixedPenalty,
     MultiplierPenalty as MultiplierPenalty,
+    PenaltyRule as PenaltyRule,
 )
 from solvers.soc.r_step import (
     CustomRStep as CustomRStep,
@@ -124,7 +125,7 @@ __all__ += [
     "write_report",
 ]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
-__all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
+__all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty", "PenaltyRule"]
 __all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]

@@ -9,7 +9,7 @@ Terms and constraints are written on poses and edges by their numbers.
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cvxpy as cp
@@ -195,6 +195,20 @@ class GraphQP(Summarised):
     A: csr_array
     w: Array
     between: csr_array
+
+    def with_penalty(self, penalty: Array) -> "GraphQP":
+        """Pose the program anew with other penalties, in the same variables.
+
+        Parameters
+        ----------
+        penalty : Array, (N_a,)
+            Diagonal of D: penalties of the rows of X.
+        """
+        X = self.variables.X
+        terms, constraints = self.change.terms, self.change.constraints
+        d = self.variables.graph.d
+        qp = rotation_qp(self.A, self.w, penalty, d, X, terms, constraints, self.qp.solver)
+        return replace(self, qp=qp)
 
     def solve(self, V: Array, neighbours: Array | None = None) -> Array:
         """Solve the subproblem for a shift.

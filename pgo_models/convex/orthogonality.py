@@ -30,7 +30,7 @@ from pgo_models.convex.convex_solver import (
     check_variable,
     finite_array,
 )
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.rotations import Array
 from pgo_models.summaries import Summarised
@@ -101,8 +101,9 @@ class OrthogonalProblem(HoldsModel):
     unit_columns, unit_rows : sequence of variables
         Every column, or every row, has norm 1.
     sparse : sequence of pairs (variable, int)
-        Variables with at most so many nonzeros. A variable may be here and in one of the other
-        lists too.
+        Variables with at most so many nonzeros.
+    sets : sequence of pairs (variable, ConstraintSet)
+        Variables in other sets, by their projections. A variable may be in several of these lists.
 
     Raises
     ------
@@ -128,12 +129,14 @@ class OrthogonalProblem(HoldsModel):
     unit_columns: Sequence[Any] = ()
     unit_rows: Sequence[Any] = ()
     sparse: Sequence[tuple[Any, int]] = ()
+    sets: Sequence[tuple[Any, ConstraintSet]] = ()
     J: Any = field(init=False)
     variables: tuple[Any, ...] = field(init=False)
     others: tuple[Any, ...] = field(init=False)
     terms: tuple[Term, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        check_settings(self, of_any_type=["problem", *_SETS])
         if not isinstance(self.problem, cp.Problem):
             raise SettingError(
                 f"the problem is a {type(self.problem).__name__}; give a cvxpy Problem"
@@ -175,6 +178,8 @@ class OrthogonalProblem(HoldsModel):
                 named.append((f"{argument}[{position}]", variable, constraint))
         for position, (variable, nonzeros) in enumerate(self.sparse):
             named.append((f"sparse[{position}]", variable, Sparse(nonzeros)))
+        for position, (variable, own) in enumerate(self.sets):
+            named.append((f"sets[{position}]", variable, own))
         if not named:
             raise SettingError(
                 "no variable is named; a convex problem is solved by problem.solve()"
@@ -218,7 +223,7 @@ class OrthogonalProblem(HoldsModel):
         copies = []
         normals = []
         for term in self.terms:
-            copy = term.constraint.project(checked[term.variable])
+            copy = term.constraint.projected(checked[term.variable])
             copies.append(copy)
             normals.append(np.zeros(copy.shape))
         return OrthogonalPoint(tuple(copies), tuple(normals))

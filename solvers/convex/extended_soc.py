@@ -32,23 +32,20 @@ class ExtendedStep:
     It changes the iterates of SOC; `ExtendedSOC` also reports the changed objective.
     """
 
-    graph: PoseGraph
-    changer: Changer
-    solver: ConvexSolver | str = "CLARABEL"
+    model: GraphQP
 
     def prepare(self, subproblem: RSubproblem) -> GraphQP:
-        """Compile the changed program with the penalties of a subproblem.
+        """Pose the changed program with the penalties of a subproblem, in the same variables.
 
         A SettingError unless the subproblem is that of the whole graph, in (R, t).
         """
-        n = self.graph.num_poses
-        d = self.graph.d
+        graph = self.model.variables.graph
+        n = graph.num_poses
         if subproblem.num_translations != n or not subproblem.needs_ground:
             raise SettingError(
                 "a changed subproblem is that of the whole graph; use Coupling.JOINT"
             )
-        rho = subproblem.penalty[n::d]
-        return graph_qp(self.graph, rho, changer=self.changer, solver=self.solver)
+        return self.model.with_penalty(subproblem.penalty)
 
 
 @dataclass(frozen=True)
@@ -113,10 +110,14 @@ class ExtendedSOC:
         return self.soc.max_iterations
 
     def init(self, problem: PGOProblem, start: Poses | None) -> SOCState:
-        """State 0 of SOC; the changed program is compiled here, and again when rho changes."""
+        """State 0 of SOC; the changed program is compiled here, and again when rho changes.
+
+        `changer` is called once: its constraints have their dual values after every step.
+        """
+        model = self.model(problem)
         if start is None:
-            start = moved_to_terms(self.model(problem), chordal_start(problem))
-        return self._recursion(problem).init(problem, start)
+            start = moved_to_terms(model, chordal_start(problem))
+        return self._recursion(model).init(problem, start)
 
     def model(self, problem: PGOProblem) -> GraphQP:
         """Compile the changed program with penalties of 1.
@@ -140,7 +141,7 @@ class ExtendedSOC:
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """Make one iteration of SOC."""
-        return self._recursion(problem).step(problem, state)
+        return self._recursion(model_of(state)).step(problem, state)
 
     def measure(self, problem: PGOProblem, state: SOCState) -> Measurement:
         """Objective of the changed problem at the poses, and the residuals of SOC."""
@@ -175,18 +176,18 @@ class ExtendedSOC:
         float
             F of the edges that count plus the added terms.
         """
-        return _model(state).cost(poses.stacked())
+        return model_of(state).cost(poses.stacked())
 
     def converged(self, state: SOCState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
         return self.soc.status_at(measurement)
 
-    def _recursion(self, problem: PGOProblem) -> Joint:
-        r_step = ExtendedStep(problem.graph, self.changer, self.solver)
-        return Joint(replace(self.soc, r_step=r_step))
+    def _recursion(self, model: GraphQP) -> Joint:
+        return Joint(replace(self.soc, r_step=ExtendedStep(model)))
 
 
-def _model(state: SOCState) -> GraphQP:
+def model_of(state: SOCState) -> GraphQP:
+    """The changed program that step (a) of a state has solved, with its `change`."""
     model = state.r_step.back_end
     assert isinstance(model, GraphQP)
     return model
