@@ -83,14 +83,19 @@ def check_convex(expression: cp.Expression, name: str) -> None:
         )
     if not expression.is_real():
         raise SettingError(f"{name} is complex; write it in real and imaginary parts")
+    if _has_semidefinite_indicator(expression):
+        raise SettingError(
+            f"{name} has a constraint Z >> 0 in an indicator, which cvxpy does not hand on to its "
+            "solvers; write cp.lambda_min(Z) >= 0 there, or make Z a cp.Variable(.., PSD=True)"
+        )
     if not expression.is_convex():
         product = _product_of_unknowns(expression)
         way_out = _DCP
         if product is not None:
-            way_out = f"it multiplies unknowns, {_short(product)}; {_PRODUCT}"
+            way_out = f"it multiplies unknowns, {in_short(product)}; {_PRODUCT}"
         raise SettingError(
             f"{name} is not convex: cvxpy finds it {expression.curvature.lower()}, "
-            f"{_short(expression)}; {way_out}"
+            f"{in_short(expression)}; {way_out}"
         )
 
 
@@ -104,7 +109,8 @@ def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constra
     for position, constraint in enumerate(constraints):
         if not (isinstance(constraint, cp.Constraint) and constraint.is_dcp()):
             raise SettingError(
-                f"constraints[{position}], {_short(constraint)}, is not convex by the rules of DCP"
+                f"constraints[{position}], {in_short(constraint)}, is not convex by the rules of "
+                "DCP"
             )
 
 
@@ -286,6 +292,11 @@ def finite_array(values: object, name: str) -> Array:
     return array
 
 
+def _has_semidefinite_indicator(part: cp.Expression | cp.Constraint) -> bool:
+    """Whether a semidefinite constraint is inside an expression, as only indicators have one."""
+    return isinstance(part, cp.PSD) or any(map(_has_semidefinite_indicator, part.args))
+
+
 def _product_of_unknowns(expression: cp.Expression) -> cp.Expression | None:
     """The first product in an expression both of whose factors have variables."""
     is_binary = isinstance(expression, cp.atoms.affine.binary_operators.BinaryOperator)
@@ -295,5 +306,6 @@ def _product_of_unknowns(expression: cp.Expression) -> cp.Expression | None:
     return next(filter(None, products_inside), None)
 
 
-def _short(expression: cp.Expression | cp.Constraint) -> str:
+def in_short(expression: cp.Expression | cp.Constraint) -> str:
+    """The beginning of an expression or a constraint, in one line, for messages."""
     return " ".join(str(expression).split())[:_MAX_SHOWN]

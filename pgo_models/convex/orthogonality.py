@@ -162,6 +162,7 @@ class OrthogonalProblem(HoldsModel):
             if variable.id not in positions:
                 check_variable(variable, "a variable of the problem")
                 others.append(variable)
+        _check_not_imposed_twice(self.problem.constraints, set(positions))
         object.__setattr__(self, "J", _minimised(self.problem))
         object.__setattr__(self, "variables", tuple(variables))
         object.__setattr__(self, "others", tuple(others))
@@ -515,6 +516,17 @@ def _real_arrays(arrays: Sequence[Array], name: str) -> tuple[Array, ...]:
 
 def _values(variables: Sequence[cp.Variable]) -> tuple[Array, ...]:
     return tuple(np.array(variable.value, dtype=float) for variable in variables)
+
+
+def _check_not_imposed_twice(constraints: Sequence[cp.Constraint], in_sets: set[int]) -> None:
+    """Raise a SettingError where a constraint that is not convex is on variables in sets alone."""
+    for position, constraint in enumerate(constraints):
+        on_sets_alone = all(variable.id in in_sets for variable in constraint.variables())
+        if on_sets_alone and not constraint.is_dcp():
+            raise SettingError(
+                f"constraints[{position}], {convex_solver.in_short(constraint)}, is not convex; if "
+                "it says that its variable is in the set, remove it: SOC imposes the set itself"
+            )
 
 
 def _minimised(problem: cp.Problem) -> cp.Expression:
