@@ -345,7 +345,7 @@ def _worst_edges(solution: Solved, robots: Partition, fit: EdgeFit) -> _Table:
     share = 100 * residuals.share[worst].sum()
     text = (
         f"The {len(rows)} of {graph.num_edges} edges that cost most, {share:.3g} % of {fit.cost} "
-        f"together. {fit.sentence()} Half of what was measured fits to "
+        f"together. {fit.sentence()} Half of all errors are below "
         f"{_median_errors(graph, residuals)}. Click on a head to sort."
     )
     misfits = np.flatnonzero(residuals.is_misfit[worst]).tolist()
