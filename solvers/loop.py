@@ -318,7 +318,8 @@ class RunMonitor:
         line = None
         if not self.verbose and is_shown(self.progress):
             line = self._line(name, method.max_iterations)
-        with Table(name, self.verbose, line, tolerance) as table:
+        cost = "J" if solver is None else str(problem.cost_name)
+        with Table(name, self.verbose, line, tolerance, cost) as table:
             course = _Course[S](lambda: method.init(problem, start), earlier)
             try:
                 status = self._iterate(method, problem, course, table)

@@ -4,6 +4,7 @@ import html
 import math
 import sys
 import time
+from bisect import bisect_left
 from collections import Counter
 from importlib import import_module
 from typing import Any
@@ -13,13 +14,19 @@ from pgo_models.figures import rounded_up
 from solvers.result import Measurement, Record, Status
 
 # Both headers together are 80 columns wide.
-_HEADER = f"{'k':>5}  {'F':>15}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"
+_HEADER = f"{'k':>5}  {{:>15}}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"
 _HEADER_OF_ROBOTS = f"  {'rounds':>6}  {'reduces':>7}  {'MB sent':>7}"
 _LINE_AFTER_SECONDS = 1.0
 _SECONDS_BETWEEN_UPDATES = 0.1
 _SAME_GRAPH = 1.5  # factor within which matrices of one graph have the entries that are expected
 # Side of a matrix whose factorisation may take seconds: 10,000 poses in space.
 _LARGE_SIDE = 40_000
+
+
+# Seconds left are told from so many residuals on, and where two rates of them are alike.
+_FEWEST_RESIDUALS = 5
+_STEADY = 1.5
+_INSTANT = 1e-9  # seconds
 
 
 def is_shown(progress: bool | None) -> bool:
@@ -158,16 +165,21 @@ class Table:
     """Prints one line for every iterate if `verbose`, or else shows figures of it in a `line`.
 
     If the run ends when residuals fall below a `tolerance`, the line has the seconds that are left,
-    provided that the logarithm of the residual keeps falling at its mean rate so far.
+    provided that the residual falls steadily (`_time_left`). `cost` is the name of the objective.
     """
 
     def __init__(
-        self, name: str, verbose: bool, line: StageLine | None = None, tolerance: float = 0.0
+        self,
+        name: str,
+        verbose: bool,
+        line: StageLine | None = None,
+        tolerance: float = 0.0,
+        cost: str = "F",
     ) -> None:
         self._name = name
+        self._cost = cost
         self._tolerance = tolerance
-        self._first_residual = math.inf  # the first one that is known, and when it was
-        self._first_elapsed = 0.0
+        self._residuals: list[tuple[float, float]] = []  # seconds, and decades above the tolerance
         self._has_header = False
         self._verbose = verbose
         self._line = line
@@ -185,16 +197,15 @@ class Table:
         """Show one record after `elapsed` seconds of wall time."""
         figures = record.measurement
         residual = max(figures.primal_residual, figures.dual_residual)
-        if math.isinf(self._first_residual):
-            self._first_residual = residual
-            self._first_elapsed = elapsed
+        if self._tolerance > 0.0 and 0.0 < residual < math.inf:
+            self._residuals.append((elapsed, math.log10(residual / self._tolerance)))
         if self._verbose:
             self._print_row(record)
         if self._line is not None:
-            texts = [self._time_left(residual, elapsed)]
+            texts = [self._time_left()]
             if math.isfinite(residual):
                 texts.append(f"residual {residual:.1e}")
-            texts.append(f"F {rounded_up(figures.objective, 8)}")
+            texts.append(f"{self._cost} {rounded_up(figures.objective, 8)}")
             if figures.num_bytes is not None:
                 texts.append(f"{1e-6 * figures.num_bytes:.2f} MB")
             self._line.show(record.k, "  ".join(filter(None, texts)))
@@ -205,7 +216,7 @@ class Table:
         if not self._has_header:
             self._has_header = True
             columns_of_robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
-            print(f"{self._name}\n{_HEADER}{columns_of_robots}")
+            print(f"{self._name}\n{_HEADER.format(self._cost)}{columns_of_robots}")
         cells = (
             f"{record.k:>5}",
             f"{rounded_up(figures.objective):>15}",
@@ -220,14 +231,26 @@ class Table:
         if self._verbose:
             print(f"{status.name} after {iterations} iterations: {status.value}", flush=True)
 
-    def _time_left(self, residual: float, elapsed: float) -> str:
-        """Text on the seconds left; empty if nothing is known of them."""
-        if not 0.0 < self._tolerance < residual < self._first_residual < math.inf:
+    def _time_left(self) -> str:
+        """Text on the seconds left; empty if they cannot be told within a factor of about two.
+
+        They are told where the logarithm of the residual has come half of its way, and falls as
+        fast lately, in the later half of the time, as before.
+        """
+        if len(self._residuals) < _FEWEST_RESIDUALS:
             return ""
-        past_decades = math.log10(self._first_residual / residual)
-        decades_left = math.log10(residual / self._tolerance)
-        seconds = (elapsed - self._first_elapsed) * decades_left / past_decades
-        return f"about {seconds:.0f} s left" if seconds >= 1.0 else ""
+        seconds, decades = zip(*self._residuals, strict=True)
+        middle = bisect_left(seconds, 0.5 * (seconds[0] + seconds[-1]))
+        fallen_before = decades[0] - decades[middle]
+        fallen_lately = decades[middle] - decades[-1]
+        if min(fallen_before, fallen_lately) <= 0.0 or decades[-1] <= 0.0:
+            return ""
+        before = fallen_before / max(seconds[middle] - seconds[0], _INSTANT)
+        lately = fallen_lately / max(seconds[-1] - seconds[middle], _INSTANT)
+        is_steady = 1.0 / _STEADY <= lately / before <= _STEADY
+        has_come_far = fallen_before + fallen_lately >= decades[-1]
+        left = decades[-1] / lately
+        return f"about {left:.0f} s left" if is_steady and has_come_far and left >= 1.0 else ""
 
 
 class _NotebookBar:

@@ -12,6 +12,9 @@ import solvers
 import solvers.progress as table_module
 from pgo_models.activity import Activity, doing
 from pgo_models.graphs import scenes
+from pgo_models.graphs.datasets import load
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.progress import StageLine, Table, is_shown
 from solvers.result import Measurement, Record, Status
 from solvers.riemannian.newton import Newton
@@ -118,15 +121,48 @@ def test_a_long_run_shows_a_bar_on_stderr_alone(
     assert "2/100" in err
 
 
-@pytest.mark.parametrize(("tolerance", "left"), [(2e-2, True), (0.0, False), (2.0, False)])
-def test_it_says_what_is_left_where_residuals_fall_to_a_tolerance(
-    tolerance, left, monkeypatch
-) -> None:
+def shown_after(decades: list[float], tolerance: float, monkeypatch) -> str:
+    """The line after residuals that have fallen by so many decades, one a second."""
     notebook = Notebook(monkeypatch)
-    with Table("SOC", False, line_of("SOC", 10.0), tolerance) as table:
-        table.row(RECORDS[0], 0.5)
-        table.row(RECORDS[1], 10.0)  # one decade of two in ten seconds
-    assert ("about 10 s left" in notebook.outputs[0][-2]) == left
+    with Table("SOC", False, line_of("SOC", 10.0), tolerance, "chi2") as table:
+        for second, fallen in enumerate(decades):
+            residual = 10.0**-fallen
+            measurement = Measurement(5.0, residual, residual)
+            table.row(Record(second, float(second), measurement), float(second))
+    return notebook.outputs[0][-2]
+
+
+STEADY = [0.2 * second for second in range(11)]
+
+
+@pytest.mark.parametrize(
+    ("decades", "tolerance", "left"),
+    [
+        (STEADY, 1e-4, "about 10 s left"),
+        (STEADY, 1e-3, "about 5 s left"),
+        (STEADY, 0.0, None),
+        (STEADY, 1e-9, None),  # not yet half of the way
+        (STEADY[:4], 1e-1, None),  # too few residuals
+        ([0.04 * second**2 for second in range(11)], 1e-6, None),  # ever faster
+        ([2.0 * (1.0 - 0.7**second) for second in range(11)], 1e-3, None),  # ever slower
+    ],
+)
+def test_it_says_what_is_left_where_residuals_fall_steadily(
+    decades, tolerance, left, monkeypatch
+) -> None:
+    text = shown_after(decades, tolerance, monkeypatch)
+    assert ("left" in text) == (left is not None)
+    assert left is None or left in text
+
+
+def test_the_line_names_the_cost(monkeypatch) -> None:
+    assert "chi2 5" in shown_after(STEADY, 0.0, monkeypatch)
+
+
+def test_the_table_names_the_cost(capsys) -> None:
+    graph = load("grid")
+    solvers.run(Newton(), PGOProblem(graph, weighting=Weighting.ROTATIONS), verbose=True)
+    assert "F(R)" in capsys.readouterr().out.splitlines()[1]
 
 
 @pytest.mark.parametrize("status", Status)
