@@ -88,7 +88,7 @@ surveyed.save(Path(folder.name) / "survey.tum")
 blocks_of_survey = surveyed.marginals()
 kept_graph = surveyed.problem.graph
 in_metres = np.sqrt(np.linalg.eigvalsh(blocks_of_survey[:, :2, :2])[:, -1])
-print(f"positions are known to {in_metres[:num_poses].max():.2f} m, the worst of them")
+print(f"positions are known to {in_metres[: num_poses].max():.2f} m, the worst of them")
 mapped = surveyed.poses.t[kept_graph.landmarks] - [500.0, 0.0]
 print("trees are off by", np.linalg.norm(mapped - trees, axis=1).round(2), "m")
 pgo.plot_graph(kept_graph, surveyed.poses, covariances=blocks_of_survey)
@@ -114,7 +114,6 @@ pgo.plot_graph(kept_graph, surveyed.poses, covariances=blocks_of_survey)
 # `weights=pgo.RotationWeight.GAUSSIAN` takes $\kappa = I_{\theta\theta} / 2$. We begin with $F$, whose
 # certificate fits on a page. Unless it is asked for $F$, `solve` minimises $\chi^2$ of the complete
 # matrices, which follows below.
-
 
 # %%
 def problem_of(graph: pgo.PoseGraph) -> pgo.PGOProblem:

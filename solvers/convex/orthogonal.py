@@ -317,6 +317,18 @@ class OrthogonalSolution(Summarised):
         kkt = f"{best}, feasibility {self.kkt.feasibility:.1e}"
         return f"OrthogonalSolution({self.status.name}, {kkt}, {len(self.objectives)} starts)"
 
+    def __str__(self) -> str:
+        found = [J for J in self.objectives if not math.isnan(J)]
+        ends = f", which end from {min(found):.6g} to {max(found):.6g}" if found else ""
+        lines = [
+            f"status       {self.status.name}: {self.status.value}",
+            f"J            {self.objective:.10g}, the least of {len(self.objectives)} starts{ends}",
+            f"KKT          stationarity {self.kkt.stationarity:.1e}, feasibility "
+            f"{self.kkt.feasibility:.1e}",
+            "lower bound  none: the sets are not convex, and another start may end lower",
+        ]
+        return "\n".join(lines)
+
 
 @door
 def solve_orthogonal(
