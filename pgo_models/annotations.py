@@ -3,7 +3,7 @@
 What is clear is converted: a graph where a problem is wanted, the name of an enum's member in any
 case, a seed for a generator, a list for an array. Anything else is answered with one sentence: what
 must be given, what was, and a way out. A class says by `_from_given` what stands for its objects,
-and by `_way_out` how to make one.
+and by `_way_out` how to make one; without annotations, these are no fields of a dataclass.
 """
 
 import builtins

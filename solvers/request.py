@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
@@ -89,7 +89,7 @@ class Pipeline:
     ['chordal start', 'SOC', 'Newton']
     """
 
-    _way_out: ClassVar[str] = "give Pipeline(soc=SOC(..)), or run(SOC(..))"
+    _way_out = "give Pipeline(soc=SOC(..)), or run(SOC(..))"
 
     soc: FirstStage = AUTO
     newton: Newton = field(default_factory=Newton)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import cvxpy as cp
 import numpy as np
@@ -82,7 +82,7 @@ class BregmanProblem(HoldsModel):
     [0.0]
     """
 
-    _way_out: ClassVar[str] = "BregmanProblem(J, variables, K, f) makes one: min J(x), K x = f"
+    _way_out = "BregmanProblem(J, variables, K, f) makes one: min J(x), K x = f"
 
     J: Any
     variables: Any

@@ -9,7 +9,7 @@ in solvers/convex/orthogonal.py.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -119,9 +119,7 @@ class OrthogonalProblem(HoldsModel):
     OrthogonalProblem((3, 3) Rotations)
     """
 
-    _way_out: ClassVar[str] = (
-        "OrthogonalProblem(problem, rotations=[X]) makes one of a cvxpy Problem"
-    )
+    _way_out = "OrthogonalProblem(problem, rotations=[X]) makes one of a cvxpy Problem"
 
     problem: Any
     orthogonal: Sequence[Any] = ()

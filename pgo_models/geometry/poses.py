@@ -6,7 +6,6 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
@@ -56,7 +55,7 @@ class Poses(ReadOnly):
     R: Array
     t: Array
 
-    _way_out: ClassVar[str] = "give Poses(R, t), or problem.with_best_translations(R)"
+    _way_out = "give Poses(R, t), or problem.with_best_translations(R)"
 
     @classmethod
     def _from_given(cls, given: object) -> Poses | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,7 +167,7 @@ class PoseGraph(ReadOnly):
     written_error: Array | None = None
     weights_error: float = 0.0
 
-    _way_out: ClassVar[str] = "pgo_models.load(..) reads a graph, and `.graph` of a problem is one"
+    _way_out = "pgo_models.load(..) reads a graph, and `.graph` of a problem is one"
 
     def __post_init__(self) -> None:
         check_settings(self, of_any_type=_WHOLE_NUMBERS + _WHOLE_ARRAYS + _REAL_ARRAYS)

@@ -5,7 +5,6 @@ The cost is equation (16) of the paper, weighted, or chi2 of information matrice
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import ClassVar
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array
@@ -83,7 +82,7 @@ class PGOProblem(ReadOnly):
     backend: CholeskyBackend | None = None
     weighting: Weighting | EdgeCost = Weighting.OWN
 
-    _way_out: ClassVar[str] = "PGOProblem(graph) makes one, and pgo_models.load(..) reads a graph"
+    _way_out = "PGOProblem(graph) makes one, and pgo_models.load(..) reads a graph"
 
     @classmethod
     def _from_given(cls, given: object) -> "PGOProblem | None":
