@@ -100,6 +100,7 @@ class _LoadedClasses(Mapping[str, object]):
         return 0
 
 
+@functools.cache
 def _options(hint: object) -> tuple[object, ...]:
     """The types of a union; a type alone is its only option."""
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
@@ -107,6 +108,7 @@ def _options(hint: object) -> tuple[object, ...]:
     return (hint,)
 
 
+@functools.cache
 def _kind(option: object) -> type | None:
     """The class of a type, without its arguments; None where anything is allowed."""
     kind = typing.get_origin(option) or option
@@ -177,6 +179,7 @@ def _meant(value: object, option: object) -> object:
     return converted
 
 
+@functools.cache
 def _number(array: object) -> type[np.generic]:
     """Type of the numbers of an annotated array."""
     [number] = typing.get_args(typing.get_args(array)[1]) or (np.float64,)
