@@ -10,6 +10,7 @@
 # notebook shows how to find out how good the answer is.
 
 # %%
+import matplotlib.pyplot as plt
 import numpy as np
 
 import pgo_models as pgo
@@ -218,6 +219,22 @@ pgo.compare_poses(
         (f"optimal, F = {best.objective:.4g}", best.poses),
     ],
 )
+
+# %% [markdown]
+# How far an answer can be from the best one is a picture, too: a dot for the cost of every answer,
+# and a bar from there down to the bound that was proved for it. Where the bar has no length, the
+# answer is the best one.
+
+# %%
+figure, axes = plt.subplots(figsize=(7.5, 2.4), layout="constrained")
+for seed, certificate in enumerate(certificates):
+    ends = [certificate.lower_bound, certificate.objective]
+    axes.plot(ends, [seed, seed], color="#D55E00", linewidth=3)
+    axes.plot(certificate.objective, seed, "o", color="#0072B2")
+axes.set_xscale("log")
+axes.set_xlabel("F, and the bound below it")
+axes.set_ylabel("start")
+axes.invert_yaxis()
 
 # %% [markdown]
 # The gap of such an answer is nearly 1: almost all of its cost could be saved. But a large gap does

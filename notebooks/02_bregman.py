@@ -99,7 +99,17 @@ for k in range(12):
 #   b^{k+1} = b^k + \mathcal{K} x^{k+1} - f.$$
 #
 # The remaining residual is *added back* to the data: the next subproblem asks $x$ to overshoot by
-# the amount by which it fell short. This is the whole method. The $B$ of the paper's Algorithm 1 is
+# the amount by which it fell short.
+#
+# *A fixed point solves the problem.* Where $b^{k+1} = b^k$, the second line says
+# $\mathcal{K} x = f$. And $p = -\alpha \mathcal{K}^\top b$ is a subgradient of $J$ at $x$, so that for
+# every other $y$ with $\mathcal{K} y = f$
+#
+# $$J(y) \;\ge\; J(x) + \langle p, y - x \rangle
+#   = J(x) - \alpha \langle b, \mathcal{K} y - \mathcal{K} x \rangle = J(x).$$
+#
+# No $\alpha$ appears in the conclusion: the penalty decides how fast the iteration goes, not where it
+# ends. This is the whole method. The $B$ of the paper's Algorithm 1 is
 # this $b$, and its constraint $\mathcal{K} x = f$ is $R - \omega = 0$.
 
 # %%

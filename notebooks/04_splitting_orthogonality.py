@@ -39,7 +39,9 @@ plt.rcParams["figure.dpi"] = 150
 # %%
 def nearest_rotation(Y):
     U, _, Vt = np.linalg.svd(Y)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    signs = np.ones(len(Y))  # in the plane, in space, or beyond
+    signs[-1] = np.linalg.det(U @ Vt)
+    return U * signs @ Vt
 
 
 rng = np.random.default_rng(0)
@@ -282,6 +284,11 @@ print(stuck)
 solvers.certify(ring_problem, stuck.poses)
 
 # %% [markdown]
+# CONVERGED is about the residuals, TRIVIAL about the cost. The measurements of this ring have no
+# noise, so that the least cost is zero, and no lower bound can be better than zero. The gap of 1 says
+# that all of the cost could be saved: the chain that winds around once has $F = 0$.
+
+# %% [markdown]
 # ## Exercises
 #
 # **1.** $Y = \operatorname{diag}(1, 1, -0.1)$. Which rotation is nearest, and how much farther away
@@ -349,3 +356,5 @@ assert runs["... accelerated (the default)"].iterations < runs["multiplier penal
 assert np.isclose(runs["fixed rho = 1"].objective, best.objective, rtol=1e-6)
 assert stuck.status is solvers.Status.CONVERGED
 assert stuck.objective > 100.0
+assert solvers.solve(ring_problem).objective < 1e-12 * stuck.objective
+assert np.allclose(nearest_rotation(np.diag([2.0, -1.0])), np.eye(2))

@@ -40,7 +40,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 def draw_robots(axes, places, meetings):
     for robot, line in enumerate(places):
-        axes.plot(*line.T, "o-", color=COLOURS[robot], markersize=9, label=f"robot {robot + 1}")
+        axes.plot(*line.T, "o-", color=COLOURS[robot], markersize=9, label=f"robot {robot}")
     for (a, i), (b, j) in meetings:
         axes.plot(
             *np.array([places[a][i], places[b][j]]).T, ":", color="#555555", linewidth=1.6, zorder=0
@@ -71,14 +71,14 @@ for robot, other, towards in ((0, 1, -0.55), (1, 0, 0.55)):
     for pose in (1, 3):
         copy = two[other][pose] + [towards, 0.16]
         right.plot(*copy, "o", color=COLOURS[other], markersize=9, markerfacecolor="white")
-        right.text(copy[0], copy[1] + 0.16, f"robot {robot + 1}'s copy", ha="center", fontsize=6)
+        right.text(copy[0], copy[1] + 0.16, f"robot {robot}'s copy", ha="center", fontsize=6)
 right.annotate("", (2.9, 1.52), (1.1, 1.52), arrowprops={"arrowstyle": "->", "color": COLOURS[0]})
 right.annotate("", (1.1, 1.28), (2.9, 1.28), arrowprops={"arrowstyle": "->", "color": COLOURS[1]})
 _ = right.text(2.0, 1.6, "x + u of what both have", ha="center", fontsize=7)
 
 # %% [markdown]
-# With two robots, two machines agree on four poses. Line for line, this is the consensus of
-# [notebook 11](11_admm_across_machines.ipynb).
+# In the right picture two machines agree on four poses. Line for line, this is the consensus of
+# [notebook 11](11_admm_across_machines.ipynb). On the paper's grid, cut in half, they agree on 18:
 
 # %%
 pair = pgo.load("grid")

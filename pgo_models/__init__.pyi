@@ -13,6 +13,7 @@ from pgo_models.certificates.handedness import HandednessTerms as HandednessTerm
 from pgo_models.certificates.lower_bound import LowerBound as LowerBound, prove_bound as prove_bound
 from pgo_models.certificates.proof_file import save_proof as save_proof
 from pgo_models.convex.bregman import BregmanProblem as BregmanProblem
+from pgo_models.convex.constraint_sets import ConstraintSet as ConstraintSet
 from pgo_models.convex.convex_solver import ConvexSolver as ConvexSolver
 from pgo_models.convex.graph_subproblem import (
     GraphQP as GraphQP,
@@ -123,7 +124,8 @@ __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]
 __all__ += ["Certificate", "Verdict", "certificate_matrix", "certify_at"]
 __all__ += ["multipliers", "prove_bound"]
 __all__ += ["Verification", "save_proof", "verify_proof"]
-__all__ += ["BregmanProblem", "ConvexSolver", "ModelChange", "OrthogonalProblem"]
+__all__ += ["BregmanProblem", "ConstraintSet", "ConvexSolver", "ModelChange"]
+__all__ += ["OrthogonalProblem"]
 __all__ += ["graph_qp", "rotation_qp", "solve_relaxation"]
 __all__ += ["animate", "animate_poses", "compare_poses", "explore_graph", "plot_graph"]
 # Types in the signatures of the names above.

@@ -4,20 +4,19 @@ Each message says what was wrong, where, the value and the way out.
 """
 
 import dataclasses
+import functools
 import importlib
+import inspect
 import math
-import typing
 from collections.abc import Callable, Sequence
-from enum import Enum
-from numbers import Integral, Real
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 # How loaders of shared libraries say that memory ran out.
 _OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "out of memory")
-# Numbers of NumPy are taken where a float or an int is annotated.
-_NUMBERS: dict[type, type] = {float: Real, int: Integral}
 
 # What a setting must be, by the argument of `check_settings` that names it.
 _RULES: dict[str, tuple[str, Callable[[float], bool]]] = {
@@ -166,13 +165,15 @@ def check_settings(
     """Raise a SettingError for the first field of a wrong type, or out of its range.
 
     The ranges are those of the fields that are named; None is in every range. Types are those of
-    the annotations.
+    the annotations; what is clearly meant is converted, as at the doors (`pgo_models.doors`).
     """
     for field in dataclasses.fields(cast(Any, settings)):
+        if not field.init:
+            continue
         value = getattr(settings, field.name)
         default_types = (type(field.default), field.default_factory)
         if field.name not in of_any_type and type(value) not in default_types:
-            _check_type(type(settings), field.name, value)
+            _check_field(settings, field, value)
     names_by_rule = {
         "positive": positive,
         "finite": finite,
@@ -189,31 +190,70 @@ def check_settings(
                 raise SettingError(f"{name} must {words}, got {value}")
 
 
-def _check_type(settings: type, name: str, value: object) -> None:
-    """Raise a SettingError unless a value has the annotated type.
+def door(function: F) -> F:
+    """Check and convert what a public function is given, by its annotations.
 
-    Arrays and protocols are not checked. Reading annotations is slow, 0.1 ms and more, so that this
-    is not called for a value of the default's type.
+    Defaults are not checked. A SettingError names the function and the argument.
     """
-    annotation = typing.get_type_hints(settings)[name]
-    types = typing.get_args(annotation) or (annotation,)
-    if not all(map(_is_plain_class, types)):
-        return
-    if isinstance(value, tuple(_NUMBERS.get(kind, kind) for kind in types)):
-        return
-    members: list[str] = []
-    type_names: list[str] = []
-    for kind in types:
-        if issubclass(kind, Enum):
-            members += map(str, kind)
-        else:
-            type_names.append(kind.__name__.removesuffix("Type"))
-    raise SettingError(f"{name} must be {' or '.join(members + type_names)}, got {value!r:.60}")
+
+    @functools.wraps(function)
+    def checked(*arguments: object, **named: object) -> object:
+        place = f"{function.__qualname__}: "
+        values = fitted_arguments(function, arguments, place)
+        parameters = _parameters_of(function)
+        for name, value in named.items():
+            if name in parameters:
+                named[name] = _argument(function, parameters[name], value, place)
+        return function(*values, **named)
+
+    return cast(F, checked)
 
 
-def _is_plain_class(annotated: object) -> bool:
-    """Whether `isinstance` can tell its objects."""
-    return isinstance(annotated, type) and not getattr(annotated, "_is_protocol", False)
+def fitted_arguments(
+    function: Callable[..., Any], arguments: Sequence[object], place: str
+) -> list[Any]:
+    """Positional arguments of a function, checked and converted by its annotations.
+
+    A SettingError begins with the place.
+    """
+    pairs = zip(_parameters_of(function).values(), arguments, strict=False)
+    values = [_argument(function, parameter, value, place) for parameter, value in pairs]
+    return [*values, *arguments[len(values) :]]  # of too many Python says so
+
+
+@functools.cache
+def _parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    return dict(inspect.signature(function).parameters)
+
+
+def _argument(
+    function: Callable[..., Any], parameter: inspect.Parameter, value: object, place: str
+) -> object:
+    annotation = parameter.annotation
+    if value is parameter.default or annotation is parameter.empty or type(value) is annotation:
+        return value
+    return _fitted(function, annotation, f"{place}{parameter.name}", value)
+
+
+def _check_field(settings: object, field: dataclasses.Field[Any], value: object) -> None:
+    """Raise a SettingError unless the value of a field has the annotated type, or means one.
+
+    Reading annotations is slow, so that this is not called for a value of the default's type.
+    """
+    owners = type(settings).__mro__
+    owner = next(kind for kind in owners if field.name in vars(kind).get("__annotations__", ()))
+    converted = _fitted(owner, field.type, field.name, value)
+    if converted is not value:
+        object.__setattr__(settings, field.name, converted)
+
+
+def _fitted(owner: object, annotation: object, name: str, value: object) -> object:
+    from pgo_models.annotations import MisfitError, fitted  # imports numpy
+
+    try:
+        return fitted(owner, annotation, value)
+    except MisfitError as error:
+        raise SettingError(f"{name} {error}") from None
 
 
 # What linear algebra raises where numbers are beyond it, and what is raised here. Errors in a

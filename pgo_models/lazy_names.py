@@ -32,6 +32,6 @@ def names_of_stub(
         return getattr(importlib.import_module(module_of[name]), name)
 
     def list_names() -> list[str]:
-        return sorted(module_of)
+        return sorted(public_names)
 
     return get_attribute, list_names, public_names

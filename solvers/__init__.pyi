@@ -74,6 +74,7 @@ from solvers.soc.penalty import (
     BoydPenalty as BoydPenalty,
     FixedPenalty as FixedPenalty,
     MultiplierPenalty as MultiplierPenalty,
+    PenaltyRule as PenaltyRule,
 )
 from solvers.soc.r_step import (
     CustomRStep as CustomRStep,
@@ -141,7 +142,7 @@ __all__ += [
 __all__ += ["ReadingComparison", "ReadingFit", "compare_readings"]
 __all__ += ["NoiseEstimate", "NoiseLevel", "estimate_noise"]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
-__all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty"]
+__all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty", "PenaltyRule"]
 __all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent", "prove_outliers"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]

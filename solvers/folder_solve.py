@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from pgo_models.certificates.certificate import Certificate
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, door
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.own_files import OpenedFiles, open_files
 from solvers.distributed.robots.own_file import READ_HERE, write_answer
@@ -45,7 +46,7 @@ from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 
 
 @dataclass(frozen=True, eq=False)
-class FolderSolution:
+class FolderSolution(Summarised):
     """What the driver knows of a solve by robots that have their own files.
 
     The poses are in the files that the robots write, and not here.
@@ -126,6 +127,7 @@ class FolderSolution:
         return [("F", f"{F} with two precisions an edge; the bound is on chi2 alone")]
 
 
+@door
 def solve_folder(
     folder: Path | str,
     pipeline: Pipeline | None = None,

@@ -15,9 +15,9 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import GraphError, SettingError, door
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
+from pgo_models.geometry.rotations import Array, BoolArray, project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, factorize
@@ -27,6 +27,7 @@ from pgo_models.problem.local_world import LocalWorld, far_middle, seen_from_poi
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.loop import run
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
@@ -46,11 +47,13 @@ _SHARE = 0.01
 # Relative decrement of Newton where an update without a certificate did not converge by itself.
 _AFRESH = 1e-9
 # Arrays with a row for every edge, by which two graphs are compared and joined.
+# Difference, in metres beside the length and in rotations, up to which two edges measure the same.
+_SAME = 1e-4
 _MEASURED = ("R_ij", "t_ij", "kappa", "tau", "information")
 
 
 @dataclass(frozen=True, eq=False)
-class GrowingSolution:
+class GrowingSolution(Summarised):
     """Poses near the optimum of a graph that grows, without a certificate.
 
     `extend(.., certify=False)` returns one, and takes it again. `with_edges` adds new edges alone,
@@ -279,6 +282,7 @@ class GrowingSolution:
         """Return the solution of a whole graph that has grown out of this one."""
         edges = _new_edges(self.graph, graph)
         if edges is None:
+            _check_grown(self.graph, graph)
             problem = PGOProblem(graph, self.backend, self.weighting)
             start = extended_poses(problem, self.graph.pose_ids, self.poses)
             return GrowingSolution._at(problem, start)._solved_afresh()
@@ -310,6 +314,7 @@ def extend(
 ) -> GrowingSolution: ...
 
 
+@door
 def extend(
     solution: Solution | GrowingSolution,
     graph: PoseGraph,
@@ -382,6 +387,7 @@ def extend(
         if isinstance(solution, Solution):
             solution = GrowingSolution.of(solution)
         return solution._with_whole(graph)
+    _check_grown(solution.problem.graph, graph)
     pipeline = pipeline if pipeline is not None else Pipeline()
     weighting = solution.problem.weighting
     if not isinstance(weighting, Weighting):
@@ -391,6 +397,39 @@ def extend(
     grown = _solve_from(problem, pipeline, start, shared)
     before = solution.ledger if isinstance(solution, Solution) else None
     return replace(grown, ledger=_joined(before, grown.ledger))
+
+
+def _check_grown(before: PoseGraph, graph: PoseGraph) -> None:
+    """Raise a GraphError unless a graph has grown out of another one: measures what that does."""
+    if graph.d != before.d:
+        raise GraphError(
+            f"{graph.name} is in {graph.d} dimensions and {before.name}, which was solved, in "
+            f"{before.d}; solve it on its own"
+        )
+    edges_before = _edges_of_ids(before)
+    edges = _edges_of_ids(graph)
+    shared = [(edges_before[ids], edges[ids]) for ids in edges_before.keys() & edges.keys()]
+    if not shared or not _measure_alike(before, graph, np.array(shared)).any():
+        raise GraphError(
+            f"{graph.name} has none of the measurements of {before.name}, which was solved; "
+            "give the whole graph, earlier edges included, or solve it on its own"
+        )
+
+
+def _edges_of_ids(graph: PoseGraph) -> dict[tuple[int, int], int]:
+    """Number of the last edge of every pair of poses, by the ids of the poses."""
+    ids = graph.pose_ids
+    pairs = zip(ids[graph.i].tolist(), ids[graph.j].tolist(), strict=True)
+    return {pair: e for e, pair in enumerate(pairs)}
+
+
+def _measure_alike(before: PoseGraph, graph: PoseGraph, shared: IntArray) -> BoolArray:
+    """Whether pairs (k, 2) of edges measure the same, up to the digits of a file, (k,)."""
+    e_before, e = shared.T
+    shift = np.linalg.norm(graph.t_ij[e] - before.t_ij[e_before], axis=1)
+    turn = np.linalg.norm(graph.R_ij[e] - before.R_ij[e_before], axis=(1, 2))
+    size = 1.0 + np.linalg.norm(before.t_ij[e_before], axis=1)
+    return np.asarray((shift <= _SAME * size) & (turn <= _SAME))
 
 
 def _solve_from(

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
-from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.errors import NotPositiveDefiniteError, SettingError, door, fitted_arguments
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.problem import PGOProblem, as_problem
+from pgo_models.problem.problem import PGOProblem
 from solvers.progress import StageLine, Table, is_shown
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
 
@@ -104,16 +104,23 @@ class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
         """
 
 
-def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]:
+@overload
+def iterate(
+    method: Solver[S], problem: PGOProblem | PoseGraph, start: Poses | None = None
+) -> Iterator[S]: ...
+@overload
+def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]: ...
+@door
+def iterate(method: Method[Any, Any, S], problem: Any, start: Any = None) -> Iterator[S]:
     """Yield state 0, state 1, .. without end.
 
     Parameters
     ----------
     method : Method
         Settings with `init` and `step`.
-    problem : P
-        A problem of the kind that the method solves.
-    start : X, optional
+    problem : PGOProblem, PoseGraph or P
+        A problem of the kind that the method solves; a PGOProblem or a PoseGraph for a Solver.
+    start : Poses or X, optional
         Where it starts; at its own start unless given.
 
     Yields
@@ -132,10 +139,24 @@ def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iter
     >>> [problem.objective(Newton().poses(problem, state)) < 200 for state in states]
     [True, True, True, True]
     """
+    problem, start = _fitted(method, problem, start)
+    return _states(method, problem, start)
+
+
+def _states(method: Method[P, X, S], problem: P, start: X | None) -> Iterator[S]:
     state = method.init(problem, start)
     while True:
         yield state
         state = method.step(problem, state)
+
+
+def _fitted(method: Method[Any, Any, Any], problem: object, start: object) -> tuple[Any, Any]:
+    """Problem and start as `init` of the method wants them, by its annotations."""
+    init = type(method).init
+    _, problem, start = fitted_arguments(
+        init, (method, problem, start), f"{type(method).__name__}: "
+    )
+    return problem, start
 
 
 @overload
@@ -161,6 +182,7 @@ def run(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> Outcome[S]: ...
+@door
 def run(
     method: Method[Any, Any, S],
     problem: Any,
@@ -220,6 +242,7 @@ def run(
     >>> run(Newton(), problem, callback=lambda state, record: record.k == 2).status.name
     'STOPPED'
     """
+    problem, start = _fitted(method, problem, start)
     return RunMonitor(time_limit, verbose, progress, callback).run(method, problem, start, earlier)
 
 
@@ -287,13 +310,12 @@ class RunMonitor:
     ) -> Outcome[S]:
         """Run a method on a problem of its kind: the loop."""
         solver = cast(Solver[S], method) if hasattr(method, "poses") else None
-        if solver is not None:
-            problem = as_problem(problem)
         name = type(method).__name__
         line = None
         if not self.verbose and is_shown(self.progress):
             line = self._line(name, method.max_iterations)
-        with Table(name, self.verbose, line) as table:
+        cost = "J" if solver is None else str(problem.cost_name)
+        with Table(name, self.verbose, line, cost) as table:
             course = _Course[S](lambda: method.init(problem, start), earlier)
             try:
                 status = self._iterate(method, problem, course, table)

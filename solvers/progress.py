@@ -15,7 +15,7 @@ from pgo_models.figures import rounded_up
 from solvers.result import Measurement, Record, Status
 
 # Both headers together are 80 columns wide.
-_HEADER = f"{'k':>5}  {'F':>15}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"
+_HEADER = f"{'k':>5}  {{:>15}}  {'primal':>9}  {'dual':>9}  {'seconds':>8}"
 _HEADER_OF_ROBOTS = f"  {'rounds':>6}  {'reduces':>7}  {'MB sent':>7}"
 
 
@@ -135,10 +135,16 @@ class StageLine:
 
 
 class Table:
-    """Prints one line for every iterate if `verbose`, or else shows figures of it in a `line`."""
+    """Prints one line for every iterate if `verbose`, or else shows figures of it in a `line`.
 
-    def __init__(self, name: str, verbose: bool, line: StageLine | None = None) -> None:
+    `cost` is the name of the objective.
+    """
+
+    def __init__(
+        self, name: str, verbose: bool, line: StageLine | None = None, cost: str = "F"
+    ) -> None:
         self._name = name
+        self._cost = cost
         self._has_header = False
         self._verbose = verbose
         self._line = line
@@ -162,7 +168,7 @@ class Table:
             texts = []
             if math.isfinite(residual):
                 texts.append(f"residual {residual:.1e}")
-            texts.append(f"F {rounded_up(figures.objective, 8)}")
+            texts.append(f"{self._cost} {rounded_up(figures.objective, 8)}")
             if figures.num_bytes is not None:
                 texts.append(f"{1e-6 * figures.num_bytes:.2f} MB")
             self._line.show(record.k, "  ".join(texts))
@@ -173,7 +179,7 @@ class Table:
         if not self._has_header:
             self._has_header = True
             columns_of_robots = "" if figures.rounds is None else _HEADER_OF_ROBOTS
-            print(f"{self._name}\n{_HEADER}{columns_of_robots}")
+            print(f"{self._name}\n{_HEADER.format(self._cost)}{columns_of_robots}")
         cells = (
             f"{record.k:>5}",
             f"{rounded_up(figures.objective):>15}",

@@ -76,6 +76,8 @@ class Pipeline:
     ['chordal start', 'SOC', 'Newton']
     """
 
+    _way_out = "give Pipeline(soc=SOC(..)), or run(SOC(..))"
+
     soc: FirstStage = AUTO
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP

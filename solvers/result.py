@@ -9,6 +9,7 @@ import numpy as np
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 
 S = TypeVar("S")
 
@@ -42,7 +43,7 @@ OUT_OF_TIME = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 
 @dataclass(frozen=True)
-class Measurement:
+class Measurement(Summarised):
     """Figures of one iterate.
 
     The best iterate of a run has the least infeasibility and, among those, the least objective.
@@ -76,7 +77,7 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(Summarised):
     """One row of a history: an iterate and its figures.
 
     Parameters
@@ -95,7 +96,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class History:
+class History(Summarised):
     """Records of all measured iterates, in order.
 
     Parameters
@@ -113,6 +114,14 @@ class History:
     """
 
     records: tuple[Record, ...] = ()
+
+    def __repr__(self) -> str:
+        if not self.records:
+            return "History(no records)"
+        first, last = self.records[0].measurement, self.records[-1].measurement
+        objectives = f"objective {first.objective:.6g} to {last.objective:.6g}"
+        residuals = f"residuals {last.primal_residual:.2g} and {last.dual_residual:.2g}"
+        return f"History({len(self)} records, {objectives}, {residuals} at the end)"
 
     def __len__(self) -> int:
         return len(self.records)
@@ -144,7 +153,7 @@ class History:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Outcome(Generic[S]):
+class Outcome(Summarised, Generic[S]):
     """A finished run of one method, on a problem of any kind.
 
     Parameters
@@ -212,7 +221,7 @@ class Run(Outcome[S]):
 
 
 @dataclass(frozen=True)
-class Stage:
+class Stage(Summarised):
     """What one stage of a solve did.
 
     Parameters

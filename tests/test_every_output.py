@@ -127,7 +127,7 @@ def test_help_and_a_missing_argument_are_said(pgo_command):
         assert (code, out, err.lower()) == (
             1,
             "",
-            "pgo: missing argument 'graph'; see pgo --help\n",
+            f"pgo: missing argument 'graph'; see pgo {command} --help\n",
         )
 
 

@@ -15,12 +15,14 @@ ROOT = Path(__file__).parent.parent
 ORDER = {
     "pgo_models": (
         "lazy_names",
+        "annotations",
         "errors",
         "activity",
         "figures",
         "verification",
         "memory",
         "html_tables",
+        "summaries",
         "files",
         "geometry",
         "graphs",

@@ -85,7 +85,7 @@ def code_of(answer: str) -> list[str]:
 
 
 def test_there_is_a_notebook_for_every_topic():
-    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 13)]
+    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 14)]
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
 
 

@@ -217,7 +217,17 @@ SETTINGS += (
 )
 SETTINGS += ("BenchmarkSettings", "ComparisonSettings", "Recovery", "ReproductionSettings")
 MADE |= {name: getattr(solvers, name) for name in SETTINGS}
-PROTOCOLS = {"Method", "Solver", "CustomRStep", "RotationStep", "Engine", "Worker", "WorkerPool"}
+PROTOCOLS = {
+    "Method",
+    "Solver",
+    "CustomRStep",
+    "RotationStep",
+    "Engine",
+    "Worker",
+    "WorkerPool",
+    "PenaltyRule",
+    "ConstraintSet",
+}
 
 
 def test_every_public_class_is_among_those_made_here():

@@ -170,32 +170,35 @@ def test_settings_out_of_range_are_refused():
     [
         (
             lambda problem: solvers.solve("grid"),
-            r"the problem is 'grid'; give a PGOProblem or a PoseGraph: .*load\(\)",
+            r"solve: problem must be a PGOProblem or a PoseGraph, got 'grid'; .*load\(\.\.\)",
         ),
         (
             lambda problem: solvers.run(solvers.Newton(), "grid"),
-            "the problem is 'grid'; give a PGOProblem",
+            "Newton: problem must be a PGOProblem, got 'grid'",
         ),
         (
             lambda problem: solvers.solve(problem, solvers.SOC()),
-            r"pipeline is a SOC; give Pipeline\(soc=SOC\(..\)\)",
+            r"pipeline must be a Pipeline .* got SOC.*; give Pipeline\(soc=SOC\(..\)\)",
         ),
         (
             lambda problem: solvers.solve(problem, robots=True),
-            "robots is True; give a whole number",
+            "robots must be .* a whole number or None, got True",
         ),
         (
             lambda problem: solvers.solve(problem, robots=2.5),
-            r"robots is 2\.5; give a whole number",
+            r"robots must be .* a whole number or None, got 2\.5",
         ),
-        (lambda problem: solvers.solve(problem, robots="2"), "robots is '2'; give a whole number"),
+        (
+            lambda problem: solvers.solve(problem, robots="2"),
+            "robots must be .* a whole number or None, got '2'",
+        ),
         (
             lambda problem: solvers.certify(problem, problem.graph.truth.R),
-            r"poses are a ndarray; give Poses\(R, t\), or",
+            r"poses must be Poses, got an array of shape \(27, 3, 3\) .*; give Poses\(R, t\), or",
         ),
         (
             lambda problem: solvers.solve(problem, start=problem.graph.truth.R),
-            "poses are a ndarray; give Poses",
+            "start must be Poses or None, got an array .*; give Poses",
         ),
         (lambda problem: problem.objective(None), "poses are a NoneType; give Poses"),
     ],

@@ -11,6 +11,9 @@ from rich.progress import Progress
 import solvers
 from pgo_models.activity import Activity, doing
 from pgo_models.graphs import scenes
+from pgo_models.graphs.datasets import load
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers import loop
 from solvers.progress import Pace, StageLine, Table, is_shown
 from solvers.result import Measurement, Record, Status
@@ -130,6 +133,20 @@ def test_a_long_run_shows_a_bar_on_stderr_alone(
     assert out == ""
     assert "SOC" in err
     assert "2/100" in err
+
+
+def test_the_line_names_the_cost(monkeypatch) -> None:
+    notebook = Notebook(monkeypatch)
+    with Table("SOC", False, line_of("SOC", 10.0), "chi2") as table:
+        for second in range(3):
+            table.row(Record(second, float(second), Measurement(5.0, 1e-3, 1e-3)))
+    assert "chi2 5" in notebook.outputs[0][-2]
+
+
+def test_the_table_names_the_cost(capsys) -> None:
+    graph = load("grid")
+    solvers.run(Newton(), PGOProblem(graph, weighting=Weighting.ROTATIONS), verbose=True)
+    assert "F(R)" in capsys.readouterr().out.splitlines()[1]
 
 
 @pytest.mark.parametrize("status", Status)

@@ -28,7 +28,6 @@ INSIDE = {
     "DualRelaxation": "cvxpy model behind a RelaxationSolution",
     "CliqueRelaxation": "cvxpy model behind a RelaxationSolution",
     "Stack": "expressions that PoseVariables has by number, for `[ ]` alone",
-    "ConstraintSet": "set of a Term, which OrthogonalProblem chooses by its name",
     "KKTResiduals": "figures of an OrthogonalSolution, which shows them",
     "RelaxationPlan": "choice of a RelaxationForm, which a RelaxationSolution shows",
     "RankReport": "figures of a RelaxationSolution, which shows them",

@@ -387,7 +387,7 @@ def fields_of_settings() -> list[Any]:
 def test_a_setting_of_another_type_is_named_where_it_is_made(kind: Any, field: str) -> None:
     others: dict[str, Any] = {
         Checkpoint: {"path": "there.json"},
-        ExtendedSOC: {"changer": None},
+        ExtendedSOC: {"changer": len},
     }.get(kind, {})
     with pytest.raises(SettingError, match=f"^{field} must be .*, got <object"):
         kind(**{**others, field: object()})

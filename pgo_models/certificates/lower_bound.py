@@ -74,7 +74,7 @@ from pgo_models.certificates.definiteness import (
 from pgo_models.certificates.dual_variables import check_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, door
 from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
@@ -82,6 +82,7 @@ from pgo_models.graphs.pose_graph import IntArray, middle_pose
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum
 from pgo_models.problem.matrices import inner, rotation_columns
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 
 # Share of the wanted gap that eta may cost; the rest is for poses a little off the optimum.
 _ETA_SHARE = 0.5
@@ -98,7 +99,7 @@ NEGLIGIBLE = 0.01
 
 
 @dataclass(frozen=True)
-class LowerBound:
+class LowerBound(Summarised):
     """A proven lower bound on F over all poses.
 
     Parameters
@@ -136,6 +137,7 @@ class LowerBound:
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
 
 
+@door
 def prove_bound(
     problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Poses | None = None
 ) -> float | None:

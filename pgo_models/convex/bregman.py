@@ -82,6 +82,8 @@ class BregmanProblem(HoldsModel):
     [0.0]
     """
 
+    _way_out = "BregmanProblem(J, variables, K, f) makes one: min J(x), K x = f"
+
     J: Any
     variables: Any
     K: Any
@@ -185,7 +187,10 @@ class BregmanProblem(HoldsModel):
 def _checked_variables(J: Any, given: Any) -> tuple[cp.Variable, ...]:  # noqa: ANN401 - checked here
     """The given variables as a tuple; a SettingError unless J is convex and has no others."""
     convex_solver.check_convex(J, "J")
-    variables = (given,) if isinstance(given, cp.Variable) else tuple(given)
+    listed = [given] if isinstance(given, cp.Variable) else given
+    if not isinstance(listed, Sequence):
+        raise SettingError(f"variables is a {type(given).__name__}; give a list of variables")
+    variables = tuple(listed)
     for position, variable in enumerate(variables):
         convex_solver.check_variable(variable, f"variables[{position}]")
     ids = {variable.id for variable in variables}

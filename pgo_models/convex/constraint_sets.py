@@ -16,7 +16,20 @@ from pgo_models.geometry.rotations import Array, project_by_svd
 
 
 class ConstraintSet(ABC):
-    """A closed set of matrices with a closed-form projection."""
+    """A closed set of matrices with a projection: a user's own has `project`, and no more.
+
+    `OrthogonalProblem(problem, sets=[(X, MySet())])` puts a variable into it.
+
+    Examples
+    --------
+    Vectors of whole numbers:
+
+    >>> class Whole(ConstraintSet):
+    ...     def project(self, V):
+    ...         return np.round(V)
+    >>> Whole().project(np.array([0.4, 1.7])).tolist()
+    [0.0, 2.0]
+    """
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
         """Raise a SettingError, which has the `name`, unless the set has matrices of this shape."""
@@ -25,19 +38,42 @@ class ConstraintSet(ABC):
 
     @abstractmethod
     def project(self, V: Array) -> Array:
-        """A point of the set that is nearest to V."""
+        """Return a point of the set that is nearest to V, in the shape of V.
 
-    @abstractmethod
+        Parameters
+        ----------
+        V : Array
+            A vector or a matrix, in the shape of the variable.
+        """
+
     def normal_part(self, P: Array, G: Array) -> Array:
-        """Projection of G onto the normal space of the set at its point P."""
+        """Projection of G onto the normal space of the set at its point P.
 
-    @abstractmethod
+        Here G itself. The multiplier rho B of SOC is normal at P as it is, because P is the
+        projection of P + B.
+        """
+        return G
+
     def least_penalty(self, P: Array, N: Array) -> float:
-        """Smallest rho at which P is still the projection of P + N / rho, for N normal at P."""
+        """Smallest rho at which P is still the projection of P + N / rho, for N normal at P.
 
-    @abstractmethod
+        Here 0, which bounds nothing.
+        """
+        return 0.0
+
     def distance(self, P: Array) -> float:
-        """How far P is from satisfying the equations of the set."""
+        """How far P is from satisfying the equations of the set; here from its projection."""
+        return float(np.linalg.norm(P - self.project(P)))
+
+    def projected(self, V: Array) -> Array:
+        """The projection, checked: a SettingError unless it has the shape of V and is finite."""
+        P = np.asarray(self.project(V), dtype=float)
+        if P.shape != V.shape or not np.isfinite(P).all():
+            raise SettingError(
+                f"{type(self).__name__}.project returned an array of shape {P.shape} for one of "
+                f"shape {V.shape}; give finite numbers in its shape"
+            )
+        return P
 
     def random(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
         """Random point of the set: the projection of normal entries.
@@ -45,7 +81,7 @@ class ConstraintSet(ABC):
         Its distribution is uniform for orthonormal columns, rotations and unit vectors.
         """
         normal_entries = rng.standard_normal(shape)
-        return self.project(normal_entries)
+        return self.projected(normal_entries)
 
 
 @dataclass(frozen=True)
@@ -191,11 +227,6 @@ class Sparse(ConstraintSet):
         jump from one iterate to the next, so that rho cannot follow it.
         """
         return 0.0
-
-    def distance(self, P: Array) -> float:
-        """Norm of the entries that hard thresholding would drop."""
-        dropped = P - self.project(P)
-        return float(np.linalg.norm(dropped))
 
 
 def _symmetric(A: Array) -> Array:

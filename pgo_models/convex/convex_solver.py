@@ -11,7 +11,7 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.lin_ops.lin_utils import get_id
 
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import PGOError, SettingError, check_settings
 from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.rotations import Array
 
@@ -83,28 +83,34 @@ def check_convex(expression: cp.Expression, name: str) -> None:
         )
     if not expression.is_real():
         raise SettingError(f"{name} is complex; write it in real and imaginary parts")
+    if _has_semidefinite_indicator(expression):
+        raise SettingError(
+            f"{name} has a constraint Z >> 0 in an indicator, which cvxpy does not hand on to its "
+            "solvers; write cp.lambda_min(Z) >= 0 there, or make Z a cp.Variable(.., PSD=True)"
+        )
     if not expression.is_convex():
         product = _product_of_unknowns(expression)
         way_out = _DCP
         if product is not None:
-            way_out = f"it multiplies unknowns, {_short(product)}; {_PRODUCT}"
+            way_out = f"it multiplies unknowns, {in_short(product)}; {_PRODUCT}"
         raise SettingError(
             f"{name} is not convex: cvxpy finds it {expression.curvature.lower()}, "
-            f"{_short(expression)}; {way_out}"
+            f"{in_short(expression)}; {way_out}"
         )
 
 
 def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constraint]) -> None:
     """Raise a SettingError unless they are lists of convex numbers, and of convex constraints."""
     for name, given in (("terms", terms), ("constraints", constraints)):
-        if isinstance(given, cp.Expression | cp.Constraint):
+        if not isinstance(given, Sequence):
             raise SettingError(f"{name} is one {type(given).__name__}; give a list: {name}=[..]")
     for position, term in enumerate(terms):
         check_convex(term, f"terms[{position}]")
     for position, constraint in enumerate(constraints):
         if not (isinstance(constraint, cp.Constraint) and constraint.is_dcp()):
             raise SettingError(
-                f"constraints[{position}], {_short(constraint)}, is not convex by the rules of DCP"
+                f"constraints[{position}], {in_short(constraint)}, is not convex by the rules of "
+                "DCP"
             )
 
 
@@ -127,7 +133,7 @@ class ConvexSolver:
     Parameters
     ----------
     name : str
-        One of `cp.installed_solvers()`: "CLARABEL", "MOSEK", "SCS", "OSQP", ..
+        One of `cp.installed_solvers()`, in any case: "CLARABEL", "MOSEK", "SCS", "OSQP", ..
     options : mapping
         Options of the solver. They win over those that a model sets: tolerances, of first-order
         methods no finer than 1e-7, and a limit of iterations for Clarabel, SCS and OSQP; none for
@@ -155,12 +161,15 @@ class ConvexSolver:
     warm_start: bool = True
 
     def __post_init__(self) -> None:
-        if self.name not in cp.installed_solvers():
+        check_settings(self)
+        name = self.name.upper()
+        if name not in cp.installed_solvers():
             installed = ", ".join(cp.installed_solvers())
             raise SettingError(
                 f"solver {self.name!r} is not installed; "
                 f"cvxpy finds {installed}; see cvxpy's manual"
             )
+        object.__setattr__(self, "name", name)
 
     @property
     def is_first_order(self) -> bool:
@@ -283,6 +292,11 @@ def finite_array(values: object, name: str) -> Array:
     return array
 
 
+def _has_semidefinite_indicator(part: cp.Expression | cp.Constraint) -> bool:
+    """Whether a semidefinite constraint is inside an expression, as only indicators have one."""
+    return isinstance(part, cp.PSD) or any(map(_has_semidefinite_indicator, part.args))
+
+
 def _product_of_unknowns(expression: cp.Expression) -> cp.Expression | None:
     """The first product in an expression both of whose factors have variables."""
     is_binary = isinstance(expression, cp.atoms.affine.binary_operators.BinaryOperator)
@@ -292,5 +306,6 @@ def _product_of_unknowns(expression: cp.Expression) -> cp.Expression | None:
     return next(filter(None, products_inside), None)
 
 
-def _short(expression: cp.Expression | cp.Constraint) -> str:
+def in_short(expression: cp.Expression | cp.Constraint) -> str:
+    """The beginning of an expression or a constraint, in one line, for messages."""
     return " ".join(str(expression).split())[:_MAX_SHOWN]

@@ -9,7 +9,7 @@ Terms and constraints are written on poses and edges by their numbers.
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cvxpy as cp
@@ -18,10 +18,13 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from pgo_models.convex.convex_solver import ConvexSolver, HoldsModel, check_terms
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings, door
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.matrices import residual_matrix, rotation_columns
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 
 
 class Unknowns(enum.Enum):
@@ -156,6 +159,7 @@ class ModelChange(HoldsModel):
 
     def __post_init__(self) -> None:
         check_terms(self.terms, self.constraints)
+        check_settings(self, of_any_type=["terms", "constraints"])
         edges = np.asarray(self.replaced_edges)
         is_mask = edges.dtype == bool
         chosen = np.flatnonzero(edges) if is_mask else edges.astype(int)
@@ -166,7 +170,7 @@ Changer = Callable[[PoseVariables], ModelChange]
 
 
 @dataclass(frozen=True, eq=False)
-class GraphQP:
+class GraphQP(Summarised):
     """A compiled R-subproblem on the poses of a graph.
 
     Parameters
@@ -191,6 +195,20 @@ class GraphQP:
     A: csr_array
     w: Array
     between: csr_array
+
+    def with_penalty(self, penalty: Array) -> "GraphQP":
+        """Pose the program anew with other penalties, in the same variables.
+
+        Parameters
+        ----------
+        penalty : Array, (N_a,)
+            Diagonal of D: penalties of the rows of X.
+        """
+        X = self.variables.X
+        terms, constraints = self.change.terms, self.change.constraints
+        d = self.variables.graph.d
+        qp = rotation_qp(self.A, self.w, penalty, d, X, terms, constraints, self.qp.solver)
+        return replace(self, qp=qp)
 
     def solve(self, V: Array, neighbours: Array | None = None) -> Array:
         """Solve the subproblem for a shift.
@@ -279,27 +297,28 @@ class GraphQP:
         return np.asarray(stacked_columns.reshape(X.shape, order="F"))
 
 
+@door
 def graph_qp(
-    graph: PoseGraph,
-    rho: Array,
+    graph: PoseGraph | PGOProblem,
+    rho: Array | float,
     unknowns: Unknowns = Unknowns.POSES,
     changer: Changer | None = None,
-    rho_t: Array | None = None,
+    rho_t: Array | float | None = None,
     solver: ConvexSolver | str = "CLARABEL",
 ) -> GraphQP:
     """Pose the R-subproblem of a whole graph.
 
     Parameters
     ----------
-    graph : PoseGraph
-        The graph.
-    rho : (n,) array
+    graph : PoseGraph or PGOProblem
+        The graph, or the problem of its cost F.
+    rho : (n,) array, or a number for all poses
         Penalties of the rotations.
     unknowns : Unknowns
         Whether translations are unknown too.
     changer : callable or None
         Given the `PoseVariables`, it returns the `ModelChange`.
-    rho_t : (n,) array or None
+    rho_t : (n,) array, a number for all poses, or None
         Penalties of the translations; none unless given.
     solver : ConvexSolver or str
         What solves the program.
@@ -312,7 +331,8 @@ def graph_qp(
     Raises
     ------
     SettingError
-        If a penalty is negative or all are zero, or the change is not convex.
+        If a penalty is negative or all are zero, the penalties are not one for every pose, the cost
+        of the problem is not F, or the change is not convex.
 
     Examples
     --------
@@ -321,13 +341,38 @@ def graph_qp(
     >>> def prior(unknown: PoseVariables) -> ModelChange:
     ...     position = np.array([1.0, 0.0, 0.0])
     ...     return ModelChange(terms=[10.0 * cp.sum_squares(unknown.t(3) - position)])
-    >>> qp = graph_qp(graph, np.full(27, 5.0), changer=prior)
+    >>> qp = graph_qp(graph, 5.0, changer=prior)
     >>> qp.qp.problem.is_dcp(dpp=True), len(qp.qp.problem.parameters())
     (True, 1)
     """
+    if isinstance(graph, PGOProblem):
+        check_terms_are_added_to_F(graph)
+        graph = graph.graph
+    rho = _penalties(rho, "rho", graph)
+    if rho_t is not None:
+        rho_t = _penalties(rho_t, "rho_t", graph)
     all_poses = np.ones(graph.num_poses, dtype=bool)
     shares = np.ones(graph.num_edges)
     return _posed(graph, all_poses, shares, rho, rho_t, unknowns, changer, solver)
+
+
+def check_terms_are_added_to_F(problem: PGOProblem) -> None:
+    """Raise a SettingError unless the cost of a problem is F, which models are posed of."""
+    if problem.weighting is not Weighting.ISOTROPIC:
+        raise SettingError(
+            "terms are added to F, with two precisions an edge; use Weighting.ISOTROPIC"
+        )
+
+
+def _penalties(rho: Array | float, name: str, graph: PoseGraph) -> Array:
+    """One penalty for every pose, (n,)."""
+    penalties = np.asarray(rho, dtype=float)
+    if penalties.shape not in ((), (graph.num_poses,)):
+        raise SettingError(
+            f"{name} has shape {penalties.shape}; give one number, or one for each of "
+            f"{graph.num_poses} poses"
+        )
+    return np.broadcast_to(penalties, graph.num_poses)
 
 
 def robot_qp(

@@ -30,9 +30,10 @@ from pgo_models.convex.convex_solver import (
     check_variable,
     finite_array,
 )
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 
 _IN_SET = 1e-6  # distance from a set up to which a point counts as one of its points
 # The sets of the arguments of OrthogonalProblem; Sparse comes with a number for every variable.
@@ -45,7 +46,7 @@ _SETS: dict[str, ConstraintSet] = {
 
 
 @dataclass(frozen=True)
-class Term:
+class Term(Summarised):
     """One non-convex constraint: a variable is in a set.
 
     Parameters
@@ -100,8 +101,9 @@ class OrthogonalProblem(HoldsModel):
     unit_columns, unit_rows : sequence of variables
         Every column, or every row, has norm 1.
     sparse : sequence of pairs (variable, int)
-        Variables with at most so many nonzeros. A variable may be here and in one of the other
-        lists too.
+        Variables with at most so many nonzeros.
+    sets : sequence of pairs (variable, ConstraintSet)
+        Variables in other sets, by their projections. A variable may be in several of these lists.
 
     Raises
     ------
@@ -117,18 +119,22 @@ class OrthogonalProblem(HoldsModel):
     OrthogonalProblem((3, 3) Rotations)
     """
 
+    _way_out = "OrthogonalProblem(problem, rotations=[X]) makes one of a cvxpy Problem"
+
     problem: Any
     orthogonal: Sequence[Any] = ()
     rotations: Sequence[Any] = ()
     unit_columns: Sequence[Any] = ()
     unit_rows: Sequence[Any] = ()
     sparse: Sequence[tuple[Any, int]] = ()
+    sets: Sequence[tuple[Any, ConstraintSet]] = ()
     J: Any = field(init=False)
     variables: tuple[Any, ...] = field(init=False)
     others: tuple[Any, ...] = field(init=False)
     terms: tuple[Term, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        check_settings(self, of_any_type=["problem", *_SETS])
         if not isinstance(self.problem, cp.Problem):
             raise SettingError(
                 f"the problem is a {type(self.problem).__name__}; give a cvxpy Problem"
@@ -154,6 +160,7 @@ class OrthogonalProblem(HoldsModel):
             if variable.id not in positions:
                 check_variable(variable, "a variable of the problem")
                 others.append(variable)
+        _check_not_imposed_twice(self.problem.constraints, set(positions))
         object.__setattr__(self, "J", _minimised(self.problem))
         object.__setattr__(self, "variables", tuple(variables))
         object.__setattr__(self, "others", tuple(others))
@@ -170,6 +177,8 @@ class OrthogonalProblem(HoldsModel):
                 named.append((f"{argument}[{position}]", variable, constraint))
         for position, (variable, nonzeros) in enumerate(self.sparse):
             named.append((f"sparse[{position}]", variable, Sparse(nonzeros)))
+        for position, (variable, own) in enumerate(self.sets):
+            named.append((f"sets[{position}]", variable, own))
         if not named:
             raise SettingError(
                 "no variable is named; a convex problem is solved by problem.solve()"
@@ -213,7 +222,7 @@ class OrthogonalProblem(HoldsModel):
         copies = []
         normals = []
         for term in self.terms:
-            copy = term.constraint.project(checked[term.variable])
+            copy = term.constraint.projected(checked[term.variable])
             copies.append(copy)
             normals.append(np.zeros(copy.shape))
         return OrthogonalPoint(tuple(copies), tuple(normals))
@@ -431,7 +440,7 @@ class SplitProblem(HoldsModel):
 
 
 @dataclass(frozen=True, eq=False)
-class KKTResiduals:
+class KKTResiduals(Summarised):
     """How far a point is from satisfying the KKT conditions of the non-convex problem.
 
     Parameters
@@ -505,6 +514,17 @@ def _real_arrays(arrays: Sequence[Array], name: str) -> tuple[Array, ...]:
 
 def _values(variables: Sequence[cp.Variable]) -> tuple[Array, ...]:
     return tuple(np.array(variable.value, dtype=float) for variable in variables)
+
+
+def _check_not_imposed_twice(constraints: Sequence[cp.Constraint], in_sets: set[int]) -> None:
+    """Raise a SettingError where a constraint that is not convex is on variables in sets alone."""
+    for position, constraint in enumerate(constraints):
+        on_sets_alone = all(variable.id in in_sets for variable in constraint.variables())
+        if on_sets_alone and not constraint.is_dcp():
+            raise SettingError(
+                f"constraints[{position}], {convex_solver.in_short(constraint)}, is not convex; if "
+                "it says that its variable is in the set, remove it: SOC imposes the set itself"
+            )
 
 
 def _minimised(problem: cp.Problem) -> cp.Expression:

@@ -19,7 +19,10 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
 
     If A and B have the same shape (l, n) the solution is U V^T of the SVD of A^T B, with the sign
     of the last singular pair changed for SO(d) when det(U V^T) < 0 (Schoenemann 1966; Lai & Osher
-    2014, section 4). With A = I it is the nearest orthonormal matrix to B. If B is (l, p) with p <
+    2014, section 4). The solution is not unique where singular values tie: with a last one of zero,
+    a rotation and a reflection fit equally well, and for SO(d) with det(U V^T) < 0, several
+    rotations do where the last two are equal; which one is found depends on rounding and on the
+    start. With A = I it is the nearest orthonormal matrix to B. If B is (l, p) with p <
     n the problem is unbalanced and has no closed form (Elden & Park 1999).
 
     Parameters

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from pgo_models.convex.convex_solver import ConvexSolver, HoldsModel, as_solver, solve_compiled
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, door
+from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.rotations import Array
 
 TOLERANCE = 1e-12
@@ -83,6 +84,7 @@ class RotationQP(HoldsModel):
         return self.last[key].copy()
 
 
+@door
 def rotation_qp(
     A: csr_array,
     w: Array,
@@ -123,7 +125,8 @@ def rotation_qp(
     Raises
     ------
     SettingError
-        If a penalty is negative or all are zero, or a term or a constraint is not convex.
+        If a penalty or a weight is negative or all penalties are zero, a shape does not fit, or a
+        term or a constraint is not convex.
 
     Notes
     -----
@@ -140,6 +143,13 @@ def rotation_qp(
     >>> rotation_qp(A, w, np.ones(problem.side), problem.d).X.shape
     (108, 3)
     """
+    rows, N = A.shape
+    check_shape(w, (rows,), "w")
+    check_shape(penalty, (N,), "penalty")
+    if d not in (2, 3):
+        raise SettingError(f"d is {d}; give 2 or 3")
+    if not (w >= 0).all():
+        raise SettingError("weights w must not be negative")
     if not ((penalty >= 0).all() and (penalty > 0).any()):
         raise SettingError("penalties must not be negative, and one must be positive")
     if X is None:

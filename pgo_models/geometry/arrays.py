@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
-from pgo_models.errors import GraphError, PGOError
+from pgo_models.errors import GraphError, PGOError, SettingError
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 
 T = TypeVar("T", bound="NDArray[Any] | csc_array | csr_array")
 
@@ -19,7 +20,7 @@ T = TypeVar("T", bound="NDArray[Any] | csc_array | csr_array")
 _EXACT = 2.0**53
 
 
-class ReadOnly:
+class ReadOnly(Summarised):
     """Base of frozen objects with arrays, which stay read-only in a pickle or a deep copy.
 
     Cached properties are not copied: the copy computes them when they are asked for.
@@ -81,6 +82,12 @@ def whole_array(values: object, name: str, error: type[PGOError] = GraphError) -
     if not _needs_copy(array, np.int64):
         return array
     return read_only(np.array(array, dtype=np.int64, order="C"))
+
+
+def check_shape(values: NDArray[Any], shape: tuple[int, ...], name: str) -> None:
+    """Raise a SettingError unless an array has this shape."""
+    if values.shape != shape:
+        raise SettingError(f"{name} has shape {values.shape}; give {shape}")
 
 
 def whole_number(value: object, name: str, error: type[PGOError] = GraphError) -> int:

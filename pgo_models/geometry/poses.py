@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, door
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
 from pgo_models.geometry.rotations import (
     Array,
@@ -54,6 +54,14 @@ class Poses(ReadOnly):
 
     R: Array
     t: Array
+
+    _way_out = "give Poses(R, t), or problem.with_best_translations(R)"
+
+    @classmethod
+    def _from_given(cls, given: object) -> Poses | None:
+        """Poses of a run or a solution, which stand for them at the doors."""
+        poses = getattr(given, "poses", None)
+        return poses if isinstance(poses, Poses) else None
 
     def __post_init__(self) -> None:
         R = real_array(self.R, "R")
@@ -314,6 +322,7 @@ def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> tuple[Array, 
     return R, float(error.max(initial=0.0))
 
 
+@door
 def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
     """Compute the ATE: the root mean square of ||t_i - t_i'||, after the estimate is aligned.
 
@@ -387,6 +396,7 @@ def absolute_rotation_error(estimate: Poses, truth: Poses) -> float:
     return float(np.sqrt(np.mean(squared_angle)))
 
 
+@door
 def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[float, float]:
     """Compute the RPE over all pairs (i, i + step), without alignment.
 

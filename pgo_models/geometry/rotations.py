@@ -6,7 +6,7 @@ The projection is step (b) of the paper's Algorithm 1, with det = +1 enforced.
 import numpy as np
 from numpy.typing import NDArray
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, door
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -38,6 +38,7 @@ _NEXT_AFTER = _entries(1, 2)
 _AFTER_NEXT = _entries(2, 1)
 
 
+@door
 def project_to_rotations(A: Array) -> Array:
     """Project matrices to the nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F.
 
@@ -210,6 +211,7 @@ def vee(W: Array) -> Array:
     return 0.5 * np.stack([x, y, z], -1)
 
 
+@door
 def exp_map(w: Array) -> Array:
     """Compute the rotations Exp(hat(w)) of tangent vectors.
 
@@ -245,6 +247,7 @@ def exp_map(w: Array) -> Array:
     return np.asarray(np.cos(angle) * np.eye(3) + first_order * hat(w) + second_order * outer)
 
 
+@door
 def log_map(R: Array) -> Array:
     """Compute the tangent vectors w of rotations, with Exp(hat(w)) = R and ||w|| <= pi.
 
@@ -292,7 +295,17 @@ def _check_ends(A: Array, *ends: tuple[int, ...]) -> None:
         )
 
 
-def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
+def as_generator(rng: np.random.Generator | int) -> np.random.Generator:
+    """The generator that is given, or a new one from the seed that is given."""
+    if isinstance(rng, np.random.Generator):
+        return rng
+    if rng < 0:
+        raise SettingError(f"the seed is {rng}; give a whole number that is not negative")
+    return np.random.default_rng(rng)
+
+
+@door
+def random_rotations(count: int, d: int, rng: np.random.Generator | int) -> Array:
     """Draw rotations uniformly (by the Haar measure) from SO(d).
 
     Parameters
@@ -301,7 +314,7 @@ def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
         Number of rotations.
     d : int
         Dimension of space: 2 or 3.
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the draws.
 
     Returns
@@ -315,6 +328,9 @@ def random_rotations(count: int, d: int, rng: np.random.Generator) -> Array:
     >>> R.shape, bool(np.linalg.det(R).min() > 0.999)
     ((4, 3, 3), True)
     """
+    rng = as_generator(rng)
+    if count < 0 or d not in (2, 3):
+        raise SettingError(f"count is {count} and d is {d}; give at least 0, and d = 2 or 3")
     if d == 2:
         angles = rng.uniform(-np.pi, np.pi, (count, 1))
         return exp_map(angles)

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, printable
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, door, printable
 from pgo_models.files import check_lines, check_writable, replace_when_done
+from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_folder import (
@@ -40,6 +41,7 @@ _ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
 _SAME_ROTATION = 1e-9
 
 
+@door
 def read_g2o(
     path: Path | str,
     weights: RotationWeight = RotationWeight.SE_SYNC,
@@ -329,6 +331,7 @@ def _check_same_poses(file: G2OLines, graph: PoseGraph) -> None:
         raise FileFormatError(file.path, line, problem)
 
 
+@door
 def write_g2o(
     graph: PoseGraph, path: Path | str, poses: Poses | None = None, mine: BoolArray | None = None
 ) -> None:
@@ -371,6 +374,7 @@ def write_g2o(
     all_edges = np.ones(graph.num_edges, dtype=bool)
     if mine is None:
         mine = np.ones(graph.num_poses, dtype=bool)
+    check_shape(mine, (graph.num_poses,), "mine")
     _write(graph, Path(path), written_poses, mine, all_edges)
 
 

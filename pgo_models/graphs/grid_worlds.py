@@ -10,9 +10,9 @@ import scipy  # and scipy.spatial when it is used
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, door
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, exp_map
+from pgo_models.geometry.rotations import Array, as_generator, exp_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.scenes import (
     MILD_NOISE,
@@ -28,10 +28,11 @@ _STRAIGHT = 0.6  # probability of going straight on where nothing is in the way
 _REACH = 1.1  # metres: poses in the same cell or in cells side by side see each other
 
 
+@door
 def grid_world(
     num_robots: int,
     poses_per_robot: int,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     *,
     d: int = 3,
     noise: NoiseModel = MILD_NOISE,
@@ -55,7 +56,7 @@ def grid_world(
         Number of robots, at least 1.
     poses_per_robot : int
         Number of poses of each, at least 2.
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the walks, the closures and the noise.
     d : int
         Dimension of space: 2 or 3.
@@ -80,6 +81,7 @@ def grid_world(
     >>> grid_world(2, 10, np.random.default_rng(0), d=2).is_connected
     True
     """
+    rng = as_generator(rng)
     if num_robots < 1:
         raise SettingError(f"num_robots must be at least 1, got {num_robots}")
     if poses_per_robot < 2:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, SettingError, extra_module
+from pgo_models.errors import MissingExtraError, SettingError, door, extra_module
 from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, has_no_gap
@@ -109,6 +109,7 @@ class Partition(ReadOnly):
         return f"Partition({self.num_robots} robots, {sizes}, {self.method.value})"
 
 
+@door
 def partition(
     graph: PoseGraph, num_robots: int | None = None, method: PartitionMethod | None = None
 ) -> Partition:
@@ -145,10 +146,6 @@ def partition(
     """
     if num_robots is not None:
         num_robots = whole_number(num_robots, "num_robots", SettingError)
-    if not isinstance(method, PartitionMethod | None):
-        raise SettingError(
-            f"method is {method!r:.60}; give one of {', '.join(map(str, PartitionMethod))}"
-        )
     names_robots = graph.robot is not None and num_robots in (None, graph.num_robots)
     if method is None:
         method = PartitionMethod.GIVEN if names_robots else PartitionMethod.CONTIGUOUS

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, check_settings, door
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array, whole_array, whole_number
 from pgo_models.geometry.poses import Poses, rotations_to_rounding
 from pgo_models.geometry.rotations import Array, BoolArray
@@ -37,6 +37,7 @@ _NAMED_COMPONENTS = 5  # components that an error names
 _WHOLE_NUMBERS = ("num_poses", "world")
 _WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks", "absent")
 _REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times", "written_error")
+_OPTIONAL = ("world", "ids", "robot", "information", "times", "written_error")
 _EDGE_FIELDS = (
     "i",
     "j",
@@ -166,7 +167,10 @@ class PoseGraph(ReadOnly):
     written_error: Array | None = None
     weights_error: float = 0.0
 
+    _way_out = "pgo_models.load(..) reads a graph, and `.graph` of a problem is one"
+
     def __post_init__(self) -> None:
+        check_settings(self, of_any_type=_WHOLE_NUMBERS + _WHOLE_ARRAYS + _REAL_ARRAYS)
         self._convert(_WHOLE_NUMBERS, whole_number)
         self._convert(_WHOLE_ARRAYS, whole_array)
         self._convert(_REAL_ARRAYS, real_array)
@@ -199,7 +203,7 @@ class PoseGraph(ReadOnly):
         """Replace the given fields by what `checked(value, name)` returns for them."""
         for name in names:
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or name not in _OPTIONAL:
                 self._set(name, checked(value, name))
 
     def _rotation_label(self, e: int) -> str:
@@ -870,6 +874,7 @@ class PoseGraph(ReadOnly):
         """
         return replace(self, robot=robot)
 
+    @door
     def without_edges(self, mask: BoolArray) -> PoseGraph:
         """Return the graph without some edges.
 
@@ -888,7 +893,6 @@ class PoseGraph(ReadOnly):
         GraphError
             When the mask has another shape, or no edge is left.
         """
-        mask = np.asarray(mask, dtype=bool)
         if mask.shape != (self.num_edges,):
             raise GraphError(
                 f"the mask has shape {mask.shape}; "

@@ -5,15 +5,22 @@ geometry, Cristofalo et al. 2020 (GeoD); the figures stand in data/reference.jso
 Every function takes its random generator.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # and scipy.spatial when it is used
 from numpy.typing import NDArray
 
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import SettingError, check_settings, door
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
+from pgo_models.geometry.rotations import (
+    Array,
+    as_generator,
+    exp_map,
+    random_rotations,
+    tangent_dimension,
+)
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 
 # Weights of the published experiments: the standard deviations, not the squares of their inverses.
@@ -76,7 +83,8 @@ class NoiseModel:
 MILD_NOISE = NoiseModel(translation_std=0.1, rotation_std=np.pi / 60)
 
 
-def circle(rng: np.random.Generator) -> PoseGraph:
+@door
+def circle(rng: np.random.Generator | int) -> PoseGraph:
     """Generate the paper's circle: 25 poses at a radius of 2.6 m in the x-y plane.
 
     The 300 directed edges join poses that are within 4.0 m. Truth rotations are uniform on SO(3),
@@ -85,7 +93,7 @@ def circle(rng: np.random.Generator) -> PoseGraph:
 
     Parameters
     ----------
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the truth rotations and the noise.
 
     Returns
@@ -110,14 +118,15 @@ def circle(rng: np.random.Generator) -> PoseGraph:
     return _network("circle", t, radius=4.0, rng=rng)
 
 
-def grid(rng: np.random.Generator) -> PoseGraph:
+@door
+def grid(rng: np.random.Generator | int) -> PoseGraph:
     """Generate the paper's grid: 27 poses on a 3 x 3 x 3 lattice with a spacing of 1.66 m.
 
     The 108 directed edges join neighbours on the lattice; all else is as in `circle`.
 
     Parameters
     ----------
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the truth rotations and the noise.
 
     Returns
@@ -140,7 +149,8 @@ def grid(rng: np.random.Generator) -> PoseGraph:
     return _network("grid", 1.66 * lattice, radius=1.66, rng=rng)
 
 
-def sphere(rng: np.random.Generator) -> PoseGraph:
+@door
+def sphere(rng: np.random.Generator | int) -> PoseGraph:
     """Generate the paper's sphere: 50 poses by Deserno's equal-area rule at a radius of 3 m.
 
     The 544 directed edges join poses that are within 3 m; all else is as in `circle`.
@@ -153,7 +163,7 @@ def sphere(rng: np.random.Generator) -> PoseGraph:
 
     Parameters
     ----------
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the truth rotations and the noise.
 
     Returns
@@ -175,9 +185,10 @@ def sphere(rng: np.random.Generator) -> PoseGraph:
     return _network("sphere", t, radius=3.0, rng=rng, left_out=_SPHERE_PAIR_LEFT_OUT)
 
 
+@door
 def random_geometric(
     num_poses: int,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     *,
     d: int = 3,
     mean_degree: float = 6.0,
@@ -193,7 +204,7 @@ def random_geometric(
     ----------
     num_poses : int
         Number of poses, at least 2.
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the truth and the noise.
     d : int
         Dimension of space: 2 or 3.
@@ -219,6 +230,7 @@ def random_geometric(
     >>> random_geometric(20, np.random.default_rng(0), d=2).is_connected
     True
     """
+    rng = as_generator(rng)
     if num_poses < 2:
         raise SettingError(f"num_poses must be at least 2, got {num_poses}")
     check_dimension(d)
@@ -248,8 +260,9 @@ def _nearest_earlier(t: Array, pose: int) -> int:
     return int(np.argmin(squared_distance))
 
 
+@door
 def victoria_park(
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     *,
     num_poses: int = 300,
     noise: NoiseModel = MILD_NOISE,
@@ -263,7 +276,7 @@ def victoria_park(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the truth and the noise.
     num_poses : int
         Number of poses of the drive, at least 20.
@@ -281,13 +294,16 @@ def victoria_park(
     Raises
     ------
     SettingError
-        For fewer than 20 poses.
+        For fewer than 20 poses, or a reach that is not positive.
 
     Examples
     --------
     >>> victoria_park(np.random.default_rng(0))
     PoseGraph('victoria_park', d=2, poses=300, edges=3523, landmarks=75, robots=1)
     """
+    rng = as_generator(rng)
+    if not 0 < reach < math.inf:
+        raise SettingError(f"reach must be positive and finite, got {reach}")
     if num_poses < 20:
         raise SettingError(f"num_poses must be at least 20, got {num_poses}")
     t, heading = _wavy_loop(num_poses)
@@ -393,13 +409,14 @@ def _network(
     name: str,
     t: Array,
     radius: float,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     left_out: tuple[int, int] | None = None,
 ) -> PoseGraph:
     """Network of the paper: both directed edges between poses at most `radius` apart.
 
     Each of the two has noise of its own. One pair may be left out.
     """
+    rng = as_generator(rng)
     shifts = t[:, None] - t[None]
     distance = np.linalg.norm(shifts, axis=2)
     is_edge: NDArray[np.bool_] = distance <= radius + _SLACK

@@ -5,11 +5,13 @@ Robots have colours, doubtful edges are marked, and estimates are compared with 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, door
+from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.geometry.rotations import Array, BoolArray, log_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -121,6 +123,13 @@ def thinning_step(count: int, most: int) -> int:
     return max(1, -(-count // most))
 
 
+def check_covariances(covariances: Array | None, graph: PoseGraph) -> None:
+    """Raise a SettingError unless covariances are one matrix for every pose, (n, p, p)."""
+    if covariances is not None:
+        p = graph.d * (graph.d + 1) // 2
+        check_shape(covariances, (graph.num_poses, p, p), "covariances")
+
+
 def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
     """Outlines, (k, 49, d) points, of ellipses that hold the true x and y with 95 %.
 
@@ -186,6 +195,7 @@ def draw_graph(
     _frame(axes, poses.t[graph.in_files])
 
 
+@door
 def plot_graph(
     graph: PoseGraph,
     poses: Poses,
@@ -230,6 +240,7 @@ def plot_graph(
     >>> plot_graph(graph, graph.truth, "27 poses").axes[0].get_title()
     '27 poses'
     """
+    check_covariances(covariances, graph)
     with column_figure(height=1.15) as figure:
         axes = _add_axes(figure, graph)
         draw_graph(graph, poses, axes, residuals=residuals)
@@ -254,8 +265,11 @@ def plot_graph(
     return figure
 
 
+@door
 def compare_poses(
-    graph: PoseGraph, panels: list[tuple[str, Poses]], residuals: EdgeResiduals | None = None
+    graph: PoseGraph,
+    panels: Sequence[tuple[str, Poses]] | Poses,
+    residuals: EdgeResiduals | None = None,
 ) -> Figure:
     """Plot several sets of poses of one graph side by side with matplotlib.
 
@@ -263,8 +277,8 @@ def compare_poses(
     ----------
     graph : PoseGraph
         Graph to draw.
-    panels : list of (str, Poses)
-        Title and poses of every panel.
+    panels : list of (str, Poses), or Poses
+        Title and poses of every panel; poses alone are one panel without a title.
     residuals : EdgeResiduals, optional
         Residuals at the poses of the last panel, in which edges are marked by them.
 
@@ -288,7 +302,8 @@ def compare_poses(
     >>> [axes.get_title() for axes in figure.axes]
     ['truth', 'start']
     """
-    row = [(title, graph, poses) for title, poses in panels]
+    titled = [("", panels)] if isinstance(panels, Poses) else panels
+    row = [(title, graph, poses) for title, poses in titled]
     return plot_panels([row], residuals)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pgo_models.errors import door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
@@ -43,6 +44,7 @@ _LINES_OF_KINDS = {
 }
 
 
+@door
 def explore_graph(
     graph: PoseGraph,
     poses: Poses,
@@ -92,6 +94,7 @@ def explore_graph(
     >>> [trace.name for trace in explore_graph(graph, graph.truth).data]
     ['edges and poses', 'edges and poses', 'misfit']
     """
+    graph_plots.check_covariances(covariances, graph)
     go = plotly("graph_objects")
     if residuals is None:
         residuals = edge_residuals(graph, poses)

@@ -17,7 +17,7 @@ from scipy.sparse import csc_array
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.files import replace_when_done
-from pgo_models.geometry.arrays import ReadOnly
+from pgo_models.geometry.arrays import ReadOnly, whole_number
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, factorize
@@ -144,6 +144,7 @@ class Marginals(ReadOnly):
     def _check(self, *poses: int) -> None:
         last = self.layout.num_poses - 1
         for pose in poses:
+            whole_number(pose, "a pose", SettingError)
             if not 0 <= pose <= last:
                 raise SettingError(f"there is no pose {pose}; give one of 0 to {last}")
 

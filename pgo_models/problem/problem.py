@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import GraphError, SettingError, check_settings
 from pgo_models.geometry.arrays import ReadOnly, read_only
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, vee
@@ -82,15 +82,15 @@ class PGOProblem(ReadOnly):
     backend: CholeskyBackend | None = None
     weighting: Weighting | EdgeCost = Weighting.OWN
 
+    _way_out = "PGOProblem(graph) makes one, and pgo_models.load(..) reads a graph"
+
+    @classmethod
+    def _from_given(cls, given: object) -> "PGOProblem | None":
+        """The problem of a graph, which stands for it at the doors."""
+        return PGOProblem(given) if isinstance(given, PoseGraph) else None
+
     def __post_init__(self) -> None:
-        if not isinstance(self.weighting, Weighting | EdgeCost):
-            raise SettingError(
-                f"weighting is {self.weighting!r}; give one of {', '.join(map(str, Weighting))}"
-            )
-        if self.backend is not None and not isinstance(self.backend, CholeskyBackend):
-            raise SettingError(
-                f"backend is {self.backend!r}; give one of {', '.join(map(str, CholeskyBackend))}"
-            )
+        check_settings(self)
         if self.weighting is Weighting.OWN:
             object.__setattr__(self, "weighting", own_weighting(self.graph))
         if self.weighting is Weighting.ROTATIONS:
@@ -927,14 +927,6 @@ class _ExtendedProblem(PGOProblem):
         return self.original.analysis
 
 
-def as_problem(given: object) -> PGOProblem:
-    """Return the problem that is given, or that of the graph that is given.
-
-    A SettingError is raised when it is neither.
-    """
-    if isinstance(given, PoseGraph):
-        return PGOProblem(given)
-    if isinstance(given, PGOProblem):
-        return given
-    way_out = "pgo_models.load() reads a file or a data set"
-    raise SettingError(f"the problem is {given!r:.60}; give a PGOProblem or a PoseGraph: {way_out}")
+def as_problem(given: PGOProblem | PoseGraph) -> PGOProblem:
+    """Return the problem that is given, or that of the graph that is given."""
+    return given if isinstance(given, PGOProblem) else PGOProblem(given)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # and scipy.special when it is used
 
-from pgo_models.errors import check_quantile
+from pgo_models.errors import check_quantile, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -20,13 +20,14 @@ from pgo_models.graphs.residuals import edge_errors
 from pgo_models.problem.edge_cost import isotropic_cost
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 
 # Probability of any misfit when all measurement errors have the covariances of their matrices.
 FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeResiduals:
+class EdgeResiduals(Summarised):
     """Residuals and costs of every edge at some poses, with the thresholds of chi-square tests.
 
     Parameters
@@ -88,6 +89,7 @@ class EdgeResiduals:
         return bool(self.is_misfit.any()) or self.is_overall_misfit
 
 
+@door
 def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResiduals:
     """Compute and test the residuals and the cost of every edge at poses.
 
@@ -169,6 +171,7 @@ def _redundancy(graph: PoseGraph, w: Array, has_translations: bool) -> float:
     return 1.0 - unknowns / max(rank, 1)
 
 
+@door
 def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     """Compute thresholds that edge costs at the true poses exceed with probability 1 - quantile.
 

@@ -10,6 +10,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.clique_tree import CliqueTree, build_clique_tree, clique_side
+from pgo_models.summaries import Summarised
 
 DEFAULT_MEMORY_LIMIT = 4e9  # bytes
 # An interior-point method is accurate; its work grows with the sixth power of a cone's side. The
@@ -47,7 +48,7 @@ class RelaxationForm(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class RelaxationPlan:
+class RelaxationPlan(Summarised):
     """A form and a solver, an estimate of their cost, and why they were chosen."""
 
     form: RelaxationForm

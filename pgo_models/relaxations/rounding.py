@@ -10,13 +10,14 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_transposes
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 
 # of the largest singular value; interior points and first-order methods leave about 1e-5
 RANK_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class RankReport:
+class RankReport(Summarised):
     """Singular values of a PSD matrix that has rank d exactly when the relaxation is tight."""
 
     singular_values: Array  # (side,): descending

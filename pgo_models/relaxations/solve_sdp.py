@@ -9,7 +9,7 @@ import cvxpy as cp
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with
 from pgo_models.convex.convex_solver import ConvexSolver
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import PGOError, SettingError, door
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
@@ -33,6 +33,7 @@ from pgo_models.relaxations.primal_dual import (
     primal_relaxation,
 )
 from pgo_models.relaxations.rounding import RankReport
+from pgo_models.summaries import Summarised
 
 DEFAULT_RELAXATION_GAP = 1e-5
 TOLERANCE = 1e-10
@@ -56,7 +57,7 @@ class RelaxationStatus(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class RelaxationSolution:
+class RelaxationSolution(Summarised):
     """Rounded poses, a proven bound, and how the relaxation was solved.
 
     Parameters
@@ -130,6 +131,7 @@ class RelaxationSolution:
         return "\n".join(lines)
 
 
+@door
 def solve_relaxation(
     problem: PGOProblem,
     form: RelaxationForm | None = None,

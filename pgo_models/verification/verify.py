@@ -90,6 +90,7 @@ from heapq import heapify, heappop, heappush
 from pathlib import Path
 from typing import Any
 
+from pgo_models.errors import SettingError
 from pgo_models.verification.balls import (
     Parts,
     above,
@@ -307,6 +308,12 @@ def verify_proof(
     >>> found.is_verified, found.bound.str(10, radius=False)
     (True, '97.01402085')
     """
+    for name, given_path in (("graph", graph), ("proof", proof)):
+        # Not by `door`, which imports another room.
+        if not isinstance(given_path, str | Path):
+            raise SettingError(f"{name} is {given_path!r:.60}; give the path of a file")
+    if not isinstance(skip_unknown, bool):
+        raise SettingError(f"skip_unknown is {skip_unknown!r:.60}; give True or False")
     path = Path(graph)
     read = read_robot_log if path.suffix == LOG_SUFFIX else read_graph
     measured = read(path, skip_unknown)

@@ -28,6 +28,7 @@ from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.matrices import norm, rotation_columns
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 from solvers.baselines.block_relaxation import (
     LeastSquares,
     Turn,
@@ -48,7 +49,7 @@ class DGSStage(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class GaussSeidelState:
+class GaussSeidelState(Summarised):
     """State after k sweeps.
 
     Parameters

@@ -21,6 +21,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton_step import scaled_decrement
 
@@ -33,7 +34,7 @@ _ROUNDING = 1e-14  # relative change of F that counts as none
 
 
 @dataclass(frozen=True, eq=False)
-class LevenbergMarquardtState:
+class LevenbergMarquardtState(Summarised):
     """Iterate k, and the next step.
 
     Parameters

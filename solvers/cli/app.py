@@ -7,24 +7,30 @@ closed), the best iterate written if there was one.
 
 import gc
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import wraps
 from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 
+from solvers.cli.help import Helpful
 from solvers.cli.shell import CommandGroup, run_command
 from solvers.distribution import text_of_version
 
 
 @dataclass(frozen=True)
 class CommandOfModule:
-    """A command that has not been imported: MODULE:FUNCTION, and its help."""
+    """A command that has not been imported: MODULE:FUNCTION, its help, and what that shows.
+
+    `groups` has the names of the arguments of every group of options.
+    """
 
     place: str
     help: str
+    groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    examples: Sequence[str] = ()
 
     @property
     def short_help(self) -> str:
@@ -36,7 +42,9 @@ class CommandOfModule:
         module, _, function = self.place.partition(":")
         command = getattr(import_module(module), function)
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name, help=self.help)(_with_garbage_collection(command))
+        shown = {"groups": self.groups, "examples": self.examples}
+        kind = type(Helpful.__name__, (Helpful,), shown)
+        app.command(name, cls=kind, help=self.help)(_with_garbage_collection(command))
         return typer.main.get_command(app)
 
 
@@ -56,6 +64,43 @@ COMMANDS = {
     "solve": CommandOfModule(
         "solvers.cli.solve_command:solve_command",
         "Solve a pose graph: poses, their cost, a proven lower bound on the optimum, and the gap.",
+        groups={
+            "What is read, and the cost that is minimised": (
+                "cost",
+                "unit_weights",
+                "rotations",
+                "drop_coupling",
+                "skip_unknown",
+                "trust_folder",
+                "drop_edge",
+                "robust",
+            ),
+            "Files that are written": ("out", "report", "covariances", "proof", "times"),
+            "How it is solved": (
+                "method",
+                "start",
+                "r_step",
+                "gap",
+                "max_iterations",
+                "tolerance",
+                "time_limit",
+                "anchor",
+            ),
+            "Robots that share the graph": (
+                "robots",
+                "split",
+                "engine",
+                "address",
+                "resume",
+                "driver_memory",
+            ),
+            "What is printed": ("verbose", "quiet", "as_json", "help"),
+        },
+        examples=(
+            "pgo solve sphere",
+            "pgo solve mine.g2o --out solved.g2o --report solved.html",
+            "pgo solve mine.g2o --robust gnc --robots 5",
+        ),
     ),
     "certify": CommandOfModule(
         "solvers.cli.certify_command:certify_command",
@@ -129,7 +174,6 @@ class Commands(CommandGroup):
 app = typer.Typer(
     name="pgo",
     cls=Commands,
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -150,4 +194,5 @@ def main(arguments: list[str] | None = None) -> None:
 
     Every error and warning of ours is one line on stderr, or one for each wrong line of a file.
     """
-    raise SystemExit(run_command(app, sys.argv[1:] if arguments is None else arguments))
+    given = sys.argv[1:] if arguments is None else arguments
+    raise SystemExit(run_command(app, given or ["--help"]))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,15 @@ from pgo_models.graphs.scenes import (
 from pgo_models.graphs.trajectories import write_tum
 from pgo_models.memory import check_memory
 from solvers.cli.options import Scene
-from solvers.cli.shell import JsonOption, QuietOption, figures_of_facts, save_then_show, wrapped
+from solvers.cli.shell import (
+    JsonOption,
+    QuietOption,
+    figures_of_facts,
+    is_standard_output,
+    print_g2o,
+    save_then_show,
+    wrapped,
+)
 
 _PAPER_SCENES = {Scene.CIRCLE: circle, Scene.GRID: grid, Scene.SPHERE: sphere}
 
@@ -36,7 +45,8 @@ def generate_command(
         typer.Option(
             "--out",
             "-o",
-            help="A .g2o file, or a name without suffix: a folder with one file a robot.",
+            help="A .g2o file, - for standard output, or a name without suffix: a folder with one "
+            "file a robot.",
         ),
     ],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random generator.")] = 0,
@@ -68,13 +78,18 @@ def generate_command(
     as_json: JsonOption = False,
 ) -> None:
     """Run `pgo generate`."""
-    if out.suffix.lower() not in ("", ".g2o"):
+    if not is_standard_output(out) and out.suffix.lower() not in ("", ".g2o"):
         raise SettingError(
             f"cannot write {out}: give a name that ends in .g2o, "
             "or a folder's name without a suffix"
         )
     rng = np.random.default_rng(seed)
     graph = chosen_scene(scene, rng, poses, robots, dimension, translation_noise, rotation_noise)
+    if is_standard_output(out):
+        if as_json:
+            raise SettingError("--json and --out - both print on standard output; leave out one")
+        print_g2o(partial(write_g2o, graph))
+        return
     truth = out.absolute().parent / f"{out.absolute().stem}.truth.tum"
     _write_scene(graph, out, truth)
     record = {**figures_of_facts(graph.facts()), "written": [str(out), str(truth)]}

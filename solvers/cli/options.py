@@ -47,10 +47,17 @@ def _finite_gap(gap: float) -> float:
     return gap
 
 
+def _standard_input(graph: str) -> str:
+    return "/dev/stdin" if graph == "-" else graph
+
+
 GraphArgument = Annotated[
     str,
     typer.Argument(
-        help="A g2o file, a folder with one file a robot, or the name of a data set (see pgo info)."
+        callback=_standard_input,
+        metavar="GRAPH",
+        help="A g2o file, - for one on standard input, a folder with one file a robot, or the name "
+        "of a data set (see pgo info).",
     ),
 ]
 SplitOption = Annotated[

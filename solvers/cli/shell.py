@@ -14,6 +14,7 @@ import shlex
 import shutil
 import signal
 import sys
+import tempfile
 import textwrap
 import time
 import warnings
@@ -28,6 +29,7 @@ import typer
 from typer.core import TyperGroup
 
 from pgo_models.errors import PGOError, SettingError, printable
+from solvers.cli.help import text_of_usage_error
 from solvers.progress_bars import JobBar
 
 # Exit codes of commands.
@@ -147,10 +149,7 @@ def _run(app: typer.Typer, arguments: list[str]) -> tuple[int, str]:
     except MemoryError:
         return BAD_INPUT, "there is not enough memory; raise the limit, or ask for less"
     except usage_error as error:
-        text = error.format_message() if isinstance(error, typer.BadParameter) else str(error)
-        if not text:  # typer has shown the help
-            return BAD_INPUT, ""
-        return BAD_INPUT, f"{text.rstrip('.')}; see pgo --help"
+        return BAD_INPUT, text_of_usage_error(error)
 
 
 class Interruption:
@@ -288,6 +287,19 @@ def command_to_type(command: str) -> str:
             lines.append("       ")
         lines[-1] += f" {word}"
     return " \\\n".join(lines)
+
+
+def is_standard_output(path: Path) -> bool:
+    """Whether the name of an output, "-", stands for standard output."""
+    return str(path) == "-"
+
+
+def print_g2o(save: Callable[[Path], object]) -> None:
+    """Print a g2o file on standard output, and nothing else, by the function that writes one."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "printed.g2o")
+        save(path)
+        typer.echo(path.read_text(encoding="utf-8"), nl=False)
 
 
 def save_then_show(

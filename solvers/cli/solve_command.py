@@ -70,6 +70,8 @@ from solvers.cli.shell import (
     NOT_CONVERGED,
     JsonOption,
     QuietOption,
+    is_standard_output,
+    print_g2o,
     save_then_show,
     wrapped,
 )
@@ -93,7 +95,8 @@ def solve_command(
         typer.Option(
             "--out",
             "-o",
-            help="Write .g2o, .tum, .kitti, .json, .png, .svg or .pdf; may be repeated.",
+            help="Write .g2o, .tum, .kitti, .json, .png, .svg or .pdf; - prints .g2o, and nothing "
+            "else; may be repeated.",
         ),
     ] = None,
     method: Annotated[
@@ -238,7 +241,10 @@ def solve_command(
     )
     stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
-    display = Display(verbose, quiet, as_json)
+    is_printed = any(map(is_standard_output, out or []))
+    if is_printed and (verbose or as_json):
+        raise SettingError("--out - prints the graph alone; leave out --verbose and --json")
+    display = Display(verbose, quiet or is_printed, as_json)
     outputs = Outputs(out or [], report, film, covariances, proof, resume)
     network.check_without_driver(stages, outputs.proof, graph)
     if network.reads_own_files(graph):
@@ -461,7 +467,8 @@ class Outputs:
             }
         )
         for path in self.out:
-            check_format(path)
+            if not is_standard_output(path):
+                check_format(path)
 
     def check_pages(self) -> None:
         """Raise an error where report, film or covariances have a name of another format."""
@@ -485,7 +492,8 @@ class Outputs:
     def check_writable(self, num_robots: int) -> None:
         """Raise an error for the first file or folder that cannot be written."""
         for path in self.out:
-            check_target(path, num_robots)
+            if not is_standard_output(path):
+                check_target(path, num_robots)
         for other in (self.report, self.film, self.resume, self.covariances, self.proof):
             if other is not None:
                 check_writable(other)
@@ -602,7 +610,9 @@ def _files_of_solution(
     """Files that need the solution alone, and the functions that write them."""
     targets: list[tuple[Path, Callable[[Path], None]]] = []
     for path in outputs.out:
-        targets.append((path, solution.save))
+        to_terminal = is_standard_output(path)
+        save = partial(_print_solution, solution) if to_terminal else solution.save
+        targets.append((path, save))
     if outputs.proof is not None:
         targets.append((outputs.proof, solution.save_proof))
     if outputs.film is not None:
@@ -627,6 +637,10 @@ def _files_of_solution(
 
         targets.append((outputs.covariances, save_covariances))
     return targets
+
+
+def _print_solution(solution: Solution, _: Path) -> None:
+    print_g2o(solution.save)
 
 
 def _text_with_error(solution: Solution) -> str:

@@ -19,16 +19,17 @@ import numpy as np
 
 from pgo_models.convex import bregman as forms
 from pgo_models.convex.bregman import BregmanPoint, BregmanProblem, Subproblem
-from pgo_models.convex.convex_solver import COLD, TOLERANCE, ConvexSolver, finite_array
+from pgo_models.convex.convex_solver import COLD, TOLERANCE, ConvexSolver, as_solver, finite_array
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 
 # States.
 
 
 @dataclass(frozen=True, eq=False)
-class _ExactState:
+class _ExactState(Summarised):
     """Iterate k of a form that minimises over the whole of x."""
 
     k: int
@@ -66,7 +67,7 @@ class MultiplierState(_ExactState):
 
 
 @dataclass(frozen=True, eq=False)
-class AlternatingState:
+class AlternatingState(Summarised):
     """Iterate k of `AlternatingBregman`."""
 
     k: int
@@ -96,6 +97,7 @@ class BregmanSettings:
             finite=["alpha", "tolerance", "subproblem_tolerance"],
             not_negative=["max_iterations"],
         )
+        as_solver(self.solver)  # raises unless it is installed
 
     def compiled(self, subproblem: Subproblem) -> Subproblem:
         """The subproblem with the solver of these settings."""

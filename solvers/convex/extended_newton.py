@@ -26,6 +26,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from pgo_models.summaries import Summarised
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.result import Measurement, Status
 from solvers.riemannian import newton_step
@@ -41,7 +42,7 @@ _SMOOTH = (AffAtom, cp.exp, cp.logistic, cp.log_sum_exp, cp.QuadForm)
 
 
 @dataclass(frozen=True, eq=False)
-class ExtendedNewtonState:
+class ExtendedNewtonState(Summarised):
     """Iterate k.
 
     Parameters

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import cvxpy as cp
 import numpy as np
 
-from pgo_models.convex.convex_solver import ConvexSolver, solve_compiled
+from pgo_models.convex.convex_solver import ConvexSolver, as_solver, solve_compiled
 from pgo_models.convex.graph_subproblem import Changer, GraphQP, graph_qp
 from pgo_models.errors import GraphError, PGOError, SettingError, check_settings
 from pgo_models.geometry.poses import Poses
@@ -14,7 +14,6 @@ from pgo_models.geometry.rotations import Array, project_to_rotations, unstack_t
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.result import Measurement, Status
 from solvers.soc.joint import Joint, SOCState
 from solvers.soc.penalty import MultiplierPenalty
@@ -33,23 +32,20 @@ class ExtendedStep:
     It changes the iterates of SOC; `ExtendedSOC` also reports the changed objective.
     """
 
-    graph: PoseGraph
-    changer: Changer
-    solver: ConvexSolver | str = "CLARABEL"
+    model: GraphQP
 
     def prepare(self, subproblem: RSubproblem) -> GraphQP:
-        """Compile the changed program with the penalties of a subproblem.
+        """Pose the changed program with the penalties of a subproblem, in the same variables.
 
         A SettingError unless the subproblem is that of the whole graph, in (R, t).
         """
-        n = self.graph.num_poses
-        d = self.graph.d
+        graph = self.model.variables.graph
+        n = graph.num_poses
         if subproblem.num_translations != n or not subproblem.needs_ground:
             raise SettingError(
                 "a changed subproblem is that of the whole graph; use Coupling.JOINT"
             )
-        rho = subproblem.rho[n::d]
-        return graph_qp(self.graph, rho, changer=self.changer, solver=self.solver)
+        return self.model.with_penalty(subproblem.rho)
 
 
 @dataclass(frozen=True)
@@ -97,6 +93,7 @@ class ExtendedSOC:
 
     def __post_init__(self) -> None:
         check_settings(self)
+        as_solver(self.solver)  # raises unless it is installed
         coupling = self.soc.effective_coupling
         if coupling is not Coupling.JOINT:
             raise SettingError(
@@ -113,10 +110,14 @@ class ExtendedSOC:
         return self.soc.max_iterations
 
     def init(self, problem: PGOProblem, start: Poses | None) -> SOCState:
-        """State 0 of SOC; the changed program is compiled here, and again when rho changes."""
+        """State 0 of SOC; the changed program is compiled here, and again when rho changes.
+
+        `changer` is called once: its constraints have their dual values after every step.
+        """
+        model = self.model(problem)
         if start is None:
-            start = moved_to_terms(self.model(problem), chordal_start(problem))
-        return self._recursion(problem).init(problem, start)
+            start = moved_to_terms(model, chordal_start(problem))
+        return self._recursion(model).init(problem, start)
 
     def model(self, problem: PGOProblem) -> GraphQP:
         """Compile the changed program with penalties of 1.
@@ -136,16 +137,11 @@ class ExtendedSOC:
         SettingError
             Unless the cost of the problem is F.
         """
-        if problem.weighting is not Weighting.ISOTROPIC:
-            raise SettingError(
-                "terms are added to F, with two precisions an edge; use Weighting.ISOTROPIC"
-            )
-        rho = np.ones(problem.num_poses)
-        return graph_qp(problem.graph, rho, changer=self.changer, solver=self.solver)
+        return graph_qp(problem, 1.0, changer=self.changer, solver=self.solver)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
         """Make one iteration of SOC."""
-        return self._recursion(problem).step(problem, state)
+        return self._recursion(model_of(state)).step(problem, state)
 
     def measure(self, problem: PGOProblem, state: SOCState) -> Measurement:
         """Objective of the changed problem at the poses, and the residuals of SOC."""
@@ -180,18 +176,18 @@ class ExtendedSOC:
         float
             F of the edges that count plus the added terms.
         """
-        return _model(state).cost(poses.stacked())
+        return model_of(state).cost(poses.stacked())
 
     def converged(self, state: SOCState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals are within tolerance."""
         return self.soc.status_at(measurement)
 
-    def _recursion(self, problem: PGOProblem) -> Joint:
-        r_step = ExtendedStep(problem.graph, self.changer, self.solver)
-        return Joint(replace(self.soc, r_step=r_step))
+    def _recursion(self, model: GraphQP) -> Joint:
+        return Joint(replace(self.soc, r_step=ExtendedStep(model)))
 
 
-def _model(state: SOCState) -> GraphQP:
+def model_of(state: SOCState) -> GraphQP:
+    """The changed program that step (a) of a state has solved, with its `change`."""
     model = state.r_step.back_end
     assert isinstance(model, GraphQP)
     return model

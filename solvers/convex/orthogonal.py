@@ -18,15 +18,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pgo_models.convex import orthogonality
-from pgo_models.convex.convex_solver import COLD, ConvexSolver
+from pgo_models.convex.convex_solver import COLD, ConvexSolver, as_solver
 from pgo_models.convex.orthogonality import (
     OrthogonalPoint,
     OrthogonalProblem,
     SplitProblem,
     norm_of_all,
 )
-from pgo_models.errors import SettingError, check_settings
-from pgo_models.geometry.rotations import Array
+from pgo_models.errors import SettingError, check_settings, door
+from pgo_models.geometry.rotations import Array, as_generator
+from pgo_models.summaries import Summarised
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
 from solvers.soc.anderson import over_relax
@@ -45,7 +46,7 @@ _BALANCE_RATIO = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class OrthogonalState:
+class OrthogonalState(Summarised):
     """Iterate k.
 
     Parameters
@@ -146,6 +147,7 @@ class OrthogonalSOC:
             self, finite=["penalty", "safeguard", "tolerance"], not_negative=["max_iterations"]
         )
         check_settings(self, above_one=["safeguard"], relaxation=["alpha"])
+        as_solver(self.solver)  # raises unless it is installed
 
     def init(self, problem: OrthogonalProblem, start: OrthogonalPoint | None) -> OrthogonalState:
         """State 0: X = P = start, the first columns of the identity unless given.
@@ -276,7 +278,7 @@ class OrthogonalSOC:
 
 
 @dataclass(frozen=True, eq=False)
-class OrthogonalSolution:
+class OrthogonalSolution(Summarised):
     """The best of several runs.
 
     Parameters
@@ -315,13 +317,27 @@ class OrthogonalSolution:
         kkt = f"{best}, feasibility {self.kkt.feasibility:.1e}"
         return f"OrthogonalSolution({self.status.name}, {kkt}, {len(self.objectives)} starts)"
 
+    def __str__(self) -> str:
+        found = [J for J in self.objectives if not math.isnan(J)]
+        ends = f", which end from {min(found):.6g} to {max(found):.6g}" if found else ""
+        lines = [
+            f"status       {self.status.name}: {self.status.value}",
+            f"J            {self.objective:.10g}, the least of {len(self.objectives)} starts{ends}",
+            f"KKT          stationarity {self.kkt.stationarity:.1e}, feasibility "
+            f"{self.kkt.feasibility:.1e}",
+            "lower bound  none: the sets are not convex, and another start may end lower",
+        ]
+        return "\n".join(lines)
 
+
+@door
 def solve_orthogonal(
     problem: OrthogonalProblem,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int = 0,
     soc: OrthogonalSOC | None = None,
     starts: int = 5,
     *,
+    solver: ConvexSolver | str | None = None,
     verbose: bool = False,
 ) -> OrthogonalSolution:
     """Run SOC from random starts and keep the best run.
@@ -333,12 +349,14 @@ def solve_orthogonal(
     ----------
     problem : OrthogonalProblem
         What is minimised.
-    rng : np.random.Generator
-        Source of the starts.
+    rng : np.random.Generator or int
+        Source of the starts, or its seed.
     soc : OrthogonalSOC or None
         Settings of the runs; the default ones unless given.
     starts : int, at least 1
         Number of runs.
+    solver : ConvexSolver, str or None
+        Solver of step (a), in place of that of the settings.
     verbose : bool
         Whether the table of every run is printed.
 
@@ -356,16 +374,19 @@ def solve_orthogonal(
 
     Examples
     --------
-    >>> import cvxpy as cp, numpy as np
+    >>> import cvxpy as cp
     >>> x = cp.Variable(2)
     >>> distance = cp.Problem(cp.Minimize(cp.sum_squares(x - [3.0, 4.0])))
     >>> problem = OrthogonalProblem(distance, unit_columns=[x])
-    >>> solve_orthogonal(problem, np.random.default_rng(0)).values[0].round(4).tolist()
+    >>> solve_orthogonal(problem).values[0].round(4).tolist()
     [0.6, 0.8]
     """
     if starts < 1:
         raise SettingError(f"starts must be at least 1, got {starts}")
+    rng = as_generator(rng)
     method = soc if soc is not None else OrthogonalSOC()
+    if solver is not None:
+        method = replace(method, solver=solver)
     outcomes = list[Outcome[OrthogonalState]]()
     for _ in range(starts):
         outcomes.append(run(method, problem, problem.random_point(rng), verbose=verbose))

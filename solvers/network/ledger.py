@@ -8,13 +8,14 @@ import numpy as np
 
 from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.summaries import Summarised
 
 DRIVER = -1  # the driver's number as a sender or receiver; robots are 0, 1, ..
 BYTES_PER_NUMBER = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Traffic:
+class Traffic(Summarised):
     """Messages of one exchange; pass the same object each time the exchange is repeated.
 
     Parameters
@@ -46,7 +47,7 @@ class Traffic:
 
 
 @dataclass(frozen=True, eq=False)
-class Ledger:
+class Ledger(Summarised):
     """Communication of a distributed run; a solve by robots returns it as `Solution.ledger`.
 
     A round is one exchange that robots wait for: between neighbouring robots, or from the robots to

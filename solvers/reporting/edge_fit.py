@@ -14,6 +14,7 @@ from pgo_models.graphs.precisions import indefinite_edges, text_of_indefinite
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.riemannian.polish import polish
 
 _SAME_COST = 1e-9  # relative difference below which chi2 and F are one cost
@@ -34,7 +35,7 @@ class Advice:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeFit:
+class EdgeFit(Summarised):
     """Costs of the edges at some poses, in the cost that shows best whether the edges fit.
 
     That cost is chi2 wherever the file has information matrices. F has only two precisions for an
@@ -217,21 +218,28 @@ def _for_own_cost(solve: str) -> str:
 def fit_sentence(residuals: EdgeResiduals, cost: str) -> str:
     """Return the result of the chi-square tests of the edges, one by one and together."""
     count = int(residuals.is_misfit.sum())
-    overall = residuals.overall
     if count > 1:
-        text = f"{count} edges cost more than errors as their information matrices say"
+        text = f"{count} edges fit worse than their information matrices allow"
     else:
-        subject = "1 edge costs" if count == 1 else "No edge costs"
-        text = f"{subject} more than errors as its information matrix says"
+        subject = "1 edge fits" if count == 1 else "No edge fits"
+        text = f"{subject} worse than its information matrix allows"
     if residuals.scale > 1.0:
-        text += f", times {residuals.scale:.3g}, which half of all edges exceed"
-    text += f" ({cost} is {overall:.3g} times what is expected"
+        text += f", with {residuals.scale:.3g} times the cost allowed, as the median edge needs"
+    overall = residuals.overall
+    text += f". {cost} of all edges is {_times_expected(overall)}"
     if overall > residuals.overall_allowed:
-        text += f", and over {residuals.overall_allowed:.3g} by chance in one of 100 graphs"
+        allowed = f"{residuals.overall_allowed:.3g} times that"
+        text += f"; by chance it exceeds {allowed} in one of 100 graphs"
     elif 0.0 < overall < _PESSIMISTIC:
         smaller = f"{overall**-0.5:.3g} times smaller than the matrices say"
-        text += f": errors are {smaller}, and wrong edges hide in that"
-    return text + ")."
+        text += f"; the errors are {smaller}, which can hide wrong edges"
+    return text + "."
+
+
+def _times_expected(overall: float) -> str:
+    """How large a sum of costs is beside its expectation."""
+    ratio = f"{overall:.3g}"
+    return "as large as expected" if ratio == "1" else f"{ratio} times as large as expected"
 
 
 def _lowered(whole: PGOProblem, poses: Poses, chi2: float) -> EdgeResiduals | None:
@@ -255,5 +263,5 @@ def _total_cost(residuals: EdgeResiduals) -> str:
     """Total cost, and its ratio to the expected cost if that is known."""
     text = rounded_up(float(residuals.cost.sum()), 4)
     if residuals.overall > 0.0:
-        text += f" ({residuals.overall:.3g} times what is expected)"
+        text += f" ({_times_expected(residuals.overall)})"
     return text

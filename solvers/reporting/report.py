@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.errors import SettingError, extra_module
+from pgo_models.errors import SettingError, door, extra_module
 from pgo_models.figures import rounded_up
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import absolute_trajectory_error
@@ -46,6 +46,7 @@ _MOST_ROBOTS = 200
 _PAGE_SUFFIXES = (".html", ".htm")
 
 
+@door
 def write_report(
     solution: Solved, path: Path | str, *, source: str | None = None, fit: EdgeFit | None = None
 ) -> None:
@@ -345,7 +346,7 @@ def _worst_edges(solution: Solved, robots: Partition, fit: EdgeFit) -> _Table:
     share = 100 * residuals.share[worst].sum()
     text = (
         f"The {len(rows)} of {graph.num_edges} edges that cost most, {share:.3g} % of {fit.cost} "
-        f"together. {fit.sentence()} Half of what was measured fits to "
+        f"together. {fit.sentence()} Half of all errors are below "
         f"{_median_errors(graph, residuals)}. Click on a head to sort."
     )
     misfits = np.flatnonzero(residuals.is_misfit[worst]).tolist()

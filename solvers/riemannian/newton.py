@@ -5,11 +5,12 @@ F never rises but by rounding.
 
 from dataclasses import dataclass
 
-from pgo_models.errors import check_settings
+from pgo_models.errors import check_settings, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton_step import NewtonFigures
 from solvers.riemannian.polish import (
@@ -22,7 +23,7 @@ SMALL = 1000  # poses in space up to which Newton alone is faster
 
 
 @dataclass(frozen=True, eq=False)
-class NewtonState:
+class NewtonState(Summarised):
     """State k: the poses and factorisations of `solvers.riemannian.polish`."""
 
     k: int
@@ -121,6 +122,7 @@ def newton_status(figures: NewtonFigures) -> Status | None:
     return None if figures.moved else Status.STALLED
 
 
+@door
 def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
     """Return Newton with the Gauss-Newton matrix instead of the Hessian.
 

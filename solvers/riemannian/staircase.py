@@ -26,6 +26,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.relaxations.low_rank import LiftedPoint, hessian_product, lifted_point
 from pgo_models.relaxations.rounding import round_factor
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 from solvers.riemannian.climb import (
     ClimbEnding,
@@ -44,7 +45,7 @@ _FLOOR = 0.01  # of the tolerance: conjugate gradients go no deeper
 
 
 @dataclass(frozen=True, eq=False)
-class StaircaseState:
+class StaircaseState(Summarised):
     """State k."""
 
     k: int

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # and scipy.special when it is used
 
-from pgo_models.errors import check_quantile, check_settings
+from pgo_models.errors import check_quantile, check_settings, door
+from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from solvers.robust.chains import Chains, Closures, cycle_distances, is_whole, squared_distances
@@ -64,6 +65,7 @@ class PCM(ValueEquality):
         check_quantile(self.quantile)
 
 
+@door
 def pairwise_consistent(
     graph: PoseGraph, known: BoolArray | None = None, quantile: float = 0.99
 ) -> BoolArray:
@@ -125,6 +127,7 @@ def pairwise_consistent(
     """
     check_quantile(quantile)
     is_known = odometry(graph) if known is None else np.asarray(known, dtype=bool)
+    check_shape(is_known, (graph.num_edges,), "known")
     kept = np.ones(graph.num_edges, dtype=bool)
     kept[is_whole(graph) & ~is_known] = False
     for edges, agree in _agreements(graph, is_known, ~is_known, quantile):

@@ -44,6 +44,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Stage, Status
 from solvers.robust.losses import HARD_CONTROL, RobustLoss
 from solvers.robust.value_equality import ValueEquality
@@ -268,7 +269,7 @@ E = TypeVar("E", bound=ReweightedEdges)
 
 
 @dataclass(frozen=True, eq=False)
-class ScheduleState(Generic[E]):
+class ScheduleState(Summarised, Generic[E]):
     """State k: position in the schedule, sums over the edges, and the edges with the poses."""
 
     k: int

@@ -27,6 +27,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton
 from solvers.soc.soc import SOC
@@ -39,7 +40,7 @@ def huber(squares: Array, thresholds: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class IRLSState:
+class IRLSState(Summarised):
     """State k.
 
     (m,) are the `costs` r_e^2 at the poses and the `thresholds` c_e^2. `objective` is Huber's cost,

@@ -12,6 +12,7 @@ from pgo_models.certificates.fit import Fit
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 from solvers.robust.outlier_record import OutlierProof
 
 # Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
@@ -56,7 +57,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, eq=False)
-class Rejection:
+class Rejection(Summarised):
     """Decision of a robust solve on every edge of `problem`, the whole one.
 
     Parameters

@@ -351,6 +351,11 @@ class LocalConsensus:
 
     soc: SOCSettings
 
+    @property
+    def max_iterations(self) -> int:
+        """The iterations of a run at most, those of `soc`."""
+        return self.soc.max_iterations
+
     def init(self, problem: PGOProblem, start: Poses) -> ConsensusState:
         """State 0: omega = the rotations of `start`."""
         assert self.soc.robots is not None

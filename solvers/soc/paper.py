@@ -22,7 +22,7 @@ from typing import Self
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array, vstack
 
-from pgo_models.errors import check_settings
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -36,11 +36,17 @@ from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.matrices import assemble, block_entries, norm, rotation_columns
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
-from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty
+from solvers.soc.penalty import (
+    BalancedPenalty,
+    BoydPenalty,
+    MultiplierPenalty,
+    PenaltyRule,
+    first_penalties,
+)
 from solvers.soc.r_step import BackEnd, RotationStep, RStep, RSubproblem, prepare
 
-PaperPenalty = FixedPenalty | BalancedPenalty | BoydPenalty
 _PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
 
 
@@ -72,7 +78,7 @@ class Blocks:
 
 
 @dataclass(frozen=True, eq=False)
-class PaperState:
+class PaperState(Summarised):
     """Iterate k of the paper's recursion; names as in Algorithm 1.
 
     Parameters
@@ -132,8 +138,9 @@ class PaperSOC:
     ----------
     robots : Partition or None
         Who owns which poses; one pose a robot unless given, as in the paper.
-    penalty : BalancedPenalty, BoydPenalty or FixedPenalty
-        Rule of rho, one for all poses. The paper's own is `BoydPenalty`.
+    penalty : PenaltyRule
+        Rule of rho, one for all poses: BalancedPenalty, BoydPenalty, FixedPenalty, or an own one,
+        whose first penalties are averaged. The paper's own is `BoydPenalty`.
     r_step : RStep or CustomRStep
         Back end of step (a). The paper's own is `RStep.FISTA`.
     tolerance : float
@@ -186,7 +193,7 @@ class PaperSOC:
     """
 
     robots: Partition | None = None
-    penalty: PaperPenalty = field(default_factory=BalancedPenalty)
+    penalty: PenaltyRule = field(default_factory=BalancedPenalty)
     r_step: BackEnd = RStep.FACTORIZED
     tolerance: float = 1e-5
     max_iterations: int = 500
@@ -213,6 +220,11 @@ class PaperSOC:
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
+        if isinstance(self.penalty, MultiplierPenalty):
+            raise SettingError(
+                "a MultiplierPenalty has a rho for every pose, and the paper one for all; give a "
+                "FixedPenalty, a BalancedPenalty or a BoydPenalty"
+            )
 
     def init(self, problem: PGOProblem, start: Poses | None) -> PaperState:
         """State 0: R = omega = start, a spanning tree unless given; B = 0."""
@@ -221,7 +233,7 @@ class PaperSOC:
         problem.stacked(start)  # raises unless the poses fit
         robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
         blocks = _split(problem, robots)
-        rho = float(self.penalty.initial(problem, start).mean())
+        rho = float(first_penalties(self.penalty, problem, start).mean())
         scale = float(problem.L.diagonal().mean())
         r_step = _prepare(problem, blocks, rho, self.r_step)
         return PaperState(
@@ -311,7 +323,7 @@ class PaperSOC:
 def _with_adapted_rho(
     problem: PGOProblem,
     state: PaperState,
-    rule: PaperPenalty,
+    rule: PenaltyRule,
     primal: float,
     change: float,
     back_end: BackEnd,
@@ -321,16 +333,14 @@ def _with_adapted_rho(
     Under a BalancedPenalty rho goes up, and may not fall any more, when the merit has stayed up for
     long.
     """
-    if isinstance(rule, FixedPenalty):
-        return state
     may_fall = state.may_fall
     if isinstance(rule, BoydPenalty):
-        factor = rule.factor(primal, state.rho * change)
-    elif state.steps_since_smallest >= _PATIENCE:
+        factor = rule.rescaling(primal, state.rho * change)
+    elif isinstance(rule, BalancedPenalty) and state.steps_since_smallest >= _PATIENCE:
         factor = rule.refactor_ratio
         may_fall = False
     else:
-        factor = rule.factor(primal, change)
+        factor = rule.rescaling(primal, change)
     if factor == 1.0 or (factor < 1.0 and not may_fall):
         return state
     rho = factor * state.rho

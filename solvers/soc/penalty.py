@@ -1,7 +1,7 @@
 """Rules for the ADMM penalty rho: from the multipliers, fixed, or balanced by the residuals."""
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -48,17 +48,17 @@ class PenaltyOrder:
         return block_at(stack_transposes(R), np.repeat(rho, d), diagonal, self.settings, B)
 
 
-class _Rule(ABC):
-    """A rule that gives the three numbers of a `PenaltyOrder`."""
+class PenaltyRule(Protocol):
+    """A rule of the penalty: one of those below, or a user's own, for `SOC(penalty=..)`."""
 
-    @abstractmethod
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """Return the numbers of a `PenaltyOrder` from ||Lambda_i||_2 / m_i.
+        """Return the first penalties, from ||Lambda_i||_2 / m_i.
 
         Parameters
         ----------
         ratio : (n,) array
-            ||Lambda_i||_2 / m_i of all poses.
+            ||Lambda_i||_2 / m_i of all poses: the norm of the multiplier of a pose at the start,
+            over the mean diagonal of M over its rotation rows.
 
         Returns
         -------
@@ -67,15 +67,43 @@ class _Rule(ABC):
             m_i, least).
         """
 
-    def initial(self, problem: PGOProblem, poses: Poses) -> Array:
-        """Penalties rho, (n,), at poses."""
-        norms = multiplier_norms(multipliers(problem, poses))
-        scale = rotation_scale(problem)
-        return PenaltyOrder(*self.bounds(norms / scale)).rho(norms, scale)
+    def rescaling(self, primal_residual: float, dual_residual: float) -> float:
+        """Return the factor by which all penalties move before the next step.
+
+        Each factor other than 1 costs a factorisation. Once the safeguard has raised the penalties,
+        factors below 1 are left out.
+
+        Parameters
+        ----------
+        primal_residual : float
+            ||R - omega||, relative.
+        dual_residual : float
+            ||omega - omega_last||, relative.
+
+        Returns
+        -------
+        float
+            1 where the penalties stay.
+        """
+
+
+class _FirstPenalty:
+    """Base of rules whose penalties stay where they are, but for a safeguard or a refresh."""
+
+    def rescaling(self, primal_residual: float, dual_residual: float) -> float:
+        """1: the residuals do not move the penalties."""
+        return 1.0
+
+
+def first_penalties(rule: PenaltyRule, problem: PGOProblem, poses: Poses) -> Array:
+    """Penalties rho, (n,), of a rule at poses."""
+    norms = multiplier_norms(multipliers(problem, poses))
+    scale = rotation_scale(problem)
+    return PenaltyOrder(*rule.bounds(norms / scale)).rho(norms, scale)
 
 
 @dataclass(frozen=True)
-class MultiplierPenalty(_Rule):
+class MultiplierPenalty(_FirstPenalty):
     """A penalty of every pose from its multiplier: rho_i = factor max(||Lambda_i||_2, q m_i).
 
     m_i is the mean diagonal of M over the rotation rows of pose i, and q a quantile of
@@ -143,7 +171,7 @@ class MultiplierPenalty(_Rule):
 
 
 @dataclass(frozen=True)
-class FixedPenalty(_Rule):
+class FixedPenalty(_FirstPenalty):
     """The same penalty for all poses, rho_i = rho, unless the safeguard raises it.
 
     Parameters
@@ -183,7 +211,7 @@ class FixedPenalty(_Rule):
         return 0.0, 0.0, self.rho
 
 
-class _ScaledRule(_Rule):
+class _ScaledRule:
     """A rule that begins at `scale` times m_i, and balances the residuals from there."""
 
     scale: float
@@ -231,7 +259,7 @@ class BalancedPenalty(_ScaledRule):
     def __post_init__(self) -> None:
         check_settings(self, positive=["scale"], above_one=["refactor_ratio"])
 
-    def factor(self, primal_residual: float, dual_residual: float) -> float:
+    def rescaling(self, primal_residual: float, dual_residual: float) -> float:
         """Return the factor by which rho moves now.
 
         Parameters
@@ -289,7 +317,7 @@ class BoydPenalty(_ScaledRule):
     def __post_init__(self) -> None:
         check_settings(self, positive=["scale"], above_one=["imbalance", "growth"])
 
-    def factor(self, primal_residual: float, dual_residual: float) -> float:
+    def rescaling(self, primal_residual: float, dual_residual: float) -> float:
         """Return the factor by which rho moves now.
 
         Parameters
@@ -309,6 +337,3 @@ class BoydPenalty(_ScaledRule):
         if dual_residual > self.imbalance * primal_residual:
             return 1.0 / self.growth
         return 1.0
-
-
-PenaltyRule = MultiplierPenalty | FixedPenalty | BalancedPenalty

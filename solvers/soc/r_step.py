@@ -18,6 +18,7 @@ from pgo_models.geometry.rotations import Array, stack_transposes, unstack_trans
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, factorize
 from pgo_models.problem.matrices import entry_positions
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.summaries import Summarised
 from solvers.soc.accelerated_gradients import minimize_with_fista, minimize_with_nesterov
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class RStep(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class RSubproblem:
+class RSubproblem(Summarised):
     """The R-subproblem of one robot, or of the whole graph.
 
     Parameters

@@ -12,10 +12,12 @@ from typing import Self
 
 import numpy as np
 
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
+from pgo_models.summaries import Summarised
 from solvers.result import Measurement
 from solvers.soc.anderson import AndersonSums
-from solvers.soc.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule
+from solvers.soc.penalty import MultiplierPenalty, PenaltyRule
 from solvers.soc.separator_stiffness import is_recheck_due
 
 MAX_RAISES = 20
@@ -43,7 +45,7 @@ class Due(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Steps:
+class Steps(Summarised):
     """Number and residuals of iterate k, with the history that decides on the penalty.
 
     The states of all couplings have these fields. The residuals are
@@ -134,9 +136,7 @@ def next_penalty(rule: PenaltyRule, ratio: Array, steps: Steps) -> tuple[Due, fl
         return Due.RAISE, 2.0
     if isinstance(rule, MultiplierPenalty):
         return _due_of_multipliers(rule, steps), 1.0
-    if isinstance(rule, BalancedPenalty):
-        return _due_of_balance(rule, steps)
-    return Due.NOTHING, 1.0
+    return _due_of_residuals(rule, steps)
 
 
 def _due_of_multipliers(rule: MultiplierPenalty, steps: Steps) -> Due:
@@ -148,11 +148,15 @@ def _due_of_multipliers(rule: MultiplierPenalty, steps: Steps) -> Due:
     return Due.NOTHING
 
 
-def _due_of_balance(rule: BalancedPenalty, steps: Steps) -> tuple[Due, float]:
+def _due_of_residuals(rule: PenaltyRule, steps: Steps) -> tuple[Due, float]:
     residuals = steps.primal_residual, steps.dual_residual
     if not np.isfinite(residuals).all():
         return Due.NOTHING, 1.0
-    factor = rule.factor(*residuals)
+    factor = rule.rescaling(*residuals)
+    if not 0 < factor < math.inf:
+        raise SettingError(
+            f"{type(rule).__name__}.rescaling returned {factor}; it must be positive and finite"
+        )
     # Once the safeguard has raised rho, the balance must not lower it again.
     if factor > 1.0 or (factor < 1.0 and steps.raises == 0):
         return Due.RESCALE, factor

@@ -106,7 +106,13 @@ class SOCSettings:
 
     def penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:
         """Rule of rho, from ||Lambda_i||_2 / m_i of all poses, (n,)."""
-        return PenaltyOrder(*self.penalty.bounds(ratio), is_stationary, self.step_settings)
+        bounds = self.penalty.bounds(ratio)
+        if not (len(bounds) == 3 and all(0 <= bound < math.inf for bound in bounds)):
+            raise SettingError(
+                f"{type(self.penalty).__name__}.bounds returned {bounds}; give three numbers that "
+                "are not negative: (per_norm, per_scale, least)"
+            )
+        return PenaltyOrder(*bounds, is_stationary, self.step_settings)
 
     def separator_penalty_for(self, translation_penalty: float) -> float:
         """Least penalty of separator rotations over m_i, given that of their translations."""

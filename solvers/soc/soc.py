@@ -39,8 +39,9 @@ class SOC(SOCSettings):
         it as JOINT, and `solve(.., robots=..)` runs it on robots.
     robots : Partition or None
         Which robot owns which poses.
-    penalty : MultiplierPenalty, FixedPenalty or BalancedPenalty
-        Rule of the ADMM penalty rho.
+    penalty : PenaltyRule
+        Rule of the ADMM penalty rho: MultiplierPenalty, FixedPenalty, BalancedPenalty, or an own
+        one.
     alpha : float in (0, 2)
         Over-relaxation: alpha x + (1 - alpha) omega takes the place of x in (b) and (c). 1 is none.
     acceleration : Anderson or None

@@ -13,7 +13,7 @@ from typing import Any
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import SettingError, check_settings, door
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -21,6 +21,7 @@ from pgo_models.plots.pages import save_page
 from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.progress_bars import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
@@ -80,7 +81,7 @@ class ComparisonSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Summarised):
     """Methods compared on one graph.
 
     Parameters
@@ -179,6 +180,7 @@ class Comparison:
             save_figure(plot_efforts(self.curves), path)
 
 
+@door
 def compare_methods(
     problem: PGOProblem | PoseGraph,
     settings: ComparisonSettings | None = None,

@@ -10,13 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pgo_models.convex.bregman import BregmanProblem
-from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array
+from pgo_models.errors import SettingError, door
+from pgo_models.geometry.arrays import check_shape
+from pgo_models.geometry.rotations import Array, as_generator
+from pgo_models.summaries import Summarised
 from solvers.convex.bregman import TwoLineBregman
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorForgetting:
+class ErrorForgetting(Summarised):
     """Distances ||x_k - x*|| of every iterate of three runs, from k = 0 on.
 
     Parameters
@@ -51,10 +53,11 @@ class ErrorForgetting:
         ]
 
 
+@door
 def error_forgetting(
     problem: BregmanProblem,
     solution: Array,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     *,
     method: TwoLineBregman | None = None,
     error_std: float = 0.1,
@@ -72,7 +75,7 @@ def error_forgetting(
         The problem.
     solution : ndarray, (m,)
         Its solution x*, to which distances are measured.
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the errors.
     method : TwoLineBregman, optional
         Settings, of which alpha and the tolerance of the subproblem are used; alpha = 5 unless
@@ -103,6 +106,8 @@ def error_forgetting(
     >>> bool(study.disturbed[-1] < 1e-6 < study.disturbed[1])
     True
     """
+    rng = as_generator(rng)
+    check_shape(solution, (problem.K.shape[1],), "solution")
     if not error_std >= 0:
         raise SettingError(f"error_std must not be negative, got {error_std}")
     if not 0 <= disturbed_steps <= iterations:

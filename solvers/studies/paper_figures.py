@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import PGOError
+from pgo_models.errors import PGOError, door
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -86,6 +86,7 @@ class PaperRun:
         return panels
 
 
+@door
 def draw_paper_figures(
     folder: Path | str,
     only: tuple[FigureSet, ...] = (),

@@ -12,13 +12,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import PGOError, SettingError, check_settings
+from pgo_models.errors import PGOError, SettingError, check_settings, door
 from pgo_models.graphs.datasets import load
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, published_rows
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.progress_bars import JobBar
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
@@ -170,7 +171,7 @@ class ReproducedRow:
 
 
 @dataclass(frozen=True)
-class Reproduction:
+class Reproduction(Summarised):
     """The reproduced tables.
 
     Parameters
@@ -188,6 +189,7 @@ class Reproduction:
     is_complete: bool
 
 
+@door
 def reproduce_tables(
     settings: ReproductionSettings | None = None,
     keep: Path | None = None,

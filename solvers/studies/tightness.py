@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import SettingError
+from pgo_models.errors import SettingError, door
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, random_rotations
+from pgo_models.geometry.rotations import Array, BoolArray, as_generator, random_rotations
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NETWORK_KAPPA, NETWORK_TAU, NoiseModel, circle, grid, observe
+from pgo_models.summaries import Summarised
 from solvers.request import Pipeline
 from solvers.studies.benchmark_runs import solve_whole
 
@@ -27,7 +28,7 @@ class SweptScene(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseSweep:
+class NoiseSweep(Summarised):
     """Result of a sweep: which graphs were certified at which noise.
 
     Parameters
@@ -113,8 +114,9 @@ def noisy_lattice(side: int, rotation_std: float, rng: np.random.Generator) -> P
     return observe("lattice", truth, i, j, noise, 10.0, 100.0, rng)
 
 
+@door
 def noise_sweep(
-    scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator
+    scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator | int
 ) -> NoiseSweep:
     """Solve and certify random graphs at every level of the rotation noise.
 
@@ -126,7 +128,7 @@ def noise_sweep(
         Standard deviations of the rotation noise, radians, positive and ascending.
     graphs : int
         Number of graphs at every level.
-    rng : numpy.random.Generator
+    rng : numpy.random.Generator or int
         Source of the noise.
 
     Returns
@@ -145,6 +147,7 @@ def noise_sweep(
     >>> sweep.fraction
     array([1.])
     """
+    rng = as_generator(rng)
     levels = np.asarray(rotation_std, dtype=float)
     is_list = levels.ndim == 1 and len(levels) > 0
     if not is_list or not (levels > 0).all() or (np.diff(levels) <= 0).any():

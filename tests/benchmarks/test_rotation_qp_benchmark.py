@@ -11,7 +11,7 @@ from pgo_models.graphs.g2o import read_g2o
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.soc.penalty import MultiplierPenalty
+from solvers.soc.penalty import MultiplierPenalty, first_penalties
 from solvers.soc.r_step import RStep, RSubproblem, prepare
 
 LIMITS = {"tinyGrid3D": 3e-3, "smallGrid3D": 15e-3}  # seconds
@@ -22,7 +22,7 @@ def test_solving_again(benchmark: BenchmarkFixture, benchmark_data, name: str) -
     problem = PGOProblem(read_g2o(benchmark_data / f"{name}.g2o"), weighting=Weighting.ISOTROPIC)
     n = problem.num_poses
     start = chordal_start(problem)
-    rho = MultiplierPenalty().initial(problem, start)
+    rho = first_penalties(MultiplierPenalty(), problem, start)
     qp = graph_qp(problem.graph, rho)
     rng = np.random.default_rng(0)
     V = start.stacked() + 0.1 * rng.standard_normal((problem.side, problem.d))

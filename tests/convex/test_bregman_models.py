@@ -24,6 +24,7 @@ from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.scenes import grid
+from solvers import Bregman, Status, run
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -223,3 +224,13 @@ def test_shared_rotation_step_adds_up_to_the_whole_graph(seed: int, num_robots: 
 
 def test_basis_pursuit_takes_any_matrix() -> None:
     assert basis_pursuit(np.ones((2, 5)), np.ones(2)).K.shape == (2, 5)
+
+
+def test_a_semidefinite_constraint_in_an_indicator_is_refused_with_one_that_works() -> None:
+    Z = cp.Variable((2, 2), symmetric=True)
+    K = np.ones((1, 4))
+    with pytest.raises(SettingError, match=r"write cp\.lambda_min\(Z\) >= 0 there"):
+        BregmanProblem(cp.sum_squares(Z) + cp.transforms.indicator([Z >> 0]), Z, K, [1.0])
+    semidefinite = cp.transforms.indicator([cp.lambda_min(Z) >= 0])
+    problem = BregmanProblem(cp.sum_squares(Z) + semidefinite, Z, K, [1.0])
+    assert run(Bregman(), problem).status is Status.CONVERGED

@@ -12,7 +12,7 @@ from graphs import varied_problem
 from scipy.optimize import Bounds, minimize
 
 from pgo_models.certificates.certificate import Verdict
-from pgo_models.convex.graph_subproblem import Changer, ModelChange, PoseVariables
+from pgo_models.convex.graph_subproblem import Changer, ModelChange, PoseVariables, graph_qp
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, log_map
@@ -175,7 +175,7 @@ def test_what_does_not_go_together_is_refused() -> None:
         ExtendedSOC(lambda unknown: ModelChange(), SOC(robots=robots))
     with pytest.raises(SettingError, match="brings its own R-step"):
         ExtendedSOC(lambda unknown: ModelChange(), SOC(r_step=RStep.FISTA))
-    step = ExtendedStep(problem().graph, lambda unknown: ModelChange())
+    step = ExtendedStep(graph_qp(problem(), 1.0))
     with pytest.raises(SettingError, match=r"use Coupling\.JOINT"):
         SOC(coupling=Coupling.CONSENSUS, robots=robots, r_step=step).init(problem(), None)
 

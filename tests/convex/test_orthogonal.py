@@ -38,6 +38,14 @@ def assert_solved(solution) -> None:
     assert solution.kkt.stationarity <= BETTER * max(1.0, solution.outcome.state.scale)
 
 
+def test_a_solution_says_that_it_has_no_lower_bound() -> None:
+    x = cp.Variable(2)
+    nearest = cp.Problem(cp.Minimize(cp.sum_squares(x - np.array([3.0, 4.0]))))
+    text = str(solve_orthogonal(OrthogonalProblem(nearest, unit_columns=[x]), 0, starts=2))
+    assert "the least of 2 starts, which end from 16 to 16" in text
+    assert "lower bound  none: the sets are not convex" in text
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_nearest_orthonormal_matrix(seed: int) -> None:
     B = rng_of(seed).standard_normal((5, 3))

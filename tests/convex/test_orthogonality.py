@@ -309,3 +309,30 @@ def test_a_multiplier_is_the_gradient_that_it_balances(kind: str) -> None:
     residuals = kkt_residuals(problem, OrthogonalPoint((nearest,), (A - nearest,)), 1.0)
     assert residuals.stationarity <= SUBPROBLEM
     np.testing.assert_allclose(residuals.multipliers[0], nearest - A, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "imposed",
+    [lambda X: np.eye(3) == X.T @ X, lambda X: cp.sum_squares(X) == 3.0],
+    ids=["orthonormal", "norm"],
+)
+def test_a_constraint_that_soc_imposes_is_to_be_removed(imposed) -> None:
+    X = cp.Variable((3, 3))
+    nearest = cp.Problem(cp.Minimize(cp.sum_squares(X - 2.0)), [imposed(X)])
+    with pytest.raises(SettingError, match="remove it: SOC imposes the set itself"):
+        OrthogonalProblem(nearest, rotations=[X])
+
+
+def test_a_constraint_on_other_variables_is_not_taken_for_the_set() -> None:
+    X = cp.Variable((3, 3))
+    y = cp.Variable(3)
+    nearest = cp.Problem(cp.Minimize(cp.sum_squares(X - 2.0) + cp.sum(y)), [cp.norm(y) == 1.0])
+    with pytest.raises(SettingError, match="not convex by the rules of DCP"):
+        OrthogonalProblem(nearest, rotations=[X])
+
+
+def test_a_rotation_and_a_reflection_tie_where_a_singular_value_is_zero() -> None:
+    flat = np.diag([3.0, 2.0, 0.0])
+    model = procrustes(np.eye(3), flat)
+    mirror = np.diag([1.0, 1.0, -1.0])
+    assert model.objective([np.eye(3)]) == model.objective([mirror])

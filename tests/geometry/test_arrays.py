@@ -235,8 +235,8 @@ def test_integers_of_any_kind_are_counts() -> None:
         (lambda: Partition(np.array([-1, 0]), PartitionMethod.GIVEN), "without a gap"),
         (lambda: Partition(np.array([[0, 1]]), PartitionMethod.GIVEN), r"robot, of shape \(1, 2\)"),
         (lambda: Partition(np.array([]), PartitionMethod.GIVEN), r"robot, of shape \(0,\)"),
-        (lambda: partition(GRAPH, 2.5), "num_robots is 2.5; give a whole number"),
-        (lambda: partition(GRAPH, True), "num_robots is True; give a whole number"),
+        (lambda: partition(GRAPH, 2.5), r"num_robots must be a whole number or None, got 2\.5"),
+        (lambda: partition(GRAPH, True), "num_robots must be a whole number or None, got True"),
     ],
 )
 def test_nothing_is_cast_silently(make: Callable[[], object], message: str) -> None:

@@ -153,8 +153,9 @@ def test_a_file_is_read_with_the_weights_asked_for(tmp_path: Path) -> None:
         == [float(read_g2o(path, weights).kappa[0]) for weights in RotationWeight]
     )
     assert read_g2o(path).kappa[0] == load(path).kappa[0] == 6.0
-    with pytest.raises(SettingError, match="weights is 'gaussian'; give RotationWeight"):
-        read_g2o(path, "gaussian")
+    assert read_g2o(path, "gaussian").kappa[0] == 3.0
+    with pytest.raises(SettingError, match=r"weights must be RotationWeight\.SE_SYNC or .*'gauss'"):
+        read_g2o(path, "gauss")
 
 
 @pytest.mark.parametrize("name", SIZES)

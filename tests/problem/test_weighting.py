@@ -154,8 +154,8 @@ def test_matrices_beyond_double_precision_are_refused_by_name() -> None:
 
 
 def test_a_weighting_is_asked_for() -> None:
-    with pytest.raises(SettingError, match=r"give one of Weighting\.OWN, Weighting\.ISOTROPIC"):
-        PGOProblem(varied_graph(0, 3, 2), weighting="information")  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match=r"must be Weighting\.OWN or Weighting\.ISOTROPIC or"):
+        PGOProblem(varied_graph(0, 3, 2), weighting="informed")  # type: ignore[arg-type]
 
 
 def test_given_weights_are_taken() -> None:

@@ -59,7 +59,7 @@ def test_the_least_F_is_judged_by_chi2_and_advised_to_minimise_it(seed: int, d: 
     assert minimum.lower_bound <= fit.lowered.cost.sum() < fit.residuals.cost.sum()
     (advice,) = fit.advice("pgo solve strained.g2o --cost isotropic", is_robust=False)
     assert advice.command == "pgo solve strained.g2o"
-    assert f"{fit.residuals.overall:.3g} times what is expected" in advice.text
+    assert f"{fit.residuals.overall:.3g} times as large as expected" in advice.text
     # At the minimum itself there is nothing left to advise.
     assert (
         solved_fit(graph, Weighting.INFORMATION).advice("pgo solve strained.g2o", is_robust=False)
@@ -133,8 +133,8 @@ def test_the_page_of_MIT_says_that_its_edges_do_not_fit(benchmark_data: Path) ->
     graph = pgo.read_g2o(benchmark_data / "MIT.g2o")
     solution = solvers.solve(pgo.PGOProblem(graph, weighting=Weighting.ISOTROPIC))
     page = Page(report_page(solution))
-    assert "4 edges cost more than errors as their information matrices say" in page.text
-    assert "chi2 is 39.7 times what is expected" in page.text
+    assert "4 edges fit worse than their information matrices allow" in page.text
+    assert "chi2 of all edges is 39.7 times as large as expected" in page.text
     assert "its minimum is at most 41.16" in page.text
     assert "pgo solve MIT" in page.text
     assert "No edge costs more" not in page.text

@@ -243,7 +243,7 @@ def test_every_case_has_a_verdict_and_something_to_try(solution, uncertain, monk
         assert certificate.cost_text in meaning(certificate)[0]
         suggestions = advice(graph, certificate, status, EdgeFit("F", doubtful))
         assert any(
-            piece.command.endswith("--robust gnc") and "3 edges cost" in piece.text
+            piece.command.endswith("--robust gnc") and "3 edges fit worse" in piece.text
             for piece in suggestions
         )
         for piece in suggestions:
@@ -283,21 +283,21 @@ def test_what_the_edges_say_together_is_said(solution):
     )
     assert not residuals.is_doubtful
     assert fit_sentence(residuals, "F").startswith(
-        "No edge costs more than errors as its information matrix says (F is 1 times"
+        "No edge fits worse than its information matrix allows. F of all edges is as large as"
     )
     assert "by chance" not in fit_sentence(residuals, "F")
     bent = replace(residuals, overall=2.0, scale=7.0)
     assert bent.is_doubtful
-    assert "times 7, which half of all edges exceed" in fit_sentence(bent, "chi2")
+    assert "with 7 times the cost allowed, as the median edge needs" in fit_sentence(bent, "chi2")
     assert (
-        f"(chi2 is 2 times what is expected, and over {bent.overall_allowed:.3g} by chance"
-        in fit_sentence(bent, "chi2")
+        "chi2 of all edges is 2 times as large as expected; by chance it exceeds "
+        f"{bent.overall_allowed:.3g} times that" in fit_sentence(bent, "chi2")
     )
-    assert "errors are 10 times smaller than the matrices say" in fit_sentence(
+    assert "the errors are 10 times smaller than the matrices say, which can hide" in fit_sentence(
         replace(residuals, overall=0.01), "F"
     )
     with_one_misfit = replace(residuals, allowed=np.where(np.arange(212) == 7, -1.0, np.inf))
-    assert fit_sentence(with_one_misfit, "F").startswith("1 edge costs")
+    assert fit_sentence(with_one_misfit, "F").startswith("1 edge fits")
 
 
 def test_exact_measurements_are_reported_too():

@@ -26,7 +26,7 @@ from solvers.network.counted_pool import Count
 from solvers.riemannian.polish import polish
 from solvers.soc.consensus import ConsensusState, LocalConsensus, LocalRobots
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty
+from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, first_penalties
 from solvers.soc.recursion_block import Agreement
 from solvers.soc.soc import SOC
 
@@ -288,7 +288,7 @@ def test_separator_penalties_follow_from_the_stiffness(
     parts = partitioner(problem.graph, seed)
     start = chordal_start(problem)
     state = started(problem, parts, start)
-    wanted = MultiplierPenalty().initial(problem, start)
+    wanted = first_penalties(MultiplierPenalty(), problem, start)
     relative = state.separators.translation
     shared = parts.separators(problem.graph)
     wanted[shared] = np.maximum(

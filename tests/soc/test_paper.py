@@ -25,7 +25,13 @@ from solvers.pipeline import solve
 from solvers.result import Status
 from solvers.riemannian.newton import gauss_newton
 from solvers.soc.paper import PaperSOC, PaperStop
-from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
+from solvers.soc.penalty import (
+    BalancedPenalty,
+    BoydPenalty,
+    FixedPenalty,
+    MultiplierPenalty,
+    first_penalties,
+)
 from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
@@ -244,7 +250,7 @@ def test_as_published_rho_follows_the_paper_s_rule_and_only_p_res_stops(
     assert (soc.penalty, soc.r_step) == (BoydPenalty(), RStep.FISTA)
     states = list(islice(iterate(soc, problem), 20))
     assert states[0].rho == pytest.approx(
-        float(BoydPenalty(1.0).initial(problem, soc.poses(problem, states[0])).mean())
+        float(first_penalties(BoydPenalty(1.0), problem, soc.poses(problem, states[0])).mean())
     )
     for before, state in pairwise(states):
         r = np.linalg.norm(state.R - state.omega)
@@ -378,7 +384,7 @@ def test_an_iterate_that_is_not_finite_is_said_to_be() -> None:
 
 def test_a_penalty_for_every_pose_is_not_the_paper_s() -> None:
     with pytest.raises(
-        SettingError, match="must be FixedPenalty or BalancedPenalty or BoydPenalty"
+        SettingError, match="MultiplierPenalty has a rho for every pose, and the paper one for all"
     ):
         paper(penalty=MultiplierPenalty()).init(varied_problem(0, 5, 2), None)
 

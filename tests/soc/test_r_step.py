@@ -18,7 +18,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.soc.consensus import LocalConsensus
 from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty
+from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, first_penalties
 from solvers.soc.r_step import RStep, RSubproblem, _largest_eigenvalue_bound, prepare
 from solvers.soc.soc import SOC
 
@@ -89,7 +89,7 @@ def test_the_back_ends_agree_on_whole_graphs(
     name: str, translations: bool, request: pytest.FixtureRequest
 ) -> None:
     problem = problem_named(name, request)
-    rho = MultiplierPenalty().initial(problem, chordal_start(problem))
+    rho = first_penalties(MultiplierPenalty(), problem, chordal_start(problem))
     rho_t = 0.1 * translation_scale(problem) * translations
     subproblem = subproblem_of(problem, np.concatenate([rho_t, np.repeat(rho, 3)]))
     rng = np.random.default_rng(0)

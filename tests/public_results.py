@@ -1,0 +1,11 @@
+"""Public classes whose objects functions make."""
+
+# Users only read them: their fields are not checked once more.
+RESULTS = {
+    *("Certificate", "EdgeResiduals", "EvaluatedPoses", "GraphQP", "HandednessTerms", "LowerBound"),
+    *("PoseVariables", "RelaxationSolution", "RotationQP", "Term", "Verification", "Marginals"),
+    *("Comparison", "EdgeFit", "ErrorForgetting", "FolderSolution"),
+    *("GrowingSolution", "History", "Ledger", "Measurement", "NoiseSweep", "OrthogonalSolution"),
+    *("Outcome", "RSubproblem", "Record", "Rejection", "Reproduction", "Run", "Solution", "Stage"),
+    "Traffic",
+}
