@@ -44,11 +44,12 @@ _NEAR = 2.0
 # Clusters that are tried in a row without success, and how often one of them is.
 _MOST_FAILURES = 20
 _MOST_TRIALS = 3
+# Poses times clusters tried, for a row without success: a trial on a large graph takes longer.
+_MOST_WORK = 40_000
 # Closures kept for every cluster that is added before distances are measured again.
 _CLOSURES_PER_CLUSTER = 10
-# Clusters that are tried for removal in a row, and for an exchange; rounds of an exchange.
+# Clusters that are tried for removal in a row, and rounds of an exchange.
 _MOST_REMOVALS = 5
-_MOST_EXCHANGES = 30
 _MOST_ROUNDS = 3
 # Rejected clusters up to this many times their thresholds tell how many wrong ones fit by chance;
 # so many of them are looked at.
@@ -220,7 +221,7 @@ class ClusterSearch:
             name = candidates.names[k]
             if trials.get(name, 0) >= _MOST_TRIALS:
                 continue
-            if num_left == 0 or num_failures == _MOST_FAILURES or not self.has_time():
+            if num_left == 0 or num_failures >= self._most_failures or not self.has_time():
                 break
             if candidates.ratio(k) > _NEAR:
                 continue
@@ -282,7 +283,7 @@ class ClusterSearch:
         """A fit of less truncated cost, by a rejected cluster that excludes some of those kept."""
         cost = self.cost(fit)
         candidates = self._candidates(fit)
-        for k in candidates.order[:_MOST_EXCHANGES].tolist():
+        for k in candidates.order[: self._most_failures].tolist():
             if not self.has_time():
                 return None
             if candidates.ratio(k) > _NEAR:
@@ -302,6 +303,11 @@ class ClusterSearch:
                 return other
             other = self._settled(kept, other.poses)
         return other
+
+    @property
+    def _most_failures(self) -> int:
+        """Clusters that are tried in a row without success, or for an exchange, at most."""
+        return max(1, min(_MOST_FAILURES, _MOST_WORK // self.problem.num_poses))
 
     def cost(self, fit: Fit) -> float:
         """Truncated cost of the poses of a fit."""
