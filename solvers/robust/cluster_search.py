@@ -44,9 +44,12 @@ _NEAR = 2.0
 # Clusters that are tried in a row without success, and how often one of them is.
 _MOST_FAILURES = 20
 _MOST_TRIALS = 3
-# Clusters that are tried for removal in a row, and for an exchange; rounds of an exchange.
+# Poses times clusters tried, for a row without success: a trial on a large graph takes longer.
+_MOST_WORK = 40_000
+# Closures kept for every cluster that is added before distances are measured again.
+_CLOSURES_PER_CLUSTER = 10
+# Clusters that are tried for removal in a row, and rounds of an exchange.
 _MOST_REMOVALS = 5
-_MOST_EXCHANGES = 30
 _MOST_ROUNDS = 3
 # Rejected clusters up to this many times their thresholds tell how many wrong ones fit by chance;
 # so many of them are looked at.
@@ -124,22 +127,22 @@ class ClusterSearch:
             fit = exchanged
 
     def expected_by_chance(self, fit: Fit) -> float:
-        """Number of wrong edges that fit the map by chance, estimated from those that nearly do.
+        """Most wrong edges to expect that fit the map by chance, from those that nearly do.
 
         Of wrong motions that lie anywhere, those within x times the threshold of their first-order
         distance are to those within it as x^(p / 2) to 1, the ratio of the volumes, with p = 3 or 6
         numbers of a motion. A run of closures under one wrong motion is one such motion. So the
-        rejected ones between 1 and x = 4 times tell how many are expected below 1. Of more than a
-        hundred, a hundred are looked at.
+        rejected ones between 1 and x = 4 times, and two standard deviations of their number, tell
+        how many are expected below 1 at most. Of more than a hundred, a hundred are looked at.
         """
         candidates = self._candidates(fit, _FAR)
         chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
         p = self.problem.d + tangent_dimension(self.problem.d)
-        expected = 0.0
-        for k in chosen.tolist():
-            if 1.0 < candidates.ratio(k) <= _FAR:
-                expected += len(candidates.groups[k]) / (_FAR ** (0.5 * p) - 1.0)
-        return expected * len(candidates.order) / max(1, len(chosen))
+        near = [k for k in chosen.tolist() if 1.0 < candidates.ratio(k) <= _FAR]
+        sizes = np.array([len(candidates.groups[k]) for k in near])
+        num_near = float(sizes.sum() + 2.0 * np.sqrt(np.sum(sizes**2)))
+        share_looked_at = len(chosen) / max(1, len(candidates.order))
+        return float(num_near / (_FAR ** (0.5 * p) - 1.0) / max(share_looked_at, 1e-300))
 
     # Adding clusters
 
@@ -148,7 +151,7 @@ class ClusterSearch:
         trials: dict[int, int] = {}
         while self.has_time():
             fit = self._with_fitting(fit)
-            larger = self._with_best_cluster(fit, self._candidates(fit), trials)
+            larger = self._with_next_clusters(fit, self._candidates(fit), trials)
             if larger is None:
                 return fit
             fit = larger
@@ -203,34 +206,44 @@ class ClusterSearch:
         order = order[ratio[order] <= most]
         return _Candidates(names, groups, thresholds, first_order, farthest, largest, order)
 
-    def _with_best_cluster(
+    def _with_next_clusters(
         self, fit: Fit, candidates: _Candidates, trials: dict[int, int]
     ) -> Fit | None:
-        """The fit with the first of the candidates that passes the test; None if none does.
+        """The fit with the first candidates that pass the test; None if none does.
 
-        `trials` counts how often each cluster has failed, and is brought up to date.
+        So many are added that the map hardly stiffens: one for every ten closures kept, at least
+        one. `trials` counts how often each cluster has failed, and is brought up to date.
         """
+        num_left = max(1, int((fit.kept & ~self.known).sum()) // _CLOSURES_PER_CLUSTER)
         num_failures = 0
+        larger: Fit | None = None
         for k in candidates.order.tolist():
             name = candidates.names[k]
             if trials.get(name, 0) >= _MOST_TRIALS:
                 continue
-            if num_failures == _MOST_FAILURES or not self.has_time():
-                return None
+            if num_left == 0 or num_failures >= self._most_failures or not self.has_time():
+                break
             if candidates.ratio(k) > _NEAR:
                 continue
-            threshold = candidates.thresholds[k]
-            kept = _with_edges(fit.kept, candidates.groups[k])
-            larger = self._settled(kept, fit.poses)
-            if larger.cost - fit.cost > threshold:
-                # Newton's method may end elsewhere from poses that have drifted far.
-                start = chordal_start(inlier_problem(self.problem, kept))
-                larger = min(larger, self._settled(kept, start), key=lambda other: other.cost)
-            if larger.cost - fit.cost <= threshold:
-                return larger
-            trials[name] = trials.get(name, 0) + 1
-            num_failures += 1
-        return None
+            before = fit if larger is None else larger
+            trial = self._with_cluster(before, candidates.groups[k], candidates.thresholds[k])
+            if trial is None:
+                trials[name] = trials.get(name, 0) + 1
+                num_failures += 1
+                continue
+            larger = trial
+            num_left -= 1
+        return larger
+
+    def _with_cluster(self, fit: Fit, cluster: IntArray, threshold: float) -> Fit | None:
+        """The fit with a cluster, if its T is at most the threshold."""
+        kept = _with_edges(fit.kept, cluster)
+        larger = self._settled(kept, fit.poses)
+        if larger.cost - fit.cost > threshold:
+            # Newton's method may end elsewhere from poses that have drifted far.
+            start = chordal_start(inlier_problem(self.problem, kept))
+            larger = min(larger, self._settled(kept, start), key=lambda other: other.cost)
+        return larger if larger.cost - fit.cost <= threshold else None
 
     # Removing clusters
 
@@ -270,7 +283,7 @@ class ClusterSearch:
         """A fit of less truncated cost, by a rejected cluster that excludes some of those kept."""
         cost = self.cost(fit)
         candidates = self._candidates(fit)
-        for k in candidates.order[:_MOST_EXCHANGES].tolist():
+        for k in candidates.order[: self._most_failures].tolist():
             if not self.has_time():
                 return None
             if candidates.ratio(k) > _NEAR:
@@ -290,6 +303,11 @@ class ClusterSearch:
                 return other
             other = self._settled(kept, other.poses)
         return other
+
+    @property
+    def _most_failures(self) -> int:
+        """Clusters that are tried in a row without success, or for an exchange, at most."""
+        return max(1, min(_MOST_FAILURES, _MOST_WORK // self.problem.num_poses))
 
     def cost(self, fit: Fit) -> float:
         """Truncated cost of the poses of a fit."""

@@ -153,7 +153,7 @@ class Rejection(Summarised):
             doubts.append("the edges kept do not fit together")
         if self.by_chance > _TOLERATED_SHARE * self.num_closures_kept:
             number = rounded_up(self.by_chance, 2)
-            doubts.append(f"about {number} wrong closures are expected to fit this map by chance")
+            doubts.append(f"up to {number} wrong closures are expected to fit this map by chance")
         num_near = int((self.rejected & self.doubtful).sum())
         if num_near > self._num_tolerated:
             doubts.append(f"{num_near} rejected edges are near their thresholds")
