@@ -158,7 +158,7 @@ __all__ += [
 ]
 # Types in the signatures of the names above.
 __all__ += ["Automatic", "HandednessAscent", "HullLagrangian"]
-__all__ += ["EdgeFit", "Outcome", "Rejection", "Support"]
+__all__ += ["EdgeFit", "Outcome", "OutlierProof", "Rejection", "Support"]
 __all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
 __all__ += ["OrthogonalSolution", "Sweep"]
 __all__ += ["Engine", "Recovery", "Traffic", "Worker", "WorkerPool"]

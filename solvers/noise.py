@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -32,6 +32,7 @@ from pgo_models.problem.matrices import entry_positions
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.selected_inversion import selected_inverse
 from pgo_models.problem.weighting import Weighting
+from pgo_models.summaries import Summarised
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.riemannian.polish import polish
@@ -44,7 +45,7 @@ _FARTHEST = 1e12  # factor on weights beyond which a kind of edges has no noise
 
 
 @dataclass(frozen=True)
-class NoiseLevel:
+class NoiseLevel(Summarised):
     """Noise of one kind of edges: standard deviations of every component.
 
     Parameters
@@ -74,7 +75,7 @@ class NoiseLevel:
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseEstimate:
+class NoiseEstimate(Summarised):
     """The noise of every kind of edges, and the graph with weights of this noise.
 
     Parameters
@@ -92,6 +93,7 @@ class NoiseEstimate:
         return "; ".join(map(str, self.levels))
 
 
+@door
 def estimate_noise(graph: PoseGraph | PGOProblem) -> NoiseEstimate:
     """Estimate the noise of odometry and closures from how well they fit each other.
 

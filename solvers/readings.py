@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.certificates.fit import Fit
-from pgo_models.errors import FAILURES, FileFormatError
+from pgo_models.errors import FAILURES, FileFormatError, door
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import g2o_files
@@ -25,6 +25,7 @@ from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import edge_residuals
+from pgo_models.summaries import Summarised
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.riemannian.newton import Newton
@@ -80,7 +81,7 @@ _QUESTIONS = {
 
 
 @dataclass(frozen=True)
-class ReadingFit:
+class ReadingFit(Summarised):
     """How well the measurements of a file fit each other under a reading.
 
     Parameters
@@ -124,7 +125,7 @@ class ReadingFit:
 
 
 @dataclass(frozen=True)
-class ReadingComparison:
+class ReadingComparison(Summarised):
     """The readings of a file, and which of them fits it better than what is written.
 
     Parameters
@@ -163,6 +164,7 @@ class ReadingComparison:
         return "\n".join(lines)
 
 
+@door
 def compare_readings(
     name_or_path: str | Path,
     *,

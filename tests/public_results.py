@@ -7,5 +7,5 @@ RESULTS = {
     *("Comparison", "EdgeFit", "ErrorForgetting", "FolderSolution"),
     *("GrowingSolution", "History", "Ledger", "Measurement", "NoiseSweep", "OrthogonalSolution"),
     *("Outcome", "RSubproblem", "Record", "Rejection", "Reproduction", "Run", "Solution", "Stage"),
-    "Traffic",
+    *("Traffic", "OutlierProof", "ReadingComparison", "ReadingFit", "NoiseEstimate", "NoiseLevel"),
 }

@@ -79,6 +79,11 @@ def scene() -> dict[str, Any]:
         "method": solvers.Newton(),
         "name_or_path": "circle",
         "changer": lambda unknown: pgo.ModelChange(),
+        "frames": [[{"x": [0.0], "y": [1.0]}]],
+        "labels": ["start"],
+        "iterates": [solution.poses],
+        "methods": [solvers.Newton()],
+        "factors": None,
         "constrained": constrained,
         "on_circle": on_circle,
     }

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import cvxpy as cp
@@ -51,7 +52,12 @@ def of_pose_graphs() -> Iterator[object]:
     relaxed = pgo.solve_relaxation(graph)
     yield from (relaxed, relaxed.rank, relaxed.plan)
     yield solvers.extend(solution, graph, certify=False)
-    yield solvers.solve(graph, robust=solvers.GNC()).robust
+    rejecting = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC()))
+    yield from (rejecting.robust, rejecting.robust.proof)
+    estimate = solvers.estimate_noise(graph)
+    yield from (estimate, estimate.levels[0])
+    compared = solvers.compare_readings(Path(__file__).parent / "cases/degrees.g2o")
+    yield from (compared, compared.written)
     yield solvers.noise_sweep("grid", [0.1], 1, 0)  # type: ignore[arg-type]
     for method in (*METHODS, solvers.SOC(robots=robots)):
         yield method

@@ -18,6 +18,9 @@ from pgo_models.geometry.rotations import Array, project_by_svd
 class ConstraintSet(ABC):
     """A closed set of matrices with a projection: a user's own has `project`, and no more.
 
+    A point P of the set, a matrix V beside it, a direction G or N and what is returned are arrays
+    of the variable's shape, (k,) or (k, l).
+
     `OrthogonalProblem(problem, sets=[(X, MySet())])` puts a variable into it.
 
     Examples

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pgo_models.errors import GraphError, GraphWarning, extra_module, printable
+from pgo_models.errors import GraphError, GraphWarning, SettingError, door, extra_module, printable
 from pgo_models.files import Problem, check_lines
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, log_map, project_to_rotations
@@ -59,6 +59,7 @@ class _UnreadableFactorError(Exception):
     """A factor that is no edge; the text says why."""
 
 
+@door
 def from_gtsam(
     factors: Any,  # noqa: ANN401 - GTSAM has no types
     values: Any = None,  # noqa: ANN401
@@ -108,6 +109,10 @@ def from_gtsam(
     >>> solvers.certify(pgo.PGOProblem(graph), graph.initial)  # doctest: +SKIP
     """
     gtsam = extra_module("gtsam", "peers")
+    if not isinstance(factors, gtsam.NonlinearFactorGraph):
+        raise SettingError(f"factors are a {type(factors).__name__}; give a NonlinearFactorGraph")
+    if values is not None and not isinstance(values, gtsam.Values):
+        raise SettingError(f"values are a {type(values).__name__}; give gtsam.Values")
     by_type: dict[str, Measurements] = {}
     unreadable: dict[str, list[int]] = {}
     for place in range(factors.size()):
@@ -134,6 +139,7 @@ def from_gtsam(
     return replace(graph, initial=_poses_of_values(gtsam, values, graph))
 
 
+@door
 def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
     """Make a factor graph of GTSAM of a PoseGraph: between factors, priors and positions of poses.
 

@@ -68,14 +68,17 @@ COMMANDS = {
             "What is read, and the cost that is minimised": (
                 "cost",
                 "unit_weights",
+                "estimate_noise",
                 "rotations",
                 "drop_coupling",
                 "skip_unknown",
                 "trust_folder",
+                "largest_component",
                 "drop_edge",
                 "robust",
+                "prove_outliers",
             ),
-            "Files that are written": ("out", "report", "covariances", "proof", "times"),
+            "Files that are written": ("out", "report", "film", "covariances", "proof", "times"),
             "How it is solved": (
                 "method",
                 "start",

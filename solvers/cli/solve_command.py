@@ -217,6 +217,13 @@ def solve_command(
             "consistency (pcm), or both (pcm-gnc)."
         ),
     ] = None,
+    prove_outliers: Annotated[
+        bool,
+        typer.Option(
+            help="With --robust: prove closures wrong that no map at least as good keeps, odometry "
+            "taken to be right, and bound the truncated cost of every map."
+        ),
+    ] = False,
     drop_edge: DropEdgeOption = None,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Print a line an iteration.")
@@ -246,6 +253,8 @@ def solve_command(
         raise SettingError("--out - prints the graph alone; leave out --verbose and --json")
     display = Display(verbose, quiet or is_printed, as_json)
     outputs = Outputs(out or [], report, film, covariances, proof, resume)
+    if prove_outliers and robust is None:
+        raise SettingError("--prove-outliers is of a robust solve; add --robust gnc")
     network.check_without_driver(stages, outputs.proof, graph)
     if network.reads_own_files(graph):
         _refuse_what_needs_the_graph(given, outputs, source.chosen_cost, method)
@@ -272,6 +281,10 @@ def solve_command(
         verbose=verbose,
         progress=display.has_bar,
     )
+    if prove_outliers:
+        from solvers.robust_solves.outlier_proof import prove_outliers as with_proof
+
+        solution = with_proof(solution, time_limit)
     solution = with_places(solution, graph, drop_edge)
     _save_and_show(solution, source, stages, outputs, display)
     warn_of_weights(graph, problem, solution.certificate, drop_edge)

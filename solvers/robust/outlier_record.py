@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgo_models.geometry.rotations import BoolArray
+from pgo_models.summaries import Summarised
 
 
 @dataclass(frozen=True, eq=False)
-class OutlierProof:
+class OutlierProof(Summarised):
     """What is proven of the closures of a graph whose known inliers are right.
 
     Parameters

@@ -38,7 +38,7 @@ import numpy as np
 
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.certificates.shrunk_information import shrink_information
-from pgo_models.errors import FAILURES, SettingError
+from pgo_models.errors import FAILURES, SettingError, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
@@ -64,6 +64,7 @@ _OUTWARD = 1.0 + 1e-12  # for sums of up to a million positive terms
 _ROUNDING = 2.0**-40  # of an eigenvalue, over the trace
 
 
+@door
 def prove_outliers(solution: Solution, time_limit: float = math.inf) -> Solution:
     """Prove closures wrong, for all maps that are as good as that of a robust solve.
 

@@ -150,8 +150,8 @@ def test_the_worst_edge_is_named_with_the_option_that_leaves_it_out(
     out = " ".join(pgo_command("solve", path)[1].split())
     line = line_of(path, 90)
     assert (
-        f"Look for wrong loop closures, which need not be the worst edges. pgo solve {path}"
-        " --robust gnc" in out
+        "Look for wrong loop closures and fixes, which need not be the worst edges. "
+        f"pgo solve {path} --robust gnc" in out
     )
     assert (
         f"The worst edge is {path}:{line}: solve without it. pgo solve {path} --drop-edge"

@@ -1,3 +1,4 @@
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 from graphs import assert_says
 
 from pgo_models.errors import FileFormatError
+from pgo_models.files import read_blocks
 from pgo_models.graphs.g2o_parser import read_lines
 from pgo_models.graphs.g2o_rows import information_of, poses_of
 
@@ -142,7 +144,8 @@ def test_numbers_that_all_lines_end_with_are_read_like_others(tmp_path: Path) ->
 
 
 def test_a_block_of_a_file_knows_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pgo_models.files._BLOCK", 100)
+    in_small_blocks = partial(read_blocks, block=100)
+    monkeypatch.setattr("pgo_models.graphs.g2o_parser.read_blocks", in_small_blocks)
     lines = [f"VERTEX_SE2 {k} {k} 0 0" for k in range(20)] + [
         f"EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1" for k in range(19)
     ]
