@@ -141,7 +141,7 @@ class Factor:
 
 class LUStep:
     def prepare(self, subproblem):
-        return Factor(splu(subproblem.K), 0.5 * subproblem.penalty[:, None])
+        return Factor(splu(subproblem.matrix), 0.5 * subproblem.rho[:, None])
 
 
 by_lu = solvers.run(solvers.SOC(r_step=LUStep()), graph)

@@ -80,6 +80,7 @@ class GrowingSolution(Summarised):
     A graph of 18 poses grows by one pose after the other:
 
     >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers import solve
     >>> graph = grid(np.random.default_rng(0))
     >>> growing = GrowingSolution.of(solve(graph.subgraph(np.arange(18))))
     >>> for n in range(19, 28):
@@ -208,7 +209,8 @@ class GrowingSolution(Summarised):
         --------
         Two poses, and a third one that sees both:
 
-        >>> from pgo_models import PoseGraph, read_g2o
+        >>> from pgo_models import PoseGraph
+        >>> from solvers import solve
         >>> step = np.array([[1.0, 0.0]])
         >>> turn = np.eye(2)[None]
         >>> one = np.ones(1)
@@ -362,6 +364,7 @@ def extend(
     Examples
     --------
     >>> from pgo_models.graphs.scenes import grid
+    >>> from solvers import solve
     >>> graph = grid(np.random.default_rng(0))
     >>> solution = solve(graph.subgraph(np.arange(18)))
     >>> extend(solution, graph).is_certified

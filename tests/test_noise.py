@@ -120,5 +120,5 @@ def test_the_command_solves_with_the_noise_and_says_it(tmp_path: Path, pgo_comma
 def test_noise_of_a_problem_is_that_of_its_graph() -> None:
     walk = noisy_walk(2, 0, 1.0)
     assert str(estimate_noise(pgo.PGOProblem(walk))) == str(estimate_noise(walk))
-    with pytest.raises(SettingError, match="the problem is 3"):
+    with pytest.raises(SettingError, match="graph must be a PGOProblem or a PoseGraph"):
         estimate_noise(3)

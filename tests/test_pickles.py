@@ -158,6 +158,9 @@ MADE: dict[str, Make] = {
     "OrthogonalSolution": lambda: solvers.solve_orthogonal(
         smallest_eigenvectors(np.diag([1.0, 2.0, 3.0]), 1), rng=np.random.default_rng(0)
     ),
+    "OutlierProof": lambda: (
+        solvers.prove_outliers(solvers.solve(GRAPH, robust=solvers.GNC())).robust.proof
+    ),
     "Rejection": lambda: solvers.solve(GRAPH, robust=solvers.GNC()).robust,
     "EdgeFit": lambda: judge_edges(solved().problem, solved().poses),
     "RSubproblem": subproblem,

@@ -163,10 +163,10 @@ def animate_poses(
 
     Examples
     --------
-    >>> from pgo_models import odometry_start
+    >>> from pgo_models import spanning_tree_start
     >>> from pgo_models.graphs.scenes import grid
     >>> graph = grid(np.random.default_rng(0))
-    >>> film = animate_poses(graph, [odometry_start(graph), graph.truth], ["odometry", "truth"])
+    >>> film = animate_poses(graph, [spanning_tree_start(graph), graph.truth], ["tree", "truth"])
     >>> len(film.frames)
     2
     """

@@ -89,7 +89,7 @@ def film(
     >>> from pgo_models import load
     >>> frames = film(load("grid")).frames
     >>> frames[0].name.partition(":")[0], frames[-1].name.partition(":")[0]
-    ('start', 'Newton 4')
+    ('start', 'Newton 1')
     """
     problem = as_problem(problem)
     if methods is None:

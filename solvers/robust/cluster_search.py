@@ -217,23 +217,49 @@ class ClusterSearch:
         num_left = max(1, int((fit.kept & ~self.known).sum()) // _CLOSURES_PER_CLUSTER)
         num_failures = 0
         larger: Fit | None = None
-        for k in candidates.order.tolist():
-            name = candidates.names[k]
-            if trials.get(name, 0) >= _MOST_TRIALS:
-                continue
-            if num_left == 0 or num_failures >= self._most_failures or not self.has_time():
+        waiting = [k for k in candidates.order if trials.get(candidates.names[k], 0) < _MOST_TRIALS]
+        while num_left and waiting and num_failures < self._most_failures and self.has_time():
+            near: list[int] = []
+            while waiting and len(near) < num_left:
+                k = waiting.pop(0)
+                if candidates.ratio(k) <= _NEAR:
+                    near.append(k)
+            if not near:
                 break
-            if candidates.ratio(k) > _NEAR:
-                continue
             before = fit if larger is None else larger
-            trial = self._with_cluster(before, candidates.groups[k], candidates.thresholds[k])
-            if trial is None:
+            after, failed = self._with_each(before, candidates, near)
+            for k in failed:
+                name = candidates.names[k]
                 trials[name] = trials.get(name, 0) + 1
-                num_failures += 1
-                continue
-            larger = trial
-            num_left -= 1
+            num_failures = num_failures + len(failed) if len(failed) == len(near) else len(failed)
+            num_left -= len(near) - len(failed)
+            if len(failed) < len(near):
+                larger = after
         return larger
+
+    def _with_each(
+        self, fit: Fit, candidates: _Candidates, chosen: list[int]
+    ) -> tuple[Fit, list[int]]:
+        """The fit with those of some candidates that pass the test, and those that do not.
+
+        Where all of them together pass, that is one solve; else each half is tried on its own. A
+        cluster that hides among others is found later, by its own rise of the cost.
+        """
+        if len(chosen) == 1:
+            k = chosen[0]
+            larger = self._with_cluster(fit, candidates.groups[k], candidates.thresholds[k])
+            return (fit, chosen) if larger is None else (larger, [])
+        edges = np.concatenate([candidates.groups[k] for k in chosen])
+        threshold = float(self.scale * self.right_costs.thresholds([edges], _QUANTILE)[0])
+        together = self._settled(_with_edges(fit.kept, edges), fit.poses)
+        if together.cost - fit.cost <= threshold:
+            return together, []
+        middle = len(chosen) // 2
+        first, failed = self._with_each(fit, candidates, chosen[:middle])
+        if not self.has_time():
+            return first, [*failed, *chosen[middle:]]
+        second, failed_later = self._with_each(first, candidates, chosen[middle:])
+        return second, [*failed, *failed_later]
 
     def _with_cluster(self, fit: Fit, cluster: IntArray, threshold: float) -> Fit | None:
         """The fit with a cluster, if its T is at most the threshold."""

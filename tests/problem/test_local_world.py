@@ -82,8 +82,11 @@ def test_poses_of_the_file_are_local_poses_rounded_once(seed, d):
     np.testing.assert_array_equal(poses.t[graph.world], 0.0)
     near = found.with_gauge_at(graph.world)
     others = graph.in_files
-    exactly = near.t[others].astype(np.longdouble) + local.point
-    np.testing.assert_array_equal(poses.t[others], exactly.astype(float))
+    exactly = [
+        [float(Fraction(a) + Fraction(b)) for a, b in zip(row, local.point.tolist(), strict=True)]
+        for row in near.t[others].tolist()
+    ]
+    np.testing.assert_array_equal(poses.t[others], exactly)
     # What is rounded to the file is a local pose exactly, and the cost is the same there.
     assert local.keeps_exactly(poses)
     back = local.local_poses(poses)

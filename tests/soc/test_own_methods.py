@@ -18,7 +18,7 @@ class OwnStep:
     """Step (a) by SciPy's sparse LU."""
 
     def prepare(self, subproblem: solvers.RSubproblem) -> "OwnFactor":
-        return OwnFactor(splu(subproblem.K), 0.5 * subproblem.penalty[:, None])
+        return OwnFactor(splu(subproblem.matrix), 0.5 * subproblem.rho[:, None])
 
 
 @dataclass

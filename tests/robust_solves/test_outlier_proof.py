@@ -1,0 +1,120 @@
+"""What is proven of closures holds for every choice of them, tried one by one on small graphs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import chain, combinations
+
+import numpy as np
+import pytest
+from graphs import informed
+from hypothesis import given, settings, strategies as st
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import SettingError
+from pgo_models.graphs.scenes import NoiseModel
+from solvers.riemannian.polish import polish
+from solvers.robust.revision import truncated_cost
+from solvers.robust_solves.outlier_proof import isotropic_below
+
+
+def walk_with_closures(
+    seed: int, d: int, num_right: int, num_wrong: int, noise: float
+) -> tuple[pgo.PoseGraph, np.ndarray]:
+    """A walk with right closures and wrong ones, and which edges are wrong."""
+    rng = np.random.default_rng(seed)
+    level = NoiseModel(noise, noise)
+    graph = pgo.grid_world(1, 14, rng, d=d, loop_closure_probability=0.0, noise=level)
+    chain_alone = graph.without_edges(np.abs(graph.i - graph.j) != 1)
+    truth = graph.truth
+    i = rng.integers(0, 6, num_right + num_wrong)
+    j = rng.integers(8, 14, num_right + num_wrong)
+    back = np.swapaxes(truth.R[i], 1, 2)
+    R = back @ truth.R[j]
+    t = np.einsum("mab,mb->ma", back, truth.t[j] - truth.t[i])
+    t[num_right:] += rng.uniform(2.0, 9.0, (num_wrong, d))
+    kappa, tau = chain_alone.kappa[0], chain_alone.tau[0]
+    spoiled = chain_alone.with_edges(i, j, pgo.Poses(R, t), kappa, tau)
+    return spoiled, np.arange(spoiled.num_edges) >= chain_alone.num_edges + num_right
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    d=st.sampled_from([2, 3]),
+    num_right=st.integers(0, 2),
+    num_wrong=st.integers(1, 3),
+    noise=st.sampled_from([0.01, 0.05, 0.3]),
+)
+def test_no_choice_of_closures_contradicts_the_proof(
+    seed: int, d: int, num_right: int, num_wrong: int, noise: float
+) -> None:
+    graph, _ = walk_with_closures(seed, d, num_right, num_wrong, noise)
+    solution = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC()))
+    robust = solution.robust
+    proof = robust.proof
+    problem = robust.problem
+    thresholds = robust.threshold_scale * pgo.chi2_thresholds(problem, robust.quantile)
+    at_answer = truncated_cost(problem, robust.known, thresholds, solution.poses)
+    assert proof.truncated_cost_bound <= at_answer <= proof.truncated_cost
+    closures = np.flatnonzero(~robust.known)
+    subsets = chain.from_iterable(combinations(closures, k) for k in range(len(closures) + 1))
+    for kept in subsets:
+        chosen = robust.known.copy()
+        chosen[list(kept)] = True
+        inliers = pgo.PGOProblem(graph.without_edges(~chosen), weighting=problem.weighting)
+        poses = polish(inliers, solution.poses)
+        cost = truncated_cost(problem, robust.known, thresholds, poses)
+        assert cost >= proof.truncated_cost_bound
+        if cost <= at_answer:
+            is_kept = ~robust.known & (problem.edge_costs(poses) <= thresholds)
+            assert not (is_kept & proof.proven_wrong).any()
+            assert is_kept.sum() <= proof.most_closures
+
+
+def test_wrong_closures_of_good_odometry_are_proven_wrong_and_right_ones_are_not() -> None:
+    graph, is_wrong = walk_with_closures(3, 2, 3, 5, 0.01)
+    solution = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC()))
+    proof = solution.robust.proof
+    np.testing.assert_array_equal(proof.proven_wrong, is_wrong)
+    assert (proof.most_closures, proof.num_kept) == (3, 3)
+    assert proof.is_complete
+    text = str(solution)
+    assert "5 of 8 closures are proven wrong" in " ".join(text.split())
+    record = solution.as_json()["robust"]
+    assert record["proven_wrong"] == np.flatnonzero(is_wrong).tolist()
+    assert record["most_closures"] == 3
+    assert 0.0 < record["truncated_cost_bound"] <= record["truncated_cost_at_most"]
+
+
+def test_where_odometry_can_follow_everything_nothing_is_proven() -> None:
+    graph, _ = walk_with_closures(0, 2, 2, 1, 1.0)
+    proof = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC())).robust.proof
+    assert not proof.proven_wrong.any()
+    assert "no closure can be proven wrong: the known inliers can follow every one" in str(proof)
+
+
+def test_a_proof_that_is_out_of_time_says_so() -> None:
+    graph, _ = walk_with_closures(3, 2, 3, 5, 0.01)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    proof = solvers.prove_outliers(solution, time_limit=1e-9).robust.proof
+    assert not proof.is_complete
+    assert not proof.proven_wrong.any()
+    assert proof.most_closures == 8
+    with pytest.raises(SettingError, match=r"give solve\(.., robust=GNC\(\)\)"):
+        solvers.prove_outliers(solvers.solve(graph))
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_isotropic_cost_is_below_chi2_at_all_poses(d: int, coupled: bool) -> None:
+    graph = informed(3, 12, d, coupled=coupled, spread=2.0, noise=NoiseModel(0.5, 0.5))
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+    below = isotropic_below(problem)
+    assert (below.graph.tau > 0.0).any()
+    rng = np.random.default_rng(0)
+    for spread in (1e-3, 0.1, 1.0, 10.0):
+        R = graph.truth.R @ pgo.exp_map(spread * rng.standard_normal((12, 2 * d - 3)))
+        poses = replace(graph.truth, R=R, t=graph.truth.t + spread * rng.standard_normal((12, d)))
+        assert (below.edge_costs(poses) <= problem.edge_costs(poses) * (1 + 1e-12)).all()
