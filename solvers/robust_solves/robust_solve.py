@@ -45,8 +45,8 @@ _NEAR_SHARE = 0.9
 # noisy spheres whose errors are four times those claimed.
 _ALIKE = 1.5
 # Least median of the costs of a kind of edges over their mean. On grid worlds of 200 poses it is
-# 0.72 to 0.94 at the least-squares solution, and 0.12 to 0.25 for closures of which one in a hundred
-# is wrong. Where more are wrong the quotient of the means is 0.56 at most.
+# 0.72 to 0.94 at the least-squares solution, and 0.12 to 0.25 for closures of which one in a
+# hundred is wrong. Where more are wrong the quotient of the means is 0.56 at most.
 _EVEN = 0.5
 # Share of the time limit that revisions leave to the solution and its certificate.
 _LAST_SHARE = 0.15
