@@ -229,6 +229,7 @@ class OrthogonalSOC:
         start, where the gradients are alike, or comes no nearer.
         """
         rho = 1.0
+        size = _size_of(point.copies)
         was_far = False
         gradient = 0.0
         distance = math.inf
@@ -238,7 +239,7 @@ class OrthogonalSOC:
                 P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)
             ]
             distance_before = distance
-            distance = norm_of_all(moves) / norm_of_all(point.copies)
+            distance = norm_of_all(moves) / size
             if was_far and distance > 0.5 * distance_before:
                 # Convex constraints, or J itself, hold X away from the start: begin with a low
                 # penalty and let the rule raise it.
@@ -405,6 +406,11 @@ def solve_orthogonal(
     return OrthogonalSolution(problem, values, state.others, best.objective, kkt, best, objectives)
 
 
+def _size_of(copies: Sequence[Array]) -> float:
+    """What a distance of copies is relative to; 1 at zero, which a set of one's own may hold."""
+    return norm_of_all(copies) or 1.0
+
+
 def _with_residuals(
     problem: OrthogonalProblem, V: Sequence[Array], state: OrthogonalState
 ) -> OrthogonalState:
@@ -419,7 +425,7 @@ def _with_residuals(
     return replace(
         state,
         scale=scale,
-        primal_residual=norm_of_all(disagreement) / norm_of_all(state.copies),
+        primal_residual=norm_of_all(disagreement) / _size_of(state.copies),
         dual_residual=norm_of_all(imbalance) / scale,
     )
 

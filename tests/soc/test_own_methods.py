@@ -150,3 +150,21 @@ def test_an_own_constraint_has_its_dual_value() -> None:
     assert len(written) == 1
     assert slope > 1.0
     assert float(written[0].dual_value) == pytest.approx(slope, rel=1e-2)
+
+
+class Whole(pgo.ConstraintSet):
+    """Vectors of whole numbers, zero among them."""
+
+    def project(self, V: np.ndarray) -> np.ndarray:
+        return np.round(V)
+
+
+def test_zero_may_be_a_point_of_an_own_set() -> None:
+    x = cp.Variable(2)
+    J = cp.Minimize(cp.sum_squares(x - np.array([1.2, 2.9])))
+    problem = pgo.OrthogonalProblem(cp.Problem(J), sets=[(x, Whole())])
+    for seed in range(5):
+        found = solvers.solve_orthogonal(problem, seed).values[0]
+        np.testing.assert_array_equal(found, np.round(found))
+    at_zero = solvers.solve_orthogonal(problem, 2)
+    assert np.isfinite(at_zero.values[0]).all()
