@@ -220,8 +220,9 @@ def solve_command(
     prove_outliers: Annotated[
         bool,
         typer.Option(
+            "--prove-outliers",
             help="With --robust: prove closures wrong that no map at least as good keeps, odometry "
-            "taken to be right, and bound the truncated cost of every map."
+            "taken to be right, and bound the truncated cost of every map.",
         ),
     ] = False,
     drop_edge: DropEdgeOption = None,

@@ -79,6 +79,22 @@ def test_info_without_a_graph_says_what_is_installed(pgo_command, monkeypatch):
         assert re.search(rf"^extra {extra} .*{name} ([\d.]+|missing)", out, re.M)
 
 
+def test_outliers_are_proven_where_that_is_asked_for(pgo_command, tmp_path):
+    graph = pgo.grid_world(1, 60, np.random.default_rng(0), d=2)
+    pgo.write_g2o(graph, tmp_path / "world.g2o")
+    line = "EDGE_SE2 3 50 40 30 1 1000 0 0 1000 0 1000\n"
+    with (tmp_path / "world.g2o").open("a") as file:
+        file.write(line)
+    words = ("solve", tmp_path / "world.g2o", "--robust", "gnc", "--prove-outliers")
+    out = " ".join(pgo_command(*words)[1].split())
+    assert re.search(r"proven 1 of \d+ closures are proven wrong, if all known inliers are", out)
+    record = printed_json(pgo_command(*words, "--json")[1])["robust"]
+    assert record["proven_wrong"] == [graph.num_edges]
+    assert record["truncated_cost_bound"] <= record["truncated_cost_at_most"]
+    code, _, err = pgo_command("solve", tmp_path / "world.g2o", "--prove-outliers")
+    assert (code, "add --robust gnc" in err) == (1, True)
+
+
 def test_a_film_is_written_beside_the_answer(pgo_command, tmp_path):
     pytest.importorskip("plotly")
     code, out, _ = pgo_command("solve", "grid", "--film", tmp_path / "film.html")
