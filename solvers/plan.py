@@ -8,8 +8,8 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
 2. SOC, the splitting of orthogonality constraints, until Newton can take over.
 3. Newton, down to rounding level.
 4. The certificate of the poses. Steps 1 to 4 are an attempt.
-5. Another attempt, from a start that grows; and Newton of the first one to its end, if it was given
-   few steps because this was to follow.
+5. Another attempt, from a start that grows; and the end of Newton in the first one, which has few
+   steps where a start that grows may follow.
 6. A second attempt, by a finer SOC or from another start.
 7. The semidefinite relaxation: poses that its solution rounds to, and its bound. For chi2, bounds
    by smaller information matrices, whose cost is below chi2.
@@ -18,9 +18,9 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
    of rotations is solved.
 
 Steps 5 to 8 are taken while the answer is open: its certificate is wider than asked for and could
-improve, and neither the time limit nor Ctrl-C has ended the solve. They can only improve the
-answer. What fails in them, as linear algebra does (`pgo_models.errors.FAILURES`), leaves the answer
-before it, with a sentence.
+improve, and neither the time limit nor Ctrl-C has ended the solve. A Newton that was cut short goes
+on in any case. They can only improve the answer. What fails in them, as linear algebra does
+(`pgo_models.errors.FAILURES`), leaves the answer before it, with a sentence.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     except RobotSilentError as error:
         return replace(place.salvage(Stage.silence), failures=(str(error),))
     best = improved(Step.GROWING, from_growing_start, place, settings, first)  # step 5
-    growth_was_enough = first.is_open and not best.is_open
-    if _was_cut_short(place, settings, first) and not growth_was_enough:
+    growth_has_ended_it = first.is_open and not best.is_open  # certified, or out of time
+    if _was_cut_short(place, settings, first) and not growth_has_ended_it:
         best = unless_it_fails(Step.LAST_STEPS, _LastSteps(first), place, settings, best)
     best = improved(Step.SECOND, from_second_start, place, settings, best)  # step 6
     best = improved(Step.STAIRCASE, from_relaxation, place, settings, best)  # step 7
@@ -124,7 +124,7 @@ def unless_it_fails(
 def from_growing_start(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Step 5: the better of the answer and an attempt from prefixes of the graph that grow.
 
-    It is made after an attempt that ended well, or whose Newton was given few steps.
+    It is made after an attempt that ended well, or whose Newton took the few steps it was given.
     """
     growing = settings.growing
     ended_well = best.status.is_success or _was_cut_short(place, settings, best)

@@ -58,8 +58,8 @@ _OF_GNC = "GNC, "
 class DoubtedProblem:
     """A problem some edges of which may be wrong.
 
-    (m,) are `known`, which are right, and `thresholds`, what an edge costs at most in the truncated
-    cost: the `quantile` of the cost of a right edge.
+    Edges that are `known`, (m,), are right. `thresholds` (m,) are what the others cost at most in
+    the truncated cost: the `quantile` of the cost of a right edge.
     """
 
     problem: PGOProblem
@@ -240,7 +240,10 @@ class PlacesOfEdges:
     ledgers: list[Ledger] = field(default_factory=list)
 
     def attempt(self, plan: Plan, start: Poses | None) -> Estimate:
-        """Run graduated non-convexity on the plan's edges, and solve with those that it keeps."""
+        """Run graduated non-convexity on the plan's edges, and solve with those that it keeps.
+
+        A plan without settings keeps all its edges.
+        """
         began = time.perf_counter()
         doubted = self.doubted
         kept = plan.candidates.copy()
@@ -273,7 +276,7 @@ class PlacesOfEdges:
         return replace(revised, attempt=attempt, found=estimate.found)
 
     def solution_nearby(self, kept: BoolArray, start: Poses | None) -> Solution:
-        """Solution with the kept edges, (m,), by Newton alone, from poses nearby or a start."""
+        """Solution with the kept edges, (m,), by Newton alone, from a start near it or its own."""
         pipeline = self.request.pipeline
         newton = pipeline.newton
         if start is not None:
@@ -281,7 +284,7 @@ class PlacesOfEdges:
         return self._solved(kept, pipeline.with_newton_alone(newton), start)
 
     def solution(self, kept: BoolArray, start: Poses | None) -> Solution:
-        """Solution with the kept edges, (m,), by all steps of the pipeline, from poses nearby."""
+        """Solution with the kept edges, (m,), by all steps, from a start near it or its own."""
         pipeline = self.request.pipeline
         if start is not None:
             pipeline = replace(pipeline, soc=None)
@@ -302,6 +305,8 @@ class PlacesOfEdges:
     def _opened(self, request: SolveRequest, gnc: GNC | None = None) -> Iterator[Place]:
         """Open the place of a request; what has crossed its network is accounted for at its end."""
         with open_place(request, gnc) as place:
-            yield place
-        if place.ledger is not None:
-            self.ledgers.append(place.ledger)
+            try:
+                yield place
+            finally:
+                if place.ledger is not None:
+                    self.ledgers.append(place.ledger)

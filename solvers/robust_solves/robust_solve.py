@@ -61,7 +61,7 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        closures fit the chordal start, and no start is given, the solution with every edge comes
        first. It is the answer if time has run out, or if nothing speaks against any edge: it is
        certified, no edge but known inliers is improbable or contradicted, and all together cost no
-       more than they may.
+       more than they may. It is the answer, too, if all edges alike cost more than they may.
     2. Attempts (`plans_in_order`). Graduated non-convexity is run as set; then there are the known
        inliers alone; then it is run on the pairwise consistent edges; with more and smaller steps;
        with tight thresholds, which the edges kept then widen; from the least-squares solution; with
@@ -73,11 +73,11 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        (`solvers.plan`) solve for the edges kept.
     4. Verdict. `Rejection` says what supports these edges.
 
-    Stages 1 to 3 are solves at the place of the request, here or by robots, whose account is
-    one ledger. Revision and pairwise consistency are found in this process, which has the
-    graph. With PCM, stages 2 and 3 are the pairwise consistent edges. A SettingError when robust is
-    neither GNC nor PCM; a GraphError when known inliers and the edges kept do not connect the
-    poses.
+    The solves of steps 1 to 3 are made at the place of the request, here or by robots, whose
+    account is one ledger. Revisions, pairwise consistency and the choice are made in this process,
+    which has the graph. With PCM, the pairwise consistent edges take the place of steps 2 and 3. A
+    SettingError when robust is neither GNC nor PCM; a GraphError when known inliers and the edges
+    kept do not connect the poses.
     """
     if not isinstance(robust, GNC | PCM):
         raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
@@ -118,7 +118,7 @@ class _RobustSolve:
         """The attempts made so far, compared."""
         return Choice(self.doubted, tuple(self.estimates))
 
-    # Stage 1: least squares, and pairwise consistency alone
+    # Step 1: least squares; and pairwise consistency alone
 
     def seems_right(self) -> bool:
         """Whether a plain solve is worth its time: affordable, and most closures fit its start."""
@@ -198,21 +198,21 @@ class _RobustSolve:
         solution = self.places.solution(kept, self.start)
         return self._result(solution, kept, 1.0, "pairwise consistency alone")
 
-    # Stage 2: attempts
+    # Step 2: attempts
 
     def make_attempts(self, settings: GNC) -> Status:
         """Make attempts until no further one is needed, and return how the last one ended.
 
-        An attempt whose edges do not connect the poses, or in which linear algebra fails, is passed
-        over; the error of the last one is raised when all are.
+        It has ended once it is revised. An attempt whose edges do not connect the poses, or in
+        which linear algebra fails, is passed over; when all are, the last error is raised.
         """
         ending = Status.CONVERGED
         last_failure: Exception = GraphError()
         try:
             for plan in plans_in_order(settings, self.doubted):
-                if self._is_known(plan):
-                    continue
                 try:
+                    if self._leads_nowhere_new(plan):
+                        continue
                     estimate = self.places.attempt(plan, self._start_of(plan))
                 except FAILURES as error:
                     last_failure = error
@@ -220,12 +220,12 @@ class _RobustSolve:
                         self.failures.append(f"the attempt {plan.name} failed ({error})")
                     continue
                 self.estimates.append(estimate)
-                ending = estimate.status
-                if ending not in OUT_OF_TIME:
+                if estimate.status not in OUT_OF_TIME:
                     self._revise_last()
+                ending = self.estimates[-1].status
                 if ending in OUT_OF_TIME or self.choice.is_enough:
                     break
-        except KeyboardInterrupt:  # between the loops, which answer it themselves
+        except KeyboardInterrupt:  # outside a run: runs end with a status instead
             ending = Status.INTERRUPTED
             if not self.estimates:
                 raise
@@ -240,8 +240,11 @@ class _RobustSolve:
         except FAILURES as error:
             self.failures.append(f"a revision failed ({error}); what it began with stands")
 
-    def _is_known(self, plan: Plan) -> bool:
-        """Whether an attempt has begun its revision where the plan's would, or has no start."""
+    def _leads_nowhere_new(self, plan: Plan) -> bool:
+        """Whether a plan begins its revision where another attempt has, or lacks its start.
+
+        The start of the plan from least squares is solved for, where that is affordable.
+        """
         if plan.settings is None:
             return any(np.array_equal(plan.candidates, other.found) for other in self.estimates)
         return plan.starts_at_least_squares and not self._has_least_squares()
@@ -300,12 +303,12 @@ class _RobustSolve:
         monitor = self.places.request.monitor
         return monitor.left >= _LAST_SHARE * monitor.time_limit
 
-    # Stage 3: choice
+    # Step 3: choice
 
     def answer_by_attempts(self, ending: Status) -> Solution:
         """The solution of the edges kept by the cheapest attempt."""
         cheapest = self.choice.cheapest
-        solution = self._solution_of(cheapest)
+        solution = cheapest.solution if ending in OUT_OF_TIME else self._solution_of(cheapest)
         stages = [estimate.stage for estimate in self.estimates]
         status = ending if ending in OUT_OF_TIME else solution.status
         solution = replace(solution, stages=(*stages, *solution.stages), status=status)
@@ -331,7 +334,7 @@ class _RobustSolve:
             return solution
         return min(solution, from_own_start, key=lambda other: other.objective)
 
-    # Stage 4: verdict
+    # Step 4: verdict
 
     def _result(
         self, solution: Solution, kept: BoolArray, scale: float, name: str, noise: float = 1.0

@@ -284,6 +284,7 @@ def test_least_squares_is_a_start_where_odometry_is_none(monkeypatch: pytest.Mon
     monkeypatch.setattr(robust_solve._RobustSolve, "_improved", lambda _, estimate: estimate)
     # as on a large graph: no plain solution at first
     monkeypatch.setattr(robust_attempts, "_CHEAP_ROWS", -1)
+    monkeypatch.setattr(robust_solve._RobustSolve, "seems_right", lambda _: False)
     monkeypatch.setattr(robust_solve, "plans_in_order", lambda *_: plans)
     robust = solvers.solve(graph, robust=solvers.GNC()).robust
     tight, plain = robust.attempts
