@@ -67,9 +67,9 @@ class Robots:
     Parameters
     ----------
     owners : Partition or int, optional
-        Owners of the poses. A number stands for the robots of the pipeline's SOC if they are so
-        many, else for the default partition. `extend` takes those of the solution unless they are
-        given, and `solve_folder` those of the files.
+        Owners of the poses. A number stands for the partition of the pipeline's SOC, if that has as
+        many robots, and else for the default one. `extend` takes those of the solution unless they
+        are given, and `solve_folder` those of the files.
     engine : Engine, optional
         Where the robots run; in this process unless given.
     driver_memory : float

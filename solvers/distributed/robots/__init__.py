@@ -2,14 +2,14 @@
 
 A robot of the substructured coupling is a value, `interior.Interior`: its part of the graph with
 the factors that hold for all poses (`system.FactoredPart`), and a state (`state.InteriorState`).
-The room is cut by what of that state an algorithm reads and writes. All share poses and cost; the
-eliminated matrix, and what an algorithm keeps beside it, is the record of its session, of which a
-robot has one at a time:
+The files are divided by what of that state an algorithm reads and writes. All share poses and cost;
+the eliminated matrix, and what an algorithm keeps beside it, is the record of its session, of which
+a robot has one at a time:
 
 | file | orders of | session in `state` |
 |---|---|---|
 | `current_poses` | taking, saving and evaluating poses, and the choice of the cost | none |
-| `translations` | the best translations of given rotations | none: one matrix for all of them |
+| `translations` | the best translations of given rotations | none: M_tt serves all rotations |
 | `start` | chordal relaxation, rotation averaging | `RelaxationSession`, `AveragingSession` |
 | `recursion` | SOC | `RecursionSession` |
 | `descent` | Newton | `DescentSession` |

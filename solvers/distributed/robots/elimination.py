@@ -240,7 +240,7 @@ class FrontFactor:
 
 @dataclass(frozen=True, eq=False)
 class HeldFront:
-    """A front K with its factors; its methods are orders, as those of `Interior`.
+    """A front K with its factors; its methods are the orders to whoever holds it.
 
     With its unknowns split into those that it eliminates, E, and those of the fronts above, B, L_EE
     L_EE^T = K_EE and L_BE = K_BE L_EE^-T (the multifrontal method, Liu 1992).

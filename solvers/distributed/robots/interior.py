@@ -2,8 +2,9 @@
 
 Orders are functions of an `Interior` and a request. They leave it as it is, and return the interior
 after the order, and the answer. Requests and answers are arrays on the poses that the driver solves
-for, sums, and the two numbers per pose from which the penalty's quantile is taken; interior poses
-and edges stay with the robot. `solvers.distributed.driver` follows a whole solve, round by round.
+for, sums, and the two numbers per pose from which the penalty's quantile is taken. Interior poses
+and edges leave the robot when the result is collected, and not before.
+`solvers.distributed.driver` follows a whole solve, round by round.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ S = TypeVar("S", bound=Session)
 class Interior:
     """A robot's part of the graph with its factors, and the state that earlier orders left."""
 
-    whole: Part  # with all edges in full
+    whole: Part  # the robot's edges, each with its full weight
     factored: FactoredPart  # with the weights of the state
     state: InteriorState
     evaluated: tuple[EvaluatedPoses, ...] = ()  # the poses of the state, and its trial

@@ -67,19 +67,6 @@ class Reweighed:
     at: CostParts
 
 
-@dataclass(frozen=True)
-class RatioSums:
-    """Counts and ratios r^2 / c^2 of the edges that may be wrong, and the robust cost of all."""
-
-    count: float
-    undecided: float
-    kept: float
-    least: float
-    largest: float
-    largest_kept: float
-    cost: float
-
-
 @dataclass(frozen=True, eq=False)
 class TrialEvaluation:
     """`CostParts` at a trial, and the reduced gradient there."""
@@ -159,7 +146,7 @@ class VectorsAnswer:
     Sums are over the rotations of the robot's interior.
     """
 
-    b: Array  # ((d+1) g, q): X on the boundary, with the interior eliminated
+    b: Array  # ((d+1) g, q): the next right-hand side on the boundary, the interior eliminated
     energies: Array  # (q, q): X^T b
     products: Array  # (q, q): X^T X
 
