@@ -241,7 +241,8 @@ def renamed(robots):
 )
 def test_another_graph_partition_or_setting_is_refused(name, change, broken_off):
     graph, path = broken_off
-    arguments = {"problem": graph, "robots": 3, "checkpoint": Checkpoint(path), **change(graph)}
+    arguments = {"problem": graph, "robots": 3, **change(graph)}
+    arguments["robots"] = solvers.Robots(arguments["robots"], checkpoint=Checkpoint(path))
     with pytest.raises(SettingError, match=rf"run with another {name}; go on with the same"):
         solvers.solve(**arguments)
     assert [one.name for one in path.parent.iterdir()] == ["run.ckpt"]
