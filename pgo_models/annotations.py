@@ -9,6 +9,7 @@ and by `_way_out` how to make one; without annotations, these are no fields of a
 import builtins
 import collections.abc
 import functools
+import operator
 import sys
 import types
 import typing
@@ -210,7 +211,7 @@ def _concrete(number: type[np.generic]) -> type[np.generic]:
 
 
 def _sequence(value: object, kind: type, entries: tuple[object, ...]) -> object:
-    """A list or a tuple whose entries fit."""
+    """A list or a tuple whose entries fit: the one that is given, where that is so as it is."""
     if isinstance(value, str | Mapping) or not isinstance(value, collections.abc.Sequence):
         raise MisfitError
     repeated = kind is not tuple or Ellipsis in entries
@@ -218,6 +219,9 @@ def _sequence(value: object, kind: type, entries: tuple[object, ...]) -> object:
     if len(hints) != len(value) and entries:
         raise MisfitError
     converted = [_converted(entry, hint) for entry, hint in zip(value, hints, strict=bool(entries))]
+    is_right = isinstance(value, tuple) if kind is tuple else isinstance(value, kind)
+    if is_right and all(map(operator.is_, converted, value)):
+        return value
     return tuple(converted) if kind is tuple else converted
 
 

@@ -167,11 +167,11 @@ class RayEngine:
             Engine with these settings, whose actors wait for the next solve.
         """
         is_ours = connect(self.address, self.num_cpus)
-        idle = list[Any]()
+        engine = replace(self, address=None, num_cpus=None, idle=[])
         try:
-            yield replace(self, address=None, num_cpus=None, idle=idle)
+            yield engine
         finally:
-            _stop(idle, is_ours)
+            _stop(engine.idle or (), is_ours)
 
 
 def _stop(actors: Iterable[Any], is_ours: bool) -> None:
