@@ -46,7 +46,7 @@ def animate(
 ) -> Figure:
     """Film of pictures that are drawn by plotly traces, with a slider and a play button.
 
-    In a page of `save_page`, and on the site, the arrow keys step and the space bar plays.
+    In a page of `save_page` the arrow keys step and the space bar plays.
 
     Parameters
     ----------

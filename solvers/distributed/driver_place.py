@@ -46,21 +46,12 @@ class AttemptWithFaults(Attempt):
 
 
 @dataclass(frozen=True, eq=False)
-class DriverPlace(Place):
-    """Start, SOC, Newton and staircase by a driver and its robots.
-
-    Where a checkpoint is of a later stage, what comes before it is passed over (`Journal`). The
-    `faults` go wrong between the robots of a CONSENSUS stage, which then does not wait.
-    """
+class PlaceOfRobots(Place):
+    """Robots, the network between them, and the checkpoints of what they do."""
 
     driver: Driver
     journal: Journal
     faults: Faults | None
-
-    @property
-    def d(self) -> int:
-        """Dimension of the space, 2 or 3."""
-        return self.driver.d
 
     @property
     def ledger(self) -> Ledger:
@@ -71,6 +62,20 @@ class DriverPlace(Place):
         """Remove the checkpoint of a solve that has ended well."""
         if best.status.is_success:
             self.journal.end()
+
+
+@dataclass(frozen=True, eq=False)
+class DriverPlace(PlaceOfRobots):
+    """Start, SOC, Newton and staircase by a driver and its robots.
+
+    Where a checkpoint is of a later stage, what comes before it is passed over (`Journal`). The
+    `faults` go wrong between the robots of a CONSENSUS stage, which then does not wait.
+    """
+
+    @property
+    def d(self) -> int:
+        """Dimension of the space, 2 or 3."""
+        return self.driver.d
 
     def chordal_start(self, soc: FirstStage) -> tuple[Attempt, SOC | None]:
         """Have the robots relax the rotations; with the start goes the SOC to run from there.

@@ -30,14 +30,13 @@ from pgo_models.problem.initialization import spanning_tree, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
-from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver
+from solvers.distributed.driver_place import PlaceOfRobots
 from solvers.here import Here
 from solvers.network.counted_pool import Count
-from solvers.network.faults import Faults
-from solvers.network.ledger import BYTES_PER_NUMBER, Ledger, Traffic
-from solvers.place import Attempt, Ending, FirstStage, Place, Step
+from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
+from solvers.place import Attempt, Ending, FirstStage, Step
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.soc.consensus import ConsensusState, ask_all
@@ -67,7 +66,7 @@ class StartInCopies(Attempt):
 
 
 @dataclass(frozen=True, eq=False)
-class RobotsAlone(Place):
+class RobotsAlone(PlaceOfRobots):
     """A solve by robots of one graph without a driver.
 
     It has a start and CONSENSUS. Of the whole problem only the trees are used, and F of the start
@@ -75,9 +74,6 @@ class RobotsAlone(Place):
     wait.
     """
 
-    driver: Driver
-    journal: Journal
-    faults: Faults | None
     here: Here
     robots: Partition
 
@@ -90,16 +86,6 @@ class RobotsAlone(Place):
     def has_landmarks(self) -> bool:
         """Whether the graph has landmarks."""
         return self.here.has_landmarks
-
-    @property
-    def ledger(self) -> Ledger:
-        """What has crossed the network so far."""
-        return self.driver.network.ledger
-
-    def finish(self, best: Attempt) -> None:
-        """Remove the checkpoint of a solve that has ended well."""
-        if best.status.is_success:
-            self.journal.end()
 
     @property
     def missing(self) -> frozenset[Step]:

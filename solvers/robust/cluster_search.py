@@ -231,10 +231,11 @@ class ClusterSearch:
             for k in failed:
                 name = candidates.names[k]
                 trials[name] = trials.get(name, 0) + 1
-            num_failures = num_failures + len(failed) if len(failed) == len(near) else len(failed)
             num_left -= len(near) - len(failed)
             if len(failed) < len(near):
                 larger = after
+                num_failures = 0
+            num_failures += len(failed)
         return larger
 
     def _with_each(

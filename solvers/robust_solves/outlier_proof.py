@@ -126,7 +126,7 @@ class _Search:
 
     `cost` is U, an upper bound. `classes` has the closures that are not proven wrong; any two of a
     class are proven inconsistent. `single` are first-order distances of all edges, (m,), and
-    `refuted` the pairs whose proof has failed.
+    `proven` the lower bound of each closure or pair that was solved for.
     """
 
     problem: PGOProblem
