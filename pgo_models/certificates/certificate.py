@@ -249,6 +249,8 @@ class Certificate(ReadOnly):
             return f"{text}, of a cost below the digits of the file"
         if self.fit is Fit.COORDINATES:
             return f"{text}, of a cost below the last bits of the coordinates"
+        if self.fit is Fit.BILLIONTH:
+            return f"{text}, of a cost below a billionth of what the edges measure"
         return f"{text}, proven to {self.digits} digits" if self.digits > 3 else text
 
     @property
@@ -410,7 +412,8 @@ def exact_to_coordinates(
     problem: PGOProblem, poses: Poses, certificate: Certificate
 ) -> Certificate:
     """The certificate, EXACT where its poses fit as the last bits of far coordinates allow."""
-    if certificate.is_certified or not fits_to_coordinates(problem, poses):
+    could_fit = certificate.fit is Fit.BILLIONTH or not certificate.is_certified
+    if not (could_fit and fits_to_coordinates(problem, poses)):
         return certificate
     return replace(certificate, fit=Fit.COORDINATES, verdict=Verdict.EXACT)
 

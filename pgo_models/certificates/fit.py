@@ -19,6 +19,8 @@ from pgo_models.problem.floating_point import UNIT_ROUNDOFF, gamma
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 _SHARE_OF_ONE = 8.0  # times sqrt(m) its own error: what an edge may be off by beside m - 1 that fit
+_BILLIONTH = 1e-9  # of what an edge measures
+_SHARE_OF_NOISE = 1e-6  # of a standard deviation
 _NEARLY = 2.0  # times its level: above that there is no need to look at every edge
 
 
@@ -28,7 +30,16 @@ class Fit(enum.Enum):
     ROUNDING = "exact to rounding: every edge fits to its last bits"
     COORDINATES = "exact to its coordinates: every edge fits to their last bits, so far from zero"
     DIGITS = "exact to the digits of the file: every edge fits to the last digits written"
+    BILLIONTH = (
+        "exact to a billionth: every edge fits to 1e-9 of what it measures, and all of them "
+        "together to 1e-6 of a standard deviation"
+    )
     NONE = "some edges do not fit"
+
+    @property
+    def is_closest(self) -> bool:
+        """Whether no poses in doubles, or none that the file can tell apart, fit more closely."""
+        return self not in (Fit.BILLIONTH, Fit.NONE)
 
     @classmethod
     def of_all(cls, fits: Iterable["Fit"]) -> "Fit":
@@ -67,6 +78,10 @@ class EdgeErrors:
     def not_below_median(self) -> "EdgeErrors":
         """Errors of every edge, and at least those of half of the edges."""
         return EdgeErrors(_not_below_median(self.translation), _not_below_median(self.rotation))
+
+    def times(self, factor: float) -> "EdgeErrors":
+        """Errors that are larger by a factor."""
+        return EdgeErrors(factor * self.translation, factor * self.rotation)
 
     def cost(self, problem: PGOProblem) -> float:
         """Bound on the cost of poses whose residuals are that large."""
@@ -115,6 +130,12 @@ def fit_of(problem: PGOProblem, poses: Poses) -> Fit:
     The poses that fit cost no more. Others may cost less, but by no more than the file leaves open:
     which of the measurements that it rounds were meant cannot be told.
 
+    A fit to a billionth. Measurements without noise have a least cost of zero, which an optimiser
+    comes close to and does not reach. Of every edge ||r_t|| <= 1e-9 ||t_ij|| and ||r_R|| <= 1e-9,
+    after rounding; priors and edges that measure no translation have the shortest ||t_ij|| of all.
+    And the cost of all is at most 1e-12, so that errors are of no account beside the noise which
+    the matrices state. This alone depends on the unit of the weights, and can only be lost by it.
+
     Parameters
     ----------
     problem : PGOProblem
@@ -140,6 +161,7 @@ def fit_at(at: EvaluatedPoses, rounding: EdgeErrors) -> Fit:
         together = rounding.plus(written)
         alone = rounding.plus(written.with_levers(problem).not_below_median())
         allowances[Fit.DIGITS] = Allowance(together, alone)
+    allowances[Fit.BILLIONTH] = _billionths(problem, rounding)
     return _closest_fit(at, allowances)
 
 
@@ -221,6 +243,22 @@ def written_errors(problem: PGOProblem) -> EdgeErrors | None:
     if written is None:
         return None
     return EdgeErrors(written[:, 0], written[:, 1])
+
+
+def _billionths(problem: PGOProblem, rounding: EdgeErrors) -> Allowance:
+    """What a fit to a billionth allows edges, less the rounding of their residuals."""
+    graph = problem.graph
+    lengths = block_norms(problem.weights.seen_offsets(graph.t_ij))
+    lengths[graph.is_prior] = 0.0  # a position, not a length
+    shortest = lengths[lengths > 0.0].min(initial=math.inf)
+    lengths[lengths == 0.0] = shortest if shortest < math.inf else 0.0
+    of_t = np.maximum(_BILLIONTH * lengths - rounding.translation, 0.0)
+    of_R = np.maximum(_BILLIONTH - rounding.rotation, 0.0)
+    largest = EdgeErrors(of_t, of_R)
+    most = largest.cost(problem)
+    of_noise = min(1.0, _SHARE_OF_NOISE / math.sqrt(most)) if most > 0.0 else 1.0
+    each = 1.0 / (_SHARE_OF_ONE * math.sqrt(graph.num_edges))
+    return Allowance(largest.times(of_noise), largest.times(each))
 
 
 def _closest_fit(at: EvaluatedPoses, allowances: dict[Fit, Allowance]) -> Fit:

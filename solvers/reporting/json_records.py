@@ -16,8 +16,8 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
     """What `.json` files hold of a certificate; None stands for what is not known.
 
     That is eta where none was proved, the error of the objective where no bound on it is known, and
-    the stationarity where it was not measured. `exact_to` is ROUNDING, COORDINATES or DIGITS where
-    the verdict is EXACT.
+    the stationarity where it was not measured. `exact_to` is a name of `Fit` where the verdict is
+    EXACT.
     """
     return {
         "lower_bound": certificate.lower_bound,

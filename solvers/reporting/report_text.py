@@ -92,6 +92,8 @@ class Solved(Protocol):
 def headline(certificate: Certificate) -> str:
     """Return the verdict in one sentence."""
     verdict = certificate.verdict
+    if verdict is Verdict.EXACT and certificate.fit is Fit.BILLIONTH:
+        return "Certified: the poses fit every measurement to a billionth of what it says."
     if verdict is Verdict.EXACT:
         digits = "double precision"
         if certificate.fit is Fit.DIGITS:
@@ -135,6 +137,13 @@ def meaning(certificate: Certificate) -> list[str]:
             cost,
             "That is no more than what the last bits of the coordinates make of it, as doubles "
             f"have them so far from zero, and {certificate.cost} is never below zero.",
+        ]
+    if certificate.fit is Fit.BILLIONTH:
+        return [
+            cost,
+            "No measurement is missed by more than a billionth of what it says, and all of them "
+            "together by less than a millionth of a standard deviation. "
+            f"{certificate.cost} is never below zero, so no other poses fit noticeably better.",
         ]
     if certificate.verdict is Verdict.EXACT:
         rounding = rounded_up(certificate.rounding_level, 2)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers_at
-from pgo_models.certificates.fit import Fit, fit_of
+from pgo_models.certificates.fit import fit_of
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError, door
 from pgo_models.geometry.poses import Poses
@@ -277,11 +277,11 @@ def _fit_every_edge(problem: PGOProblem, poses: Poses, factor: CholeskyFactor) -
     layout = TangentLayout(problem.num_poses, problem.d)
     moved = poses
     for _ in range(MOST_FITTING_STEPS):
-        if fit_of(problem, moved) is not Fit.NONE:
+        if fit_of(problem, moved).is_closest:
             return moved
         gradient = layout.join(*problem.riemannian_gradient(moved))
         moved = moved.moved_along(*layout.split(-factor.solve(gradient)))
-    return poses if fit_of(problem, moved) is Fit.NONE else moved
+    return moved if fit_of(problem, moved).is_closest else poses
 
 
 @door
