@@ -115,7 +115,12 @@ def triangle_places(side: int) -> NDArray[np.int64]:
 
 
 def _numbers(values: object, name: str, wanted: str, error: type[PGOError]) -> NDArray[Any]:
-    """Array of integers or real numbers; raises `error` for others."""
+    """Array of integers or real numbers; raises `error` for others.
+
+    What has `as_matrix`, as `Rotation` of scipy, stands for its matrices.
+    """
+    if callable(as_matrix := getattr(values, "as_matrix", None)):
+        values = as_matrix()
     try:
         array = np.asarray(values)
     except ValueError as reason:  # rows of several lengths
