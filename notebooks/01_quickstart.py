@@ -4,6 +4,12 @@
 # Open with `jupyter lab notebooks/01_quickstart.ipynb`; `pip install -e '.[notebooks,fast]'`
 # installs it.
 #
+# * **Prerequisites:** matrices, and the rotations among them; for the proof of the bound, what positive
+#   definite means
+# * **Time:** 20 minutes
+# * **Next:** [notebook 14](14_is_it_really_the_best.ipynb), which takes the lower bound apart for
+#   readers without optimisation
+#
 # A robot measures its motion between poses, and it recognises places that it has seen before. Every
 # measurement has a small error, so the measurements contradict each other. *Pose graph
 # optimisation* finds the poses that contradict them least. Many methods return an answer; this
@@ -221,6 +227,23 @@ pgo.compare_poses(
 )
 
 # %% [markdown]
+# `solvers.film` shows a method at work: the graph, how far its cost is above the least one of the
+# film, and how far the best bound so far is below it. First a start from which Newton's method finds
+# the best poses. The bound is zero until it is near them, and then it meets the cost.
+
+# %%
+ends_well = next(seed for seed, item in enumerate(certificates) if item.is_certified)
+solvers.film(ring_problem, (solvers.Newton(),), random_start(ends_well))
+
+# %% [markdown]
+# Now the start of the worst answer. The method converges as well, with a gradient of zero, but the
+# bound stays where it is. (The film knows only its own bounds; those above are better, because
+# `certify` also tries other starts.)
+
+# %%
+solvers.film(ring_problem, (solvers.Newton(),), random_start(certificates.index(worst)))
+
+# %% [markdown]
 # How far an answer can be from the best one is a picture, too: a dot for the cost of every answer,
 # and a bar from there down to the bound that was proved for it. Where the bar has no length, the
 # answer is the best one.
@@ -290,6 +313,11 @@ axes.invert_yaxis()
 # ```
 #
 # </details>
+
+# %% [markdown]
+# ## Checks of the numbers above
+#
+# This cell is for the tests of the library; if you have changed parameters, you may skip it.
 
 # %%
 assert np.isclose(cost(graph, graph.truth), problem.objective(graph.truth))

@@ -7,12 +7,20 @@
 # The paper's subsection *Equivalence to ADMM* iterates the minimisation of the augmented Lagrangian
 # $T$ times and then updates the multiplier; with $T = 1$ this is ADMM. Does $T = 1$ cost
 # iterations? This notebook counts them.
+#
+# * **Prerequisites:** [notebook 2](02_bregman.ipynb), Lagrange multipliers, and soft thresholding.
+# * **Time:** 30 minutes
+# * **Next:** [notebook 4](04_splitting_orthogonality.ipynb), how a convex solver is made to return
+#   rotations.
+#
+# What only draws is in [`drawings/bregman_is_admm.py`](drawings/bregman_is_admm.py).
 
 # %%
 import itertools
 
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.bregman_is_admm import draw_adaptive, draw_counts, draw_residuals, spiral_film
 
 import pgo_models as pgo
 import solvers
@@ -31,8 +39,8 @@ plt.rcParams["figure.dpi"] = 150
 # and the *method of multipliers* (the paper's equation (8)) is
 # $x^{k+1} = \arg\min_x \mathcal{L}_\alpha(x, \lambda^k)$,
 # $\lambda^{k+1} = \lambda^k + \alpha (f - \mathcal{K} x^{k+1})$. Completing the square with
-# $b = -\lambda / \alpha$ gives the two-line form, equation (4), of [notebook 2](02_bregman.ipynb). With
-# $p = \mathcal{K}^\top \lambda$ it is equation (2). The forms are equivalent without any
+# $b = -\lambda / \alpha$ gives the two-line form, equation (4), of [notebook 2](02_bregman.ipynb).
+# With $p = \mathcal{K}^\top \lambda$ it is equation (2). The forms are equivalent without any
 # approximation, so all three give the same numbers.
 
 # %%
@@ -127,16 +135,7 @@ counts = np.array(
     [[len(residuals(alpha, T)) for alpha in penalties] for T in all_passes], dtype=float
 )
 counts[counts == 3000] = np.nan  # not within the limit
-
-figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 2.8), layout="constrained", sharey=True)
-for T, row, marker in zip(all_passes, counts, "osD^", strict=True):
-    left.loglog(penalties, row, f"{marker}-", label=f"T = {T}")
-    right.loglog(penalties, T * row, f"{marker}-", label=f"T = {T}")
-left.set_ylabel("until 1e-4")
-for axes, title in ((left, "outer iterations"), (right, "passes over the blocks")):
-    axes.set_xlabel("penalty alpha")
-    axes.set_title(title, fontsize=10)
-_ = left.legend(fontsize=8)
+draw_counts(penalties, dict(zip(all_passes, counts, strict=True)))
 
 # %% [markdown]
 # There are two regimes, and a large $T$ does not pay in either of them:
@@ -152,16 +151,7 @@ _ = left.legend(fontsize=8)
 # choice. The choice of $\alpha$ matters more. Here are the residuals for three values of it.
 
 # %%
-figure, panels = plt.subplots(1, 3, figsize=(7.5, 2.6), layout="constrained", sharey=True)
-for axes, alpha in zip(panels, (0.1, 3.0, 100.0), strict=True):
-    primal, dual = residuals(alpha, 1, most=120).T
-    axes.semilogy(primal, color="#0072B2", label="primal")
-    axes.semilogy(np.where(dual > 0, dual, np.nan), "--", color="#E69F00", label="dual")
-    axes.set_title(f"alpha = {alpha:g}", fontsize=10)
-    axes.set_xlabel("iteration")
-panels[0].set_ylabel("residual, T = 1")
-panels[0].set_ylim(1e-5, 10.0)
-_ = panels[0].legend(fontsize=8)
+draw_residuals({alpha: residuals(alpha, 1, most=120) for alpha in (0.1, 3.0, 100.0)})
 
 # %% [markdown]
 # ## The adaptive penalty
@@ -170,25 +160,26 @@ _ = panels[0].legend(fontsize=8)
 # subsection *The SOC Algorithm*: with a small penalty the primal residual is far above the dual
 # one, with a large penalty far below. So the rule doubles $\alpha$ when $r > \mu s$ and halves it
 # when $s > \mu r$; Boyd et al. suggest $\mu = 10$. One line is easily forgotten:
-# $b = -\lambda / \alpha$ is *scaled*. When $\alpha$ changes, $b$ must be divided by the same factor, so
-# that $\lambda$ does not change.
+# $b = -\lambda / \alpha$ is *scaled*. When $\alpha$ changes, $b$ must be divided by the same
+# factor, so that $\lambda$ does not change.
 
 
 # %%
 def adaptive(alpha, mu, rescale, most=1000):
+    """Penalty and larger residual of every iteration."""
     d, b = np.zeros(99), np.zeros(99)
-    k, worst = 0, np.inf
-    while worst >= 1e-4 and k < most:
+    trace = []
+    while len(trace) < most and (not trace or trace[-1][1] >= 1e-4):
         d_before = d
         u = np.linalg.solve(np.eye(100) + alpha * D.T @ D, noisy + alpha * D.T @ (d - b))
         v = D @ u + b
         d = np.sign(v) * np.maximum(np.abs(v) - weight / alpha, 0.0)
         b = b + D @ u - d
         primal, dual = np.linalg.norm(D @ u - d), alpha * np.linalg.norm(D.T @ (d - d_before))
-        k, worst = k + 1, max(primal, dual)
+        trace.append((alpha, max(primal, dual)))
         factor = 2.0 if primal > mu * dual else 0.5 if dual > mu * primal else 1.0
         alpha, b = factor * alpha, b / factor if rescale else b
-    return k, alpha
+    return np.array(trace)
 
 
 starts = (0.1, 1.0, 10.0, 100.0)
@@ -197,26 +188,49 @@ by_rule = {
     for mu in (10.0, 2.0)
     for rescale in (True, False)
 }
-print(f"{'alpha starts at':25}", *(f"{alpha:10g}" for alpha in starts))
-print(f"{'alpha fixed':25}", *(f"{len(residuals(alpha, 1)):10}" for alpha in starts))
-for (mu, rescale), ends in by_rule.items():
-    name = f"mu = {mu:g}, b {'rescaled' if rescale else 'not rescaled'}"
-    print(f"{name:25}", *(f"{f'{k} ({last:.2g})':>10}" for k, last in ends))
 
 # %% [markdown]
-# The table has the iterations, and the last $\alpha$ in brackets. With $\mu = 10$ the rule needs 104 to
-# 148 iterations from every initial $\alpha$, where a fixed one may need thousands. It seldom moves
-# $\alpha$, and so the forgotten rescaling does no harm yet: 81 to 148 iterations. With $\mu = 2$ it
-# follows the residuals closely and needs 71 to 79 iterations, but only with the rescaling. Without it
-# no run ends within the limit of 1000: every change of $\alpha$ changes the multiplier, which changes
-# the residuals, which change $\alpha$ again.
+# The table has the iterations until both residuals are below $10^{-4}$, of at most 1000, and in
+# brackets how often $\alpha$ changed.
+
+
+# %%
+def changes(trace):
+    return np.count_nonzero(np.diff(trace[:, 0]))
+
+
+print(f"{'alpha starts at':25}", *(f"{alpha:10g}" for alpha in starts))
+print(f"{'alpha fixed':25}", *(f"{len(residuals(alpha, 1)):10}" for alpha in starts))
+for (mu, rescale), traces in by_rule.items():
+    name = f"mu = {mu:g}, b {'rescaled' if rescale else 'not rescaled'}"
+    print(f"{name:25}", *(f"{f'{len(trace)} ({changes(trace)})':>10}" for trace in traces))
+
+# %% [markdown]
+# What the forgotten line does depends on $\mu$.
 #
-# The library has this rule, with $\mu = 10$, as `BoydPenalty`, for SOC as in the paper. Its dual residual has
-# the unit of the weights, so its result depends on that unit. `BalancedPenalty` compares relative
-# residuals instead, without the factor $\rho$, as OSQP does, and changes $\rho$ by a factor of
-# five, but only when they differ by a factor of 25, because every new $\rho$ costs a factorisation.
-# (A safeguard raises a fixed $\rho$ that is too small for SOC to converge, as 1 is here:
-# [notebook 4](04_splitting_orthogonality.ipynb).)
+# * With Boyd's $\mu = 10$, which `BoydPenalty` uses, the rule needs 104 to 148 iterations from
+#   every initial $\alpha$, where a fixed one may need thousands. Without the rescaling it needs 81
+#   to 148, so the mistake does not show: $\alpha$ changes at most six times, the last time in
+#   iteration 41 or before, and from then on the iteration with a constant $\alpha$ converges from
+#   whatever $b$ it has.
+# * With $\mu = 2$ the rule follows the residuals closely. With the rescaling this pays: 71 to 79
+#   iterations. Without it **no run ends within 1,000 iterations**: every change of $\alpha$ changes
+#   the multiplier $\lambda = -\alpha b$, which changes the residuals, which change $\alpha$ again.
+#
+# So a run that converges does not prove that the update is right. The picture shows the runs from
+# $\alpha = 100$: those with $\mu = 2$ are dotted, those without the rescaling are red, and the grey
+# line is the tolerance.
+
+# %%
+draw_adaptive({rule: traces[-1] for rule, traces in by_rule.items()}, shown=160)
+
+# %% [markdown]
+# The library has this rule, with $\mu = 10$, as `BoydPenalty`, for SOC as in the paper. Its dual
+# residual has the unit of the weights, so its result depends on that unit. `BalancedPenalty`
+# compares relative residuals instead, without the factor $\rho$, as OSQP does, and changes $\rho$
+# by a factor of five, but only when they differ by a factor of 25, because every new $\rho$ costs a
+# factorisation. (A safeguard raises a fixed $\rho$ that is too small for SOC to converge, as 1 is
+# here: [notebook 4](04_splitting_orthogonality.ipynb).)
 
 # %%
 problem = pgo.PGOProblem(pgo.load("grid"))
@@ -244,20 +258,35 @@ for start in (1.0, 10.0, 100.0, 1000.0):
 K = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 2.0], [1.0, 2.0, 2.0]])
 
 
-def three_blocks(passes, iterations=400):
+def block_path(blocks, passes=1, iterations=400):
+    """Iterates x and b, one after the other in a row; a block is a list of columns of K."""
     x, b = np.ones(3), np.zeros(3)
+    path = [np.concatenate([x, b])]
     for _ in range(iterations):
         for _ in range(passes):
-            for i in range(3):
-                others = K @ x - K[:, i] * x[i]
-                x[i] = -K[:, i] @ (others + b) / (K[:, i] @ K[:, i])
+            for block in blocks:
+                others = K @ x - K[:, block] @ x[block]
+                x[block] = -np.linalg.lstsq(K[:, block], others + b)[0]
         b = b + K @ x
-    return float(np.linalg.norm(x))
+        path.append(np.concatenate([x, b]))
+    return np.array(path)
 
 
-spiral = {T: three_blocks(T) for T in (1, 2, 3, 5, 10)}
+one_by_one = [[0], [1], [2]]
+spiral = {T: np.linalg.norm(block_path(one_by_one, T)[-1, :3]) for T in (1, 2, 3, 5, 10)}
 for T, size in spiral.items():
     print(f"T = {T:2}   ||x|| after 400 iterations {size:.1e}")
+two_blocks = block_path([[0], [1, 2]])
+print(f"two blocks   ||x|| after 400 iterations {np.linalg.norm(two_blocks[-1, :3]):.1e}")
+
+# %% [markdown]
+# The film has two runs with $T = 1$, side by side in one plane: across is the first unknown,
+# upwards its multiplier. Both start at $x = (1, 1, 1)$, $b = 0$. The red one minimises over the
+# three unknowns one by one. The blue one minimises over $x_1$ and then over $(x_2, x_3)$ together,
+# which makes two blocks of the same problem.
+
+# %%
+spiral_film(block_path(one_by_one)[:81, [0, 3]], two_blocks[:81, [0, 3]], every=4)
 
 # %% [markdown]
 # Here $T$ decides: with enough passes the iteration is the method of multipliers, which converges.
@@ -330,16 +359,24 @@ for T, size in spiral.items():
 #
 # </details>
 
+# %% [markdown]
+# ## Checks of the numbers above
+#
+# The last cell checks the statements of this notebook. A reader who has changed parameters may skip
+# it.
+
 # %%
 assert all(difference < 1e-5 for difference in worst_difference.values())
 assert np.nanmin(counts[0]) < 100
 assert np.ptp(counts[:, penalties.index(1.0)]) <= 2  # small penalty: T does not matter
 save = counts[0, -2] / counts[2, -2]
 assert 4.0 < save < 6.0  # large penalty: T = 5 saves a factor of about 5 outer iterations
-most = {rule: max(k for k, _ in ends) for rule, ends in by_rule.items()}
+most = {rule: max(map(len, traces)) for rule, traces in by_rule.items()}
 assert most[10.0, True] < 160
 assert most[10.0, False] < 160
 assert most[2.0, True] < 90
-assert min(k for k, _ in by_rule[2.0, False]) == 1000
+assert min(map(len, by_rule[2.0, False])) == 1000
+assert min(map(len, by_rule[10.0, False])) >= 81
+assert np.linalg.norm(two_blocks[-1, :3]) < 1e-4
 assert spiral[1] > 1e3
 assert spiral[10] < 1e-6

@@ -4,12 +4,20 @@
 # Open with `jupyter lab notebooks/05_sdp_and_certificates.ipynb`;
 # `pip install -e '.[notebooks,fast]'` installs it.
 #
+# - **Prerequisites:** [notebook 1](01_quickstart.ipynb) for the certificate,
+#   [notebook 4](04_splitting_orthogonality.ipynb) for SOC; eigenvalues, and Lagrangian duality as in
+#   a first course on optimisation.
+# - **Time:** 35 minutes
+# - **Next:** [notebook 16](16_beyond_the_relaxation.ipynb), what can still be proven where the
+#   relaxation is loose
+#
 # SE-Sync, with which the paper compares its results, finds certified global optima of a problem
 # that is not convex. The reason is a semidefinite relaxation that is *tight* as long as the noise
 # is not too strong. This notebook writes the relaxation and its dual in a few lines, and shows
 # which number is the certificate and which only looks like one. It follows the proven bound as it
-# approaches $F$, finds the noise level at which tightness ends, and goes on from there with a
-# certificate that the relaxation does not have.
+# approaches $F$, has a proof checked by a program that trusts neither, and finds the noise level at
+# which tightness ends. The two films are drawn by
+# [`drawings/sdp_and_certificates.py`](drawings/sdp_and_certificates.py).
 
 # %%
 import itertools
@@ -20,6 +28,7 @@ from pathlib import Path
 import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.sdp_and_certificates import bounds_film, noise_film
 
 import pgo_models as pgo
 import solvers
@@ -33,8 +42,10 @@ plt.rcParams["figure.dpi"] = 150
 # %% [markdown]
 # ## The relaxation
 #
-# Given rotations, the best translations solve a linear system. With these translations, equation
-# (16) becomes a quadratic form in the rotations alone. With $Y$ the rows of all $R_i^\top$,
+# The cost $F(R, t)$ of the paper, its equation (16), is the sum over all edges of the squared errors
+# of rotation and translation. Given rotations, the best translations solve a linear system, and with
+# them $F$ becomes a quadratic form in the rotations alone, with a matrix $Q$. Let $Y$ have the
+# matrices $R_i^\top$ one below the other. Then
 #
 # $$\min_t F(R, t) = \operatorname{tr}(Y^\top Q Y) = \operatorname{tr}(Q Z), \qquad Z = Y Y^\top.$$
 #
@@ -73,10 +84,13 @@ print("largest eigenvalues of Z     ", np.linalg.eigvalsh(Z.value)[::-1][:5].rou
 # $$\max_\Lambda \sum_i \operatorname{tr} \Lambda_i \quad \text{subject to} \quad
 #   Q - \operatorname{blockdiag}(\Lambda) \succeq 0.$$
 #
-# Every feasible $\Lambda$ is a proof of a lower bound. cvxpy returns the best $\Lambda$ with the
-# primal solution (with the opposite sign). The formula of [notebook 1](01_quickstart.ipynb),
-# $\Lambda_i = \operatorname{sym}((M X)_i R_i)$, gives the same multipliers at the optimal poses
-# **without solving any SDP**.
+# Every feasible $\Lambda$ is a proof of a lower bound. The matrix
+# $S = Q - \operatorname{blockdiag}(\Lambda)$ decides whether it is feasible. cvxpy returns the best
+# $\Lambda$ with the primal solution (with the opposite sign). The formula of
+# [notebook 1](01_quickstart.ipynb) gives the same multipliers at the optimal poses **without solving
+# any SDP**: $\Lambda_i$ is the symmetric part of $(M X)_i R_i$. Here $X$ holds the translations and the
+# matrices $R_i^\top$, $M$ is the matrix with $F = \operatorname{tr}(X^\top M X)$, and $(M X)_i$ is
+# the block of $M X$ in the rows of $R_i^\top$.
 
 # %%
 from_sdp = -np.array([constraint.dual_value for constraint in orthogonal])
@@ -131,26 +145,32 @@ ring = pgo.PGOProblem(
 twice_round = ring.with_best_translations(
     pgo.exp_map(4 * np.pi / count * np.arange(count)[:, None])
 )
+
+# %%
 candidates = [
     ("8 poses, optimum", problem, answer.poses),
     ("8 poses, random", problem, problem.with_best_translations(pgo.random_rotations(n, d, rng))),
     ("ring, optimum", ring, solvers.solve(ring).poses),
     ("ring, local minimum", ring, solvers.polish(ring, twice_round)),
 ]
-rows = {}
-for name, judged, poses in candidates:
-    poses = judged.with_best_translations(poses.R)
-    objective, Lambda_here = judged.objective(poses), pgo.multipliers(judged, poses)
-    difference = objective - np.trace(Lambda_here, axis1=1, axis2=2).sum()
-    S = judged.Q.copy()
-    for i in range(judged.num_poses):
-        rows_i = slice(judged.d * i, judged.d * i + judged.d)
-        S[rows_i, rows_i] -= Lambda_here[i]
-    lambda_min = np.linalg.eigvalsh(S)[0]
-    rows[name] = (objective, difference, lambda_min)
-    print(
-        f"{name:20} F {objective:9.4f}   F - tr(Lambda) {difference:8.0e}   lambda_min(S) {lambda_min:9.1e}"
-    )
+
+
+def judge(problem, poses):
+    """F, F - tr(Lambda) and the smallest eigenvalue of S, with the best translations."""
+    poses = problem.with_best_translations(poses.R)
+    objective, Lambda = problem.objective(poses), pgo.multipliers(problem, poses)
+    difference = objective - np.trace(Lambda, axis1=1, axis2=2).sum()
+    S = problem.Q.copy()
+    for i in range(problem.num_poses):
+        rows_i = slice(problem.d * i, problem.d * i + problem.d)
+        S[rows_i, rows_i] -= Lambda[i]
+    return objective, difference, np.linalg.eigvalsh(S)[0]
+
+
+rows = {name: judge(judged, poses) for name, judged, poses in candidates}
+for name, (objective, difference, lambda_min) in rows.items():
+    print(f"{name:20} F {objective:9.4f}   F - tr(Lambda) {difference:8.0e}", end="")
+    print(f"   lambda_min(S) {lambda_min:9.1e}")
 
 # %% [markdown]
 # $F - \operatorname{tr} \Lambda$ is zero *everywhere*, even at random rotations. The reason is that
@@ -201,6 +221,7 @@ print(f"F in the local minimum {stuck.objective:.4f}, after the staircase {climb
 
 # %%
 def closing_in(problem, iterations=25):
+    """Certificates of the iterates of SOC: what is proven of the optimum after each."""
     soc = solvers.SOC()
     states = itertools.islice(solvers.iterate(soc, problem), iterations)
     return [pgo.certify_at(problem, soc.poses(problem, state)) for state in states]
@@ -212,34 +233,24 @@ problems = {
 }
 optima = {name: solvers.solve(judged) for name, judged in problems.items()}
 on_the_way = {name: closing_in(judged) for name, judged in problems.items()}
+for name, certificates in on_the_way.items():
+    gaps = " ".join(f"{certificate.gap:.0e}" for certificate in certificates[::6])
+    shifted = sum(certificate.eta > 0 for certificate in certificates)
+    print(f"{name:22} gap after 0, 6, 12, 18, 24: {gaps}; {shifted} iterates needed a shift")
 
-figure, axes = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
-for (name, certificates), colour in zip(on_the_way.items(), ("#0072B2", "#E69F00"), strict=True):
-    above = np.array([item.objective for item in certificates]) / optima[name].lower_bound - 1
-    below = np.array([item.lower_bound for item in certificates]) / optima[name].objective - 1
-    iterations = np.arange(len(certificates))
-    axes.plot(iterations, above, "v-", iterations, below, "^-", color=colour, markersize=4)
-    axes.fill_between(iterations, below, above, color=colour, alpha=0.3, label=name)
-    shifted = sum(item.eta > 0 for item in certificates)
-    print(
-        f"{name:22} gap after 0, 6, 12, 18, 24:",
-        *(f"{item.gap:.0e}" for item in certificates[::6]),
-        end="",
-    )
-    print(f"; {shifted} iterates needed a shift")
-axes.set_yscale("symlog", linthresh=1e-15, linscale=0.5)
-axes.set_yticks([sign * 10.0**power for sign in (-1, 1) for power in (-12, -8, -4, 0)] + [0.0])
-axes.set_xlabel("iteration of SOC")
-axes.set_ylabel("relative to the optimum")
-axes.set_title("above: F of the poses; below: the bound proven there", fontsize=10)
-_ = axes.legend(fontsize=8)
+# %%
+bounds_film(on_the_way, {name: solution.objective for name, solution in optima.items()})
 
 # %% [markdown]
-# In every iteration the optimum is proven to lie in the shaded region. The shaded region is the
-# gap, which needs no knowledge of the optimum: one can stop as soon as the gap is small enough.
-# Both bounds converge at the same rate, on the sphere down to the rounding level, without Newton's
-# method. The first three iterates are too far from the optimum for $S_r$ to be positive definite.
-# They also have a bound, with the shift of the next section, but a poorer one.
+# In every iteration the optimum is proven to lie in the shaded region, whose height is the gap. The
+# vertical axis is logarithmic on either side of the optimum: every tick is four powers of ten closer
+# to it than the one before. The gap needs no knowledge of the optimum, so that one can stop as soon
+# as it is small enough. Both bounds converge at the same rate, on the sphere down to the rounding
+# level, without Newton's method. On the sphere the first three iterates are too far from the optimum
+# for $S$ without the grounded pose to be positive definite. They also have a bound, with a shift
+# that [notebook 16](16_beyond_the_relaxation.ipynb) derives, but a poorer one.
+#
+# `solvers.film(problem)` films any graph like this, with its picture above the curves.
 
 # %% [markdown]
 # ## A proof that does not need trust
@@ -271,178 +282,66 @@ print("verdict     ", changed.verdict)
 # %% [markdown]
 # ## Where it fails: the end of tightness
 #
-# The bound is sharp only if $Z$ has rank $d$ although no constraint requires it. `noise_sweep`
-# solves and certifies graphs with the geometry of the paper's circle and grid and increasing
-# rotation noise (the paper's noise is 30 degrees). The two curves with
-# handedness terms are explained in the last section.
+# The bound is sharp only if $Z$ has rank $d$ although no constraint requires it. The slider turns up
+# the rotation noise of one graph, the paper's circle of 25 poses. The random numbers stay the same,
+# and only their standard deviation grows. (The paper's noise is 30 degrees.) At every level `solve`
+# finds poses, and `solve_relaxation` finds $Z$. The setting `handedness=None` keeps `solve` to the
+# certificate of this notebook.
 
 # %%
-degrees = np.array([30.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0, 80.0])
-sweeps = {
-    scene.value: solvers.noise_sweep(scene, np.deg2rad(degrees), 4, np.random.default_rng(0))
-    for scene in SweptScene
-}
-curves = [(name, sweep.rotation_std, sweep.fraction) for name, sweep in sweeps.items()]
-curves += [
-    (f"{name}, handedness terms", sweep.rotation_std, sweep.fraction_with_terms)
-    for name, sweep in sweeps.items()
-]
-plot_tightness(curves)
-
-# %% [markdown]
-# There are four graphs at every level, so one graph is 25 %: enough for the picture, but not for
-# the third digit. The circle, with 12 measurements from every pose, remains tight longer than the
-# grid with 4 on average. Some graphs of the grid are not certified at 40 degrees, not far above the
-# paper's 30. What remains beyond this limit? Here is one graph of the grid with 60 degrees.
-
-# %%
-loose_problem = pgo.PGOProblem(
-    noisy_scene(SweptScene.GRID, np.deg2rad(60), np.random.default_rng(3))
-)
-loose = solvers.solve(loose_problem, solvers.Pipeline(handedness=None))
-loose
-
-# %%
-loose_relaxed = pgo.solve_relaxation(loose_problem)
-print("rank of Z:", loose_relaxed.rank)
-print(
-    f"{loose_relaxed.lower_bound:.3f} <= optimum <= {loose.objective:.3f}; Z rounded: {loose_relaxed.objective:.3f}"
-)
-
-# %% [markdown]
-# $Z$ has rank 4. No rotations have this Gram matrix, and rounding it to rotations increases the
-# cost. Now $S$ has *four* zero eigenvalues at the best $\Lambda$, and grounding a pose removes only
-# three. The remaining matrix is not safely positive definite, so the library needs a shift: if
-# $S + \eta \operatorname{blockdiag}(0, I)$ is positive definite without one translation, then
-# $\operatorname{tr}(X^\top S X) \ge -\eta\, n d$, because $R_i R_i^\top = I$, and
-#
-# $$F(X) \ge \operatorname{tr} \Lambda - \eta\, n d.$$
-#
-# The library searches for a small $\eta$ with which the factorisation succeeds. The shaded band is
-# $|\lambda| \le \eta$; all four zeros are in it.
-
-# %%
-print(f"eta {loose.certificate.eta:.2g}: {loose.certificate.source.value}")
-plot_spectrum(loose_problem, loose.certificate, count=10)
-
-# %% [markdown]
-# The verdict is `NOT_CERTIFIED`, **which does not mean that the poses are wrong**: they may be
-# optimal. The gap of 0.2 % is proven: no poses are better by more than that. A bound remains useful
-# when the relaxation is not tight, where a yes-or-no answer would not.
-
-# %% [markdown]
-# ## Rotations, not reflections
-#
-# What does the relaxation not know? It has $R_i R_i^\top = I$, but no determinant: $S$ acts on the
-# rows of $X$, and a row of some poses may change its sign as if they were mirrored. For a pair of
-# poses with $T = R_i^\top R_j$ at the answer and any $P \succeq 0$, $3 \times 3$, let
-#
-# $$B X = R_j^\top - T^\top R_i^\top, \qquad W = \tfrac14 (\tfrac12 \operatorname{tr}(P) I - P).$$
-#
-# On rotations $E = T^\top R_i^\top R_j$ has a unit quaternion $(w, v)$, and
-# $\operatorname{tr}(W (B X)(B X)^\top) = \operatorname{tr}(W (2 I - E - E^\top)) = v^\top P v \ge 0$. On
-# reflections the same term can be negative. So it may be *taken off* the cost: what is left is
-# nowhere above $F$ on rotations, and equal to it at the answer. $S$ becomes
-# $S - \sum_e B_e^\top W_e B_e$, with the same sparsity.
-
-# %%
-rng = np.random.default_rng(0)
-P = np.outer(*2 * [rng.standard_normal(3)])
-W = (np.trace(P) / 2 * np.eye(3) - P) / 4
-rotations = pgo.random_rotations(100_000, 3, rng)
-mirrored = rotations * np.array([1.0, 1.0, -1.0])
-for name, E in (("rotations", rotations), ("reflections", mirrored)):
-    term = np.einsum("ab,kab->k", W, 2 * np.eye(3) - E - np.swapaxes(E, 1, 2))
-    print(f"{name:12} the term is at least {term.min():6.3f}")
-
-# %% [markdown]
-# Where does that help? Take an edge of chi2 that knows the turn about its first axis better than the
-# other two: $I_{rr} = \operatorname{diag}(10, 2, 2)$. Its $W = \operatorname{tr}(I_{rr}) / 2 I -
-# I_{rr}$ has the eigenvalues $-3, 5, 5$. No *rotation* makes the edge cost less than zero. A
-# mirror does: moving $E$ from $I$ to the mirror image $I - 2 u u^\top$ costs $4 u^\top W u$, which is
-# negative along the first axis. The relaxation pays with such moves. $P = p\, u u^\top$ takes them
-# away, and what rotations lose by it is never more than they cost.
-
-# %%
-I_rr = np.diag([10.0, 2.0, 2.0])
-W_edge = np.trace(I_rr) / 2 * np.eye(3) - I_rr
-p = 8 * 3.5
-P_edge = np.diag([p, 0.0, 0.0])
-W_less = W_edge - (np.trace(P_edge) / 2 * np.eye(3) - P_edge) / 4
-
-
-def cost(weights, E):
-    return np.einsum("ab,kab->k", weights, 2 * np.eye(3) - E - np.swapaxes(E, 1, 2))
-
-
-angles = np.linspace(0, np.pi, 61)
-shares = np.linspace(0, 1, 61)
-figure, (of_rotations, of_mirrors) = plt.subplots(1, 2, figsize=(6.4, 2.8), sharey=True)
-for k, (axis, colour) in enumerate(zip(("stiff axis", "another axis"), ("C0", "C1"), strict=True)):
-    u = np.eye(3)[k]
-    turned = pgo.exp_map(angles[:, None] * u)
-    mirrored = np.eye(3) - 2 * shares[:, None, None] * np.outer(u, u)
-    for panel, x, E in (
-        (of_rotations, np.rad2deg(angles), turned),
-        (of_mirrors, shares, mirrored),
-    ):
-        panel.plot(x, cost(W_edge, E), color=colour, label=axis)
-        panel.plot(x, cost(W_less, E), color=colour, linestyle="--", label=f"{axis}, less the term")
-        panel.axhline(0, color="0.7", linewidth=0.8, zorder=0)
-of_rotations.set_xlabel("rotation about the axis (degrees)")
-of_mirrors.set_xlabel("share of the way to the mirror image")
-of_rotations.set_ylabel("cost of the edge")
-of_rotations.legend(fontsize="x-small", frameon=False)
-figure.tight_layout()
-
-# %% [markdown]
-# Which $P_e$ make $S_r$ positive definite? The smallest eigenvalue is a concave function of all
-# $P_e$. `solve` ascends it, and where that does not suffice takes $P_e$ from the multipliers of a
-# tighter relaxation, which is described below.
-
-# %%
-closed = solvers.solve(loose_problem)
-closed
-
-# %%
-terms = closed.certificate.bound.terms
-before = pgo.certify_at(loose_problem, closed.poses)
-print(f"gap without terms {before.gap:.2g}, with terms of {terms.num_pairs} pairs {closed.gap:.2g}")
-descents = [
-    solvers.polish(
-        loose_problem,
-        loose_problem.with_best_translations(pgo.random_rotations(27, 3, np.random.default_rng(k))),
+relaxation_alone = solvers.Pipeline(handedness=None)
+noises = (30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0, 90.0)
+levels = []
+for noise in noises:
+    noisy = pgo.PGOProblem(
+        noisy_scene(SweptScene.CIRCLE, np.deg2rad(noise), np.random.default_rng(0))
     )
-    for k in range(40)
-]
-best_descent = min(loose_problem.objective(poses) for poses in descents)
-print(f"best of 40 descents {best_descent:.6f}, proven minimum {closed.lower_bound:.6f}")
-
-# %% [markdown]
-# The same constraint can be given to the relaxation itself: for a rotation $E$ with the unit
-# quaternion $q$ the matrix $4 q q^\top$ is linear in $E$, and $Z_{ij}$ is a mixture of rotations if and
-# only if this $4 \times 4$ matrix of $Z_{ij}$ is positive semidefinite. Here are both relaxations.
-
-# %%
-with_hulls = pgo.solve_relaxation(loose_problem, pgo.RelaxationForm.HULL_DUAL)
-for name, relaxation in (("without hulls", loose_relaxed), ("with hulls", with_hulls)):
+    found = solvers.solve(noisy, relaxation_alone)
+    eigenvalues = pgo.solve_relaxation(noisy).rank.singular_values
+    levels.append((noise, eigenvalues, found.gap))
     print(
-        f"{name:13} value {relaxation.value:.4f}, rank of Z {relaxation.rank.rank}, "
-        f"Z rounded {relaxation.objective:.4f}, {relaxation.verdict.name}"
+        f"{noise:.0f} degrees: F {found.objective:.3f}, bound {found.lower_bound:.3f}, "
+        f"gap {found.gap:.1e}, eigenvalues of Z",
+        *eigenvalues[:6].round(2),
     )
 
+# %%
+noise_film(levels, d=3)
+
 # %% [markdown]
-# The answer was optimal all along. The relaxation's value is 0.2 % below it, because it admits blocks
-# $Z_{ij}$ that are no mixture of rotations. The terms are the multipliers of what excludes them: that
-# $Z_{ij}$ is in the convex hull of $\mathrm{SO}(3)$ (Saunderson, Parrilo, Willsky 2015). Olsson,
-# Lochman, Malmport and Zach (2025) add that hull to the semidefinite program of rotation averaging.
-# `solve` needs no model of cvxpy for it: an augmented Lagrangian on a low-rank factor of $Z$
-# (`HullLagrangian`) takes graphs of a thousand poses. Where no $P_e$ on the edges suffices, as on
-# most graphs of the grid at 70 degrees, the gap stays open. In the plane there is nothing to gain.
-# The 2 by 2 matrices are the sum of two planes at right angles: one holds the rotations, the other
-# the reflections. The measured $R_{ij}$ is a rotation, so the cost sees of $Z_{ij}$ only the part in
-# the first plane, and that part is never outside the hull of $\mathrm{SO}(2)$, the unit disc: for a
-# rotation it is on the circle, for a reflection at the centre.
+# Up to 55 degrees $Z$ has three eigenvalues of 25, one for each column of rotations, and the bound
+# meets $F$ to rounding. From 60 degrees on there is a fourth eigenvalue, later a fifth and a sixth. No
+# rotations have such a Gram matrix: the relaxation has found something cheaper than rotations, its
+# value is below the optimum, and the bound stays below $F$ by as much.
+#
+# Is this graph typical? Here are four graphs at every level, of the circle and of the paper's grid,
+# and the share of them whose optimum the relaxation proves.
+
+
+# %%
+def share_certified(scene, noise, rng, count=4):
+    """Share of random graphs whose optimum the relaxation proves; the noise is in degrees."""
+    graphs = [noisy_scene(scene, np.deg2rad(noise), rng) for _ in range(count)]
+    solutions = [solvers.solve(graph, relaxation_alone) for graph in graphs]
+    return np.mean([solution.is_certified for solution in solutions])
+
+
+swept = (30.0, 40.0, 50.0, 60.0, 70.0, 80.0)
+shares = {}
+for scene in SweptScene:
+    rng = np.random.default_rng(0)
+    shares[scene.value] = np.array([share_certified(scene, noise, rng) for noise in swept])
+plot_tightness([(name, np.deg2rad(swept), share) for name, share in shares.items()])
+
+# %% [markdown]
+# One graph is 25 %: enough for the picture, but not for the third digit. The circle, with 12
+# measurements from every pose, remains tight longer than the grid with 4 on average. Some graphs of
+# the grid are not certified at 40 degrees, not far above the paper's 30.
+#
+# The verdict beyond this limit is `NOT_CERTIFIED`, **which does not mean that the poses are wrong**:
+# they may be optimal. The gap is proven: no poses are better by more than that. Whether the poses or
+# the relaxation are to blame, and how the gap can be closed all the same, is the subject of
+# [notebook 16](16_beyond_the_relaxation.ipynb).
 
 # %% [markdown]
 # ## Exercises
@@ -498,6 +397,11 @@ for name, relaxation in (("without hulls", loose_relaxed), ("with hulls", with_h
 #
 # </details>
 
+# %% [markdown]
+# ## Checks of the numbers above
+#
+# This cell holds what the text says of the numbers above. If you have changed a parameter, skip it.
+
 # %%
 assert np.isclose(primal.value, answer.objective, rtol=1e-5)
 assert np.isclose(dual.value, answer.objective, rtol=1e-4)
@@ -508,12 +412,6 @@ assert float(verified.gap) < 1e-10
 assert not changed.is_verified
 assert float(changed.bound) < answer.lower_bound
 assert relaxed.rank.rank == 3
-assert not loose.is_certified
-assert closed.is_certified
-assert closed.lower_bound <= best_descent * (1 + 1e-12)
-assert loose.lower_bound < closed.lower_bound
-assert with_hulls.verdict is pgo.Verdict.CERTIFIED
-assert with_hulls.rank.rank == 3
 assert all(abs(difference) < 1e-8 * objective for objective, difference, _ in rows.values())
 assert rows["8 poses, optimum"][2] > -1e-6
 assert rows["ring, optimum"][2] > -1e-6
@@ -530,12 +428,12 @@ for name, certificates in on_the_way.items():
     assert certificates[0].gap > 0.05
     assert all(item.eta == 0 for item in certificates[5:])
     assert certificates[-1].gap < 1e-8
-assert sweeps["circle"].fraction[0] == sweeps["grid"].fraction[0] == 1.0
-assert sweeps["circle"].fraction[-1] < 0.5
-assert sweeps["grid"].fraction[-1] == 0.0
-assert sweeps["circle"].last_tight > sweeps["grid"].last_tight
-assert loose_relaxed.rank.rank == 4
-assert loose.certificate.eta > 0
-assert loose.lower_bound < loose.objective
-assert loose_relaxed.lower_bound <= loose.objective < loose_relaxed.objective
-assert 1e-4 < loose.gap < 0.01
+assert all(shares[name][0] == 1.0 for name in ("circle", "grid"))
+assert shares["circle"][-1] < 0.5
+assert shares["grid"][-1] == 0.0
+assert shares["circle"].sum() > shares["grid"].sum()
+for noise, eigenvalues, gap in levels:
+    is_tight = noise <= 55.0
+    assert (eigenvalues[3] < 1e-4 * eigenvalues[2]) == is_tight
+    assert (gap < 1e-6) == is_tight
+assert levels[-1][2] > 0.05

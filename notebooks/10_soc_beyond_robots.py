@@ -4,11 +4,17 @@
 # Open with `jupyter lab notebooks/10_soc_beyond_robots.ipynb`; `pip install -e '.[notebooks,fast]'`
 # installs it.
 #
+# - **Prerequisites:** [notebook 4](04_splitting_orthogonality.ipynb), which derives the splitting of
+#   orthogonality constraints for rotations
+# - **Time:** 35 minutes
+# - **Next:** [notebook 11](11_admm_across_machines.ipynb), one problem that is solved across machines
+#
 # The three steps of the paper's equation (19) do not depend on robots: (a) is any convex problem,
 # (b) a projection, (c) a sum. This notebook solves four problems from other fields, each beside the
 # usual method: localised modes of a vibrating plate, a rotation fitted to points of which some are
 # wrong, interpretable principal components, and the sparse low-rank approximation that the paper's
-# second remark names for compressing what robots send.
+# second remark names for compressing what robots send. What only draws is in
+# [`drawings/soc_beyond_robots.py`](drawings/soc_beyond_robots.py).
 
 # %%
 import itertools
@@ -16,6 +22,13 @@ import itertools
 import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.soc_beyond_robots import (
+    draw_components,
+    draw_errors,
+    draw_modes,
+    draw_paths,
+    film_of_modes,
+)
 from scipy.fft import dct, idct
 
 import pgo_models as pgo
@@ -41,21 +54,31 @@ plt.rcParams["figure.dpi"] = 110
 
 
 # %%
-def compressed_modes(A, count, weight, rho, iterations, rng):
-    P = Q = project_stiefel(rng.standard_normal((len(A), count)))
+def compressed_modes(A, start, weight, rho, iterations):
+    P = Q = start
     B, C = np.zeros_like(P), np.zeros_like(Q)
     solve = np.linalg.inv(2 * A + 2 * rho * np.eye(len(A)))
     for _ in range(iterations):
         X = solve @ (rho * (P - B) + rho * (Q - C))  # (a)
-        P, Q = project_stiefel(X + B), soft_threshold(X + C, weight / rho)  # (b), one for each copy
+        P = project_stiefel(X + B)  # (b), one for each copy
+        Q = soft_threshold(X + C, weight / rho)
         B, C = B + X - P, C + X - Q  # (c)
     return P, Q, np.linalg.norm(X - P) + np.linalg.norm(X - Q)
+
+
+def random_columns(rows, count, seed):
+    return project_stiefel(np.random.default_rng(seed).standard_normal((rows, count)))
 
 
 def price(A, weight, X):
     return np.sum(X * (A @ X)) + weight * np.abs(X).sum()
 
 
+# %% [markdown]
+# The plate is a grid of 16 times 16 points. Its Laplacian is made of those of its two sides.
+
+
+# %%
 def path_laplacian(count):
     D = np.diff(np.eye(count), axis=0)
     return D.T @ D
@@ -65,27 +88,38 @@ side = 16
 line = path_laplacian(side)
 plate = np.kron(line, np.eye(side)) + np.kron(np.eye(side), line)
 waves = np.linalg.eigh(plate)[1][:, :4]
-modes, thresholded, residual = compressed_modes(plate, 4, 0.2, 8.0, 800, np.random.default_rng(0))
+start = random_columns(side**2, 4, seed=0)
+modes, thresholded, residual = compressed_modes(plate, start, 0.2, 8.0, 800)
 print(f"residual {residual:.0e}; nonzeros of {side**2}: {(np.abs(thresholded) > 1e-9).sum(axis=0)}")
-print(
-    f"objective: compressed {price(plate, 0.2, modes):.3f}, eigenvectors {price(plate, 0.2, waves):.3f}"
-)
-
-figure, panels = plt.subplots(2, 4, figsize=(7.0, 3.6), layout="constrained")
-for row, (name, columns) in enumerate((("eigenvector", waves), ("compressed mode", modes))):
-    for k in range(4):
-        field = columns[:, k].reshape(side, side)
-        panels[row, k].imshow(
-            field, cmap="RdBu", vmin=-np.abs(field).max(), vmax=np.abs(field).max()
-        )
-        panels[row, k].set_title(f"{name} {k + 1}", fontsize=8)
-        panels[row, k].axis("off")
+print(f"objective of the compressed modes {price(plate, 0.2, modes):.3f}")
+print(f"objective of the eigenvectors     {price(plate, 0.2, waves):.3f}")
+draw_modes(side, [("eigenvector", waves), ("compressed mode", modes)])
 
 # %% [markdown]
 # The upper row shows the eigenvectors, the lower row the compressed modes. Each mode is local, and
-# exactly zero elsewhere. The modes are not eigenvectors; as $w$ goes to zero they span the same
-# space.
-#
+# exactly zero elsewhere. The modes are not eigenvectors; but as $w$ goes to zero, they span the
+# same space. To see this, lower $w$ step by step, each time from the modes of the step before, with
+# $\rho$ in proportion to $w$ but not too small. The share of the modes in the span of the
+# eigenvectors $V$ is
+# $\lVert V^\top P \rVert^2$ over the number of columns.
+
+# %%
+weights = (0.5, 0.35, 0.25, 0.2, 0.14, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01, 0.005, 0.002)
+along, columns = {}, start
+for weight in weights:
+    columns, _, _ = compressed_modes(plate, columns, weight, max(40 * weight, 1.5), 1000)
+    along[weight] = columns
+shares = [np.linalg.norm(waves.T @ columns) ** 2 / 4 for columns in along.values()]
+print("share in the span of the eigenvectors:", np.round(shares, 3))
+film_of_modes(side, along, shares)
+
+# %% [markdown]
+# At $w = 0.5$ the modes are spots of about ten points each. They grow as $w$ falls, and move apart
+# where they would touch, until one of them is in each corner ($w = 0.03$). From there on they
+# become smooth, and at
+# $w = 0.002$ they are combinations of the four eigenvectors to within half a per cent.
+
+# %% [markdown]
 # ## The library agrees
 #
 # `sparse_components` is the same problem for `solve_orthogonal`, whose step (a) uses cvxpy and
@@ -94,16 +128,15 @@ for row, (name, columns) in enumerate((("eigenvector", waves), ("compressed mode
 
 # %%
 string = path_laplacian(20)
-by_hand, _, _ = compressed_modes(string, 2, 0.2, 8.0, 1500, np.random.default_rng(1))
+by_hand, _, _ = compressed_modes(string, random_columns(20, 2, seed=1), 0.2, 8.0, 1500)
 small = sparse_components(string, 2, 0.2)
 run = solvers.run(
     solvers.OrthogonalSOC(penalty=8.0, tolerance=1e-4, max_iterations=300),
     small,
     small.point([by_hand]),
 )
-print(
-    f"objective by hand {price(string, 0.2, by_hand):.6f}, by the library {run.objective:.6f}, {run.status.name}"
-)
+print(f"objective by hand        {price(string, 0.2, by_hand):.6f}")
+print(f"objective by the library {run.objective:.6f}, {run.status.name}")
 
 # %% [markdown]
 # ## A rotation, and points of which some are wrong
@@ -130,8 +163,9 @@ def degrees(X):
     return np.degrees(np.arccos(np.clip((np.trace(X.T @ truth) - 1) / 2, -1.0, 1.0)))
 
 
-shares, errors = (0.0, 0.2, 0.4), {}
-for share in shares:
+# %%
+errors = {}
+for share in (0.0, 0.2, 0.4):
     seen = scan(share)
     squares = pgo.project_to_rotations((points.T @ seen)[None])[0]
     X = cp.Variable((3, 3))
@@ -139,15 +173,8 @@ for share in shares:
     fit = pgo.OrthogonalProblem(distances, rotations=[X])
     found = solvers.run(solvers.OrthogonalSOC(tolerance=1e-4), fit, fit.point([squares]))
     errors[share] = degrees(squares), degrees(found.state.copies[0])
-    print(
-        "{:.0%} wrong: off by {:5.2f} degrees by squares, {:.2f} by distances".format(
-            share, *errors[share]
-        )
-    )
-assert np.isclose(
-    procrustes(points, seen, rotation=True).objective([squares]),
-    np.sum((points @ squares - seen) ** 2),
-)
+    print(f"{share:.0%} of the points wrong:", end=" ")
+    print("off by {:.2f} degrees by squares, {:.2f} by distances".format(*errors[share]))
 
 # %% [markdown]
 # ## Interpretable principal components
@@ -160,38 +187,35 @@ assert np.isclose(
 causes = np.zeros((30, 3))
 for k in range(3):
     causes[10 * k : 10 * k + 8, k] = 8**-0.5
-readings = rng.standard_normal((80, 3)) @ np.diag(
-    [3.0, 2.8, 2.6]
-) @ causes.T + 0.5 * rng.standard_normal((80, 30))
+strengths = rng.standard_normal((80, 3)) * np.array([3.0, 2.8, 2.6])
+readings = strengths @ causes.T + 0.5 * rng.standard_normal((80, 30))
 covariance = readings.T @ readings / 80
 values, vectors = np.linalg.eigh(covariance)
 principal = vectors[:, -3:]
-sparse = sparse_components(
-    values[-1] * np.eye(30) - covariance, 3, 0.6
-)  # largest of C: smallest of c I - C
-components = solvers.run(
-    solvers.OrthogonalSOC(tolerance=1e-4), sparse, sparse.point([principal])
-).state.X[0]
+
+# %% [markdown]
+# The components belong to the largest eigenvalues of the covariance $C$, so that
+# `sparse_components`, which minimises, is given $c I - C$ with the largest eigenvalue $c$.
+
+# %%
+sparse = sparse_components(values[-1] * np.eye(30) - covariance, 3, 0.6)
+soc = solvers.OrthogonalSOC(tolerance=1e-4)
+components = solvers.run(soc, sparse, sparse.point([principal])).state.X[0]
 
 
 def likeness(X):
     return np.abs(X.T @ causes).max(axis=1)
 
 
-explained = [
-    np.trace(X.T @ covariance @ X) / values.sum() for X in (principal, project_stiefel(components))
-]
-print(
-    "likeness to a cause: principal",
-    likeness(principal).round(2),
-    " sparse",
-    likeness(components).round(2),
-)
-print("variance explained: principal {:.1%}, sparse {:.1%}".format(*explained))
-figure, panels = plt.subplots(1, 2, figsize=(7.0, 1.8), layout="constrained", sharey=True)
-for axes, title, X in zip(panels, ("principal", "sparse"), (principal, components), strict=True):
-    axes.imshow(X.T, cmap="RdBu", vmin=-0.5, vmax=0.5, aspect="auto")
-    axes.set(title=title, xlabel="sensor", yticks=range(3))
+def explained(X):
+    return np.trace(X.T @ covariance @ X) / values.sum()
+
+
+variances = explained(principal), explained(project_stiefel(components))
+print("likeness to a cause, principal:", likeness(principal).round(2))
+print("                        sparse:", likeness(components).round(2))
+print("variance explained: principal {:.1%}, sparse {:.1%}".format(*variances))
+draw_components([("principal", principal), ("sparse", components)])
 
 # %% [markdown]
 # ## Sparse low-rank approximation
@@ -212,15 +236,19 @@ for axes, title, X in zip(panels, ("principal", "sparse"), (principal, component
 rng = np.random.default_rng(2)
 time_steps, robots, rank, rho_share = 64, 24, 4, 3.0
 paths = np.cumsum(np.cumsum(rng.standard_normal((time_steps, robots)), axis=0), axis=0)
-paths = (paths - paths.mean(axis=0)) @ (
-    0.3 * np.eye(robots) + rng.standard_normal((robots, robots)) / robots
-)
+mixing = 0.3 * np.eye(robots) + rng.standard_normal((robots, robots)) / robots
+paths = (paths - paths.mean(axis=0)) @ mixing
 paths /= np.linalg.norm(paths, 2)  # in units in which c = 1
 Y = dct(paths, axis=0, norm="ortho")
 U, spectrum, _ = np.linalg.svd(Y, full_matrices=False)
 c = spectrum[0] ** 2
 
+# %% [markdown]
+# The copy $P$ is in the set of orthonormal columns, the copy $Q$ in that of matrices with at most
+# $s$ nonzeros. Compare with the simpler way: cut the small entries of the singular vectors.
 
+
+# %%
 def slrma(nonzeros, iterations):
     rho = rho_share * c
     solve = np.linalg.inv(2 * (c * np.eye(time_steps) - Y @ Y.T) + 2 * rho * np.eye(time_steps))
@@ -228,13 +256,18 @@ def slrma(nonzeros, iterations):
     B_P, B_Q = np.zeros_like(P), np.zeros_like(Q)
     for _ in range(iterations):
         X = solve @ (rho * (P - B_P) + rho * (Q - B_Q))
-        P, Q = project_stiefel(X + B_P), project_sparse(X + B_Q, nonzeros)
+        P = project_stiefel(X + B_P)
+        Q = project_sparse(X + B_Q, nonzeros)
         B_P, B_Q = B_P + X - P, B_Q + X - Q
     return P, Q
 
 
+def restored_from(basis):
+    return basis @ np.linalg.lstsq(basis, Y, rcond=None)[0]
+
+
 def relative_error(basis):
-    return np.linalg.norm(Y - basis @ np.linalg.lstsq(basis, Y, rcond=None)[0]) / np.linalg.norm(Y)
+    return np.linalg.norm(Y - restored_from(basis)) / np.linalg.norm(Y)
 
 
 kept = (12, 16, 24, 40, 64)
@@ -242,17 +275,7 @@ curves = {
     "SLRMA": [relative_error(slrma(s, 2000)[1]) for s in kept],
     "SVD, small entries cut": [relative_error(project_sparse(U[:, :rank], s)) for s in kept],
 }
-figure, axes = plt.subplots(figsize=(5.0, 2.8), layout="constrained")
-for (name, curve), marker in zip(curves.items(), "os", strict=True):
-    axes.plot(kept, curve, f"{marker}-", label=name)
-axes.axhline(
-    relative_error(U[:, :rank]),
-    color="#999999",
-    linestyle=":",
-    label=f"SVD, all {rank * time_steps} entries",
-)
-axes.set(xlabel="nonzeros of B", ylabel="relative error")
-_ = axes.legend(fontsize=8)
+draw_errors(kept, curves, relative_error(U[:, :rank]))
 
 # %% [markdown]
 # The library takes the same steps, with one copy for each set and the same penalty.
@@ -266,17 +289,16 @@ library = next(itertools.islice(states, 20, None)).copies
 difference = max(np.abs(a - b).max() for a, b in zip(library, slrma(24, 20), strict=True))
 print(f"after 20 iterations the copies differ by {difference:.0e}")
 
+# %% [markdown]
+# So 24 numbers for $B$ and four for each robot replace all samples. The figure shows the paths of
+# four of the robots.
+
 # %%
-restored = slrma(24, 2000)[1]
-decoded = idct(restored @ np.linalg.lstsq(restored, Y, rcond=None)[0], axis=0, norm="ortho")
-figure, axes = plt.subplots(figsize=(5.0, 2.4), layout="constrained")
-axes.plot(paths[:, :4], color="#999999", linewidth=2.5)
-axes.plot(decoded[:, :4], color="#0072B2", linewidth=1.0)
-axes.set(
-    xlabel="time", ylabel="position", title="four of the robots, and from 24 numbers and 4 a robot"
-)
-sent = np.count_nonzero(restored) + rank * robots
-print(f"{sent} numbers in place of {Y.size}; error {relative_error(restored):.1%}")
+basis = slrma(24, 2000)[1]
+decoded = idct(restored_from(basis), axis=0, norm="ortho")
+sent = np.count_nonzero(basis) + rank * robots
+print(f"{sent} numbers in place of {Y.size}; error {relative_error(basis):.1%}")
+draw_paths(paths[:, :4], decoded[:, :4])
 
 # %% [markdown]
 # ## Where it fails
@@ -288,11 +310,10 @@ print(f"{sent} numbers in place of {Y.size}; error {relative_error(restored):.1%
 #    gives a worse result than that of the SVD.
 
 # %%
-never = compressed_modes(plate, 4, 0.2, 1.0, 800, np.random.default_rng(0))[2]
-objectives = [
-    price(plate, 0.2, compressed_modes(plate, 4, 0.2, 8.0, 800, np.random.default_rng(k))[0])
-    for k in range(5)
-]
+never = compressed_modes(plate, start, 0.2, 1.0, 800)[2]
+starts = [random_columns(side**2, 4, seed) for seed in range(5)]
+ends = [compressed_modes(plate, other, 0.2, 8.0, 800)[0] for other in starts]
+objectives = [price(plate, 0.2, end) for end in ends]
 print(f"rho = 1: residual {never:.1f} after 800 iterations")
 print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 
@@ -308,7 +329,7 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 # has to balance it. The threshold of $\rho$ grows in proportion.
 #
 # ```python
-# settled = {rho: compressed_modes(plate, 4, 0.5, rho, 800, np.random.default_rng(0))[2] for rho in (8.0, 20.0)}
+# settled = {rho: compressed_modes(plate, start, 0.5, rho, 800)[2] for rho in (8.0, 20.0)}
 # assert settled[8.0] > 0.1 > 100 * settled[20.0]
 # ```
 #
@@ -353,15 +374,25 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 #
 # </details>
 
+# %% [markdown]
+# ## Checks of the numbers above
+#
+# Readers who have changed parameters may skip this cell, which holds for those given. The first
+# check is that the library's Procrustes problem has the sum of squares as its cost.
+
 # %%
+by_library = procrustes(points, seen, rotation=True).objective([squares])
+assert np.isclose(by_library, np.sum((points @ squares - seen) ** 2))
 assert residual < 1e-2
 assert (np.abs(thresholded) > 1e-9).sum(axis=0).max() < 0.2 * side**2
 assert price(plate, 0.2, modes) < 0.8 * price(plate, 0.2, waves)
+assert np.all(np.diff(shares) > 0)
+assert shares[0] < 0.2 < 0.99 < shares[-1]
 assert np.isclose(run.objective, price(string, 0.2, by_hand), rtol=1e-3)
 assert errors[0.0][1] < 1.0
 assert all(squares > 3 * distances for squares, distances in (errors[0.2], errors[0.4]))
 assert likeness(components).min() > 0.99 > likeness(principal).min()
-assert explained[0] >= explained[1] > 0.97 * explained[0]
+assert variances[0] >= variances[1] > 0.97 * variances[0]
 assert all(ours <= cut * (1 + 1e-9) for ours, cut in zip(*curves.values(), strict=True))
 assert difference < 1e-9
 assert never > 0.1

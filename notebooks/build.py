@@ -19,6 +19,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 FOLDER = Path(__file__).parent
+FILM = "application/vnd.plotly.v1+json"  # a figure of plotly, in the output of a cell
 COLOURS = 128  # of a picture; with fewer colours two robots look alike
 MOST_BYTES = 400_000
 
@@ -38,8 +39,19 @@ def is_spent_bar(output: nbformat.NotebookNode) -> bool:
     )
 
 
+def describe_film(data: nbformat.NotebookNode) -> None:
+    """Say in words what a film shows, for a viewer that cannot draw it, and drop other forms."""
+    figure = data[FILM]
+    description = figure.layout.get("meta", {}).get("description")
+    if not description:
+        raise SystemExit("a film has no description; `animate` takes one")
+    data.clear()
+    data[FILM] = figure
+    data["text/plain"] = f"Film: {description}"
+
+
 def tidy(cell: nbformat.NotebookNode) -> None:
-    """Remove execution times and progress bars from a cell, and reduce its pictures."""
+    """Remove execution times and progress bars from a cell, reduce its pictures, describe films."""
     cell.metadata = nbformat.NotebookNode()
     if cell.cell_type != "code":
         return
@@ -53,6 +65,8 @@ def tidy(cell: nbformat.NotebookNode) -> None:
         if "image/png" in data:
             data["image/png"] = small_png(data["image/png"])
             output["metadata"] = nbformat.NotebookNode()
+        if FILM in data:
+            describe_film(data)
 
 
 def build(source: Path) -> Path:

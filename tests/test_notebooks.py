@@ -1,4 +1,4 @@
-"""The sources of the notebooks run, use public names only and end with asserts.
+"""The sources of the notebooks run, use public names only and check their numbers in the last cell.
 
 Every .ipynb is built from its source.
 `python notebooks/build.py` builds them. Neither Jupyter nor jupytext is needed here: a percent
@@ -22,20 +22,24 @@ import solvers
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
 NAMES = [source.stem for source in SOURCES]
-LIBRARIES = {"cvxpy", "matplotlib", "numpy", "pandas", "scipy"}
+LIBRARIES = {"cvxpy", "matplotlib", "numpy", "pandas", "scipy", "drawings"}
 ANSWER = re.compile(r"<details><summary>Answer</summary>\n\n(.*?)\n\n</details>", re.S)
+DRAWINGS = "drawings"  # the folder of what notebooks draw with
+FILM = "application/vnd.plotly.v1+json"
+# Notebooks in which something moves, and the number of their films and sliders.
+FILMS = {"01": 2, "02": 2, "03": 1, "04": 3, "05": 2, "06": 2, "09": 3, "10": 1, "11": 1, "12": 1}
+FILMS |= {"13": 1, "14": 2, "15": 2, "16": 2}
+MOST_LINES = 30  # of a cell
+CHECKS = "## Checks of the numbers above"
 EXERCISES = 3
 MOST_BYTES = 400_000
 
-# What is run in place of parts of a notebook that take long: a sweep over four levels of the noise,
-# not eight, with one graph at each, not four. The asserts of the notebook hold of it, too.
+# What is run in place of parts of a notebook that take long: a sweep over three levels of the
+# noise, not six, with one graph at each, not three. The asserts of the notebook hold of it, too.
 SHORTENED = {
-    "05_sdp_and_certificates": [
-        (
-            "np.array([30.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0, 80.0])",
-            "np.array([30.0, 45.0, 60.0, 80.0])",
-        ),
-        ("np.deg2rad(degrees), 4, np", "np.deg2rad(degrees), 1, np"),
+    "16_beyond_the_relaxation": [
+        ("np.array([30.0, 40.0, 50.0, 60.0, 70.0, 80.0])", "np.array([30.0, 50.0, 80.0])"),
+        ("np.deg2rad(degrees), 3, np", "np.deg2rad(degrees), 1, np"),
     ],
 }
 
@@ -85,7 +89,9 @@ def code_of(answer: str) -> list[str]:
 
 
 def test_there_is_a_notebook_for_every_topic():
-    assert [name[:2] for name in NAMES] == [f"{number:02d}" for number in range(1, 14)]
+    numbers = [f"{number:02d}" for number in range(1, len(NAMES) + 1)]
+    assert len(NAMES) >= 16
+    assert [name[:2] for name in NAMES] == numbers
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
 
 
@@ -132,19 +138,68 @@ def test_a_notebook_was_run_to_its_end_and_is_small(source):
         for output in outputs
         if output["output_type"] == "error" or output.get("name") == "stderr"
     ]
-    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 1
+    kinds = [kind for output in outputs for kind in output.get("data", {})]
+    assert "image/png" in kinds or FILM in kinds
+    assert kinds.count(FILM) >= FILMS.get(source.name[:2], 0)
     assert path.stat().st_size <= MOST_BYTES
 
 
 @each_source
-def test_a_source_asks_a_question_and_ends_with_asserts(source):
-    parts = cells(source)
-    kind, opening = parts[0]
+def test_a_film_in_a_notebook_has_frames_with_labels_and_says_in_words_what_it_shows(source):
+    for output in outputs_of(source):
+        figure = output.get("data", {}).get(FILM)
+        if figure is not None:
+            (slider,) = figure["layout"]["sliders"]
+            names = [frame["name"] for frame in figure["frames"]]
+            assert [step["args"][0] for step in slider["steps"]] == [[name] for name in names]
+            assert len(names) >= 4
+            text = "".join(output["data"]["text/plain"])
+            assert text.removeprefix("Film: ") == figure["layout"]["meta"]["description"]
+            assert len(text.split()) >= 8
+
+
+def outputs_of(source: Path) -> list[dict]:
+    notebook = json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    return [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+
+
+@each_source
+def test_a_source_asks_a_question_and_says_what_it_takes_and_what_comes_next(source):
+    kind, opening = cells(source)[0]
     assert kind == "markdown"
     assert opening.startswith(f"# {int(source.name[:2])}. ")
     assert "?" in opening
-    kind, ending = [part for part in parts if part[0] == "code"][-1]
+    for label in ("**Prerequisites:** ", "**Time:** ", "**Next:** "):
+        assert opening.count(label) == 1, label
+    assert re.search(r"\*\*Time:\*\* \d+ minutes", opening)
+
+
+@each_source
+def test_every_check_is_in_the_last_cell_which_says_that_it_may_be_skipped(source):
+    *parts, (heading_kind, heading), (kind, ending) = cells(source)
+    assert (heading_kind, kind) == ("markdown", "code")
+    assert heading.startswith(CHECKS)
+    assert "skip" in heading
     assert any(isinstance(node, ast.Assert) for node in ast.parse(ending).body)
+    for kind, text in parts:
+        if kind == "code":
+            assert not [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Assert)]
+
+
+@each_source
+def test_no_cell_is_longer_than_a_screen(source):
+    for kind, text in cells(source)[:-1]:
+        assert kind == "markdown" or len(text.splitlines()) <= MOST_LINES, text[:200]
+
+
+@each_source
+def test_what_a_notebook_draws_with_is_named_and_linked(source):
+    text = source.read_text(encoding="utf-8")
+    modules = re.findall(rf"^(?:from|import) {DRAWINGS}(?:\.(\w+)| import (\w+))", text, re.M)
+    for names in modules:
+        path = f"{DRAWINGS}/{''.join(names)}.py"
+        assert (FOLDER / path).exists()
+        assert f"[`{path}`]({path})" in text
 
 
 @each_source

@@ -11,6 +11,7 @@ docstrings.
 
 import argparse
 import ast
+import json
 import os
 import re
 import shutil
@@ -24,6 +25,7 @@ sys.path.insert(0, str(ROOT))
 import pgo_models  # noqa: E402 - on the path that is set above
 import solvers  # noqa: E402
 from pgo_models.errors import MissingExtraError, extra_module  # noqa: E402
+from pgo_models.plots.pages import figure_html  # noqa: E402
 
 PACKAGES = {"pgo_models": pgo_models, "solvers": solvers}
 # Pages of the repository, and their names on the site; links between them are adapted.
@@ -32,6 +34,8 @@ PAGES = {
     "CHANGELOG.md": "changelog.md",
     "data/README.md": "data.md",
 }
+FILM = "application/vnd.plotly.v1+json"  # a figure of plotly, in the output of a notebook's cell
+PLOTLY_SCRIPT = "../_static/plotly.min.js"  # of `conf.py`, seen from the pages of the notebooks
 # Files of the repository that are no page of the site, and the page that a link to them opens.
 INSTEAD = {"README.md": "index.md"}
 
@@ -146,11 +150,35 @@ def write_reference(folder: Path) -> None:
 
 
 def table_text(text: str) -> str:
-    """Return text in which nothing outside code is markup, for a cell of a Markdown table."""
-    pieces = re.split(r"(`[^`]+`)", text)
-    return "".join(
-        piece if k % 2 else re.sub(r"([|*_])", r"\\\1", piece) for k, piece in enumerate(pieces)
-    )
+    """Return text for a cell of a Markdown table, in which only code and formulas are markup."""
+    import formulas  # beside this file
+
+    cell = ""
+    for k, piece in enumerate(re.split(r"(`[^`]+`)", text)):
+        if k % 2:
+            cell += piece
+            continue
+        for part, is_formula in formulas.inline(piece):
+            cell += f"${part}$" if is_formula else re.sub(r"([|*_$])", r"\\\1", part)
+    return cell
+
+
+def with_films(notebook: str) -> str:
+    """Return a notebook, as JSON, whose plotly figures are HTML that needs no Python.
+
+    Links to pages of the site lead to them from where notebooks are on the site.
+    """
+    content = json.loads(notebook.replace("](site/", "](../"))
+    script: str | bool = PLOTLY_SCRIPT  # which a page loads with its first film
+    for cell in content["cells"]:
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if FILM in data:
+                figure = extra_module("plotly.io", "docs").from_json(json.dumps(data[FILM]))
+                height = f"{figure.layout.height or 480}px"
+                output["data"] = {"text/html": figure_html(figure, script, height)}
+                script = False
+    return json.dumps(content)
 
 
 def assemble(source: Path) -> None:
@@ -161,7 +189,13 @@ def assemble(source: Path) -> None:
     (source / "notebooks").mkdir()
     notebooks = sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb"))
     for notebook in notebooks:
-        shutil.copy(notebook, source / "notebooks")
+        text = with_films(notebook.read_text(encoding="utf-8"))
+        (source / "notebooks" / notebook.name).write_text(text, encoding="utf-8")
+    shutil.copytree(
+        ROOT / "notebooks" / "drawings",
+        source / "notebooks" / "drawings",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
     shutil.copytree(ROOT / "notebooks" / "pictures", source / "notebooks" / "pictures")
     shutil.copy(ROOT / "notebooks" / "tables.json", source / "notebooks")
     for page, name in PAGES.items():

@@ -67,17 +67,29 @@ def save_page(figure: Figure, path: Path | str) -> None:
     The script of plotly adds about 5 MB to the page. A `description` in the figure's `meta` is
     written below it. Errors are those of `replace_when_done`.
     """
+    body = figure_html(figure, script=True, height="92vh")
+    page = (
+        '<!DOCTYPE html><html><head><meta charset="utf-8" />'
+        '<meta name="viewport" content="width=device-width, initial-scale=1" />'
+        f"</head><body>{body}</body></html>"
+    )
+    with replace_when_done(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def figure_html(figure: Figure, script: bool | str, height: str) -> str:
+    """Return the part of a page that shows a plotly figure, and below it what it shows in words.
+
+    Plotly is in the part itself where `script` is true, and else is loaded from this address.
+    """
     has_frames = len(figure.frames) > 0  # whose controls a bar of tools would cover
-    page = figure.to_html(
-        include_plotlyjs=True,
+    part: str = figure.to_html(
+        full_html=False,
+        include_plotlyjs=script,
         config={**PAGE_CONFIG, "displayModeBar": False} if has_frames else PAGE_CONFIG,
         auto_play=False,
-        default_height="92vh",
+        default_height=height,
         post_script=FILM_KEYS,
     )
     description = (figure.layout.meta or {}).get("description", "")
-    caption = f"<p>{html.escape(description)}</p></body>" if description else "</body>"
-    view = '<head><meta name="viewport" content="width=device-width, initial-scale=1" />'
-    page = page.replace("<head>", view, 1).replace("</body>", caption, 1)
-    with replace_when_done(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    return f"{part}<p>{html.escape(description)}</p>" if description else part

@@ -155,9 +155,8 @@ def _film_of(problem: PGOProblem, iterates: Sequence[FilmedIterate]) -> Figure:
         for iterate in iterates
     ]
     description = (
-        f"{graph.name} from {iterates[0].name} to {iterates[-1].name}. {problem.cost_name} falls "
-        f"from {costs[0]:.6g} to {costs[-1]:.6g}, and the proven lower bound rises from "
-        f"{bounds[0]:.6g} to {bounds[-1]:.6g}."
+        f"{graph.name} from {iterates[0].name} to {iterates[-1].name}. "
+        f"{problem.cost_name} {_course(costs)}, and the proven lower bound {_course(bounds)}."
     )
     return animate(
         frames,
@@ -167,6 +166,15 @@ def _film_of(problem: PGOProblem, iterates: Sequence[FilmedIterate]) -> Figure:
         title=f"{graph.name}: {problem.cost_name} and what is proven of it",
         description=description,
     )
+
+
+def _course(values: Array) -> str:
+    """Where values go from the first to the last, in words."""
+    first = f"{values[0]:.6g}"
+    last = f"{values[-1]:.6g}"
+    if first == last:
+        return f"stays at {last}"
+    return f"{'falls' if values[-1] < values[0] else 'rises'} from {first} to {last}"
 
 
 def _shares(distance: Array, least: float) -> Array:

@@ -57,6 +57,13 @@ def test_a_frame_draws_every_edge_at_the_poses_of_its_iterate(d: int) -> None:
         )
 
 
+def test_the_description_of_a_film_says_of_what_stands_still_that_it_stays() -> None:
+    graph = pgo.load("grid")
+    best = solvers.solve(graph).poses
+    film = solvers.film(graph, [solvers.Newton()], start=best)
+    assert " stays at " in film.layout.meta["description"]
+
+
 def test_films_of_large_graphs_stay_small_and_keep_their_paths_and_ends() -> None:
     graph = pgo.grid_world(2, 3000, np.random.default_rng(0), d=3)
     film = pgo.animate_poses(graph, [graph.truth] * 60)
@@ -119,7 +126,9 @@ def test_a_film_of_methods_shows_cost_and_bound_closing_in() -> None:
     assert max(above[-1], below[-1]) < 1e-9
     assert (np.diff(below) <= 0.0).all()  # the best bound counts
     solution = solvers.solve(graph)
-    assert f"{solution.objective:.6g}" in film.layout.meta["description"]
+    description = film.layout.meta["description"]
+    assert " falls from " in description
+    assert f" to {solution.objective:.6g}, and the proven lower bound rises from " in description
     for k, frame in enumerate(film.frames):
         markers = [trace for trace in frame.data if trace.mode == "markers"]
         assert [(marker.x[0], marker.y[0]) for marker in markers] == [(k, above[k]), (k, below[k])]
