@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, overload
 
 import numpy as np
@@ -32,12 +32,17 @@ from solvers.loop import run
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
 from solvers.place import Attempt, Place, Step
-from solvers.places import solution_by
+from solvers.places import in_local_world, solution_by
 from solvers.plan import solve_at, unless_it_fails
 from solvers.request import Pipeline, SolveRequest
 from solvers.riemannian.growing_map import GrowingMap
 from solvers.riemannian.newton import Newton
 from solvers.robots import Robots
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC
+from solvers.robust.revision import inlier_problem
+from solvers.robust.weighted_edges import held_together, known_inliers
+from solvers.robust_solves.robust_solve import go_on_robustly
 from solvers.soc.subgraph import PartProblem
 from solvers.solution import Solution
 
@@ -302,6 +307,7 @@ def extend(
     *,
     certify: Literal[True] = True,
     robots: Robots | Partition | None = None,
+    robust: GNC | PCM | None = None,
 ) -> Solution: ...
 
 
@@ -313,6 +319,7 @@ def extend(
     *,
     certify: Literal[False],
     robots: Robots | Partition | None = None,
+    robust: GNC | PCM | None = None,
 ) -> GrowingSolution: ...
 
 
@@ -324,6 +331,7 @@ def extend(
     *,
     certify: bool = True,
     robots: Robots | Partition | None = None,
+    robust: GNC | PCM | None = None,
 ) -> Solution | GrowingSolution:
     """Solve a graph that has grown out of another one, from the solution of that.
 
@@ -347,6 +355,11 @@ def extend(
         Robots that own the poses of the grown graph. Unless their owners are given, they are those
         of the solution. A new pose goes to the robot that the graph names, or where these are not
         the robots of the solution, to that of the pose that its first edge joins it with.
+    robust : GNC or PCM, optional
+        How to find wrong edges among the new ones, as in `solve`. Edges that the solution has kept
+        stay, and those that it rejected stay out, unless the new ones speak against that: new
+        closures are tested in clusters against the map, and so are those rejected and kept before
+        (`go_on_robustly`).
 
     Returns
     -------
@@ -358,8 +371,8 @@ def extend(
     GraphError
         When the graph has no pose of the solution, or is not connected.
     SettingError
-        When no certificate is asked for, and there are robots, landmarks or priors, or the cost is
-        not quadratic; when the robots are not those of the graph's poses.
+        When no certificate is asked for, and there are robots, landmarks or priors, wrong edges are
+        sought, or the cost is not quadratic; when the robots are not those of the graph's poses.
 
     Examples
     --------
@@ -369,6 +382,12 @@ def extend(
     >>> solution = solve(graph.subgraph(np.arange(18)))
     >>> extend(solution, graph).is_certified
     True
+
+    Closures that are new are doubted, one after the other:
+
+    >>> from solvers import GNC
+    >>> extend(solution, graph, robust=GNC()).robust.rejected.sum()
+    np.int64(0)
 
     Robots go on with what they own, and so does the account of what they send:
 
@@ -387,6 +406,8 @@ def extend(
             raise SettingError(
                 "certify=False is for updates in one place; robots go on with a certificate"
             )
+        if robust is not None:
+            raise SettingError("robust updates have a certificate; leave certify=False out")
         if isinstance(solution, Solution):
             solution = GrowingSolution.of(solution)
         return solution._with_whole(graph)
@@ -396,10 +417,44 @@ def extend(
     if not isinstance(weighting, Weighting):
         weighting = Weighting.ISOTROPIC
     problem = PGOProblem(graph, solution.problem.backend, weighting)
-    start = extended_poses(problem, solution.problem.graph.pose_ids, solution.poses)
-    grown = _solve_from(problem, pipeline, start, shared)
+    ids = solution.problem.graph.pose_ids
+    if robust is None:
+        start = extended_poses(problem, ids, solution.poses)
+        grown = _solve_from(problem, pipeline, start, shared)
+    else:
+        kept, new = _decided_before(solution, graph)
+        kept = held_together(
+            graph, kept | known_inliers(graph, robust.known), np.zeros(graph.num_edges)
+        )
+        start = extended_poses(inlier_problem(problem, kept), ids, solution.poses)
+        request = SolveRequest(problem, pipeline, start, robots=shared)
+        grown = in_local_world(partial(go_on_robustly, robust, kept, new), request)
     before = solution.ledger if isinstance(solution, Solution) else None
     return replace(grown, ledger=_joined(before, grown.ledger))
+
+
+def _decided_before(
+    solution: Solution | GrowingSolution, graph: PoseGraph
+) -> tuple[BoolArray, BoolArray]:
+    """Edges of a grown graph, (m,): those that the solution before has kept, and new ones."""
+    rejection = solution.robust if isinstance(solution, Solution) else None
+    before = solution.problem.graph if rejection is None else rejection.problem.graph
+    measured = _measurements(before)
+    is_kept = np.ones(len(measured), dtype=bool) if rejection is None else rejection.kept
+    decisions = dict(zip(measured, is_kept.tolist(), strict=True))
+    decided = [decisions.get(row) for row in _measurements(graph)]
+    kept = np.array([decision is True for decision in decided])
+    return kept, np.array([decision is None for decision in decided])
+
+
+def _measurements(graph: PoseGraph) -> list[tuple[int, int, bytes, bytes]]:
+    """What tells an edge from others: the ids of its poses, and what it measures."""
+    ids = graph.pose_ids
+    tails = ids[graph.i].tolist()
+    heads = ids[graph.j].tolist()
+    turns = [R.tobytes() for R in graph.R_ij]
+    shifts = [t.tobytes() for t in graph.t_ij]
+    return list(zip(tails, heads, turns, shifts, strict=True))
 
 
 def _check_grown(before: PoseGraph, graph: PoseGraph) -> None:

@@ -14,7 +14,7 @@ lower the truncated cost of `revision`, which decides of exchanges.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -32,7 +32,7 @@ from solvers.robust.chains import Chains
 from solvers.robust.clusters import closure_clusters
 from solvers.robust.distances import FirstOrder
 from solvers.robust.revision import Fit, inlier_problem, is_held, truncated_cost
-from solvers.robust.weighted_edges import held_together
+from solvers.robust.weighted_edges import first_poses, held_together
 
 # Probability with which a right cluster passes the test.
 _QUANTILE = 0.99
@@ -86,7 +86,9 @@ class ClusterSearch:
     """Search among the edges of `problem` that are not `known`, (m,).
 
     `allowed` (m,) are the thresholds of the truncated cost, times the scale s, which is `scale`.
-    The search ends early, with the best it has, once `has_time` is false.
+    The search ends early, with the best it has, once `has_time` is false. `new` (m,) are edges that
+    have come since others were decided upon: a run of closures with one of them may stand in place
+    of kept ones although it is far from the map.
     """
 
     problem: PGOProblem
@@ -94,6 +96,7 @@ class ClusterSearch:
     allowed: Array
     scale: float
     has_time: Callable[[], bool]
+    new: BoolArray | None = None
 
     @cached_property
     def clusters(self) -> list[IntArray]:
@@ -308,17 +311,50 @@ class ClusterSearch:
 
     def _exchanged(self, fit: Fit) -> Fit | None:
         """A fit of less truncated cost, by a rejected cluster that excludes some of those kept."""
-        cost = self.cost(fit)
+        limit = (1.0 - _LEAST_DECREASE) * self.cost(fit)
         candidates = self._candidates(fit)
         for k in candidates.order[: self._most_failures].tolist():
             if not self.has_time():
                 return None
-            if candidates.ratio(k) > _NEAR:
-                continue
-            other = self._in_place_of_misfits(fit, candidates.groups[k])
-            if self.cost(other) < (1.0 - _LEAST_DECREASE) * cost:
+            if candidates.ratio(k) <= _NEAR:
+                other = self._in_place_of_misfits(fit, candidates.groups[k])
+                if self.cost(other) < limit:
+                    return other
+        for run in self._rivals(fit):
+            if not self.has_time():
+                return None
+            # The map can bend between two clusters that contradict each other.
+            other = self._without_misfits(self._in_place_of_misfits(fit, run))
+            if self.cost(other) < limit:
                 return other
         return None
+
+    def _rivals(self, fit: Fit) -> Iterator[IntArray]:
+        """Rejected runs with new closures that are near odometry, if known edges hold the poses.
+
+        What excludes a kept cluster is far from a map that this has bent. A single closure hardly
+        outweighs others.
+        """
+        if self.new is None or self._at_odometry is None:
+            return
+        candidates = self._at_odometry
+        num_left = self._most_failures
+        for k in candidates.order.tolist():
+            run = candidates.groups[k]
+            if len(run) > 1 and self.new[run].any() and not fit.kept[run].any():
+                if candidates.ratio(k) <= _NEAR:
+                    yield run
+                num_left -= 1
+            if num_left == 0:
+                return
+
+    @cached_property
+    def _at_odometry(self) -> _Candidates | None:
+        """Clusters near the map of the known edges; None where these do not hold the poses."""
+        graph = self.problem.graph
+        if not is_held(graph, self.known):
+            return None
+        return self._candidates(self._settled(self.known, first_poses(graph, self.known)))
 
     def _in_place_of_misfits(self, fit: Fit, cluster: IntArray) -> Fit:
         """The fit with a cluster, and then with the edges within their thresholds alone."""

@@ -24,7 +24,7 @@ from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
 from solvers.robust.revision import Fit, drop_contradicted, error_scale
-from solvers.robust.weighted_edges import known_inliers
+from solvers.robust.weighted_edges import held_together, known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
     Estimate,
@@ -79,14 +79,8 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     SettingError when robust is neither GNC nor PCM; a GraphError when known inliers and the edges
     kept do not connect the poses.
     """
-    if not isinstance(robust, GNC | PCM):
-        raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
-    request = with_partition(request)
-    problem = request.problem
-    known = known_inliers(problem.graph, robust.known)
-    thresholds = chi2_thresholds(problem, robust.quantile)
-    doubted = DoubtedProblem(problem, known, thresholds, robust.quantile)
-    job = _RobustSolve(doubted, PlacesOfEdges(doubted, request), request.start)
+    job = _RobustSolve.of(robust, request)
+    doubted = job.doubted
     if request.start is None and (doubted.is_cheap or job.seems_right()):
         answer = job.answer_by_least_squares()
         if answer is not None:
@@ -97,12 +91,32 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     return job.answer_by_attempts(ending)
 
 
+def go_on_robustly(
+    robust: GNC | PCM, kept: BoolArray, new: BoolArray, request: SolveRequest
+) -> Solution:
+    """Solution of a graph that has grown, from its start, without the edges that are wrong.
+
+    `kept` (m,) are the edges that were kept before, and `new` (m,) those that were not there. All
+    that are neither kept nor known are candidates: they are tested in clusters against the map,
+    which may also lose clusters that it has kept, or exchange one for another (`ClusterSearch`). So
+    a later closure can revise an earlier decision. There is one attempt, which is cheap; a robust
+    solve of the whole graph makes several. With PCM the pairwise consistent edges are those kept.
+    Errors are those of `solve_robustly`.
+    """
+    job = _RobustSolve.of(robust, request)
+    job.new = new
+    if isinstance(robust, PCM):
+        return job.answer_by_consistency(robust.quantile)
+    return job.answer_by_update(kept)
+
+
 @dataclass(eq=False)
 class _RobustSolve:
     """A robust solve under way: what its stages share, and the estimates made so far.
 
     `least_squares` are the poses of the solution with every edge, once it was found. `failures` are
-    sentences on what failed that could only have improved the answer.
+    sentences on what failed that could only have improved the answer. `new` (m,) are the edges that
+    were not there before, if the graph has grown.
     """
 
     doubted: DoubtedProblem
@@ -111,7 +125,20 @@ class _RobustSolve:
     least_squares: Poses | None = None
     estimates: list[Estimate] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
+    new: BoolArray | None = None
     began: float = field(default_factory=time.perf_counter)
+
+    @classmethod
+    def of(cls, robust: GNC | PCM, request: SolveRequest) -> _RobustSolve:
+        """Begin a robust solve of what is requested."""
+        if not isinstance(robust, GNC | PCM):
+            raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
+        request = with_partition(request)
+        problem = request.problem
+        known = known_inliers(problem.graph, robust.known)
+        thresholds = chi2_thresholds(problem, robust.quantile)
+        doubted = DoubtedProblem(problem, known, thresholds, robust.quantile)
+        return cls(doubted, PlacesOfEdges(doubted, request), request.start)
 
     @property
     def choice(self) -> Choice:
@@ -197,6 +224,20 @@ class _RobustSolve:
         kept = known | pairwise_consistent(self.doubted.problem.graph, known, quantile)
         solution = self.places.solution(kept, self.start)
         return self._result(solution, kept, 1.0, "pairwise consistency alone")
+
+    # In place of attempts: the edges kept before the graph has grown
+
+    def answer_by_update(self, kept: BoolArray) -> Solution:
+        """The solution that goes on from the edges `kept`, (m,), and the start, once revised."""
+        doubted = self.doubted
+        assert self.start is not None
+        ratio = doubted.problem.edge_costs(self.start) / doubted.thresholds
+        kept = held_together(doubted.problem.graph, kept | doubted.known, ratio)
+        plan = Plan("the solution before", None, kept)
+        self.estimates.append(self.places.attempt(plan, self.start))
+        if self.estimates[-1].status not in OUT_OF_TIME:
+            self._revise_last()
+        return self.answer_by_attempts(self.estimates[-1].status)
 
     # Step 2: attempts
 
@@ -287,7 +328,9 @@ class _RobustSolve:
         doubted = self.doubted
         scale = choice.threshold_scale
         allowed = scale * doubted.thresholds
-        return ClusterSearch(doubted.problem, doubted.known, allowed, scale, self._has_time)
+        return ClusterSearch(
+            doubted.problem, doubted.known, allowed, scale, self._has_time, self.new
+        )
 
     def _by_chance(self, solution: Solution, kept: BoolArray) -> float:
         """Number of wrong closures that are expected to fit by chance.
