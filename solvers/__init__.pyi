@@ -113,6 +113,7 @@ from solvers.studies.tightness import (
     SweptScene as SweptScene,
     noise_sweep as noise_sweep,
 )
+from solvers.team.robot import Robot as Robot
 
 __all__ = [
     "History",
@@ -130,6 +131,7 @@ __all__ += [
     "FolderSolution",
     "GrowingSolution",
     "Pipeline",
+    "Robot",
     "Robots",
     "Solution",
     "certify",

@@ -27,7 +27,7 @@ from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.own_files import OpenedFiles, open_files
-from solvers.distributed.robots.own_file import READ_HERE, write_answer
+from solvers.distributed.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.distributed.robots_with_files import RobotsWithFiles
 from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
@@ -200,34 +200,56 @@ def solve_folder(
     files = list(enumerate(g2o_files(folder)))
     if out is not None:
         check_g2o_folder(out, len(files))
-    stages: list[Stage] = []
     engine = _engine_of_robots(robots.engine, len(files))
-    opened = open_files(files, engine, robots.driver_memory, weighting, trust_folder)
-    name = f"{folder.name}, {FILES_HERE}" if opened.num_absent else folder.name
-    driver = opened.driver
-    journal = Journal(None, {}, stages)
-    with closing(driver):
-        place = RobotsWithFiles(
-            monitor, stages, driver, journal, None, name, pipeline.gap, opened.weighting
+    job = FilesOfRobots(folder.name, files, engine, robots.driver_memory, weighting, trust_folder)
+    return job.solved(pipeline, monitor, None if out is None else Path(out).absolute())
+
+
+@dataclass(frozen=True, eq=False)
+class FilesOfRobots:
+    """Files that robots read, each where it runs, under one name, to be solved for one cost.
+
+    `engine` runs the robots, `memory` are the bytes that the driver's fronts may take.
+    """
+
+    name: str
+    files: list[RobotFile]
+    engine: Engine
+    memory: float
+    weighting: Weighting
+    trust_folder: bool = False
+
+    def solved(
+        self, pipeline: Pipeline, monitor: RunMonitor, out: Path | None = None
+    ) -> FolderSolution:
+        """The solution, which robots write to the folder `out`, if it is given."""
+        stages: list[Stage] = []
+        opened = open_files(self.files, self.engine, self.memory, self.weighting, self.trust_folder)
+        name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
+        driver = opened.driver
+        journal = Journal(None, {}, stages)
+        with closing(driver):
+            place = RobotsWithFiles(
+                monitor, stages, driver, journal, None, name, pipeline.gap, opened.weighting
+            )
+            best = solve_at(place, pipeline, None)
+            best, frame, F = place.move_to_frame(best)
+            if out is not None:
+                nothing = [None] * len(self.files)
+                driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)
+        return FolderSolution(
+            name=name,
+            certificate=best.proof,
+            sizes=opened.sizes,
+            status=best.status,
+            stages=tuple(stages),
+            ledger=driver.network.ledger,
+            frame=frame,
+            F=F,
+            note=_note(self.weighting, opened, place.note(best)),
+            num_absent=opened.num_absent,
+            seconds=time.perf_counter() - monitor.began,
         )
-        best = solve_at(place, pipeline, None)
-        best, frame, F = place.move_to_frame(best)
-        if out is not None:
-            write = partial(write_answer, Path(out).absolute())
-            driver.network.ask(write, [None] * len(files), Count.PIGGYBACKED)
-    return FolderSolution(
-        name=name,
-        certificate=best.proof,
-        sizes=opened.sizes,
-        status=best.status,
-        stages=tuple(stages),
-        ledger=driver.network.ledger,
-        frame=frame,
-        F=F,
-        note=_note(weighting, opened, place.note(best)),
-        num_absent=opened.num_absent,
-        seconds=time.perf_counter() - monitor.began,
-    )
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:

@@ -62,6 +62,7 @@ ORDER = {
         "extended_solve",
         "pipeline",
         "folder_solve",
+        "team",
         "growing",
         "readings",
         "noise",

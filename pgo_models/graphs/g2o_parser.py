@@ -5,6 +5,7 @@ decided in `g2o_dialects`.
 """
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -118,9 +119,20 @@ def read_lines(
     beside lines in 3D.
     """
     path = Path(path)
+    return parse_lines(path, read_blocks(path), skip_unknown, reading, needs_matrices)
+
+
+def parse_lines(
+    path: Path,
+    blocks: Iterable[str],
+    skip_unknown: bool = False,
+    reading: Reading = Reading.AS_WRITTEN,
+    needs_matrices: bool = True,
+) -> G2OLines:
+    """Lines of the text that `blocks` are, whole lines each; errors name the `path`."""
     source = Source(path, skip_unknown)
     first_line = 1
-    for block in read_blocks(path):
+    for block in blocks:
         lines = block.removesuffix("\n").split("\n")
         source.take(first_line, lines)
         first_line += len(lines)

@@ -109,6 +109,16 @@ COMMANDS = {
         "solvers.cli.certify_command:certify_command",
         "Judge poses from anywhere: how far their cost can be above the global optimum.",
     ),
+    "robot": CommandOfModule(
+        "solvers.cli.robot_command:robot_command",
+        "Solve as one robot of a team: every robot on its machine, with its own file.",
+        examples=(
+            "head -c 32 /dev/urandom > team.key",
+            "pgo robot a.g2o --name a --team a,b --key team.key --listen 0.0.0.0:7447",
+            "pgo robot b.g2o --name b --team a,b --key team.key --listen 0.0.0.0:7447 "
+            "--connect first:7447",
+        ),
+    ),
     "info": CommandOfModule(
         "solvers.cli.info_command:info_command",
         "Show what a pose graph is made of, or what this installation has.",

@@ -22,9 +22,9 @@ COMPUTED_AGAIN = {"is_computed_again": True}
 def serialize(value: object) -> dict[str, NDArray[Any]]:
     """Arrays of which `deserialize` makes an equal record.
 
-    The record is None, a number, a string, an array, a member of an enum, a dataclass, a sequence
-    of such, or a mapping of strings or integers to such; a sequence comes back as a tuple. Raises a
-    TypeError if it contains anything else.
+    The record is None, a number, a string, an array, a member of an enum, a dataclass or a named
+    tuple, a sequence of such, or a mapping of strings or integers to such; a sequence comes back as
+    a tuple. Raises a TypeError if it contains anything else.
     """
     arrays: _Arrays = {}
     tree = json.dumps(_describe(value, arrays))
@@ -56,12 +56,8 @@ def _describe(value: object, arrays: _Arrays) -> object:
         return {"array": number}
     if isinstance(value, enum.Enum):
         return {"enum": type(value).__name__, "member": value.name}
-    if dataclasses.is_dataclass(value):
-        names = [
-            field.name
-            for field in dataclasses.fields(value)
-            if not field.metadata.get("is_computed_again")
-        ]
+    names = _names_of_fields(value)
+    if names is not None:
         fields = {name: _describe(getattr(value, name), arrays) for name in names}
         return {"class": type(value).__name__, "fields": fields}
     if isinstance(value, Mapping):
@@ -72,6 +68,14 @@ def _describe(value: object, arrays: _Arrays) -> object:
     if isinstance(value, Sequence):
         return {"items": [_describe(item, arrays) for item in value]}
     raise TypeError(f"cannot serialize {value!r}")
+
+
+def _names_of_fields(value: object) -> list[str] | None:
+    """Names of what a dataclass or a named tuple is made of; None of anything else."""
+    if dataclasses.is_dataclass(value):
+        fields = dataclasses.fields(value)
+        return [field.name for field in fields if not field.metadata.get("is_computed_again")]
+    return list(getattr(value, "_fields", ())) or None
 
 
 def _rebuild(

@@ -222,6 +222,10 @@ class FileAgent(BaseAgent):
         self.robot, self.path = source
         self.record: FileRecord | None = None
 
+    def lines(self) -> G2OLines:
+        """Lines of its file."""
+        return read_lines(self.path)
+
     def known(self, kind: type[F]) -> F:
         """What the order before has left."""
         assert isinstance(self.record, kind)
@@ -243,7 +247,7 @@ def read_file(agent: FileAgent, _: None) -> Claim:
 
     Errors are those of `read_lines`, and a GraphError for priors and landmarks.
     """
-    lines = read_lines(agent.path)
+    lines = agent.lines()
     if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():
         raise GraphError(
             f"{agent.path} has priors or landmarks, which all robots share; {READ_HERE}"

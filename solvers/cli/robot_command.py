@@ -1,0 +1,128 @@
+"""`pgo robot`: one robot of a team, on its own machine, with its own file."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pgo_models.errors import FileFormatError, SettingError
+from pgo_models.files import check_writable
+from pgo_models.problem.weighting import Weighting
+from solvers.cli.options import Cost, CostOption
+from solvers.cli.shell import (
+    DONE,
+    NOT_CERTIFIED,
+    JsonOption,
+    QuietOption,
+    save_then_show,
+    wrapped,
+)
+
+if TYPE_CHECKING:
+    from solvers.team.messages import Outcome
+    from solvers.team.robot import Robot
+
+_INDENT = 13  # columns of the labels
+_WEIGHTINGS = {
+    None: Weighting.OWN,
+    Cost.CHI2: Weighting.INFORMATION,
+    Cost.ISOTROPIC: Weighting.ISOTROPIC,
+}
+
+
+def robot_command(
+    graph: Annotated[
+        Path,
+        typer.Argument(help="The g2o file of this robot: its poses and edges."),
+    ],
+    name: Annotated[str, typer.Option("--name", help="Name of this robot.")],
+    team: Annotated[str, typer.Option("--team", help="Names of all robots, as a,b,c.")],
+    key: Annotated[
+        Path, typer.Option("--key", help="File with the secret of the team, 16 bytes or more.")
+    ],
+    listen: Annotated[
+        str, typer.Option("--listen", metavar="HOST:PORT", help="Where others reach this robot.")
+    ],
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--connect",
+            metavar="HOST:PORT",
+            help="Where another robot listens; may be given again. One is enough.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Write this robot's poses and edges as .g2o.")
+    ] = None,
+    cost: CostOption = None,
+    patience: Annotated[
+        float,
+        typer.Option("--patience", help="Seconds after which a silent robot counts as absent."),
+    ] = 10.0,
+    wait: Annotated[
+        float, typer.Option("--wait", help="Seconds to wait for robots that are absent.")
+    ] = math.inf,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run `pgo robot`."""
+    from solvers.team.robot import Robot  # greenlet and Zenoh are of an extra
+    from solvers.team.zenoh_link import ZenohLink, carry
+
+    if out is not None:
+        check_writable(out)
+    if cost not in _WEIGHTINGS:
+        raise SettingError("robots of a team minimise chi2 or F; give --cost chi2 or isotropic")
+    names = [word.strip() for word in team.split(",")]
+    robot = Robot(name, names, _secret(key), weighting=_WEIGHTINGS[cost], patience=patience)
+    robot.read(graph)
+    reporter = _Reporter(quiet or as_json)
+    interrupted = False
+    with ZenohLink(robot, listen, connect or []) as link:
+        reporter.say(f"{name} listens at {listen}, and waits for {', '.join(robot.others)}")
+        try:
+            carry(robot, link, wait, reporter)
+        except KeyboardInterrupt:
+            if robot.outcome is None:
+                raise
+            interrupted = True
+    writers = [(out, robot.write)] if out is not None and robot.poses else []
+    record = robot.as_json if as_json else None
+    text = wrapped("\n".join(f"{label:<12} {value}" for label, value in robot.facts()), _INDENT)
+    save_then_show(writers, lambda: typer.echo(text), record, quiet)
+    is_done = robot.is_certified and not interrupted
+    raise typer.Exit(DONE if is_done else NOT_CERTIFIED)
+
+
+def _secret(path: Path) -> bytes:
+    """The secret of a team, from its file."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        problem = f"the key of the team cannot be read: {error.strerror}"
+        raise FileFormatError(path, None, problem) from error
+
+
+class _Reporter:
+    """Says on stderr who is there, and how solves end."""
+
+    def __init__(self, is_silent: bool) -> None:
+        self._is_silent = is_silent
+        self._said: set[str] = set()
+        self._outcome: Outcome | None = None
+
+    def __call__(self, robot: "Robot") -> None:
+        """Say what is new of a robot."""
+        for other in robot.ledger.received:
+            if other not in self._said:
+                self._said.add(other)
+                self.say(f"{other} is there")
+        if robot.outcome is not self._outcome and robot.outcome is not None:
+            self._outcome = robot.outcome
+            self.say(f"{robot.outcome.text}")
+
+    def say(self, text: str) -> None:
+        """Print a line on stderr."""
+        if not self._is_silent:
+            typer.echo(f"pgo: {text}", err=True)

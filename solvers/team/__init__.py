@@ -1,0 +1,1 @@
+"""Robots that are apart: an object for each, which exchanges messages and knows no network."""

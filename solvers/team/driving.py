@@ -1,0 +1,107 @@
+"""A solve that one robot drives, step by step, as the answers of the others arrive.
+
+The page of a solve (`solvers.plan`) asks robots and waits. Here it runs in a coroutine of the
+package greenlet: where it would wait, it stops, and goes on when the last answer is there. So the
+robot that drives has neither threads nor sockets, and the page is the one of every other place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+from pgo_models.errors import PGOError
+from pgo_models.problem.weighting import Weighting
+from solvers.distributed.robots.own_file import FileAgent
+from solvers.folder_solve import FilesOfRobots, FolderSolution
+from solvers.loop import RunMonitor
+from solvers.network.engine import DEFAULT_MEMORY
+from solvers.network.messages import Idle, Worker, obey, raise_first_error
+from solvers.request import Pipeline
+from solvers.team.messages import Ask, Reply, Term, error_of_message
+from solvers.team.wire import Order
+
+T = TypeVar("T")
+Q = TypeVar("Q")
+A = TypeVar("A")
+
+
+class _AbandonedError(BaseException):
+    """Raised in the page of a solve that is given up; no page catches it."""
+
+
+@dataclass(eq=False)
+class Drive:
+    """A solve of the term by the robots `members`, the first of which is this one, with its agent.
+
+    `waiting` are the asks without an answer, by robot, `outcome` the solution or error at the end.
+    """
+
+    greenlet: ModuleType
+    term: Term
+    members: tuple[str, ...]
+    agent: FileAgent
+    pipeline: Pipeline
+    weighting: Weighting
+    call: int = -1
+    waiting: dict[str, Ask] = field(default_factory=dict)
+    outcome: FolderSolution | PGOError | None = None
+    _answers: list[Any] = field(default_factory=list)
+    _page: Any = None
+
+    def begin(self) -> None:
+        """Run the page until it waits for answers, or ends."""
+        self._page = self.greenlet.greenlet(self._solve)
+        self._page.switch()
+
+    def take(self, robot: str, reply: Reply) -> None:
+        """Take an answer; with the last one the page goes on."""
+        if reply.call != self.call or robot not in self.waiting:
+            return
+        del self.waiting[robot]
+        place = self.members.index(robot)
+        error = reply.error
+        self._answers[place] = reply.answer if error is None else error_of_message(error, robot)
+        if not self.waiting:
+            self._page.switch()
+
+    def abandon(self) -> None:
+        """Give the solve up."""
+        if self._page is not None and not self._page.dead:
+            self._page.throw(_AbandonedError)
+        self.waiting.clear()
+
+    def _solve(self) -> None:
+        files = [(k, Path(f"{name}.g2o")) for k, name in enumerate(self.members)]
+        job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting)
+        try:
+            self.outcome = job.solved(self.pipeline, RunMonitor(progress=False))
+        except PGOError as error:
+            self.outcome = error
+        except _AbandonedError:
+            pass
+
+    # An engine, and its pool of workers: the robots are there already.
+
+    def open(self, make: Callable[[T], Worker], parts: Sequence[T]) -> Drive:
+        """Return the pool of the robots, which have their parts."""
+        return self
+
+    def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
+        """Give every robot an order with its request, and wait for all answers."""
+        self.call += 1
+        named = Order.of(order)
+        self._answers = [None] * len(requests)
+        for place, (name, request) in enumerate(zip(self.members, requests, strict=True)):
+            if place > 0 and request is not Idle.IDLE:
+                self.waiting[name] = Ask(self.term, self.call, place, named, request)
+        self._answers[:1] = obey([self.agent], order, requests[:1])
+        if self.waiting:
+            self.greenlet.getcurrent().parent.switch()
+        return raise_first_error(self._answers)
+
+    def close(self) -> None:
+        """Keep the robots: they outlive a solve."""

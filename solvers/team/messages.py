@@ -1,0 +1,123 @@
+"""What robots of a team send each other, and errors as messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from pgo_models import errors
+from pgo_models.certificates.certificate import Certificate
+from pgo_models.errors import PGOError
+from solvers.team.wire import Order
+
+_PLAIN_ERRORS = {
+    kind.__name__: kind
+    for kind in (errors.GraphError, errors.NotPositiveDefiniteError, errors.SettingError)
+}
+
+
+class Priority(IntEnum):
+    """What a transport may send first where it cannot send everything at once."""
+
+    URGENT = 0  # others wait for it
+    NORMAL = 1
+
+
+@dataclass(frozen=True, order=True)
+class Term:
+    """Names a solve: a number that only grows, and the robot that drives."""
+
+    number: int
+    driver: str
+
+
+@dataclass(frozen=True)
+class Hello:
+    """A robot is there, with measurements of this revision; `term` is the latest that it knows."""
+
+    revision: int
+    term: Term
+
+
+@dataclass(frozen=True, eq=False)
+class Ask:
+    """Order number `call` of a solve, with its request; `place` is the robot's number in it."""
+
+    term: Term
+    call: int
+    place: int
+    order: Order
+    request: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Reply:
+    """The answer to order number `call`, or what went wrong."""
+
+    term: Term
+    call: int
+    answer: Any
+    error: tuple[str, str] | None = None  # name and text of a PGOError
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How a solve of the team has ended.
+
+    Parameters
+    ----------
+    term : Term
+        The solve.
+    certificate : Certificate, optional
+        Cost, bound, gap and verdict, without poses; None where the solve failed.
+    covered : tuple of str
+        Robots whose measurements it holds for.
+    absent : tuple of str
+        Robots of the team that were not heard of.
+    num_absent_poses : int
+        Poses that edges name and no robot has: what is found holds for these edges all the same.
+    rounds : int
+        Rounds of the solve.
+    note : str
+        What went wrong, or what the solution lacks.
+    """
+
+    term: Term
+    certificate: Certificate | None
+    covered: tuple[str, ...]
+    absent: tuple[str, ...]
+    num_absent_poses: int = 0
+    rounds: int = 0
+    note: str = ""
+
+    @property
+    def text(self) -> str:
+        """What is proven, and of which robots, in a line."""
+        if self.certificate is None:
+            return self.note
+        names = ", ".join(self.covered)
+        gap = self.certificate.gap_text
+        return f"{self.certificate.verdict.name} for {names}: gap {gap}, {self.rounds} rounds"
+
+
+@dataclass(frozen=True)
+class Heard:
+    """The outcome of this solve has arrived."""
+
+    term: Term
+
+
+MESSAGES = (Hello, Ask, Reply, Outcome, Heard, Term)
+
+
+def error_as_message(error: PGOError) -> tuple[str, str]:
+    """Name and text of an error."""
+    return type(error).__name__, str(error)
+
+
+def error_of_message(message: tuple[str, str], robot: str) -> PGOError:
+    """The error of another robot, of its kind where that has a text alone."""
+    name, text = message
+    kind = _PLAIN_ERRORS.get(name)
+    return PGOError(f"{robot}: {text}") if kind is None else kind(text)

@@ -1,0 +1,799 @@
+"""A robot of a team that solves together: an object without sockets, threads or a clock.
+
+Whoever has a network gives the robot what arrives (`receive`) and the time (`tick`), and sends what
+it has to say (`outbox`). Every robot keeps its own measurements. The robot whose name comes first
+among those that are awake drives: it runs the solve of robots with files of their own
+(`solvers.folder_solve`), learns the interface between the robots, and passes on what they tell each
+other. Any robot can be the one. Messages may be lost, late, repeated, or come in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pgo_models.errors import GraphError, PGOError, SettingError, door, extra_module
+from pgo_models.files import replace_when_done
+from pgo_models.geometry.arrays import real_array
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.g2o_parser import G2OLines, parse_lines
+from pgo_models.graphs.g2o_rows import numbers_of
+from pgo_models.problem.weighting import Weighting
+from solvers.distributed.robots.own_file import FileAgent, PlacedFile
+from solvers.folder_solve import FolderSolution
+from solvers.network.serialization import deserialize, serialize
+from solvers.request import Pipeline
+from solvers.team.driving import Drive
+from solvers.team.messages import (
+    MESSAGES,
+    Ask,
+    Heard,
+    Hello,
+    Outcome,
+    Priority,
+    Reply,
+    Term,
+    error_as_message,
+)
+from solvers.team.wire import WireError, opened, packed, records_of_rooms, sealed, unpacked
+
+PATIENCE = 10.0  # seconds
+RETRY = 1.0
+_FEWEST_KEY_BYTES = 16
+_EDGE_TAGS = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
+_VERTEX_TAGS = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
+
+
+class Message(NamedTuple):
+    """A message to be sent: the robot that it is for, its bytes, and what goes first."""
+
+    to: str
+    data: bytes
+    priority: Priority
+
+
+@dataclass(frozen=True, eq=False)
+class TeamLedger:
+    """Bytes that a robot has handed out for others and received from them, by robot.
+
+    `messages` counts those handed out, `dropped` those received that were none of the team.
+    """
+
+    sent: Mapping[str, int] = field(default_factory=dict)
+    received: Mapping[str, int] = field(default_factory=dict)
+    messages: int = 0
+    dropped: int = 0
+
+    @property
+    def both(self) -> tuple[Mapping[str, int], Mapping[str, int]]:
+        """Bytes sent, and bytes received."""
+        return self.sent, self.received
+
+    def after_sending(self, message: Message) -> TeamLedger:
+        """Return the ledger after one more message."""
+        sent = _with_more(self.sent, message.to, len(message.data))
+        return replace(self, sent=sent, messages=self.messages + 1)
+
+    def after_receiving(self, robot: str, data: bytes) -> TeamLedger:
+        """Return the ledger after a message of another robot."""
+        return replace(self, received=_with_more(self.received, robot, len(data)))
+
+    def after_dropping(self) -> TeamLedger:
+        """Return the ledger after bytes that were no message of the team."""
+        return replace(self, dropped=self.dropped + 1)
+
+
+def _with_more(counts: Mapping[str, int], name: str, more: int) -> Mapping[str, int]:
+    return {**counts, name: counts.get(name, 0) + more}
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """A message and who it is from and to."""
+
+    sender: str
+    receiver: str
+    message: object
+
+
+@dataclass(frozen=True, eq=False)
+class Saved:
+    """What `Robot.save` keeps."""
+
+    name: str
+    team: tuple[str, ...]
+    lines: tuple[str, ...]
+    term: Term
+    outcome: Outcome | None
+    ids: Array
+    poses: Poses | None
+
+
+class _Agent(FileAgent):
+    """The robot's part in a solve, with lines in place of a file."""
+
+    def __init__(self, number: int, name: str, text: str) -> None:
+        super().__init__((number, Path(f"{name}.g2o")))
+        self._text = text
+
+    def lines(self) -> G2OLines:
+        """Lines of the robot's measurements."""
+        return parse_lines(self.path, [self._text])
+
+
+@dataclass(eq=False)
+class _Part:
+    """The part of this robot in a solve: its agent, and its last answer, which may be lost."""
+
+    agent: FileAgent
+    call: int = -1
+    reply: Reply | None = None
+
+
+class Robot:
+    """A robot of a team, with its measurements, its messages, and what is known of its poses.
+
+    Parameters
+    ----------
+    name : str
+        Name of the robot, unique in the team.
+    team : sequence of str
+        Names of all robots of the team, with its own.
+    key : bytes
+        Secret of the team, 16 bytes or more, which seals messages.
+    pipeline : Pipeline, optional
+        Settings of a solve that this robot drives.
+    weighting : Weighting
+        Cost of such a solve: F, chi2, or the own one of the measurements.
+    patience : float
+        Seconds after which a robot that was not heard of counts as absent.
+    retry : float
+        Seconds after which a message that was not answered is sent again.
+
+    Raises
+    ------
+    SettingError
+        For a name that is not in the team, a name twice, a short key, or times that are not
+        positive.
+    MissingExtraError
+        Without the package greenlet, which the extra `team` brings.
+
+    Examples
+    --------
+    Two robots in one process, and a loop in place of a network:
+
+    >>> import numpy as np
+    >>> key = b"sixteen or more bytes"
+    >>> robots = {name: Robot(name, ["a", "b"], key) for name in ("a", "b")}
+    >>> ahead = np.array([1.0, 0.0])
+    >>> for name, first in (("a", 0), ("b", 2)):
+    ...     robots[name].add_pose(first)
+    ...     robots[name].add_pose(first + 1)
+    ...     robots[name].add_edge(first, first + 1, np.eye(2), ahead, kappa=100.0, tau=100.0)
+    >>> robots["a"].add_edge(1, 2, np.eye(2), ahead, kappa=100.0, tau=100.0)
+    >>> robots["b"].add_edge(3, 0, np.eye(2), np.array([-2.9, 0.0]), kappa=100.0, tau=100.0)
+    >>> for step in range(200):
+    ...     now = 0.1 * step
+    ...     for robot in robots.values():
+    ...         robot.tick(now)
+    ...         for message in robot.outbox():
+    ...             robots[message.to].receive(message.data, now)
+    >>> outcome = robots["b"].outcome
+    >>> outcome.certificate.verdict.name, outcome.covered
+    ('CERTIFIED', ('a', 'b'))
+    >>> sorted(robots["b"].poses)
+    [2, 3]
+    """
+
+    def __init__(
+        self,
+        name: str,
+        team: Iterable[str],
+        key: bytes,
+        *,
+        pipeline: Pipeline | None = None,
+        weighting: Weighting = Weighting.OWN,
+        patience: float = PATIENCE,
+        retry: float = RETRY,
+    ) -> None:
+        self.name = name
+        self.team = tuple(sorted(team))
+        self._greenlet = extra_module("greenlet", "team")
+        _check_settings(name, self.team, key, patience, retry)
+        self._key = key
+        self._pipeline = pipeline if pipeline is not None else Pipeline()
+        self._weighting = weighting
+        self._patience = patience
+        self.retry = retry
+        self._lines: list[str] = []
+        self._d: int | None = None
+        # The others: when each was last heard of, and the revision of its measurements.
+        self._last_heard: dict[str, float] = {}
+        self._revisions: dict[str, int] = {}
+        self._began: float | None = None
+        self._hello_at = -np.inf
+        self._sent_at: dict[str, float] = {}  # when the last ask or outcome was sent to each
+        self._term = Term(0, "")
+        self._part: _Part | None = None
+        self._drive: Drive | None = None
+        self._tried: dict[str, int] | None = None  # revisions of the robots in the last solve
+        self._unheard: dict[str, Outcome] = {}  # robots that have not confirmed the outcome
+        self._out: list[Message] = []
+        self._known: tuple[Array, Poses] | None = None
+        self.outcome: Outcome | None = None
+        self.ledger = TeamLedger()
+
+    # Measurements
+
+    @door
+    def add_pose(
+        self,
+        pose_id: int,
+        R: Array | None = None,
+        t: Array | None = None,
+        *,
+        fixed: bool = False,
+    ) -> None:
+        """Add a pose of this robot; its position is where the answer is placed if it is `fixed`.
+
+        Parameters
+        ----------
+        pose_id : int
+            Id of the pose, unique in the team.
+        R : Array, (d, d), optional
+            Estimate of its rotation; the identity unless given.
+        t : Array, (d,), optional
+            Estimate of its position, metres; the origin unless given.
+        fixed : bool
+            Whether the frame of the answer is that of this pose.
+        """
+        if R is None or t is None:
+            self._lines.append(f"{_PENDING_VERTEX} {pose_id}")
+        else:
+            d = self._dimension_of(t)
+            numbers = " ".join(map(repr, _numbers(R, t, d)))
+            self._lines.append(f"{_VERTEX_TAGS[d]} {pose_id} {numbers}")
+        if fixed:
+            self._lines.append(f"FIX {pose_id}")
+
+    @door
+    def add_edge(
+        self,
+        i: int,
+        j: int,
+        R: Array,
+        t: Array,
+        *,
+        information: Array | None = None,
+        kappa: float | None = None,
+        tau: float | None = None,
+    ) -> None:
+        """Add a measurement of pose j as seen from pose i; either may be another robot's.
+
+        Parameters
+        ----------
+        i, j : int
+            Ids of the poses.
+        R : Array, (d, d)
+            Measured rotation.
+        t : Array, (d,)
+            Measured position of j in the frame of i, metres.
+        information : Array, (3, 3) or (6, 6), optional
+            Information matrix, of (x, y, theta) or (x, y, z, rotation).
+        kappa, tau : float, optional
+            Precisions in place of a matrix, per radian^2 and metre^2.
+
+        Raises
+        ------
+        SettingError
+            Unless there is either a matrix or both precisions.
+        GraphError
+            For shapes that are of no pose.
+        """
+        d = self._dimension_of(t)
+        matrix = _information(information, kappa, tau, d)
+        upper = matrix[np.triu_indices(len(matrix))]
+        numbers = " ".join(map(repr, [*_numbers(R, t, d), *upper.tolist()]))
+        self._lines.append(f"{_EDGE_TAGS[d]} {i} {j} {numbers}")
+
+    @door
+    def read(self, path: Path | str) -> None:
+        """Add the lines of a g2o file: VERTEX lines of this robot's poses, and its EDGE lines.
+
+        Parameters
+        ----------
+        path : Path or str
+            Path of the file. Errors are those of `read_g2o`.
+        """
+        text = Path(path).read_text(encoding="utf-8")
+        lines = parse_lines(Path(path), [text if text.endswith("\n") else f"{text}\n"])
+        self._d = lines.d
+        self._lines += text.splitlines()
+
+    @property
+    def revision(self) -> int:
+        """How many lines its measurements are, so that others notice when it has more."""
+        return len(self._lines)
+
+    def _dimension_of(self, t: Array) -> int:
+        d = len(np.atleast_1d(t))
+        if d not in (2, 3) or self._d not in (None, d):
+            raise GraphError(f"t has {d} numbers; give 2 in the plane or 3 in space, always alike")
+        self._d = d
+        return d
+
+    def _text(self) -> str:
+        """The measurements as a g2o file."""
+        assert self._d is not None
+        tag = _VERTEX_TAGS[self._d]
+        numbers = "0 0 0" if self._d == 2 else "0 0 0 0 0 0 1"
+        lines = []
+        for line in self._lines:
+            pending = line.startswith(_PENDING_VERTEX)
+            lines.append(f"{tag} {line.split()[1]} {numbers}" if pending else line)
+        return "\n".join(lines) + "\n"
+
+    # Answers
+
+    @property
+    def poses(self) -> dict[int, tuple[Array, Array]]:
+        """Rotation (d, d) and position (d,) of every pose of this robot, by id; none before."""
+        if self._known is None:
+            return {}
+        ids, poses = self._known
+        rows = zip(ids.tolist(), poses.R, poses.t, strict=True)
+        return {int(pose_id): (R, t) for pose_id, R, t in rows}
+
+    @property
+    def covered(self) -> tuple[str, ...]:
+        """Robots whose measurements the last outcome holds for."""
+        return () if self.outcome is None else self.outcome.covered
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Robots of the team that the last outcome is without."""
+        return self.team if self.outcome is None else self.outcome.absent
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the last outcome is of the whole team, and nobody waits for this robot."""
+        is_whole = self.outcome is not None and not self.outcome.absent
+        return is_whole and self._drive is None and not self._unheard and not self._out
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the last outcome is certified, for the robots that it covers."""
+        certificate = None if self.outcome is None else self.outcome.certificate
+        return certificate is not None and certificate.is_certified
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return what is known, as it is printed, with labels.
+
+        Returns
+        -------
+        list of (str, str)
+            Pairs of a label and a text.
+        """
+        facts = [("robot", f"{self.name} of {', '.join(self.team)}")]
+        outcome = self.outcome
+        if outcome is None:
+            return [*facts, ("outcome", "none: no solve has ended")]
+        if outcome.certificate is None:
+            facts.append(("outcome", outcome.note))
+        else:
+            facts += outcome.certificate.facts()
+            facts += [("covered", ", ".join(outcome.covered)), ("note", outcome.note)]
+            facts.append(("rounds", str(outcome.rounds)))
+        facts.append(("absent", ", ".join(outcome.absent)))
+        sent, received = (sum(counts.values()) for counts in self.ledger.both)
+        traffic = f"{sent} sent, {received} received, {self.ledger.dropped} messages dropped"
+        facts.append(("bytes", traffic))
+        return [(label, text) for label, text in facts if text]
+
+    def as_json(self) -> dict[str, object]:
+        """Return what is known as JSON has it.
+
+        Returns
+        -------
+        dict
+            Names, cost, bound, verdict, who is covered and absent, and bytes by robot.
+        """
+        outcome = self.outcome
+        certificate = None if outcome is None else outcome.certificate
+        known: dict[str, object] = {}
+        if certificate is not None:
+            known = {
+                "cost": certificate.cost,
+                "objective": certificate.objective,
+                "lower_bound": certificate.lower_bound,
+                "proven_gap": certificate.proven_gap,
+                "verdict": certificate.verdict.name,
+            }
+        return {
+            "robot": self.name,
+            "team": list(self.team),
+            **known,
+            "covered": list(self.covered),
+            "absent": list(self.absent),
+            "rounds": 0 if outcome is None else outcome.rounds,
+            "note": "" if outcome is None else outcome.note,
+            "sent": dict(self.ledger.sent),
+            "received": dict(self.ledger.received),
+            "dropped": self.ledger.dropped,
+        }
+
+    def write(self, path: Path | str) -> None:
+        """Write this robot's poses and edges as a g2o file; the poses are those of the outcome.
+
+        Parameters
+        ----------
+        path : Path or str
+            Path of the file. Errors are those of `write_g2o`.
+
+        Raises
+        ------
+        SettingError
+            When there are no poses yet.
+        """
+        if self._known is None:
+            raise SettingError(f"{self.name} has no poses yet; a solve has to end before")
+        ids, poses = self._known
+        tag = _VERTEX_TAGS[poses.d]
+        lines = []
+        for pose_id, row in zip(ids.tolist(), numbers_of(poses.R, poses.t).tolist(), strict=True):
+            lines.append(f"{tag} {int(pose_id)} {' '.join(map(repr, row))}")
+        others = (_PENDING_VERTEX, *_VERTEX_TAGS.values())
+        lines += [line for line in self._lines if not line.startswith(others)]
+        with replace_when_done(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def __repr__(self) -> str:
+        size = f"{self.revision} lines"
+        if self.outcome is None:
+            return f"Robot({self.name!r}, {size}, no outcome yet)"
+        certificate = self.outcome.certificate
+        verdict = self.outcome.note if certificate is None else certificate.verdict.name
+        return f"Robot({self.name!r}, {size}, {verdict}, covered={self.covered})"
+
+    # Messages
+
+    def outbox(self) -> list[Message]:
+        """Hand out what is to be sent, what others wait for first.
+
+        Returns
+        -------
+        list of Message
+            Messages, each once; those that are not answered come again.
+        """
+        messages = sorted(self._out, key=lambda message: message.priority)
+        self._out = []
+        for message in messages:
+            self.ledger = self.ledger.after_sending(message)
+        return messages
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take what has arrived: in any order, and any number of times.
+
+        Parameters
+        ----------
+        data : bytes
+            A message of another robot. Other bytes are dropped, and counted.
+        now : float
+            The time in seconds, of any clock that does not go back.
+        """
+        try:
+            envelope = opened(self._key, data, (Envelope, *MESSAGES))
+            if not isinstance(envelope, Envelope) or envelope.receiver != self.name:
+                raise WireError("a message for another robot")
+            if envelope.sender not in self.team or envelope.sender == self.name:
+                raise WireError("a message of nobody in the team")
+        except WireError:
+            self.ledger = self.ledger.after_dropping()
+            return
+        sender = envelope.sender
+        self.ledger = self.ledger.after_receiving(sender, data)
+        self._last_heard[sender] = now
+        message = envelope.message
+        if isinstance(message, Hello):
+            self._revisions[sender] = max(message.revision, self._revisions.get(sender, 0))
+            self._learn_term(message.term)
+        elif isinstance(message, Ask):
+            self._obey(sender, message)
+        elif isinstance(message, Reply):
+            self._take_reply(sender, message, now)
+        elif isinstance(message, Outcome):
+            self._take_outcome(sender, message)
+        elif isinstance(message, Heard):
+            outcome = self._unheard.get(sender)
+            if outcome is not None and outcome.term == message.term:
+                del self._unheard[sender]
+
+    def tick(self, now: float) -> None:
+        """Do what is due: say hello, begin a solve, repeat what was not answered, give up.
+
+        Parameters
+        ----------
+        now : float
+            The time in seconds, as for `receive`. Call it a few times in `retry` seconds.
+        """
+        if self._began is None:
+            self._began = now
+        if now - self._hello_at >= self.retry:
+            self._hello_at = now
+            for name in self.others:
+                self._send(name, Hello(self.revision, self._term), Priority.NORMAL)
+        awake = self._awake(now)
+        if self._drive is not None:
+            self._go_on_driving(now, awake)
+        if self._drive is None and awake[0] == self.name and self._is_time(now, awake):
+            self._begin_drive(awake, now)
+        for name, outcome in list(self._unheard.items()):
+            if name not in awake:
+                del self._unheard[name]
+            elif now - self._sent_at.get(name, -np.inf) >= self.retry:
+                self._sent_at[name] = now
+                self._send(name, outcome, Priority.NORMAL)
+
+    @property
+    def others(self) -> list[str]:
+        """Names of the other robots."""
+        return [name for name in self.team if name != self.name]
+
+    def _awake(self, now: float) -> tuple[str, ...]:
+        """Robots that were heard of lately, and this one, in the order of their names."""
+        awake = []
+        for name in self.team:
+            last = self._last_heard.get(name, -np.inf)
+            if name == self.name or now - last <= self._patience:
+                awake.append(name)
+        return tuple(awake)
+
+    def _send(self, to: str, message: object, priority: Priority) -> None:
+        data = sealed(self._key, Envelope(self.name, to, message))
+        self._out.append(Message(to, data, priority))
+
+    def _learn_term(self, term: Term) -> None:
+        """Give up a solve that another robot has overtaken."""
+        if term > self._term:
+            self._term = term
+            self._part = None
+            self._give_up()
+
+    def _give_up(self) -> None:
+        if self._drive is not None:
+            self._drive.abandon()
+            self._drive = None
+            self._tried = None
+
+    # Driving
+
+    def _is_time(self, now: float, awake: tuple[str, ...]) -> bool:
+        """Whether a solve should begin: everybody is there or was waited for, and something is new.
+
+        Robots without measurements are waited for, too.
+        """
+        assert self._began is not None
+        revisions = self._current_revisions(awake)
+        has_waited = now - self._began >= self._patience
+        is_ready = len(awake) == len(self.team) or has_waited
+        return is_ready and min(revisions.values()) > 0 and revisions != self._tried
+
+    def _current_revisions(self, awake: tuple[str, ...]) -> dict[str, int]:
+        others = {name: self._revisions.get(name, 0) for name in awake if name != self.name}
+        return {self.name: self.revision, **others}
+
+    def _begin_drive(self, awake: tuple[str, ...], now: float) -> None:
+        self._tried = self._current_revisions(awake)
+        self._term = Term(self._term.number + 1, self.name)
+        agent = _Agent(0, self.name, self._text())
+        self._part = _Part(agent)
+        members = (self.name, *(name for name in awake if name != self.name))
+        self._drive = Drive(
+            self._greenlet, self._term, members, agent, self._pipeline, self._weighting
+        )
+        self._drive.begin()
+        self._after_step(now)
+
+    def _go_on_driving(self, now: float, awake: tuple[str, ...]) -> None:
+        """Ask again where no answer came, and give up where a robot has gone."""
+        assert self._drive is not None
+        for name, ask in list(self._drive.waiting.items()):
+            if name not in awake:
+                self._give_up()
+                return
+            if now - self._sent_at.get(name, -np.inf) >= self.retry:
+                self._sent_at[name] = now
+                self._send(name, ask, Priority.URGENT)
+
+    def _take_reply(self, sender: str, reply: Reply, now: float) -> None:
+        if self._drive is not None and reply.term == self._drive.term:
+            before = self._drive.call
+            self._drive.take(sender, reply)
+            if self._drive.call != before or self._drive.outcome is not None:
+                self._after_step(now)
+
+    def _after_step(self, now: float) -> None:
+        """Send what the page of the solve asks for, or its outcome if it has ended."""
+        drive = self._drive
+        assert drive is not None
+        for name, ask in drive.waiting.items():
+            self._sent_at[name] = now
+            self._send(name, ask, Priority.URGENT)
+        if drive.outcome is None:
+            return
+        self._drive = None
+        absent = tuple(name for name in self.team if name not in drive.members)
+        self.outcome = _outcome_of(drive, absent)
+        self._keep_poses()
+        self._unheard = {name: self.outcome for name in drive.members[1:]}
+        for name in self._unheard:
+            self._sent_at[name] = now
+            self._send(name, self.outcome, Priority.NORMAL)
+
+    # Following
+
+    def _obey(self, sender: str, ask: Ask) -> None:
+        """Obey an order once, and answer it as often as it is asked."""
+        if ask.term.driver != sender or ask.term < self._term:
+            self._send(sender, Hello(self.revision, self._term), Priority.NORMAL)
+            return
+        if ask.term > self._term:
+            self._learn_term(ask.term)
+        if self._part is None and ask.call > 0:
+            # This robot has begun anew and has lost its part: the solve has to begin again, too.
+            self._term = Term(ask.term.number + 1, self.name)
+            self._send(sender, Hello(self.revision, self._term), Priority.URGENT)
+            return
+        if self._part is None:
+            if self._d is None:
+                return
+            self._part = _Part(_Agent(ask.place, self.name, self._text()))
+        part = self._part
+        if ask.call == part.call + 1:
+            part.call = ask.call
+            part.reply = self._answer(part.agent, ask)
+        if ask.call == part.call and part.reply is not None:
+            self._send(sender, part.reply, Priority.URGENT)
+
+    def _answer(self, agent: FileAgent, ask: Ask) -> Reply:
+        try:
+            return Reply(ask.term, ask.call, ask.order.function()(agent, ask.request))
+        except PGOError as error:
+            return Reply(ask.term, ask.call, None, error_as_message(error))
+
+    def _take_outcome(self, sender: str, outcome: Outcome) -> None:
+        if outcome.term == self._term and outcome.term.driver == sender:
+            if self.outcome is None or self.outcome.term != outcome.term:
+                self.outcome = outcome
+                self._keep_poses()
+            self._send(sender, Heard(outcome.term), Priority.NORMAL)
+
+    def _keep_poses(self) -> None:
+        """Keep the poses of the outcome; where a solve has failed, those before it."""
+        assert self.outcome is not None
+        record = None if self._part is None else self._part.agent.record
+        if self.outcome.certificate is None or not isinstance(record, PlacedFile):
+            return
+        own = record.subgraph.is_own
+        ids = record.joined.graph.pose_ids[own]
+        self._known = ids.astype(float), record.kept[np.flatnonzero(own)]
+
+    # On disk
+
+    def save(self) -> bytes:
+        """Return the measurements and the last outcome as bytes, without the key.
+
+        Returns
+        -------
+        bytes
+            What `Robot.load` takes. A solve that is under way begins again.
+        """
+        ids, poses = self._known if self._known is not None else (np.zeros(0), None)
+        saved = Saved(
+            self.name, self.team, tuple(self._lines), self._term, self.outcome, ids, poses
+        )
+        return packed(serialize(saved))
+
+    @classmethod
+    def load(
+        cls, data: bytes, key: bytes, *, patience: float = PATIENCE, retry: float = RETRY
+    ) -> Robot:
+        """Return a robot that `save` has made bytes of.
+
+        Parameters
+        ----------
+        data : bytes
+            The bytes.
+        key : bytes
+            Secret of the team.
+        patience, retry : float
+            As of `Robot`.
+
+        Returns
+        -------
+        Robot
+            With the same measurements, outcome and poses.
+
+        Raises
+        ------
+        SettingError
+            For other bytes.
+        """
+        try:
+            saved = deserialize(unpacked(data), (*records_of_rooms(), *MESSAGES, Saved))
+        except ValueError as error:
+            raise SettingError(f"these bytes are no saved robot: {error}") from error
+        robot = cls(saved.name, saved.team, key, patience=patience, retry=retry)
+        robot._lines = list(saved.lines)
+        robot._term = saved.term
+        robot.outcome = saved.outcome
+        if robot._lines:
+            in_space = any(line.startswith(_IN_SPACE) for line in robot._lines)
+            robot._d = 3 if in_space else 2
+        if saved.poses is not None:
+            robot._known = saved.ids, saved.poses
+        return robot
+
+
+_PENDING_VERTEX = "POSE"
+_IN_SPACE = ("EDGE_SE3", "VERTEX_SE3", "VERTEX3", "EDGE3")
+
+
+def _check_settings(
+    name: str, team: tuple[str, ...], key: bytes, patience: float, retry: float
+) -> None:
+    if len(set(team)) < len(team):
+        raise SettingError(f"the team {', '.join(team)} has a name twice; give each robot its own")
+    if name not in team:
+        raise SettingError(f"{name!r} is not in the team {', '.join(team)}; add it")
+    if not isinstance(key, bytes) or len(key) < _FEWEST_KEY_BYTES:
+        raise SettingError(
+            f"the key of a team is bytes, {_FEWEST_KEY_BYTES} or more: secrets.token_bytes(32)"
+        )
+    if not (patience > 0.0 and retry > 0.0):
+        raise SettingError(f"patience is {patience} and retry {retry}; give positive seconds")
+
+
+def _numbers(R: Array, t: Array, d: int) -> list[float]:
+    """Numbers of a pose as on a line of a g2o file."""
+    pose = Poses(real_array(R, "R")[None], real_array(t, "t")[None])
+    numbers: list[float] = numbers_of(pose.R, pose.t)[0].tolist()
+    return numbers
+
+
+def _information(
+    information: Array | None, kappa: float | None, tau: float | None, d: int
+) -> Array:
+    """Matrix of an edge, or that of its precisions, as `write_g2o` writes it."""
+    size = 3 if d == 2 else 6
+    if information is not None:
+        matrix = real_array(information, "information")
+        if matrix.shape != (size, size):
+            raise GraphError(f"information has shape {matrix.shape}; give {(size, size)}")
+        return matrix
+    if kappa is None or tau is None:
+        raise SettingError("an edge needs information, or kappa and tau")
+    rotation = [kappa] if d == 2 else [2.0 * kappa] * 3
+    return np.diag([*[tau] * d, *rotation])
+
+
+def _outcome_of(drive: Drive, absent: tuple[str, ...]) -> Outcome:
+    """The outcome of a solve that has ended."""
+    ended = drive.outcome
+    covered = tuple(sorted(drive.members))
+    if isinstance(ended, FolderSolution):
+        return Outcome(
+            drive.term,
+            ended.certificate,
+            covered,
+            absent,
+            ended.num_absent,
+            ended.ledger.rounds,
+            ended.note,
+        )
+    return Outcome(drive.term, None, (), absent, note=f"failed: {ended}")

@@ -1,0 +1,103 @@
+"""A network in memory with its own clock, which loses, delays, repeats and reorders messages."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import pgo_models as pgo
+import solvers
+from pgo_models.graphs.pose_graph import PoseGraph
+
+STEP = 0.02  # seconds
+KEY = b"a key for tests, not for a team"
+
+
+@dataclass
+class Network:
+    """Robots, and what is on its way between them; those `asleep` neither send nor hear."""
+
+    robots: dict[str, solvers.Robot]
+    rng: np.random.Generator
+    lost: float = 0.0
+    repeated: float = 0.0
+    delay: float = 0.02
+    now: float = 0.0
+    asleep: set[str] = field(default_factory=set)
+    carried: int = 0  # bytes that have arrived
+    _on_the_way: list[tuple[float, int, str, bytes]] = field(default_factory=list)
+    _count: int = 0
+
+    def run(self, seconds: float) -> None:
+        """Let time pass until all who are awake are settled, or the seconds are over."""
+        end = self.now + seconds
+        while self.now < end and not self.is_settled:
+            self._pass_step()
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        end = self.now + seconds
+        while self.now < end:
+            self._pass_step()
+
+    def _pass_step(self) -> None:
+        self.now += STEP
+        self._deliver()
+        for name, robot in self.robots.items():
+            if name not in self.asleep:
+                robot.tick(self.now)
+                self._send(name, robot)
+
+    @property
+    def is_settled(self) -> bool:
+        awake = [robot for name, robot in self.robots.items() if name not in self.asleep]
+        terms = {robot.outcome.term for robot in awake if robot.outcome is not None}
+        return len(terms) == 1 and all(robot.is_settled for robot in awake)
+
+    def _send(self, name: str, robot: solvers.Robot) -> None:
+        for message in robot.outbox():
+            copies = 1 + (self.rng.random() < self.repeated)
+            for _ in range(copies):
+                if self.rng.random() >= self.lost:
+                    self._count += 1
+                    when = self.now + self.delay * self.rng.exponential()
+                    heapq.heappush(self._on_the_way, (when, self._count, message.to, message.data))
+
+    def _deliver(self) -> None:
+        while self._on_the_way and self._on_the_way[0][0] <= self.now:
+            _, _, name, data = heapq.heappop(self._on_the_way)
+            if name in self.robots and name not in self.asleep:
+                self.carried += len(data)
+                self.robots[name].receive(data, self.now)
+                self._send(name, self.robots[name])
+
+
+def robots_of(
+    graph: PoseGraph,
+    num_robots: int,
+    weighting: pgo.Weighting = pgo.Weighting.ISOTROPIC,
+) -> dict[str, solvers.Robot]:
+    """A robot for every part of a graph, with its own poses and the edges that begin at them."""
+    owners = pgo.partition(graph, num_robots).robot
+    names = [f"r{k}" for k in range(num_robots)]
+    robots = {
+        name: solvers.Robot(name, names, KEY, weighting=weighting, patience=5.0, retry=0.3)
+        for name in names
+    }
+    for pose, owner in enumerate(owners.tolist()):
+        robots[names[owner]].add_pose(int(graph.pose_ids[pose]))
+    for e in range(graph.num_edges):
+        give_edge(robots[names[owners[graph.i[e]]]], graph, e)
+    return robots
+
+
+def give_edge(robot: solvers.Robot, graph: PoseGraph, e: int) -> None:
+    """Have a robot measure an edge of a graph."""
+    i, j = (int(graph.pose_ids[ends[e]]) for ends in (graph.i, graph.j))
+    R, t = graph.R_ij[e], graph.t_ij[e]
+    if graph.information is not None:
+        robot.add_edge(i, j, R, t, information=graph.information[e])
+    else:
+        robot.add_edge(i, j, R, t, kappa=float(graph.kappa[e]), tau=float(graph.tau[e]))

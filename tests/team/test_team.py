@@ -1,0 +1,238 @@
+"""Robots that are apart solve and certify together, whatever happens to their messages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from budget import examples
+from graphs import informed
+from networks import KEY, Network, give_edge, robots_of
+
+import pgo_models as pgo
+import solvers
+from pgo_models.errors import SettingError
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel
+from solvers.team.robot import TeamLedger
+
+pytest.importorskip("greenlet")
+
+
+def world(d: int = 2, n: int = 40) -> PoseGraph:
+    return replace(pgo.grid_world(1, n, 3, d=d), information=None)
+
+
+def assert_is_the_optimum(
+    robots: dict[str, solvers.Robot],
+    graph: PoseGraph,
+    weighting: pgo.Weighting = pgo.Weighting.ISOTROPIC,
+) -> None:
+    """All have the same outcome, a bound below the optimum, and poses of the central cost."""
+    problem = pgo.PGOProblem(graph, weighting=weighting)
+    best = solvers.solve(problem)
+    terms = set()
+    poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for robot in robots.values():
+        assert robot.outcome is not None
+        certificate = robot.outcome.certificate
+        assert certificate is not None, robot.outcome.note
+        assert certificate.is_certified
+        assert certificate.lower_bound <= best.objective * (1 + 1e-12)
+        terms.add(robot.outcome.term)
+        poses |= robot.poses
+    assert len(terms) == 1
+    assert sorted(poses) == graph.pose_ids.tolist()
+    together = pgo.Poses(
+        np.array([poses[k][0] for k in sorted(poses)]),
+        np.array([poses[k][1] for k in sorted(poses)]),
+    )
+    assert problem.objective(together) == pytest.approx(best.objective, rel=1e-6)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_robots_have_the_certified_optimum_of_all_their_measurements(d: int) -> None:
+    graph = world(d)
+    network = Network(robots_of(graph, 3), np.random.default_rng(0))
+    network.run(60.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+    for robot in network.robots.values():
+        assert robot.covered == ("r0", "r1", "r2")
+        assert robot.absent == ()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_robots_minimise_chi2_of_information_matrices(d: int) -> None:
+    graph = informed(3, 30, d, coupled=True, spread=0.5, noise=NoiseModel(1e-2, 1e-2))
+    network = Network(robots_of(graph, 3, pgo.Weighting.OWN), np.random.default_rng(0))
+    network.run(60.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph, pgo.Weighting.INFORMATION)
+
+
+@pytest.mark.parametrize("seed", range(examples(12)))
+def test_messages_may_be_lost_late_repeated_and_in_any_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = world(n=20)
+    lost, repeated = rng.uniform(0.0, 0.4, 2)
+    network = Network(robots_of(graph, 3), rng, lost, repeated, delay=rng.uniform(0.0, 0.3))
+    while network.now < 600.0 and not network.is_settled:
+        network.wait(rng.uniform(0.5, 3.0))
+        sleeper = f"r{rng.integers(3)}"
+        network.asleep = {sleeper} if rng.random() < 0.2 else set()
+    network.asleep = set()
+    network.run(600.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+
+
+def test_a_robot_that_never_comes_is_named_and_the_others_have_an_answer() -> None:
+    graph = world()
+    robots = robots_of(graph, 3)
+    network = Network(robots, np.random.default_rng(0), asleep={"r2"})
+    network.wait(20.0)
+    for name in ("r0", "r1"):
+        robot = robots[name]
+        assert robot.absent == ("r2",)
+        assert robot.covered == ("r0", "r1")
+        assert robot.outcome is not None
+        assert robot.outcome.certificate is not None
+        assert robot.outcome.certificate.is_certified
+        assert robot.outcome.num_absent_poses > 0
+        assert not robot.is_settled
+
+
+@pytest.mark.parametrize("late", ["r0", "r2"])
+def test_a_robot_may_join_late_also_the_one_that_drives_from_then_on(late: str) -> None:
+    graph = world()
+    network = Network(robots_of(graph, 3), np.random.default_rng(0), asleep={late})
+    network.wait(15.0)
+    network.asleep = set()
+    network.run(60.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+
+
+def test_after_a_cut_of_twenty_seconds_all_go_on() -> None:
+    graph = world()
+    network = Network(robots_of(graph, 3), np.random.default_rng(0), delay=0.5)
+    network.run(3.0)
+    assert not network.is_settled
+    network.asleep = {"r0"}
+    network.wait(20.0)
+    network.asleep = set()
+    network.run(200.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+
+
+def test_a_robot_that_begins_anew_during_a_solve_is_solved_with_again() -> None:
+    graph = world()
+    robots = robots_of(graph, 3)
+    network = Network(robots, np.random.default_rng(0), delay=0.3)
+    network.run(4.0)
+    assert robots["r1"].outcome is None
+    network.robots["r1"] = solvers.Robot.load(robots["r1"].save(), KEY, patience=5.0, retry=0.3)
+    network.run(200.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+
+
+def test_what_is_measured_later_is_solved_with_the_rest() -> None:
+    graph = world()
+    last = np.arange(graph.num_edges) >= graph.num_edges - 2
+    robots = robots_of(graph.without_edges(last), 3)
+    network = Network(robots, np.random.default_rng(0))
+    network.run(60.0)
+    assert network.is_settled
+    before = robots["r0"].outcome
+    for e in np.flatnonzero(last).tolist():
+        give_edge(robots["r1"], graph, e)
+    network.wait(1.0)
+    network.run(60.0)
+    assert network.is_settled
+    assert robots["r0"].outcome is not before
+    assert_is_the_optimum(robots, graph)
+
+
+def test_bytes_are_counted_where_they_are_handed_out_and_received() -> None:
+    network = Network(robots_of(world(), 3), np.random.default_rng(0))
+    network.run(60.0)
+    network.wait(2.0)
+    ledgers = [robot.ledger for robot in network.robots.values()]
+    sent = sum(sum(ledger.sent.values()) for ledger in ledgers)
+    received = sum(sum(ledger.received.values()) for ledger in ledgers)
+    assert sent == received == network.carried > 0
+    assert network.robots["r1"].ledger.sent["r0"] == network.robots["r0"].ledger.received["r1"]
+    assert all(ledger.dropped == 0 for ledger in ledgers)
+
+
+def test_messages_without_the_key_changed_ones_and_those_for_others_are_dropped() -> None:
+    robots = robots_of(world(), 2)
+    stranger = solvers.Robot("r0", ["r0", "r1"], b"another key of 16 bytes")
+    for robot in (stranger, robots["r0"]):
+        robot.tick(0.0)
+    (false,), (right,) = stranger.outbox(), robots["r0"].outbox()
+    changed = right.data[:-1] + bytes([right.data[-1] ^ 1])
+    receiver = robots["r1"]
+    for data in (false.data, changed, b"", b"PGO1", right.data[:40], b"PGO0" + right.data[4:]):
+        receiver.receive(data, 0.0)
+    assert receiver.ledger == receiver.ledger
+    assert receiver.ledger.dropped == 6
+    assert receiver.ledger.received == {}
+    robots["r0"].receive(right.data, 0.0)  # its own
+    assert robots["r0"].ledger.dropped == 1
+    receiver.receive(right.data, 0.0)
+    assert receiver.ledger.received == {"r0": len(right.data)}
+
+
+def test_a_saved_robot_keeps_its_measurements_poses_and_outcome() -> None:
+    network = Network(robots_of(world(3), 2), np.random.default_rng(0))
+    network.run(60.0)
+    robot = network.robots["r1"]
+    again = solvers.Robot.load(robot.save(), KEY)
+    assert again.revision == robot.revision
+    assert again.covered == robot.covered
+    assert again.outcome is not None
+    assert robot.outcome is not None
+    assert again.outcome.term == robot.outcome.term
+    for pose, (R, t) in robot.poses.items():
+        np.testing.assert_array_equal(again.poses[pose][0], R)
+        np.testing.assert_array_equal(again.poses[pose][1], t)
+    assert again.ledger.messages == TeamLedger().messages
+    with pytest.raises(SettingError, match="no saved robot"):
+        solvers.Robot.load(b"something else", KEY)
+
+
+def test_robots_without_a_common_edge_say_so() -> None:
+    names = ["a", "b"]
+    robots = {name: solvers.Robot(name, names, KEY) for name in names}
+    for first, robot in zip((0, 10), robots.values(), strict=True):
+        robot.add_pose(first)
+        robot.add_pose(first + 1)
+        robot.add_edge(first, first + 1, np.eye(2), np.array([1.0, 0.0]), kappa=1.0, tau=1.0)
+    network = Network(robots, np.random.default_rng(0))
+    network.wait(20.0)
+    for robot in robots.values():
+        assert robot.outcome is not None
+        assert robot.outcome.certificate is None
+        assert "2 parts, no edge between" in robot.outcome.note
+        assert robot.poses == {}
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"name": "c"}, "'c' is not in the team a, b; add it"),
+        ({"team": ["a", "a"]}, "has a name twice"),
+        ({"key": b"short"}, "16 or more"),
+        ({"patience": 0.0}, "give positive seconds"),
+    ],
+)
+def test_settings_are_checked(settings: dict[str, object], sentence: str) -> None:
+    given = {"name": "a", "team": ["a", "b"], "key": KEY, **settings}
+    name, team, key = (given.pop(word) for word in ("name", "team", "key"))
+    with pytest.raises(SettingError, match=sentence):
+        solvers.Robot(name, team, key, **given)  # type: ignore[arg-type]
