@@ -101,6 +101,7 @@ OF_THEIR_OWN: dict[str, dict[str, str]] = {
     "read_kitti": {"path": "kitti"},
 }
 CLASSES_WITH_MORE: dict[str, dict[str, Any]] = {
+    "Robot": {"name": "a", "team": ["a", "b"], "key": b"sixteen or more bytes"},
     "Partition": {"method": pgo.PartitionMethod.GIVEN},
     "noise_sweep": {
         "scene": solvers.SweptScene.GRID,

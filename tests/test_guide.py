@@ -58,6 +58,8 @@ def test_there_is_a_page_for_every_task():
         "rooms",
         "letters",
         "contributing",
+        "gallery",
+        "how_do_i",
     }
 
 
@@ -110,7 +112,8 @@ BUILD = runpy.run_path(str(SITE / "build.py"))  # the script is not run
 
 def assert_links_lead_somewhere(page: Path, text: str) -> None:
     """Check the links of a page of the site, into which notebooks and pictures are copied."""
-    copied = (SITE / "notebooks", SITE / "notebooks" / "pictures")
+    pictures = SITE / "notebooks" / "pictures"
+    copied = (SITE / "notebooks", pictures, pictures / "gallery")
     for target in re.findall(r"\]\(([^)#]+)\)", text):
         if target.startswith("http"):
             continue
@@ -182,6 +185,93 @@ def test_the_page_of_the_command_line_has_every_command_and_scene():
     assert set(re.findall(r"^## pgo (\w+)$", page, re.M)) == set(COMMANDS)
     for scene in cli_options.Scene:
         assert f"`{scene.value}`" in section_of("generate")
+
+
+QUESTIONS = re.findall(
+    r"^\| (.*\?) \| (.*) \| (.*) \|$",
+    (SITE / "guide" / "how_do_i.md").read_text(encoding="utf-8"),
+    re.M,
+)
+# Answers that are not run here: they need GTSAM, the network, a cluster, or a class of the reader.
+NOT_RUN = (
+    "read a factor graph of GTSAM?",
+    "certify GTSAM's answer?",
+    "get a public benchmark graph?",
+    "run robots on several machines?",
+    "write my own splitting method?",
+)
+
+
+def answers(cell: str) -> list[str]:
+    """The commands or lines of Python of an answer."""
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_every_question_has_an_answer_and_a_page_that_explains_it():
+    assert 40 <= len(QUESTIONS) <= 70
+    assert {question for question, _, _ in QUESTIONS} >= set(NOT_RUN)
+    for question, answer, page in QUESTIONS:
+        assert answers(answer), question
+        assert re.search(r"\]\(\S+\.md(#\S+)?\)|\{py:obj\}", page), question
+
+
+def test_every_command_that_answers_a_question_has_the_options_it_is_given():
+    for question, answer, _ in QUESTIONS:
+        for line in answers(answer):
+            if not line.startswith("pgo "):
+                continue
+            _, command, *words = shlex.split(line)
+            known = {name for option in COMMANDS[command].params for name in option.opts}
+            given = {word for word in words if word.startswith("-")}
+            assert given <= known, question
+
+
+@pytest.mark.slow
+def test_the_answers_do_what_the_questions_ask(pgo_command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PGO_DATA", raising=False)
+    text = (SITE / "guide" / "how_do_i.md").read_text(encoding="utf-8")
+    (_, command), (_, imports) = BLOCK.findall(text)
+    assert pgo_command(*shlex.split(command.splitlines()[0])[2:])[0] == 0
+    names: dict[str, object] = {}
+    exec(imports.replace(">>> ", ""), names)
+    for question, answer, _ in QUESTIONS:
+        if question in NOT_RUN:
+            continue
+        for line in answers(answer):
+            if line.startswith("pgo "):
+                code, _, err = pgo_command(*shlex.split(line)[1:])
+                assert code in (0, 3), f"{line}\n{err}"
+            else:
+                exec(line, names)
+
+
+GALLERY = runpy.run_path(str(SITE / "gallery.py"))  # the script is not run
+
+
+def test_every_block_of_the_gallery_has_its_picture_and_every_picture_its_block():
+    text = GALLERY["PAGE"].read_text(encoding="utf-8")
+    blocks = GALLERY["blocks_with_pictures"](text)
+    assert len(blocks) == len(re.findall("^```python$", text, re.M)) > 15
+    (_, first), *others = blocks
+    assert first == ""  # what all of them begin with
+    shown = [picture for _, picture in others]
+    assert len(shown) == len(set(shown))
+    written = {path.stem for path in GALLERY["PICTURES"].glob("*")}
+    assert set(shown) == set(re.findall(r"gallery/(\w+)\.png", text)) == written
+    for block, _ in others:
+        assert 1 <= len(re.findall("^(?:>>>|\\.\\.\\.)", block, re.M)) <= 5
+    sizes = [path.stat().st_size for path in GALLERY["PICTURES"].glob("*")]
+    assert sum(sizes) < 600_000
+
+
+@pytest.mark.slow
+def test_the_blocks_of_the_gallery_make_figures(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    blocks = GALLERY["blocks_with_pictures"](GALLERY["PAGE"].read_text(encoding="utf-8"))
+    for picture, figure in GALLERY["drawn"](blocks):
+        is_figure = hasattr(figure, "savefig") or hasattr(figure, "write_html")
+        assert is_figure or figure.suffix == ".html", picture
 
 
 MESSAGES = (SITE / "guide" / "one_iteration.md").read_text(encoding="utf-8")

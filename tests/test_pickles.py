@@ -220,6 +220,7 @@ SETTINGS += (
 )
 SETTINGS += ("BenchmarkSettings", "ComparisonSettings", "Recovery", "ReproductionSettings")
 MADE |= {name: getattr(solvers, name) for name in SETTINGS}
+MADE["Robot"] = lambda: solvers.Robot("a", ["a", "b"], b"sixteen or more bytes")
 PROTOCOLS = {
     "Method",
     "Solver",

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TypeVar
 
-from pgo_models.errors import PGOError
+from pgo_models.errors import PGOError, extra_module
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.robots.own_file import FileAgent
 from solvers.folder_solve import FilesOfRobots, FolderSolution
@@ -40,7 +39,6 @@ class Drive:
     `waiting` are the asks without an answer, by robot, `outcome` the solution or error at the end.
     """
 
-    greenlet: ModuleType
     term: Term
     members: tuple[str, ...]
     agent: FileAgent
@@ -54,7 +52,7 @@ class Drive:
 
     def begin(self) -> None:
         """Run the page until it waits for answers, or ends."""
-        self._page = self.greenlet.greenlet(self._solve)
+        self._page = extra_module("greenlet", "team").greenlet(self._solve)
         self._page.switch()
 
     def take(self, robot: str, reply: Reply) -> None:
@@ -100,7 +98,7 @@ class Drive:
                 self.waiting[name] = Ask(self.term, self.call, place, named, request)
         self._answers[:1] = obey([self.agent], order, requests[:1])
         if self.waiting:
-            self.greenlet.getcurrent().parent.switch()
+            self._page.parent.switch()
         return raise_first_error(self._answers)
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ other. Any robot can be the one. Messages may be lost, late, repeated, or come i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -190,10 +190,11 @@ class Robot:
     [2, 3]
     """
 
+    @door
     def __init__(
         self,
         name: str,
-        team: Iterable[str],
+        team: Sequence[str],
         key: bytes,
         *,
         pipeline: Pipeline | None = None,
@@ -203,7 +204,7 @@ class Robot:
     ) -> None:
         self.name = name
         self.team = tuple(sorted(team))
-        self._greenlet = extra_module("greenlet", "team")
+        extra_module("greenlet", "team")  # which a solve needs
         _check_settings(name, self.team, key, patience, retry)
         self._key = key
         self._pipeline = pipeline if pipeline is not None else Pipeline()
@@ -593,9 +594,7 @@ class Robot:
         agent = _Agent(0, self.name, self._text())
         self._part = _Part(agent)
         members = (self.name, *(name for name in awake if name != self.name))
-        self._drive = Drive(
-            self._greenlet, self._term, members, agent, self._pipeline, self._weighting
-        )
+        self._drive = Drive(self._term, members, agent, self._pipeline, self._weighting)
         self._drive.begin()
         self._after_step(now)
 
