@@ -113,6 +113,7 @@ from solvers.studies.tightness import (
     SweptScene as SweptScene,
     noise_sweep as noise_sweep,
 )
+from solvers.team.agent import Sharing as Sharing
 from solvers.team.robot import Robot as Robot
 
 __all__ = [
@@ -133,6 +134,7 @@ __all__ += [
     "Pipeline",
     "Robot",
     "Robots",
+    "Sharing",
     "Solution",
     "certify",
     "extend",

@@ -153,15 +153,25 @@ def read_g2o(
         read_lines(file, skip_unknown, reading, needs_matrices=not unit_weights)
         for file in g2o_files(path)
     ]
+    graph = graph_of_robots(path, files, weights, trust_folder)
+    return graph.unit_weights() if unit_weights else graph
+
+
+def graph_of_robots(
+    path: Path, files: list[G2OLines], weights: RotationWeight, trust_folder: bool = False
+) -> PoseGraph:
+    """Graph of files that have been read, each of a robot, or of one file.
+
+    Those of several robots have to be of one graph, unless the folder is trusted. Poses of robots
+    without a file are `PoseGraph.absent`.
+    """
     files = _files_of_robots(files)
     _check_ids_of_landmarks(files)
     _common_dimension(files)
     if not trust_folder:
         check_one_graph(files)
     graph = graph_of_files(path, files, weights)
-    if unit_weights:
-        graph = graph.unit_weights()
-    if not path.is_dir():
+    if not path.is_dir() and len(files) == 1:
         return graph
     absent = absent_ids(files)
     if not len(absent):

@@ -9,7 +9,8 @@ import typer
 from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.files import check_writable
 from pgo_models.problem.weighting import Weighting
-from solvers.cli.options import Cost, CostOption
+from solvers.cli.choices import chosen_robust
+from solvers.cli.options import Cost, CostOption, Robust
 from solvers.cli.shell import (
     DONE,
     NOT_CERTIFIED,
@@ -56,6 +57,18 @@ def robot_command(
         Path | None, typer.Option("--out", "-o", help="Write this robot's poses and edges as .g2o.")
     ] = None,
     cost: CostOption = None,
+    share_measurements: Annotated[
+        bool,
+        typer.Option(
+            "--share-measurements",
+            help="Send the measurements to the robot that drives: mostly fewer bytes, and all that "
+            "pgo solve can. Without it they stay with this robot.",
+        ),
+    ] = False,
+    robust: Annotated[
+        Robust | None,
+        typer.Option(help="Find wrong edges, as pgo solve does; with --share-measurements."),
+    ] = None,
     patience: Annotated[
         float,
         typer.Option("--patience", help="Seconds after which a silent robot counts as absent."),
@@ -67,7 +80,8 @@ def robot_command(
     as_json: JsonOption = False,
 ) -> None:
     """Run `pgo robot`."""
-    from solvers.team.robot import Robot  # greenlet and Zenoh are of an extra
+    from solvers.team.agent import Sharing  # greenlet and Zenoh are of an extra
+    from solvers.team.robot import Robot
     from solvers.team.zenoh_link import ZenohLink, carry
 
     if out is not None:
@@ -75,7 +89,15 @@ def robot_command(
     if cost not in _WEIGHTINGS:
         raise SettingError("robots of a team minimise chi2 or F; give --cost chi2 or isotropic")
     names = [word.strip() for word in team.split(",")]
-    robot = Robot(name, names, _secret(key), weighting=_WEIGHTINGS[cost], patience=patience)
+    robot = Robot(
+        name,
+        names,
+        _secret(key),
+        weighting=_WEIGHTINGS[cost],
+        sharing=Sharing.MEASUREMENTS if share_measurements else Sharing.INTERFACE,
+        robust=chosen_robust(robust),
+        patience=patience,
+    )
     robot.read(graph)
     reporter = _Reporter(quiet or as_json)
     interrupted = False

@@ -2,7 +2,8 @@
 
 The page of a solve (`solvers.plan`) asks robots and waits. Here it runs in a coroutine of the
 package greenlet: where it would wait, it stops, and goes on when the last answer is there. So the
-robot that drives has neither threads nor sockets, and the page is the one of every other place.
+robot that drives has neither threads nor sockets, and the page is the one of every other place. A
+team that shares its measurements has the robot that drives solve alone, with all that `solve` can.
 """
 
 from __future__ import annotations
@@ -13,13 +14,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pgo_models.errors import PGOError, extra_module
+from pgo_models.graphs.g2o import graph_of_robots
+from pgo_models.graphs.g2o_parser import parse_lines
+from pgo_models.graphs.precisions import RotationWeight
+from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.distributed.robots.own_file import FileAgent
 from solvers.folder_solve import FilesOfRobots, FolderSolution
 from solvers.loop import RunMonitor
 from solvers.network.engine import DEFAULT_MEMORY
 from solvers.network.messages import Idle, Worker, obey, raise_first_error
-from solvers.request import Pipeline
+from solvers.pipeline import solution_for
+from solvers.request import Pipeline, SolveRequest
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC
+from solvers.solution import Solution
+from solvers.team.agent import OwnAnswer, Sharing, TeamAgent, give_measurements, take_answer
 from solvers.team.messages import Ask, Reply, Term, error_of_message
 from solvers.team.wire import Order
 
@@ -41,12 +50,13 @@ class Drive:
 
     term: Term
     members: tuple[str, ...]
-    agent: FileAgent
+    agent: TeamAgent
     pipeline: Pipeline
     weighting: Weighting
+    robust: GNC | PCM | None = None
     call: int = -1
     waiting: dict[str, Ask] = field(default_factory=dict)
-    outcome: FolderSolution | PGOError | None = None
+    outcome: FolderSolution | Solution | PGOError | None = None
     _answers: list[Any] = field(default_factory=list)
     _page: Any = None
 
@@ -73,14 +83,41 @@ class Drive:
         self.waiting.clear()
 
     def _solve(self) -> None:
-        files = [(k, Path(f"{name}.g2o")) for k, name in enumerate(self.members)]
-        job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting)
         try:
-            self.outcome = job.solved(self.pipeline, RunMonitor(progress=False))
+            if self.agent.sharing is Sharing.MEASUREMENTS:
+                self.outcome = self._solved_in_one_place()
+            else:
+                self.outcome = self._solved_by_robots()
         except PGOError as error:
             self.outcome = error
         except _AbandonedError:
             pass
+
+    def _solved_by_robots(self) -> FolderSolution:
+        """The solution by robots with files of their own."""
+        files = [(k, Path(f"{name}.g2o")) for k, name in enumerate(self.members)]
+        job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting)
+        return job.solved(self.pipeline, RunMonitor(progress=False))
+
+    def _solved_in_one_place(self) -> Solution:
+        """The solution of the graph of all measurements; each robot is told of its poses."""
+        nothing = [None] * len(self.members)
+        texts = self.ask(give_measurements, nothing)
+        files = [
+            parse_lines(Path(f"{name}.g2o"), [text])
+            for name, text in zip(self.members, texts, strict=True)
+        ]
+        graph = graph_of_robots(Path("team"), files, RotationWeight.SE_SYNC)
+        request = SolveRequest(
+            PGOProblem(graph, weighting=self.weighting),
+            self.pipeline,
+            robust=self.robust,
+            monitor=RunMonitor(progress=False),
+        )
+        solution = solution_for(request)
+        answers = [OwnAnswer.of(solution, robot) for robot in range(len(self.members))]
+        self.ask(take_answer, answers)
+        return solution
 
     # An engine, and its pool of workers: the robots are there already.
 

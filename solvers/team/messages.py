@@ -81,6 +81,10 @@ class Outcome:
         Rounds of the solve.
     note : str
         What went wrong, or what the solution lacks.
+    robust : str
+        What a robust solve says of the edges that it kept, doubts first.
+    is_held : bool
+        Whether nothing speaks against these edges.
     """
 
     term: Term
@@ -90,6 +94,16 @@ class Outcome:
     num_absent_poses: int = 0
     rounds: int = 0
     note: str = ""
+    robust: str = ""
+    is_held: bool = True
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the gap is within the one asked for, and nothing speaks against the edges kept.
+
+        It is so of the robots that are covered.
+        """
+        return self.is_held and self.certificate is not None and self.certificate.is_certified
 
     @property
     def text(self) -> str:
@@ -97,8 +111,8 @@ class Outcome:
         if self.certificate is None:
             return self.note
         names = ", ".join(self.covered)
-        gap = self.certificate.gap_text
-        return f"{self.certificate.verdict.name} for {names}: gap {gap}, {self.rounds} rounds"
+        said = self.robust or self.certificate.verdict.name
+        return f"{said}, for {names}: gap {self.certificate.gap_text}, {self.rounds} rounds"
 
 
 @dataclass(frozen=True)

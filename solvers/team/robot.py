@@ -21,13 +21,17 @@ from pgo_models.files import replace_when_done
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.g2o_parser import G2OLines, parse_lines
+from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.g2o_rows import numbers_of
 from pgo_models.problem.weighting import Weighting
-from solvers.distributed.robots.own_file import FileAgent, PlacedFile
 from solvers.folder_solve import FolderSolution
 from solvers.network.serialization import deserialize, serialize
 from solvers.request import Pipeline
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC
+from solvers.robust.rejection import Support
+from solvers.solution import Solution
+from solvers.team.agent import OwnAnswer, Sharing, TeamAgent
 from solvers.team.driving import Drive
 from solvers.team.messages import (
     MESSAGES,
@@ -110,27 +114,14 @@ class Saved:
     lines: tuple[str, ...]
     term: Term
     outcome: Outcome | None
-    ids: Array
-    poses: Poses | None
-
-
-class _Agent(FileAgent):
-    """The robot's part in a solve, with lines in place of a file."""
-
-    def __init__(self, number: int, name: str, text: str) -> None:
-        super().__init__((number, Path(f"{name}.g2o")))
-        self._text = text
-
-    def lines(self) -> G2OLines:
-        """Lines of the robot's measurements."""
-        return parse_lines(self.path, [self._text])
+    known: OwnAnswer | None
 
 
 @dataclass(eq=False)
 class _Part:
     """The part of this robot in a solve: its agent, and its last answer, which may be lost."""
 
-    agent: FileAgent
+    agent: TeamAgent
     call: int = -1
     reply: Reply | None = None
 
@@ -150,6 +141,12 @@ class Robot:
         Settings of a solve that this robot drives.
     weighting : Weighting
         Cost of such a solve: F, chi2, or the own one of the measurements.
+    sharing : Sharing
+        What this robot tells others: its INTERFACE, so that its measurements stay with it, or its
+        MEASUREMENTS, compressed, which mostly are fewer bytes. Then the robot that drives solves
+        alone, with all that `solve` can: priors and GPS, landmarks, robust solves, covariances.
+    robust : GNC or PCM, optional
+        How a team that shares its measurements finds wrong edges.
     patience : float
         Seconds after which a robot that was not heard of counts as absent.
     retry : float
@@ -158,8 +155,8 @@ class Robot:
     Raises
     ------
     SettingError
-        For a name that is not in the team, a name twice, a short key, or times that are not
-        positive.
+        For a name that is not in the team, a name twice, a short key, times that are not positive,
+        or a robust solve of robots that do not share their measurements.
     MissingExtraError
         Without the package greenlet, which the extra `team` brings.
 
@@ -199,6 +196,8 @@ class Robot:
         *,
         pipeline: Pipeline | None = None,
         weighting: Weighting = Weighting.OWN,
+        sharing: Sharing = Sharing.INTERFACE,
+        robust: GNC | PCM | None = None,
         patience: float = PATIENCE,
         retry: float = RETRY,
     ) -> None:
@@ -209,6 +208,10 @@ class Robot:
         self._key = key
         self._pipeline = pipeline if pipeline is not None else Pipeline()
         self._weighting = weighting
+        self._sharing = sharing
+        self._robust = robust
+        if robust is not None and sharing is not Sharing.MEASUREMENTS:
+            raise SettingError("a robust solve of a team needs sharing=Sharing.MEASUREMENTS")
         self._patience = patience
         self.retry = retry
         self._lines: list[str] = []
@@ -225,7 +228,7 @@ class Robot:
         self._tried: dict[str, int] | None = None  # revisions of the robots in the last solve
         self._unheard: dict[str, Outcome] = {}  # robots that have not confirmed the outcome
         self._out: list[Message] = []
-        self._known: tuple[Array, Poses] | None = None
+        self._known: OwnAnswer | None = None
         self.outcome: Outcome | None = None
         self.ledger = TeamLedger()
 
@@ -346,9 +349,25 @@ class Robot:
         """Rotation (d, d) and position (d,) of every pose of this robot, by id; none before."""
         if self._known is None:
             return {}
-        ids, poses = self._known
-        rows = zip(ids.tolist(), poses.R, poses.t, strict=True)
-        return {int(pose_id): (R, t) for pose_id, R, t in rows}
+        poses = self._known.poses
+        return dict(zip(self._known.ids.tolist(), zip(poses.R, poses.t, strict=True), strict=True))
+
+    @property
+    def covariances(self) -> dict[int, Array]:
+        """Covariance (p, p) of every pose of this robot, by id, of teams that share measurements.
+
+        Where they are not known, there are none.
+        """
+        if self._known is None or self._known.covariances is None:
+            return {}
+        return dict(zip(self._known.ids.tolist(), self._known.covariances, strict=True))
+
+    @property
+    def rejected(self) -> list[tuple[int, int]]:
+        """Ids of the ends of edges at this robot's poses that a robust solve has left out."""
+        if self._known is None:
+            return []
+        return [(i, j) for i, j in self._known.rejected.tolist()]
 
     @property
     def covered(self) -> tuple[str, ...]:
@@ -369,8 +388,7 @@ class Robot:
     @property
     def is_certified(self) -> bool:
         """Whether the last outcome is certified, for the robots that it covers."""
-        certificate = None if self.outcome is None else self.outcome.certificate
-        return certificate is not None and certificate.is_certified
+        return self.outcome is not None and self.outcome.is_certified
 
     def facts(self) -> list[tuple[str, str]]:
         """Return what is known, as it is printed, with labels.
@@ -388,6 +406,9 @@ class Robot:
             facts.append(("outcome", outcome.note))
         else:
             facts += outcome.certificate.facts()
+            facts.append(("closures", outcome.robust))
+            left_out = ", ".join(f"{i} to {j}" for i, j in self.rejected)
+            facts.append(("left out", left_out))
             facts += [("covered", ", ".join(outcome.covered)), ("note", outcome.note)]
             facts.append(("rounds", str(outcome.rounds)))
         facts.append(("absent", ", ".join(outcome.absent)))
@@ -423,6 +444,9 @@ class Robot:
             "absent": list(self.absent),
             "rounds": 0 if outcome is None else outcome.rounds,
             "note": "" if outcome is None else outcome.note,
+            "robust": "" if outcome is None else outcome.robust,
+            "is_certified": self.is_certified,
+            "rejected": [list(pair) for pair in self.rejected],
             "sent": dict(self.ledger.sent),
             "received": dict(self.ledger.received),
             "dropped": self.ledger.dropped,
@@ -443,11 +467,12 @@ class Robot:
         """
         if self._known is None:
             raise SettingError(f"{self.name} has no poses yet; a solve has to end before")
-        ids, poses = self._known
+        poses = self._known.poses
         tag = _VERTEX_TAGS[poses.d]
         lines = []
-        for pose_id, row in zip(ids.tolist(), numbers_of(poses.R, poses.t).tolist(), strict=True):
-            lines.append(f"{tag} {int(pose_id)} {' '.join(map(repr, row))}")
+        ids = self._known.ids.tolist()
+        for pose_id, row in zip(ids, numbers_of(poses.R, poses.t).tolist(), strict=True):
+            lines.append(f"{tag} {pose_id} {' '.join(map(repr, row))}")
         others = (_PENDING_VERTEX, *_VERTEX_TAGS.values())
         lines += [line for line in self._lines if not line.startswith(others)]
         with replace_when_done(path) as temporary:
@@ -459,7 +484,8 @@ class Robot:
             return f"Robot({self.name!r}, {size}, no outcome yet)"
         certificate = self.outcome.certificate
         verdict = self.outcome.note if certificate is None else certificate.verdict.name
-        return f"Robot({self.name!r}, {size}, {verdict}, covered={self.covered})"
+        held = "" if self.outcome.is_held else "DOUBTFUL, "
+        return f"Robot({self.name!r}, {size}, {held}{verdict}, covered={self.covered})"
 
     # Messages
 
@@ -488,7 +514,7 @@ class Robot:
             The time in seconds, of any clock that does not go back.
         """
         try:
-            envelope = opened(self._key, data, (Envelope, *MESSAGES))
+            envelope = opened(self._key, data, (Envelope, OwnAnswer, *MESSAGES))
             if not isinstance(envelope, Envelope) or envelope.receiver != self.name:
                 raise WireError("a message for another robot")
             if envelope.sender not in self.team or envelope.sender == self.name:
@@ -591,10 +617,12 @@ class Robot:
     def _begin_drive(self, awake: tuple[str, ...], now: float) -> None:
         self._tried = self._current_revisions(awake)
         self._term = Term(self._term.number + 1, self.name)
-        agent = _Agent(0, self.name, self._text())
+        agent = self._new_agent(0)
         self._part = _Part(agent)
         members = (self.name, *(name for name in awake if name != self.name))
-        self._drive = Drive(self._term, members, agent, self._pipeline, self._weighting)
+        self._drive = Drive(
+            self._term, members, agent, self._pipeline, self._weighting, self._robust
+        )
         self._drive.begin()
         self._after_step(now)
 
@@ -651,7 +679,7 @@ class Robot:
         if self._part is None:
             if self._d is None:
                 return
-            self._part = _Part(_Agent(ask.place, self.name, self._text()))
+            self._part = _Part(self._new_agent(ask.place))
         part = self._part
         if ask.call == part.call + 1:
             part.call = ask.call
@@ -659,7 +687,7 @@ class Robot:
         if ask.call == part.call and part.reply is not None:
             self._send(sender, part.reply, Priority.URGENT)
 
-    def _answer(self, agent: FileAgent, ask: Ask) -> Reply:
+    def _answer(self, agent: TeamAgent, ask: Ask) -> Reply:
         try:
             return Reply(ask.term, ask.call, ask.order.function()(agent, ask.request))
         except PGOError as error:
@@ -675,12 +703,13 @@ class Robot:
     def _keep_poses(self) -> None:
         """Keep the poses of the outcome; where a solve has failed, those before it."""
         assert self.outcome is not None
-        record = None if self._part is None else self._part.agent.record
-        if self.outcome.certificate is None or not isinstance(record, PlacedFile):
-            return
-        own = record.subgraph.is_own
-        ids = record.joined.graph.pose_ids[own]
-        self._known = ids.astype(float), record.kept[np.flatnonzero(own)]
+        answer = None if self._part is None else self._part.agent.answer
+        if self.outcome.certificate is not None and answer is not None:
+            self._known = answer
+
+    def _new_agent(self, place: int) -> TeamAgent:
+        """The part of this robot in a solve, with its measurements as they are now."""
+        return TeamAgent(place, self.name, self._text(), self._sharing)
 
     # On disk
 
@@ -692,10 +721,8 @@ class Robot:
         bytes
             What `Robot.load` takes. A solve that is under way begins again.
         """
-        ids, poses = self._known if self._known is not None else (np.zeros(0), None)
-        saved = Saved(
-            self.name, self.team, tuple(self._lines), self._term, self.outcome, ids, poses
-        )
+        lines = tuple(self._lines)
+        saved = Saved(self.name, self.team, lines, self._term, self.outcome, self._known)
         return packed(serialize(saved))
 
     @classmethod
@@ -724,7 +751,7 @@ class Robot:
             For other bytes.
         """
         try:
-            saved = deserialize(unpacked(data), (*records_of_rooms(), *MESSAGES, Saved))
+            saved = deserialize(unpacked(data), (*records_of_rooms(), *MESSAGES, OwnAnswer, Saved))
         except ValueError as error:
             raise SettingError(f"these bytes are no saved robot: {error}") from error
         robot = cls(saved.name, saved.team, key, patience=patience, retry=retry)
@@ -734,8 +761,7 @@ class Robot:
         if robot._lines:
             in_space = any(line.startswith(_IN_SPACE) for line in robot._lines)
             robot._d = 3 if in_space else 2
-        if saved.poses is not None:
-            robot._known = saved.ids, saved.poses
+        robot._known = saved.known
         return robot
 
 
@@ -786,13 +812,25 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...]) -> Outcome:
     ended = drive.outcome
     covered = tuple(sorted(drive.members))
     if isinstance(ended, FolderSolution):
+        rounds = ended.ledger.rounds
+        note = ended.note
+        return Outcome(
+            drive.term, ended.certificate, covered, absent, ended.num_absent, rounds, note
+        )
+    if isinstance(ended, Solution):
+        d = ended.poses.d
+        nobodys = Poses.identity(0, d)
+        certificate = replace(ended.certificate, poses=nobodys, Lambda=np.zeros((0, d, d)))
+        robust = ended.robust
         return Outcome(
             drive.term,
-            ended.certificate,
+            certificate,
             covered,
             absent,
-            ended.num_absent,
-            ended.ledger.rounds,
-            ended.note,
+            num_absent_poses=len(ended.problem.graph.absent),
+            rounds=drive.call + 1,
+            note=ended.note,
+            robust="" if robust is None else robust.headline,
+            is_held=robust is None or robust.support is Support.CHECKED,
         )
     return Outcome(drive.term, None, (), absent, note=f"failed: {ended}")

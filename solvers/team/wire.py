@@ -45,7 +45,12 @@ _ROOMS = (
     "solvers.riemannian",
     "solvers.soc",
 )
-_MODULES_OF_ORDERS = ("solvers.distributed.robots.", "solvers.network.moments", "solvers.soc.")
+_MODULES_OF_ORDERS = (
+    "solvers.distributed.robots.",
+    "solvers.network.moments",
+    "solvers.soc.",
+    "solvers.team.agent",
+)
 
 
 class WireError(PGOError):

@@ -78,12 +78,23 @@ def robots_of(
     graph: PoseGraph,
     num_robots: int,
     weighting: pgo.Weighting = pgo.Weighting.ISOTROPIC,
+    sharing: solvers.Sharing = solvers.Sharing.INTERFACE,
+    robust: solvers.GNC | None = None,
 ) -> dict[str, solvers.Robot]:
     """A robot for every part of a graph, with its own poses and the edges that begin at them."""
     owners = pgo.partition(graph, num_robots).robot
     names = [f"r{k}" for k in range(num_robots)]
     robots = {
-        name: solvers.Robot(name, names, KEY, weighting=weighting, patience=5.0, retry=0.3)
+        name: solvers.Robot(
+            name,
+            names,
+            KEY,
+            weighting=weighting,
+            sharing=sharing,
+            robust=robust,
+            patience=5.0,
+            retry=0.3,
+        )
         for name in names
     }
     for pose, owner in enumerate(owners.tolist()):

@@ -167,6 +167,18 @@ def test_three_machines_have_one_certified_map(fleet: Fleet) -> None:
             assert sum(by_system) == pytest.approx(sent + received, rel=0.2)
 
 
+def test_machines_that_share_their_measurements_need_two_rounds(fleet: Fleet) -> None:
+    for name in NAMES:
+        fleet.start(name, "--share-measurements", "--robust", "gnc")
+    best = central()
+    for name in NAMES:
+        code, told = fleet.ended(name)
+        assert code == 0, told
+        assert told["rounds"] == 2
+        assert told["rejected"] == []
+        assert told["objective"] == pytest.approx(best.objective, rel=1e-6)
+
+
 def test_a_late_robot_is_waited_for_and_one_that_never_comes_is_named(fleet: Fleet) -> None:
     fleet.start("a", "--wait", "25")
     time.sleep(8.0)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from budget import examples
 from graphs import informed
 from networks import KEY, Network, give_edge, robots_of
+from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
+from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.team.robot import TeamLedger
@@ -155,6 +158,105 @@ def test_what_is_measured_later_is_solved_with_the_rest() -> None:
     assert network.is_settled
     assert robots["r0"].outcome is not before
     assert_is_the_optimum(robots, graph)
+
+
+def test_a_team_that_shares_its_measurements_finds_wrong_ones_in_three_messages_each() -> None:
+    graph, is_wrong = spoiled(world(n=100), 0.4, "random", 1)
+    sharing = solvers.Sharing.MEASUREMENTS
+    robots = robots_of(graph, 3, sharing=sharing, robust=solvers.GNC())
+    network = Network(robots, np.random.default_rng(0))
+    network.run(60.0)
+    assert network.is_settled
+    right = graph.without_edges(is_wrong)
+    assert_is_the_optimum(robots, right)
+    wrong = {(int(graph.i[e]), int(graph.j[e])) for e in np.flatnonzero(is_wrong)}
+    found = {pair for robot in robots.values() for pair in robot.rejected}
+    assert found == wrong
+    for robot in robots.values():
+        assert robot.outcome is not None
+        assert robot.outcome.rounds == 2
+        assert sorted(robot.covariances) == sorted(robot.poses)
+        assert all(S.shape == (3, 3) for S in robot.covariances.values())
+        assert "closures hold the map" in robot.outcome.robust
+        assert robot.is_certified
+
+
+def test_doubts_of_a_robust_solve_reach_all_robots() -> None:
+    # A tree with one closure more: nothing checks whether it is right.
+    names = ["a", "b"]
+    robots = {}
+    for name in names:
+        sharing = solvers.Sharing.MEASUREMENTS
+        robots[name] = solvers.Robot(name, names, KEY, sharing=sharing, robust=solvers.GNC())
+    ahead = np.array([1.0, 0.0])
+    for k in range(6):
+        robot = robots["a" if k < 3 else "b"]
+        robot.add_pose(k)
+        robot.add_edge(k, k + 1, np.eye(2), ahead, kappa=1e2, tau=1e2)
+    robots["b"].add_edge(0, 6, np.eye(2), -20.0 * ahead, kappa=1e2, tau=1e2)
+    network = Network(robots, np.random.default_rng(0))
+    network.run(30.0)
+    assert network.is_settled
+    for robot in robots.values():
+        assert robot.outcome is not None
+        assert robot.outcome.certificate is not None
+        assert not robot.is_certified
+        assert robot.outcome.robust.startswith("UNCHECKED")
+
+
+def test_sharing_measurements_takes_fewer_bytes_than_sharing_interfaces() -> None:
+    graph = world(3, 60)
+    carried = {}
+    for sharing in solvers.Sharing:
+        network = Network(robots_of(graph, 3, sharing=sharing), np.random.default_rng(0))
+        network.run(60.0)
+        assert network.is_settled
+        assert_is_the_optimum(network.robots, graph)
+        carried[sharing] = network.carried
+    assert 3 * carried[solvers.Sharing.MEASUREMENTS] < carried[solvers.Sharing.INTERFACE]
+
+
+def test_gps_and_landmarks_need_a_team_that_shares_its_measurements(tmp_path: Path) -> None:
+    graph = world(n=30)
+    assert graph.truth is not None
+    graph = graph.with_position_prior(np.arange(4), graph.truth.t[:4], 10.0)
+    owners = np.arange(graph.num_poses) * 2 // graph.num_poses
+    owners[graph.world] = 0
+    write_g2o_folder(graph.with_robots(owners), tmp_path / "files")
+    for sharing in solvers.Sharing:
+        robots = {}
+        for k, name in enumerate(("a", "b")):
+            robots[name] = solvers.Robot(name, ["a", "b"], KEY, sharing=sharing)
+            robots[name].read(tmp_path / "files" / f"{k}.g2o")
+        network = Network(robots, np.random.default_rng(0))
+        network.run(30.0)
+        assert network.is_settled
+        outcome = robots["b"].outcome
+        assert outcome is not None
+        if sharing is solvers.Sharing.INTERFACE:
+            assert "has priors or landmarks, which all robots share" in outcome.note
+        else:
+            assert robots["b"].is_certified
+            assert len(robots["a"].poses) + len(robots["b"].poses) == 30
+
+
+def test_a_robot_that_shares_its_interface_alone_gives_away_nothing_else() -> None:
+    names = ["a", "b"]
+    robots = {}
+    for name, sharing in zip(names, reversed(solvers.Sharing), strict=True):
+        robots[name] = solvers.Robot(name, names, KEY, sharing=sharing)
+        robots[name].add_pose(ord(name))
+        robots[name].add_edge(
+            97, 98, np.eye(2), np.array([1.0, 0.0]), kappa=1.0, tau=1.0 + ord(name)
+        )
+    network = Network(robots, np.random.default_rng(0))
+    network.run(30.0)
+    assert network.is_settled
+    for robot in robots.values():
+        assert robot.outcome is not None
+        assert "b shares its interface alone" in robot.outcome.note
+    with pytest.raises(SettingError, match=r"needs sharing=Sharing\.MEASUREMENTS"):
+        solvers.Robot("a", names, KEY, robust=solvers.GNC())
 
 
 def test_bytes_are_counted_where_they_are_handed_out_and_received() -> None:
