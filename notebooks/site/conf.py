@@ -49,6 +49,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = project
 html_static_path = [str(SITE / "static")]
 html_css_files = ["site.css"]
+html_search_scorer = str(SITE / "static" / "scorer.js")
 html_copy_source = False
 html_show_sourcelink = False
 # Summaries need other files, which a browser does not read when pages are opened from the disk.
@@ -68,11 +69,13 @@ html_sidebars = {"benchmarks": [], "changelog": [], "proved": []}
 
 
 def setup(app: object) -> None:
-    """Take MathJax from a package of the extra `docs`, and convert the docstrings.
+    """Take MathJax and plotly from packages of the extra `docs`, and convert the docstrings.
 
-    MathJax is one file without fonts.
+    MathJax is one file without fonts. Pages with films load plotly.
     """
     (folder,) = find_spec("sphinx-mathjax-offline").submodule_search_locations
     app.config.html_static_path.append(f"{folder}/static/mathjax/tex-svg.js")
     app.config.mathjax_path = "tex-svg.js"
+    plotly = Path(find_spec("plotly").origin).parent
+    app.config.html_static_path.append(f"{plotly}/package_data/plotly.min.js")
     docstrings.connect(app)

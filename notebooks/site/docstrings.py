@@ -2,9 +2,10 @@
 
 The docstrings are written as plain text, with `code` and **bold** as the only markup. Everything
 else that reStructuredText would take for markup (|x|, R_i, a * b) is escaped. A block that is
-indented relative to the prose around it is a formula and becomes a literal block. Examples stay
-examples. A public name in backticks becomes a link. The comments beside the fields of a dataclass
-become its attributes.
+indented relative to the prose around it is displayed: typeset if it is a formula that `formulas.py`
+can read, else as it is written. Formulas in the prose are typeset, too. Examples stay examples. A
+public name in backticks becomes a link. The comments beside the fields of a dataclass become its
+attributes.
 """
 
 import dataclasses
@@ -13,6 +14,7 @@ import inspect
 import re
 from collections.abc import Iterator
 
+import formulas  # beside this file
 from docutils import nodes
 from sphinx.addnodes import desc_annotation, pending_xref
 
@@ -69,13 +71,16 @@ def as_code(text: str) -> str:
     return f"``{text}``"
 
 
-def escaped(line: str) -> str:
-    """Return one line of prose in which only code, bold and links are markup."""
-    pieces = re.split(r"(``[^`]+``|`[^`]+`|\*\*[^*\s](?:[^*]*[^*\s])?\*\*)", line)
+def escaped(text: str, has_formulas: bool = True) -> str:
+    """Return prose in which only code, bold, links and formulas are markup."""
+    pieces = re.split(r"(``[^`]+``|`[^`]+`|\*\*[^*\s](?:[^*]*[^*\s])?\*\*)", text)
     for k, piece in enumerate(pieces):
         if k % 2 == 0:
-            # "file:" would be taken for the beginning of an address.
-            pieces[k] = re.sub(r"([*|_\\`]|(?<=\bfile):)", r"\\\1", piece, flags=re.I)
+            parts = formulas.inline(piece) if has_formulas else [(piece, False)]
+            pieces[k] = "".join(
+                f":math:`{part}`" if is_formula else without_markup(part)
+                for part, is_formula in parts
+            )
         elif piece.startswith("`") and not piece.startswith("``"):
             pieces[k] = as_code(piece.strip("`"))
             before = pieces[k - 1]
@@ -85,11 +90,27 @@ def escaped(line: str) -> str:
     return "".join(pieces)
 
 
+def without_markup(text: str) -> str:
+    """Return prose in which nothing is markup; "file:" would begin an address."""
+    return re.sub(r"([*|_\\`]|(?<=\bfile):)", r"\\\1", text, flags=re.I)
+
+
+def joined(block: list[str]) -> list[str]:
+    """Return lines of which those that are indented alike are one; a formula may go across them."""
+    out: list[str] = []
+    for line in block:
+        if out and indentation(line) == indentation(out[-1]) > 0:
+            out[-1] += " " + line.strip()
+        else:
+            out.append(line)
+    return out
+
+
 def parameter(line: str) -> str:
-    """Return a line of a section: "name : type" with the type as a literal, or prose."""
+    """Return a line of a section: "name : type" with the type as a literal, a type, or prose."""
     if match := re.match(r"(\w+(?:, \w+)*) : (.+)$", line):
         return f"{match[1]} : ``{match[2].replace('`', '')}``"
-    return escaped(line)
+    return escaped(line, has_formulas=line.startswith(" "))
 
 
 def attributes(block: list[str]) -> list[str]:
@@ -141,12 +162,13 @@ def split_formulas(block: list[str], base: int) -> Iterator[list[str]]:
 def as_rest(lines: list[str]) -> list[str]:
     """Return a numpydoc docstring in the form that napoleon reads."""
     out: list[str] = []
-    in_section = is_attributes = False
+    in_section = is_attributes = in_references = False
     for block in blocks(lines):
         head = block[0].strip()
         if head in SECTIONS and len(block) > 1 and set(block[1].strip()) == {"-"}:
             in_section = head not in ("Examples", "Notes", "References")
             is_attributes = head == "Attributes"
+            in_references = head == "References"
             out += [".. rubric:: Attributes", ""] if is_attributes else block[:2]
             block = block[2:]
             if not block:
@@ -155,28 +177,42 @@ def as_rest(lines: list[str]) -> list[str]:
         if head.startswith(">>>"):
             out += [*block, ""]
         elif in_section:
-            out += [*(attributes(block) if is_attributes else map(parameter, block)), ""]
+            described = joined(block)
+            out += [*(attributes(described) if is_attributes else map(parameter, described)), ""]
+        elif in_references:
+            out += [*(escaped(line, has_formulas=False) for line in block), ""]
         else:
             for part in split_formulas(block, 0):
                 if indentation(part[0]) > 0 and not LIST_ITEM.match(part[0].strip()):
-                    out += ["::", "", *part, ""]
+                    out += displayed(part)
                 else:
                     out += [*items_apart(part), ""]
     return out
 
 
+def displayed(block: list[str]) -> list[str]:
+    """Return an indented block as a formula if it can be read as one, else as a literal block."""
+    tex = formulas.display(block)
+    if tex is None:
+        return ["::", "", *block, ""]
+    return [".. math::", "", f"    {tex}", ""]
+
+
 def items_apart(block: list[str]) -> list[str]:
     """Return prose; in a list, separate the items and indent their continuation lines."""
-    if not LIST_ITEM.match(block[0].strip()):
-        return [escaped(line) for line in block]
-    out: list[str] = []
-    for line in block:
-        text = line.strip()
-        if mark := LIST_ITEM.match(text):
-            out += ["", mark[0] + escaped(text[mark.end() :])]
-            width = mark.end()
+    lines = [line.strip() for line in block]
+    if not LIST_ITEM.match(lines[0]):
+        return [escaped(" ".join(lines))]
+    items: list[str] = []
+    for line in lines:
+        if LIST_ITEM.match(line):
+            items.append(line)
         else:
-            out.append(" " * width + escaped(text))
+            items[-1] += " " + line
+    out: list[str] = []
+    for item in items:
+        mark = LIST_ITEM.match(item)[0]
+        out += ["", mark + escaped(item.removeprefix(mark))]
     return out[1:]
 
 
@@ -209,6 +245,9 @@ def process(
     if what == "class" and issubclass(thing, enum.Enum):
         members = [f"* **{member.name}**: {escaped(str(member.value))}" for member in thing]
         converted += ["", *members, ""]
+    if what in ("attribute", "data", "property") and converted:
+        # Napoleon would take what stands before a colon of the first line for a type.
+        converted[:1] = re.split(r"(?<=:) ", converted[0], maxsplit=1)
     lines[:] = converted
 
 
@@ -225,7 +264,9 @@ def link_types(app: object, tree: nodes.document) -> None:
     Sphinx would search all classes for the other types.
     """
     for reference in list(tree.findall(pending_xref)):
-        if reference.get("refdomain") != "py" or not reference.get("refspecific"):
+        if reference.get("refdomain") != "py":
+            continue
+        if not reference.get("refspecific") and reference["reftarget"] not in NAMES:
             continue
         target = NAMES.get(reference["reftarget"].removeprefix("~").rpartition(".")[2])
         if target is None:
