@@ -153,14 +153,18 @@ def read_g2o(
         read_lines(file, skip_unknown, reading, needs_matrices=not unit_weights)
         for file in g2o_files(path)
     ]
-    graph = graph_of_robots(path, files, weights, trust_folder)
+    graph = graph_of_robots(path, files, weights, path.is_dir(), trust_folder)
     return graph.unit_weights() if unit_weights else graph
 
 
 def graph_of_robots(
-    path: Path, files: list[G2OLines], weights: RotationWeight, trust_folder: bool = False
+    path: Path,
+    files: list[G2OLines],
+    weights: RotationWeight,
+    is_folder: bool,
+    trust_folder: bool = False,
 ) -> PoseGraph:
-    """Graph of files that have been read, each of a robot, or of one file.
+    """Graph of files that have been read: of a folder with one for each robot, or of one file.
 
     Those of several robots have to be of one graph, unless the folder is trusted. Poses of robots
     without a file are `PoseGraph.absent`.
@@ -171,9 +175,7 @@ def graph_of_robots(
     if not trust_folder:
         check_one_graph(files)
     graph = graph_of_files(path, files, weights)
-    if not path.is_dir() and len(files) == 1:
-        return graph
-    absent = absent_ids(files)
+    absent = absent_ids(files) if is_folder else np.zeros(0, dtype=np.int64)
     if not len(absent):
         return graph
     name = f"{graph.name}, {FILES_HERE}"

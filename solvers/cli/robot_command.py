@@ -133,6 +133,7 @@ class _Reporter:
         self._is_silent = is_silent
         self._said: set[str] = set()
         self._outcome: Outcome | None = None
+        self._failure = ""
 
     def __call__(self, robot: "Robot") -> None:
         """Say what is new of a robot."""
@@ -142,7 +143,10 @@ class _Reporter:
                 self.say(f"{other} is there")
         if robot.outcome is not self._outcome and robot.outcome is not None:
             self._outcome = robot.outcome
-            self.say(f"{robot.outcome.text}")
+            self.say(robot.outcome.text)
+        if robot.failure != self._failure:
+            self._failure = robot.failure
+            self.say(robot.failure or "what went wrong is mended")
 
     def say(self, text: str) -> None:
         """Print a line on stderr."""

@@ -212,7 +212,8 @@ def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: P
     poses, pose = np.unique(shared, return_inverse=True)
     num_shared = [len(border.poses) for border in borders]
     robot = np.repeat(np.arange(len(borders)), num_shared)
-    for kind, what in enumerate(("graph", "positions", "rotations")):
+    whats = ("graph falls", "positions fall", "rotations fall")
+    for kind, what in enumerate(whats):
         label = np.concatenate([border.labels[kind] for border in borders])
         parts, part = np.unique(np.stack([robot, label]), axis=1, return_inverse=True)
         num_vertices = len(poses) + parts.shape[1]
@@ -221,5 +222,5 @@ def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: P
         if len(poses):
             count += connected_components(tied)[0]
         if count > 1:
-            problem = f"the {what} of all robots fall into {count} parts, no edge between"
-            raise GraphError(f"{folder}: {problem}; {READ_HERE}")
+            problem = f"the {what} into {count} parts, no edge between"
+            raise GraphError(f"{folder}: {problem}; solve each part in a folder of its own")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -53,10 +54,14 @@ class Ask:
 
 @dataclass(frozen=True, eq=False)
 class Reply:
-    """The answer to order number `call`, or what went wrong."""
+    """The answer to order number `call`, or what went wrong.
+
+    `revision` is that of the measurements that the robot takes part with.
+    """
 
     term: Term
     call: int
+    revision: int
     answer: Any
     error: tuple[str, str] | None = None  # name and text of a PGOError
 
@@ -71,8 +76,8 @@ class Outcome:
         The solve.
     certificate : Certificate, optional
         Cost, bound, gap and verdict, without poses; None where the solve failed.
-    covered : tuple of str
-        Robots whose measurements it holds for.
+    revisions : dict of str to int
+        Robots that took part, with how many lines of measurements each.
     absent : tuple of str
         Robots of the team that were not heard of.
     num_absent_poses : int
@@ -89,13 +94,18 @@ class Outcome:
 
     term: Term
     certificate: Certificate | None
-    covered: tuple[str, ...]
+    revisions: Mapping[str, int]
     absent: tuple[str, ...]
     num_absent_poses: int = 0
     rounds: int = 0
     note: str = ""
     robust: str = ""
     is_held: bool = True
+
+    @property
+    def covered(self) -> tuple[str, ...]:
+        """Robots whose measurements the certificate holds for."""
+        return () if self.certificate is None else tuple(sorted(self.revisions))
 
     @property
     def is_certified(self) -> bool:

@@ -24,6 +24,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.g2o_rows import numbers_of
 from pgo_models.problem.weighting import Weighting
+from solvers.distributed.robots.own_file import READ_HERE
 from solvers.folder_solve import FolderSolution
 from solvers.network.serialization import deserialize, serialize
 from solvers.request import Pipeline
@@ -48,6 +49,8 @@ from solvers.team.wire import WireError, opened, packed, records_of_rooms, seale
 
 PATIENCE = 10.0  # seconds
 RETRY = 1.0
+# Share of its patience after which a robot says again that it is there.
+_SHARE_OF_PATIENCE = 0.25
 _FEWEST_KEY_BYTES = 16
 _EDGE_TAGS = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 _VERTEX_TAGS = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
@@ -111,6 +114,8 @@ class Saved:
 
     name: str
     team: tuple[str, ...]
+    weighting: Weighting
+    sharing: Sharing
     lines: tuple[str, ...]
     term: Term
     outcome: Outcome | None
@@ -122,6 +127,7 @@ class _Part:
     """The part of this robot in a solve: its agent, and its last answer, which may be lost."""
 
     agent: TeamAgent
+    revision: int
     call: int = -1
     reply: Reply | None = None
 
@@ -151,6 +157,15 @@ class Robot:
         Seconds after which a robot that was not heard of counts as absent.
     retry : float
         Seconds after which a message that was not answered is sent again.
+
+    Attributes
+    ----------
+    outcome : Outcome, optional
+        How the last solve that succeeded has ended.
+    last : Outcome, optional
+        How the last solve has ended, also if it has failed (`failure` says why).
+    ledger : TeamLedger
+        Bytes by robot.
 
     Raises
     ------
@@ -220,7 +235,9 @@ class Robot:
         self._last_heard: dict[str, float] = {}
         self._revisions: dict[str, int] = {}
         self._began: float | None = None
-        self._hello_at = -np.inf
+        self._hello_at = -np.inf  # when hello was said to all, and to those that are not awake
+        self._sought_at = -np.inf
+        self._said_revision = -1
         self._sent_at: dict[str, float] = {}  # when the last ask or outcome was sent to each
         self._term = Term(0, "")
         self._part: _Part | None = None
@@ -229,6 +246,7 @@ class Robot:
         self._unheard: dict[str, Outcome] = {}  # robots that have not confirmed the outcome
         self._out: list[Message] = []
         self._known: OwnAnswer | None = None
+        self.last: Outcome | None = None
         self.outcome: Outcome | None = None
         self.ledger = TeamLedger()
 
@@ -290,7 +308,9 @@ class Robot:
         information : Array, (3, 3) or (6, 6), optional
             Information matrix, of (x, y, theta) or (x, y, z, rotation).
         kappa, tau : float, optional
-            Precisions in place of a matrix, per radian^2 and metre^2.
+            Precisions in place of a matrix, per radian^2 and metre^2. They are those of F
+            (`weighting=Weighting.ISOTROPIC`); the matrix that stands for them is that of
+            `write_g2o`, of which `Weighting.OWN` is chi2.
 
         Raises
         ------
@@ -380,10 +400,21 @@ class Robot:
         return self.team if self.outcome is None else self.outcome.absent
 
     @property
+    def failure(self) -> str:
+        """What went wrong in the last solve; empty if nothing did. `outcome` is one before it."""
+        is_failure = self.last is not None and self.last.certificate is None
+        return self.last.note if self.last is not None and is_failure else ""
+
+    @property
     def is_settled(self) -> bool:
-        """Whether the last outcome is of the whole team, and nobody waits for this robot."""
-        is_whole = self.outcome is not None and not self.outcome.absent
-        return is_whole and self._drive is None and not self._unheard and not self._out
+        """Whether the last solve was of the whole team, and nobody waits for this robot.
+
+        It was of all measurements that this robot has.
+        """
+        last = self.last
+        if last is None or last.absent or last.revisions.get(self.name) != self.revision:
+            return False
+        return self._drive is None and not self._unheard and not self._out
 
     @property
     def is_certified(self) -> bool:
@@ -399,19 +430,18 @@ class Robot:
             Pairs of a label and a text.
         """
         facts = [("robot", f"{self.name} of {', '.join(self.team)}")]
+        facts.append(("failure", self.failure))
         outcome = self.outcome
         if outcome is None:
-            return [*facts, ("outcome", "none: no solve has ended")]
-        if outcome.certificate is None:
-            facts.append(("outcome", outcome.note))
+            facts.append(("outcome", "none: no solve has succeeded"))
         else:
-            facts += outcome.certificate.facts()
-            facts.append(("closures", outcome.robust))
+            if outcome.certificate is not None:
+                facts += outcome.certificate.facts()
             left_out = ", ".join(f"{i} to {j}" for i, j in self.rejected)
-            facts.append(("left out", left_out))
+            facts += [("closures", outcome.robust), ("left out", left_out)]
             facts += [("covered", ", ".join(outcome.covered)), ("note", outcome.note)]
             facts.append(("rounds", str(outcome.rounds)))
-        facts.append(("absent", ", ".join(outcome.absent)))
+        facts.append(("absent", ", ".join(self.absent)))
         sent, received = (sum(counts.values()) for counts in self.ledger.both)
         traffic = f"{sent} sent, {received} received, {self.ledger.dropped} messages dropped"
         facts.append(("bytes", traffic))
@@ -444,6 +474,8 @@ class Robot:
             "absent": list(self.absent),
             "rounds": 0 if outcome is None else outcome.rounds,
             "note": "" if outcome is None else outcome.note,
+            "failure": self.failure,
+            "revisions": {} if outcome is None else dict(outcome.revisions),
             "robust": "" if outcome is None else outcome.robust,
             "is_certified": self.is_certified,
             "rejected": [list(pair) for pair in self.rejected],
@@ -480,12 +512,11 @@ class Robot:
 
     def __repr__(self) -> str:
         size = f"{self.revision} lines"
-        if self.outcome is None:
-            return f"Robot({self.name!r}, {size}, no outcome yet)"
-        certificate = self.outcome.certificate
-        verdict = self.outcome.note if certificate is None else certificate.verdict.name
+        if self.outcome is None or self.outcome.certificate is None:
+            return f"Robot({self.name!r}, {size}, {self.failure or 'no outcome yet'})"
         held = "" if self.outcome.is_held else "DOUBTFUL, "
-        return f"Robot({self.name!r}, {size}, {held}{verdict}, covered={self.covered})"
+        verdict = f"{held}{self.outcome.certificate.verdict.name}"
+        return f"Robot({self.name!r}, {size}, {verdict}, covered={self.covered})"
 
     # Messages
 
@@ -550,11 +581,8 @@ class Robot:
         """
         if self._began is None:
             self._began = now
-        if now - self._hello_at >= self.retry:
-            self._hello_at = now
-            for name in self.others:
-                self._send(name, Hello(self.revision, self._term), Priority.NORMAL)
         awake = self._awake(now)
+        self._say_hello(now, awake)
         if self._drive is not None:
             self._go_on_driving(now, awake)
         if self._drive is None and awake[0] == self.name and self._is_time(now, awake):
@@ -579,6 +607,20 @@ class Robot:
             if name == self.name or now - last <= self._patience:
                 awake.append(name)
         return tuple(awake)
+
+    def _say_hello(self, now: float, awake: tuple[str, ...]) -> None:
+        """Say hello to those that are not awake often, to all now and then, and when asked to."""
+        is_due = now - self._hello_at >= _SHARE_OF_PATIENCE * self._patience
+        is_due |= self._said_revision != self.revision
+        seeks = now - self._sought_at >= self.retry
+        for name in self.others:
+            if is_due or (seeks and name not in awake):
+                self._send(name, Hello(self.revision, self._term), Priority.NORMAL)
+        if is_due:
+            self._hello_at = now
+            self._said_revision = self.revision
+        if is_due or seeks:
+            self._sought_at = now
 
     def _send(self, to: str, message: object, priority: Priority) -> None:
         data = sealed(self._key, Envelope(self.name, to, message))
@@ -618,7 +660,7 @@ class Robot:
         self._tried = self._current_revisions(awake)
         self._term = Term(self._term.number + 1, self.name)
         agent = self._new_agent(0)
-        self._part = _Part(agent)
+        self._part = _Part(agent, self.revision)
         members = (self.name, *(name for name in awake if name != self.name))
         self._drive = Drive(
             self._term, members, agent, self._pipeline, self._weighting, self._robust
@@ -639,6 +681,8 @@ class Robot:
 
     def _take_reply(self, sender: str, reply: Reply, now: float) -> None:
         if self._drive is not None and reply.term == self._drive.term:
+            if self._tried is not None:
+                self._tried[sender] = reply.revision
             before = self._drive.call
             self._drive.take(sender, reply)
             if self._drive.call != before or self._drive.outcome is not None:
@@ -655,12 +699,13 @@ class Robot:
             return
         self._drive = None
         absent = tuple(name for name in self.team if name not in drive.members)
-        self.outcome = _outcome_of(drive, absent)
-        self._keep_poses()
-        self._unheard = {name: self.outcome for name in drive.members[1:]}
+        assert self._tried is not None
+        outcome = _outcome_of(drive, absent, self._tried)
+        self._end_with(outcome)
+        self._unheard = {name: outcome for name in drive.members[1:]}
         for name in self._unheard:
             self._sent_at[name] = now
-            self._send(name, self.outcome, Priority.NORMAL)
+            self._send(name, outcome, Priority.NORMAL)
 
     # Following
 
@@ -679,32 +724,33 @@ class Robot:
         if self._part is None:
             if self._d is None:
                 return
-            self._part = _Part(self._new_agent(ask.place))
+            self._part = _Part(self._new_agent(ask.place), self.revision)
         part = self._part
         if ask.call == part.call + 1:
             part.call = ask.call
-            part.reply = self._answer(part.agent, ask)
+            part.reply = self._answer(part, ask)
         if ask.call == part.call and part.reply is not None:
             self._send(sender, part.reply, Priority.URGENT)
 
-    def _answer(self, agent: TeamAgent, ask: Ask) -> Reply:
+    def _answer(self, part: _Part, ask: Ask) -> Reply:
         try:
-            return Reply(ask.term, ask.call, ask.order.function()(agent, ask.request))
+            answer = ask.order.function()(part.agent, ask.request)
         except PGOError as error:
-            return Reply(ask.term, ask.call, None, error_as_message(error))
+            return Reply(ask.term, ask.call, part.revision, None, error_as_message(error))
+        return Reply(ask.term, ask.call, part.revision, answer)
 
     def _take_outcome(self, sender: str, outcome: Outcome) -> None:
         if outcome.term == self._term and outcome.term.driver == sender:
-            if self.outcome is None or self.outcome.term != outcome.term:
-                self.outcome = outcome
-                self._keep_poses()
+            if self.last is None or self.last.term != outcome.term:
+                self._end_with(outcome)
             self._send(sender, Heard(outcome.term), Priority.NORMAL)
 
-    def _keep_poses(self) -> None:
-        """Keep the poses of the outcome; where a solve has failed, those before it."""
-        assert self.outcome is not None
+    def _end_with(self, outcome: Outcome) -> None:
+        """Keep an outcome and the poses with it; where a solve has failed, those before it."""
+        self.last = outcome
         answer = None if self._part is None else self._part.agent.answer
-        if self.outcome.certificate is not None and answer is not None:
+        if outcome.certificate is not None and answer is not None:
+            self.outcome = outcome
             self._known = answer
 
     def _new_agent(self, place: int) -> TeamAgent:
@@ -721,15 +767,32 @@ class Robot:
         bytes
             What `Robot.load` takes. A solve that is under way begins again.
         """
-        lines = tuple(self._lines)
-        saved = Saved(self.name, self.team, lines, self._term, self.outcome, self._known)
+        saved = Saved(
+            self.name,
+            self.team,
+            self._weighting,
+            self._sharing,
+            tuple(self._lines),
+            self._term,
+            self.outcome,
+            self._known,
+        )
         return packed(serialize(saved))
 
     @classmethod
     def load(
-        cls, data: bytes, key: bytes, *, patience: float = PATIENCE, retry: float = RETRY
+        cls,
+        data: bytes,
+        key: bytes,
+        *,
+        pipeline: Pipeline | None = None,
+        robust: GNC | PCM | None = None,
+        patience: float = PATIENCE,
+        retry: float = RETRY,
     ) -> Robot:
         """Return a robot that `save` has made bytes of.
+
+        Cost and sharing are as saved; the settings of solves that it drives are given again.
 
         Parameters
         ----------
@@ -737,7 +800,7 @@ class Robot:
             The bytes.
         key : bytes
             Secret of the team.
-        patience, retry : float
+        pipeline, robust, patience, retry
             As of `Robot`.
 
         Returns
@@ -751,10 +814,20 @@ class Robot:
             For other bytes.
         """
         try:
-            saved = deserialize(unpacked(data), (*records_of_rooms(), *MESSAGES, OwnAnswer, Saved))
+            saved = deserialize(unpacked(data), (*records_of_rooms(), *MESSAGES, *_SAVED))
         except ValueError as error:
             raise SettingError(f"these bytes are no saved robot: {error}") from error
-        robot = cls(saved.name, saved.team, key, patience=patience, retry=retry)
+        robot = cls(
+            saved.name,
+            saved.team,
+            key,
+            pipeline=pipeline,
+            weighting=saved.weighting,
+            sharing=saved.sharing,
+            robust=robust,
+            patience=patience,
+            retry=retry,
+        )
         robot._lines = list(saved.lines)
         robot._term = saved.term
         robot.outcome = saved.outcome
@@ -765,6 +838,7 @@ class Robot:
         return robot
 
 
+_SAVED = (OwnAnswer, Saved, Sharing, Weighting)
 _PENDING_VERTEX = "POSE"
 _IN_SPACE = ("EDGE_SE3", "VERTEX_SE3", "VERTEX3", "EDGE3")
 
@@ -807,25 +881,27 @@ def _information(
     return np.diag([*[tau] * d, *rotation])
 
 
-def _outcome_of(drive: Drive, absent: tuple[str, ...]) -> Outcome:
+def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, int]) -> Outcome:
     """The outcome of a solve that has ended."""
     ended = drive.outcome
-    covered = tuple(sorted(drive.members))
     if isinstance(ended, FolderSolution):
-        rounds = ended.ledger.rounds
-        note = ended.note
         return Outcome(
-            drive.term, ended.certificate, covered, absent, ended.num_absent, rounds, note
+            drive.term,
+            ended.certificate,
+            revisions,
+            absent,
+            num_absent_poses=ended.num_absent,
+            rounds=ended.ledger.rounds,
+            note=ended.note,
         )
     if isinstance(ended, Solution):
         d = ended.poses.d
         nobodys = Poses.identity(0, d)
-        certificate = replace(ended.certificate, poses=nobodys, Lambda=np.zeros((0, d, d)))
         robust = ended.robust
         return Outcome(
             drive.term,
-            certificate,
-            covered,
+            replace(ended.certificate, poses=nobodys, Lambda=np.zeros((0, d, d))),
+            revisions,
             absent,
             num_absent_poses=len(ended.problem.graph.absent),
             rounds=drive.call + 1,
@@ -833,4 +909,6 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...]) -> Outcome:
             robust="" if robust is None else robust.headline,
             is_held=robust is None or robust.support is Support.CHECKED,
         )
-    return Outcome(drive.term, None, (), absent, note=f"failed: {ended}")
+    # What robots with own files lack, a team that shares its measurements has.
+    text = str(ended).replace(READ_HERE, "robots that share their measurements can")
+    return Outcome(drive.term, None, revisions, absent, note=f"failed: {text}")

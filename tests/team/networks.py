@@ -53,7 +53,7 @@ class Network:
     @property
     def is_settled(self) -> bool:
         awake = [robot for name, robot in self.robots.items() if name not in self.asleep]
-        terms = {robot.outcome.term for robot in awake if robot.outcome is not None}
+        terms = {robot.last.term for robot in awake if robot.last is not None}
         return len(terms) == 1 and all(robot.is_settled for robot in awake)
 
     def _send(self, name: str, robot: solvers.Robot) -> None:
