@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graphs import informed, varied_graph
+from networks import KEY, Network, give_edge
 
 import pgo_models as pgo
 import solvers
@@ -25,13 +26,12 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, victoria_park
 from pgo_models.problem.weighting import Weighting
 from solvers.folder_solve import FolderSolution
-from solvers.solution import Solution
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 PAGE = Path(__file__).parents[1] / "notebooks/site/guide/capabilities.md"
 WORKS = "yes"
 MISSING = "no"
-Answer = Solution | FolderSolution
+Answer = "Solution | FolderSolution | Apart"
 
 
 def consensus(graph: PoseGraph) -> solvers.SOC:
@@ -94,12 +94,117 @@ def own_files(
         )
 
 
+@dataclass(frozen=True)
+class Stage:
+    """Name of a stage."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """Edges that were left out, (m,)."""
+
+    rejected: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """What robots that are apart know of a graph, and their network."""
+
+    graph: PoseGraph
+    network: Network
+
+    @property
+    def robot(self) -> solvers.Robot:
+        return self.network.robots["r1"]
+
+    @property
+    def certificate(self) -> pgo.Certificate:
+        if self.robot.outcome is None or self.robot.outcome.certificate is None:
+            raise pgo.PGOError(self.robot.failure)
+        return self.robot.outcome.certificate
+
+    @property
+    def note(self) -> str:
+        assert self.robot.outcome is not None
+        return self.robot.outcome.note
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        assert self.robot.outcome is not None
+        return tuple(map(Stage, self.robot.outcome.stages))
+
+    @property
+    def robust(self) -> Rejected:
+        ids = self.graph.pose_ids
+        pairs = zip(ids[self.graph.i].tolist(), ids[self.graph.j].tolist(), strict=True)
+        left_out = {pair for robot in self.network.robots.values() for pair in robot.rejected}
+        return Rejected(np.array([pair in left_out for pair in pairs]))
+
+    def marginals(self) -> np.ndarray:
+        found = {}
+        for robot in self.network.robots.values():
+            found |= robot.covariances
+        return np.array([found[pose] for pose in sorted(found)])
+
+    def extended(self, grown: PoseGraph) -> bool:
+        """Whether an edge that is measured later is solved with the rest."""
+        give_edge(self.network.robots["r0"], grown, grown.num_edges - 1)
+        before = self.robot.outcome
+        self.network.run(60.0)
+        after = self.robot.outcome
+        assert before is not None
+        assert after is not None
+        return sum(after.revisions.values()) == sum(before.revisions.values()) + 1
+
+
+def apart(
+    graph: PoseGraph,
+    pipeline: solvers.Pipeline,
+    weighting: Weighting,
+    lost: float = 0.0,
+    **options: Any,
+) -> Apart:
+    unknown = set(options) - {"robust", "callback"}
+    if unknown:
+        raise pgo.PGOError(
+            f"robots that are apart have no {unknown.pop()} in a solve; Robot.save keeps what one "
+            "of them has measured and knows"
+        )
+    robust = options.get("robust")
+    names = ["r0", "r1"]
+    robots = {}
+    with tempfile.TemporaryDirectory() as folder:
+        owners = np.arange(graph.num_poses) * 2 // graph.num_poses
+        if graph.world is not None:
+            owners[graph.world] = 0
+        write_g2o_folder(graph.with_robots(owners), Path(folder) / "robots")
+        for k, name in enumerate(names):
+            robots[name] = solvers.Robot(
+                name,
+                names,
+                KEY,
+                pipeline=pipeline,
+                weighting=weighting,
+                sharing=solvers.Sharing.MEASUREMENTS,
+                robust=robust,
+                retry=0.3,
+            )
+            robots[name].read(Path(folder) / "robots" / f"{k}.g2o")
+    network = Network(robots, np.random.default_rng(0), lost=lost)
+    network.run(120.0)
+    return Apart(graph, network)
+
+
 HERE = Place("here", here)
+APART = Place("robots that are apart", apart)
 PLACES = (
     HERE,
     Place("robots and a driver", with_driver),
     Place("robots without a driver", without_driver),
     Place("robots with own files", own_files),
+    APART,
 )
 
 
@@ -140,7 +245,7 @@ def finds_a_wrong_edge(robust: solvers.GNC | solvers.PCM, place: Place) -> bool:
 
 def has_covariances(place: Place) -> bool:
     answer = place.solve(graph_with_matrices(), weighting=Weighting.ISOTROPIC)
-    if not isinstance(answer, Solution):
+    if isinstance(answer, FolderSolution):
         raise pgo.PGOError("its solution has no poses, and so no covariances of them")
     return answer.marginals().shape == (8, 3, 3)
 
@@ -190,12 +295,16 @@ def extends(place: Place) -> bool:
     grown = varied_graph(3, 8, 3).with_edges(
         np.array([0]), np.array([5]), pgo.Poses(np.eye(3)[None], np.zeros((1, 3))), 1e-3, 1e-3
     )
-    if not isinstance(answer, Solution):
+    if isinstance(answer, Apart):
+        return answer.extended(grown)
+    if isinstance(answer, FolderSolution):
         raise pgo.PGOError("extend takes a Solution, which has poses")
     return solvers.extend(answer, grown).problem.graph.num_edges == grown.num_edges
 
 
 def bears_faults(place: Place) -> bool:
+    if place is APART:
+        return has_cost_of(Place("", partial(apart, lost=0.3)), graph_in_space(), Weighting.OWN)
     pipeline = solvers.Pipeline(soc=consensus(graph_in_space()))
     robots = solvers.Robots(faults=solvers.Faults())
     answer = place.solve(graph_in_space(), pipeline, Weighting.ISOTROPIC, robots=robots)

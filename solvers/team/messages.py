@@ -84,6 +84,8 @@ class Outcome:
         Poses that edges name and no robot has: what is found holds for these edges all the same.
     rounds : int
         Rounds of the solve.
+    stages : tuple of str
+        Names of the stages of the solve.
     note : str
         What went wrong, or what the solution lacks.
     robust : str
@@ -98,6 +100,7 @@ class Outcome:
     absent: tuple[str, ...]
     num_absent_poses: int = 0
     rounds: int = 0
+    stages: tuple[str, ...] = ()
     note: str = ""
     robust: str = ""
     is_held: bool = True

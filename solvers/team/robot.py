@@ -440,7 +440,7 @@ class Robot:
             left_out = ", ".join(f"{i} to {j}" for i, j in self.rejected)
             facts += [("closures", outcome.robust), ("left out", left_out)]
             facts += [("covered", ", ".join(outcome.covered)), ("note", outcome.note)]
-            facts.append(("rounds", str(outcome.rounds)))
+            facts += [("stages", ", ".join(outcome.stages)), ("rounds", str(outcome.rounds))]
         facts.append(("absent", ", ".join(self.absent)))
         sent, received = (sum(counts.values()) for counts in self.ledger.both)
         traffic = f"{sent} sent, {received} received, {self.ledger.dropped} messages dropped"
@@ -473,6 +473,7 @@ class Robot:
             "covered": list(self.covered),
             "absent": list(self.absent),
             "rounds": 0 if outcome is None else outcome.rounds,
+            "stages": [] if outcome is None else list(outcome.stages),
             "note": "" if outcome is None else outcome.note,
             "failure": self.failure,
             "revisions": {} if outcome is None else dict(outcome.revisions),
@@ -892,6 +893,7 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, i
             absent,
             num_absent_poses=ended.num_absent,
             rounds=ended.ledger.rounds,
+            stages=tuple(stage.name for stage in ended.stages),
             note=ended.note,
         )
     if isinstance(ended, Solution):
@@ -905,6 +907,7 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, i
             absent,
             num_absent_poses=len(ended.problem.graph.absent),
             rounds=drive.call + 1,
+            stages=tuple(stage.name for stage in ended.stages),
             note=ended.note,
             robust="" if robust is None else robust.headline,
             is_held=robust is None or robust.support is Support.CHECKED,

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/team.py [NAME ..]
 
-Robots in this process exchange messages at once (`tests/team/networks.py`). Files are those that
+Robots in this process exchange messages at once (`tests/networks.py`). Files are those that
 `write_g2o_folder` writes, with all digits of the doubles.
 """
 
@@ -18,7 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "team"))
+sys.path.insert(0, str(Path(__file__).parent.parent))
 from networks import KEY, Network
 
 import pgo_models as pgo
