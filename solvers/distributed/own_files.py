@@ -51,6 +51,9 @@ from solvers.network.engine import Engine
 from solvers.soc.subgraph import RobotSummary, place_poses
 
 
+SOLVE_PARTS = "solve each part in a folder of its own"
+
+
 @dataclass(frozen=True, eq=False)
 class OpenedFiles:
     """Robots that have read their files, and what their driver knows of the graph.
@@ -223,4 +226,4 @@ def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: P
             count += connected_components(tied)[0]
         if count > 1:
             problem = f"the {what} into {count} parts, no edge between"
-            raise GraphError(f"{folder}: {problem}; solve each part in a folder of its own")
+            raise GraphError(f"{folder}: {problem}; {SOLVE_PARTS}")

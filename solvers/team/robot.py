@@ -24,6 +24,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.g2o_rows import numbers_of
 from pgo_models.problem.weighting import Weighting
+from solvers.distributed.own_files import SOLVE_PARTS
 from solvers.distributed.robots.own_file import READ_HERE
 from solvers.folder_solve import FolderSolution
 from solvers.network.serialization import deserialize, serialize
@@ -615,12 +616,12 @@ class Robot:
         is_due |= self._said_revision != self.revision
         seeks = now - self._sought_at >= self.retry
         for name in self.others:
-            if is_due or (seeks and name not in awake):
+            if (seeks and name not in awake) or (is_due and name in awake):
                 self._send(name, Hello(self.revision, self._term), Priority.NORMAL)
         if is_due:
             self._hello_at = now
             self._said_revision = self.revision
-        if is_due or seeks:
+        if seeks:
             self._sought_at = now
 
     def _send(self, to: str, message: object, priority: Priority) -> None:
@@ -912,6 +913,7 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, i
             robust="" if robust is None else robust.headline,
             is_held=robust is None or robust.support is Support.CHECKED,
         )
-    # What robots with own files lack, a team that shares its measurements has.
+    # What robots with own files lack, a team that shares its measurements has; and parts may meet.
     text = str(ended).replace(READ_HERE, "robots that share their measurements can")
+    text = text.replace(SOLVE_PARTS, "an edge between them joins them")
     return Outcome(drive.term, None, revisions, absent, note=f"failed: {text}")

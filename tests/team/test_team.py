@@ -319,8 +319,8 @@ def test_robots_without_a_common_edge_say_so() -> None:
     for robot in robots.values():
         assert robot.outcome is None
         assert robot.failure == (
-            "failed: team: the graph falls into 2 parts, no edge between; solve each part in a "
-            "folder of its own"
+            "failed: team: the graph falls into 2 parts, no edge between; an edge between them "
+            "joins them"
         )
         assert robot.poses == {}
         assert robot.covered == ()
