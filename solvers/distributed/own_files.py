@@ -50,7 +50,6 @@ from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
 from solvers.soc.subgraph import RobotSummary, place_poses
 
-
 SOLVE_PARTS = "solve each part in a folder of its own"
 
 
