@@ -2,7 +2,8 @@
 
 `pgo_models.certificates` bounds at given poses. Here it is decided at which: the poses given, the
 stationary points that Newton reaches from them and from the chordal start, and for chi2 the minimum
-of a smaller cost. Where the relaxation is loose in space, handedness terms are sought as well.
+of a smaller cost. Where the relaxation is loose, what tells rotations from reflections follows:
+handedness terms in space, complex numbers in the plane.
 """
 
 import warnings
@@ -16,6 +17,7 @@ from pgo_models.certificates.certificate import (
     certificate_of_whole,
     certify_at,
     judge,
+    with_shifted_complex_numbers,
     with_terms,
 )
 from pgo_models.errors import FAILURES, GraphWarning, door
@@ -42,7 +44,8 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     is always that of the poses given. `certify_at` bounds at the poses as they are. Of a problem
     with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its tangent at the
     stationary point, and where that fails by smaller information matrices (`bound_by_shrinking`).
-    In space, handedness terms follow where the bound is still wide (`HandednessAscent`).
+    Where the bound is still wide, in space handedness terms follow (`HandednessAscent`), and in the
+    plane rotations are taken as complex numbers.
 
     Parameters
     ----------
@@ -90,7 +93,8 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
         polished = certify_at(problem, polish(problem, poses), gap, stationarity)
         source = BoundSource.REFINED if is_stationary else BoundSource.POLISHED
         certificate = judge(problem, poses, replace(polished, source=source))
-    for improve in (_beside_the_chordal_start, _by_smaller_matrices, _by_terms):
+    steps = (_beside_the_chordal_start, _by_complex_numbers, _by_smaller_matrices, _by_terms)
+    for improve in steps:
         if not bound_is_tight(problem, certificate):
             certificate = _improved(improve, problem, poses, certificate)
     return certificate
@@ -132,6 +136,16 @@ def _by_smaller_matrices(
 ) -> Certificate:
     """The certificate, or a better one of chi2 by smaller information matrices."""
     return with_shrunk_information(problem, certificate)
+
+
+def _by_complex_numbers(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
+    """The certificate, or a better one in the plane by rotations as complex numbers."""
+    ground = problem.at_best_translations(certificate.poses)
+    at_bound = replace(judge(problem, ground, certificate), poses=ground)
+    found = with_shifted_complex_numbers(problem, at_bound, ground)
+    if found is at_bound:
+        return certificate
+    return judge(problem, poses, replace(found, source=certificate.source))
 
 
 def _by_terms(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:

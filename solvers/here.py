@@ -16,6 +16,7 @@ from pgo_models.certificates.certificate import (
     certify_at,
     certify_with,
     judge,
+    with_shifted_complex_numbers,
     with_terms,
 )
 from pgo_models.certificates.lower_bound import NO_BOUND
@@ -210,6 +211,16 @@ class Here(Place):
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
         return replace(best, certificate=with_shrunk_information(self.problem, best.proof))
+
+    def bound_in_complex_numbers(self, best: Attempt) -> Attempt:
+        """Return the same poses, with the bound of rotations as complex numbers if it is better."""
+        problem = self.problem
+        ground = problem.at_best_translations(best.known_poses)
+        at_best = replace(judge(problem, ground, best.proof), poses=ground)
+        found = with_shifted_complex_numbers(problem, at_best, ground)
+        if found is at_best:
+            return best
+        return replace(best, certificate=judge(problem, best.known_poses, found))
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None

@@ -56,6 +56,7 @@ class Step(enum.Enum):
     SECOND = "a second attempt"
     STAIRCASE = "the Riemannian staircase"
     SMALLER_MATRICES = "smaller information matrices"
+    COMPLEX = "rotations as complex numbers"
     TERMS = "handedness terms"
     HULLS = "the relaxation with hulls of rotations"
 
@@ -239,6 +240,13 @@ class Place(ABC):
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
         raise self._refusal(Step.SMALLER_MATRICES.value)
+
+    def bound_in_complex_numbers(self, best: Attempt) -> Attempt:
+        """Return the same poses, with the bound of rotations as complex numbers if it is better.
+
+        It is for graphs in the plane. In one process `certify` has tried it without a shift eta.
+        """
+        raise self._refusal(Step.COMPLEX.value)
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None

@@ -122,7 +122,8 @@ class Pipeline:
     def asks_for(self, step: Step, d: int) -> bool:
         """Whether a step after the first attempt is to be taken, where the answer is open.
 
-        Handedness terms are for graphs in space: in the plane they add nothing.
+        Handedness terms are for graphs in space. In the plane rotations are taken as complex
+        numbers instead, which knows all that such terms could.
 
         Parameters
         ----------
@@ -136,7 +137,8 @@ class Pipeline:
         bool
             Whether there are settings for it.
         """
-        seeks_terms = self.handedness is not None and d == 3
+        tells_reflections = self.handedness is not None
+        seeks_terms = tells_reflections and d == 3
         return {
             Step.WHOLE: True,
             Step.GROWING: self.growing is not None,
@@ -144,6 +146,7 @@ class Pipeline:
             Step.SECOND: self.second_try,
             Step.STAIRCASE: self.staircase is not None,
             Step.SMALLER_MATRICES: self.staircase is not None,
+            Step.COMPLEX: tells_reflections and d == 2,
             Step.TERMS: seeks_terms,
             Step.HULLS: seeks_terms,
         }[step]

@@ -11,7 +11,7 @@ import enum
 import math
 from dataclasses import dataclass, replace
 
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
 from pgo_models.certificates.fit import Fit, fits_to_coordinates
 from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
 from pgo_models.certificates.lower_bound import (
@@ -19,6 +19,9 @@ from pgo_models.certificates.lower_bound import (
     LowerBound,
     best_bound,
     best_bound_with_terms,
+    best_complex_bound,
+    has_complex_form,
+    prove_at,
 )
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
@@ -116,7 +119,8 @@ class Certificate(ReadOnly):
         F of these, the best value known.
     Lambda : (n, d, d) array
         Multipliers, which with eta and these poses are the proof: anyone can check it with
-        `prove_bound`. Those of `BoundSource.SOFTENED` are of the smaller matrices.
+        `prove_bound`, told whether `bound` is_complex. Those of `BoundSource.SOFTENED` are of the
+        smaller matrices.
     wanted_gap : float
         The gap that was asked for.
     verdict : Verdict
@@ -325,7 +329,8 @@ class Certificate(ReadOnly):
         less = f"less {rounding} for rounding"
         if self.weights_error > 0.0:
             less += f" and {rounded_up(self.weights_error, 2)} of it for that of the weights"
-        return f"proved {form}{shift}{cap}{self._terms_text}, {less}"
+        numbers = ", with rotations as complex numbers" if self.bound.is_complex else ""
+        return f"proved {form}{numbers}{shift}{cap}{self._terms_text}, {less}"
 
     @property
     def _terms_text(self) -> str:
@@ -341,7 +346,9 @@ def certify_at(
     """Judge poses by the bound of the multipliers at these poses as they are.
 
     It is valid anywhere, and sharp near an optimum. `solvers.certify` moves poses that are not
-    stationary to the stationary point nearby, and bounds there.
+    stationary to the stationary point nearby, and bounds there. Where the bound leaves a wider gap,
+    one proof more is tried: in the plane with rotations as complex numbers, in space with
+    handedness terms in closed form.
 
     Parameters
     ----------
@@ -390,8 +397,10 @@ def certify_at(
         BoundSource.GIVEN,
         ground=best,
     )
-    if problem.d == 2 or not certificate.can_improve:
+    if not certificate.can_improve:
         return certificate
+    if problem.d == 2:
+        return with_complex_numbers(problem, certificate, best)
     terms = closed_form_terms(problem.tangent_at(best), best)
     return certificate if terms is None else with_terms(problem, certificate, terms, best)
 
@@ -429,12 +438,57 @@ def with_terms(
     gap = certificate.wanted_gap
     tangent = problem.tangent_at(ground)
     bound = best_bound_with_terms(tangent, Lambda, ground, gap, certificate.objective, terms)
+    return with_better(problem, certificate, Lambda, bound)
+
+
+def with_complex_numbers(
+    problem: PGOProblem, certificate: Certificate, ground: Poses
+) -> Certificate:
+    """The certificate, or a better one that takes rotations of the plane as complex numbers.
+
+    It is grounded at the poses `ground`, with the multipliers there and eta = 0.
+    """
+    if not has_complex_form(problem):
+        return certificate
+    Lambda = scalar_multipliers(multipliers(problem, ground))
+    bound = prove_at(problem.tangent_at(ground), Lambda, ground, is_complex=True)
+    return certificate if bound is None else with_better(problem, certificate, Lambda, bound)
+
+
+def with_shifted_complex_numbers(
+    problem: PGOProblem, certificate: Certificate, ground: Poses
+) -> Certificate:
+    """`with_complex_numbers` with the smallest eta found, and with either multipliers.
+
+    They are those at the poses `ground` or those of the certificate, which may be of a relaxation.
+    """
+    if not has_complex_form(problem):
+        return certificate
+    tangent = problem.tangent_at(ground)
+    gap = certificate.wanted_gap
+    objective = certificate.objective
+    at_ground = scalar_multipliers(multipliers(problem, ground))
+    of_certificate = scalar_multipliers(certificate.Lambda)
+    bound = best_complex_bound(tangent, at_ground, ground, gap, objective)
+    other = best_complex_bound(tangent, of_certificate, ground, gap, objective)
+    if bound.value < other.value:
+        return with_better(problem, certificate, of_certificate, other, certificate.source)
+    return with_better(problem, certificate, at_ground, bound)
+
+
+def with_better(
+    problem: PGOProblem,
+    certificate: Certificate,
+    Lambda: Array,
+    bound: LowerBound,
+    source: BoundSource = BoundSource.GIVEN,
+) -> Certificate:
+    """The certificate, or one of the same poses with a better bound, proved with these Lambda."""
     if bound.value <= certificate.bound.value:
         return certificate
+    gap = certificate.wanted_gap
     stationarity = certificate.stationarity
-    return certify_with(
-        problem, certificate.poses, Lambda, gap, stationarity, BoundSource.GIVEN, bound
-    )
+    return certify_with(problem, certificate.poses, Lambda, gap, stationarity, source, bound)
 
 
 def certify_with(

@@ -173,6 +173,10 @@ class RobotsOfGraph(DriverPlace):
         """Try smaller information matrices, in one place."""
         return self.here.bound_by_smaller_matrices(best)
 
+    def bound_in_complex_numbers(self, best: Attempt) -> Attempt:
+        """Take rotations of the plane as complex numbers, in one place."""
+        return self.here.bound_in_complex_numbers(best)
+
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
     ) -> Attempt:
