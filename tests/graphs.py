@@ -87,6 +87,23 @@ def informed(
     return replace(graph, information=information)
 
 
+def planar_lattice(
+    seed: int, side: int, rotation_std: float, kappa: float = 1.0, tau: float = 100.0
+) -> PoseGraph:
+    """side^2 poses of the plane, 1 m apart, with an edge between neighbours.
+
+    With a kappa far below tau the relaxation over the rows of X is loose.
+    """
+    rng = np.random.default_rng(seed)
+    index = np.arange(side**2).reshape(side, side)
+    t = np.stack(np.divmod(index.ravel(), side), axis=1).astype(float)
+    truth = Poses(random_rotations(side**2, 2, rng), t)
+    i = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
+    j = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
+    noise = NoiseModel(translation_std=0.1, rotation_std=rotation_std)
+    return observe("lattice", truth, i, j, noise, kappa, tau, rng)
+
+
 def varied_problem(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PGOProblem:
     """Problem of `varied_graph`."""
     return PGOProblem(varied_graph(seed, n, d, noise))
