@@ -17,6 +17,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
+from solvers.studies.tightness import noisy_lattice
 
 EPS = float(np.finfo(float).eps)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -87,21 +88,9 @@ def informed(
     return replace(graph, information=information)
 
 
-def planar_lattice(
-    seed: int, side: int, rotation_std: float, kappa: float = 1.0, tau: float = 100.0
-) -> PoseGraph:
-    """side^2 poses of the plane, 1 m apart, with an edge between neighbours.
-
-    With a kappa far below tau the relaxation over the rows of X is loose.
-    """
-    rng = np.random.default_rng(seed)
-    index = np.arange(side**2).reshape(side, side)
-    t = np.stack(np.divmod(index.ravel(), side), axis=1).astype(float)
-    truth = Poses(random_rotations(side**2, 2, rng), t)
-    i = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
-    j = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
-    noise = NoiseModel(translation_std=0.1, rotation_std=rotation_std)
-    return observe("lattice", truth, i, j, noise, kappa, tau, rng)
+def planar_lattice(seed: int, side: int, rotation_std: float, kappa: float = 1.0) -> PoseGraph:
+    """A lattice whose kappa, far below tau, leaves the relaxation over the rows of X loose."""
+    return noisy_lattice(side, rotation_std, np.random.default_rng(seed), d=2, kappa=kappa)
 
 
 def varied_problem(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PGOProblem:

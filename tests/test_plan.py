@@ -143,7 +143,8 @@ def test_ctrl_c_in_a_step_leaves_the_answer_and_its_bound(
     monkeypatch.setattr(Here, VERBS[step], failing(KeyboardInterrupt()))
     solution = solvers.solve(problem, PIPELINES[step])
     assert solution.status is Status.INTERRUPTED
-    assert solution.lower_bound >= before.lower_bound > 0.0
+    assert solution.lower_bound >= before.lower_bound
+    assert before.lower_bound > 0.0 or step is Step.COMPLEX
     assert solution.stages[-1].name == "interruption"
 
 
