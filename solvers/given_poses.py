@@ -17,9 +17,9 @@ from pgo_models.certificates.certificate import (
     certificate_of_whole,
     certify_at,
     judge,
-    with_shifted_complex_numbers,
     with_terms,
 )
+from pgo_models.certificates.lower_bound import has_complex_form
 from pgo_models.errors import FAILURES, GraphWarning, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -28,8 +28,14 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from solvers.handedness.complex_relaxation import (
+    ComplexRelaxation,
+    ComplexState,
+    certificates_of_relaxation,
+)
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
+from solvers.result import Outcome
 from solvers.riemannian.polish import polish, relative_decrement
 from solvers.riemannian.shrunk_bound import bound_is_tight, with_shrunk_information
 
@@ -45,7 +51,7 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its tangent at the
     stationary point, and where that fails by smaller information matrices (`bound_by_shrinking`).
     Where the bound is still wide, in space handedness terms follow (`HandednessAscent`), and in the
-    plane rotations are taken as complex numbers.
+    plane the relaxation with rotations as complex numbers (`ComplexRelaxation`).
 
     Parameters
     ----------
@@ -139,13 +145,18 @@ def _by_smaller_matrices(
 
 
 def _by_complex_numbers(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
-    """The certificate, or a better one in the plane by rotations as complex numbers."""
-    ground = problem.at_best_translations(certificate.poses)
-    at_bound = replace(judge(problem, ground, certificate), poses=ground)
-    found = with_shifted_complex_numbers(problem, at_bound, ground)
-    if found is at_bound:
+    """The certificate, or a better one by the relaxation with complex numbers, in the plane."""
+    if not has_complex_form(problem):
         return certificate
-    return judge(problem, poses, replace(found, source=certificate.source))
+    method = ComplexRelaxation()
+    finished: Outcome[ComplexState] = RunMonitor().run(method, problem, certificate.poses)
+    gap = certificate.wanted_gap
+    candidates = certificates_of_relaxation(problem, method, finished.state, gap)
+    found = max(candidates, key=lambda known: known.lower_bound)
+    if found.lower_bound <= certificate.lower_bound:
+        return certificate
+    found = replace(found, stationarity=certificate.stationarity, source=BoundSource.COMPLEX)
+    return judge(problem, poses, found)
 
 
 def _by_terms(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:

@@ -16,16 +16,20 @@ from pgo_models.certificates.certificate import (
     certify_at,
     certify_with,
     judge,
-    with_shifted_complex_numbers,
     with_terms,
 )
-from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.certificates.lower_bound import NO_BOUND, has_complex_form
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.rounding import round_factor
+from solvers.handedness.complex_relaxation import (
+    ComplexRelaxation,
+    ComplexState,
+    certificates_of_relaxation,
+)
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.place import AUTO, BROKEN_OFF, Attempt, Ending, FirstStage, Place, after_search
@@ -212,15 +216,17 @@ class Here(Place):
         """Return the same poses, with the bound of smaller information matrices if it is better."""
         return replace(best, certificate=with_shrunk_information(self.problem, best.proof))
 
-    def bound_in_complex_numbers(self, best: Attempt) -> Attempt:
-        """Return the same poses, with the bound of rotations as complex numbers if it is better."""
+    def solve_in_complex_numbers(self, best: Attempt, method: ComplexRelaxation) -> Attempt:
+        """Solve the relaxation with complex numbers, and return the better poses and bound."""
         problem = self.problem
-        ground = problem.at_best_translations(best.known_poses)
-        at_best = replace(judge(problem, ground, best.proof), poses=ground)
-        found = with_shifted_complex_numbers(problem, at_best, ground)
-        if found is at_best:
+        if not has_complex_form(problem):
             return best
-        return replace(best, certificate=judge(problem, best.known_poses, found))
+        finished: Outcome[ComplexState] = self.monitor.run(method, problem, best.known_poses)
+        stage = stage_of_search(finished)
+        self.stages.append(replace(stage, name=f"{stage.name}{self.where}"))
+        for found in certificates_of_relaxation(problem, method, finished.state, self.gap):
+            best = self.better(best, Attempt(found.poses, best.status, certificate=found))
+        return after_search(best, best.proof, stage)
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None

@@ -19,7 +19,6 @@ from pgo_models.certificates.lower_bound import (
     LowerBound,
     best_bound,
     best_bound_with_terms,
-    best_complex_bound,
     has_complex_form,
     prove_at,
 )
@@ -77,6 +76,10 @@ class BoundSource(enum.Enum):
         "where the semidefinite relaxation with hulls of rotations was solved, "
         "whose optimum is below F if it is not tight"
     )
+    COMPLEX = (
+        "where the relaxation with rotations as complex numbers was solved, "
+        "whose optimum is below F if it is not tight"
+    )
     SOFTENED = (
         "where smaller information matrices, whose cost is below chi2 at all poses, "
         "have their minimum"
@@ -85,7 +88,7 @@ class BoundSource(enum.Enum):
     @property
     def is_of_relaxation(self) -> bool:
         """Whether the multipliers are those of a semidefinite relaxation as solved."""
-        return self in (BoundSource.RELAXATION, BoundSource.HULLS)
+        return self in (BoundSource.RELAXATION, BoundSource.HULLS, BoundSource.COMPLEX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,40 +458,17 @@ def with_complex_numbers(
     return certificate if bound is None else with_better(problem, certificate, Lambda, bound)
 
 
-def with_shifted_complex_numbers(
-    problem: PGOProblem, certificate: Certificate, ground: Poses
-) -> Certificate:
-    """`with_complex_numbers` with the smallest eta found, and with either multipliers.
-
-    They are those at the poses `ground` or those of the certificate, which may be of a relaxation.
-    """
-    if not has_complex_form(problem):
-        return certificate
-    tangent = problem.tangent_at(ground)
-    gap = certificate.wanted_gap
-    objective = certificate.objective
-    at_ground = scalar_multipliers(multipliers(problem, ground))
-    of_certificate = scalar_multipliers(certificate.Lambda)
-    bound = best_complex_bound(tangent, at_ground, ground, gap, objective)
-    other = best_complex_bound(tangent, of_certificate, ground, gap, objective)
-    if bound.value < other.value:
-        return with_better(problem, certificate, of_certificate, other, certificate.source)
-    return with_better(problem, certificate, at_ground, bound)
-
-
 def with_better(
-    problem: PGOProblem,
-    certificate: Certificate,
-    Lambda: Array,
-    bound: LowerBound,
-    source: BoundSource = BoundSource.GIVEN,
+    problem: PGOProblem, certificate: Certificate, Lambda: Array, bound: LowerBound
 ) -> Certificate:
     """The certificate, or one of the same poses with a better bound, proved with these Lambda."""
     if bound.value <= certificate.bound.value:
         return certificate
     gap = certificate.wanted_gap
     stationarity = certificate.stationarity
-    return certify_with(problem, certificate.poses, Lambda, gap, stationarity, source, bound)
+    return certify_with(
+        problem, certificate.poses, Lambda, gap, stationarity, BoundSource.GIVEN, bound
+    )
 
 
 def certify_with(

@@ -46,7 +46,7 @@ from pgo_models.certificates.definiteness import (
 from pgo_models.certificates.rounding_errors import matrix_errors
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import SymbolicCholesky, analyze
+from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF
 from pgo_models.problem.matrices import diagonal_positions, meets
 from pgo_models.problem.ordering import row_order
@@ -193,6 +193,20 @@ class ComplexUnknowns(Unknowns):
         """Symbolic factorisation of the pattern of E^* M E."""
         order = row_order(self.problem.pose_order, 2, 2)
         return analyze(self.M, self.problem.backend, order)
+
+    def factorize_shifted(self, shift: float) -> CholeskyFactor:
+        """Factor of E^* M E with a shift of the numbers r, t_0 grounded by doubling its diagonal.
+
+        A NotPositiveDefiniteError when there is none.
+        """
+        n = self.problem.num_poses
+        data = self.M.data.copy()
+        positions = diagonal_positions(self.M)
+        data[positions[2 * n :]] += shift
+        data[positions[:2]] *= 2.0
+        shifted = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
+        shifted.has_canonical_format = True
+        return self.analysis.factorize(shifted)
 
     @cached_property
     def fixed(self) -> IntArray:
