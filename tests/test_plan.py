@@ -65,7 +65,7 @@ VERBS = {
     Step.SECOND: "start_again",
     Step.STAIRCASE: "climb",
     Step.SMALLER_MATRICES: "bound_by_smaller_matrices",
-    Step.COMPLEX: "bound_in_complex_numbers",
+    Step.COMPLEX: "solve_in_complex_numbers",
     Step.TERMS: "bound_by_terms",
     Step.HULLS: "solve_hulls",
 }
