@@ -18,10 +18,10 @@ loses.
 
 P >= 0 is what the convex hull of SO(3) adds to the relaxation edge by edge (Saunderson, Parrilo &
 Willsky 2015); Olsson, Lochman, Malmport & Zach (2025) add it to the semidefinite program of
-rotation averaging. These terms are for space. In the plane the R_j^T R_i are the a I + b J,
-J = (0, -1; 1, 0), with a^2 + b^2 = 1. That they have this form is linear, and is what
-`pgo_models.certificates.unknowns` has in place of terms; the rest, a^2 + b^2 <= 1, follows from R_i
-R_i^T = I.
+rotation averaging. These terms are for space. In the plane rotations are the blocks (a, b; -b, a)
+with a^2 + b^2 = 1. That they have this form is linear, and is what
+`pgo_models.certificates.unknowns` has in place of terms; a^2 + b^2 <= 1, the rest of the hull,
+follows from R_i R_i^T = I.
 """
 
 from dataclasses import dataclass

@@ -48,10 +48,10 @@ nothing of poses: if S + eta blockdiag(0, I) is positive definite without the ro
 translation, F >= tr(Lambda) + constant - eta n d (weak duality: Rosen et al. 2019; Carlone et al.
 2015).
 
-**In the plane** Z is known better: its blocks are those of sums and products of rotations, a I + b
-J with J = (0, -1; 1, 0), if those of X' are. So S_r has to be positive on such Z alone, as a
-Hermitian matrix of the complex numbers a + b i (`pgo_models.certificates.unknowns`). All else in
-this proof stays as it is.
+**In the plane** Z is known better: its blocks have the form (a, b; -b, a) of sums and products of
+rotations, if those of X' have it. So S_r has to be positive on such Z alone, as a Hermitian matrix
+of the complex numbers a + b i (`pgo_models.certificates.unknowns`). All else in this proof stays as
+it is.
 
 **Rotations alone.** A problem without translations (`PGOProblem.has_translations`) is bounded in
 the same way. Its X has zeros in the rows t_i^T, X' as well, and M = blockdiag(M_tt, L), where M_tt

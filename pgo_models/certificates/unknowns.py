@@ -7,21 +7,21 @@ vanish in the rows left out,
 
 **All rows of Z** (`RowUnknowns`) count as unknowns in space: H has to be positive definite.
 
-**In the plane** Z is known better. Rotations are the a I + b J, J = (0, -1; 1, 0), of length 1, and
-sums and products of such matrices have this form again. So if the blocks of X' have it, then those
-of Z = X - X' V have it, too, and H has to be positive on such Z alone (`ComplexUnknowns`). With a
-block P = (a, b; -b, a) as the complex number r = a + b i, and a row t^T = (t_0, t_1) as t_0 + t_1
-i, Z has 2 n complex unknowns in place of 3 n rows: z = (t, r), and
+**In the plane** Z is known better. Rotations are blocks (a, b; -b, a) with a^2 + b^2 = 1, and sums
+and products of such blocks have this form again. So if the blocks of X' have it, then those of Z =
+X - X' V have it, too, and H has to be positive on such Z alone (`ComplexUnknowns`). With the block
+as the complex number r = a + b i, and a row t^T = (t_0, t_1) as t_0 + t_1 i, Z has 2 n complex
+unknowns in place of 3 n rows: z = (t, r), and
 
-    tr(Z^T H Z) = z^* H_c z,    H_c = E^* H E,
+    tr(Z^T H Z) = z^* H_c z,    H_c = U^* H U,
 
-where E takes z to Z (1, i)^T: t to t, and r to the rows (r, i r). What H_c leaves out are
+where U takes z to Z (1, i)^T: t to t, and r to the rows (r, i r). What H_c leaves out are
 reflections, one direction for every pose, on which S can be negative. Every Lambda_i of a given
 trace gives the same H_c, so that multiples of the identity, lambda_i / 2 I, are all that is needed.
 This is the dual of the relaxation of Calafiore, Carlone & Dellaert (2016), *Pose graph optimization
 in the complex domain*; the relaxation with all rows is never better. They are equal where the
-blocks of M have the form a I + b J, as of rotations alone, and differ as the blocks tau t_ij t_ij^T
-of translations have not.
+blocks of M have the form (a, b; -b, a), as of rotations alone, and differ as the blocks
+tau t_ij t_ij^T of translations have not.
 
 **In real numbers** z is (Re t, Im t) of every pose and then (Re r, Im r) of every pose, 4 n
 numbers, and H_c is a real symmetric matrix of this side, the one with blocks (Re, -Im; Im, Re). A
@@ -132,7 +132,7 @@ class RowUnknowns(Unknowns):
 
 @dataclass(frozen=True, eq=False)
 class ComplexUnknowns(Unknowns):
-    """Complex numbers t and r in the plane: Z has the blocks a I + b J for rotations."""
+    """Complex numbers t and r in the plane: Z has blocks (a, b; -b, a) for rotations."""
 
     @property
     def is_complex(self) -> bool:
@@ -151,7 +151,7 @@ class ComplexUnknowns(Unknowns):
         return _stacked(pairs[:n], pairs[n:])
 
     def gradient(self, product: Array, error: Array) -> tuple[Array, Array]:
-        """E^* G (1, i)^T, (4 n, 1): a and b are each in two entries of a block, which add up."""
+        """U^* G (1, i)^T, (4 n, 1): a and b are each in two entries of a block, which add up."""
         n = self.problem.num_poses
         first = product[n::2]
         second = product[n + 1 :: 2]
@@ -165,7 +165,7 @@ class ComplexUnknowns(Unknowns):
 
     @cached_property
     def M(self) -> csc_array:
-        """E^* M E in real numbers, (4 n, 4 n).
+        """U^* M U in real numbers, (4 n, 4 n).
 
         Every entry is one of M, or the sum or difference of two, rounded once. The lower triangle
         of the stored M counts for both: rounding left them different.
@@ -190,12 +190,12 @@ class ComplexUnknowns(Unknowns):
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:
-        """Symbolic factorisation of the pattern of E^* M E."""
+        """Symbolic factorisation of the pattern of U^* M U."""
         order = row_order(self.problem.pose_order, 2, 2)
         return analyze(self.M, self.problem.backend, order)
 
     def factorize_shifted(self, shift: float) -> CholeskyFactor:
-        """Factor of E^* M E with a shift of the numbers r, t_0 grounded by doubling its diagonal.
+        """Factor of U^* M U with a shift of the numbers r, t_0 grounded by doubling its diagonal.
 
         A NotPositiveDefiniteError when there is none.
         """
@@ -233,7 +233,7 @@ class ComplexUnknowns(Unknowns):
     def _stored_certificate(self, Lambda: Array, eta: float) -> StoredMatrix | None:
         """H_c in double precision, without the pose left out; None where it is out of range.
 
-        Lambda_i is lambda_i / 2 I, and H_c has E^* M E - lambda_i + 2 eta on the diagonal of r_i.
+        Lambda_i is lambda_i / 2 I, and H_c has U^* M U - lambda_i + 2 eta on the diagonal of r_i.
         The shares of the diagonal D are those of four errors. In exact arithmetic, for any z and
         the two columns Z_c of its Z, that of the stored M is at most sum_c Z_c^T diag(shares
         diagonal) Z_c (`matrix_errors`); with D / 2 for the diagonal of both rows of r, that is z^T

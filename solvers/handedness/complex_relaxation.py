@@ -61,13 +61,13 @@ class ComplexPoint:
 
     Y: Array  # (n, 1, 2 q): the two rows of every r_i, one after the other
     value: float  # the least cost over the translations
-    lam: Array  # (n, 1, 1): lambda_i, whose sum is the value
+    multipliers: Array  # (n, 1, 1): lambda_i, whose sum is the value
     gradient: Array  # (n, 1, 2 q): Riemannian: 2 ((M X)_i - lambda_i X_i)
 
     @property
     def Lambda(self) -> Array:
         """The multipliers as blocks lambda_i / 2 I, (n, 2, 2)."""
-        return 0.5 * self.lam * np.eye(2)
+        return 0.5 * self.multipliers * np.eye(2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +112,13 @@ class ComplexCost:
     def evaluate(self, Y: Array) -> ComplexPoint:
         """Return the point Y with value, multipliers and gradient."""
         QY = self.apply_Q(Y)
-        lam = row_products(QY, Y)
-        return ComplexPoint(Y, float(np.sum(lam)), lam, 2.0 * (QY - lam @ Y))
+        multipliers = row_products(QY, Y)
+        gradient = 2.0 * (QY - multipliers @ Y)
+        return ComplexPoint(Y, float(np.sum(multipliers)), multipliers, gradient)
 
     def hessian_product(self, point: ComplexPoint, V: Array) -> Array:
         """Apply the Riemannian Hessian at a point to a tangent."""
-        return 2.0 * project_to_tangent(point.Y, self.apply_Q(V) - point.lam @ V)
+        return 2.0 * project_to_tangent(point.Y, self.apply_Q(V) - point.multipliers @ V)
 
     def precondition(self, point: ComplexPoint, V: Array) -> Array:
         """Apply the inverse of Q with a shift to a tangent, and project."""
@@ -152,7 +153,7 @@ class ComplexRelaxation:
     Parameters
     ----------
     columns : int
-        Number of columns q of the factor. With four no graph was found that has a local minimum.
+        Number of columns q of the factor. With four, no local minimum was found on any graph.
     tolerance : float
         On the decrement.
     max_iterations : int
