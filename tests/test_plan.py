@@ -38,7 +38,7 @@ PIPELINES = {
     Step.SECOND: replace(FIRST_ALONE, second_try=True),
     Step.STAIRCASE: replace(FIRST_ALONE, staircase=solvers.Staircase()),
     Step.SMALLER_MATRICES: replace(FIRST_ALONE, staircase=solvers.Staircase(max_iterations=1)),
-    Step.COMPLEX: replace(FIRST_ALONE, handedness=SHORT_SEARCH),
+    Step.COMPLEX: replace(FIRST_ALONE, staircase=solvers.Staircase(), handedness=SHORT_SEARCH),
     Step.TERMS: replace(FIRST_ALONE, handedness=SHORT_SEARCH),
     Step.HULLS: replace(FIRST_ALONE, handedness=SHORT_SEARCH),
 }
