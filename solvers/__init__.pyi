@@ -17,6 +17,7 @@ from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder 
 from solvers.given_poses import certify as certify
 from solvers.growing import GrowingSolution as GrowingSolution, extend as extend
 from solvers.handedness.ascent import HandednessAscent as HandednessAscent
+from solvers.handedness.complex_relaxation import ComplexRelaxation as ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian as HullLagrangian
 from solvers.handedness.search import HandednessSearch as HandednessSearch
 from solvers.loop import Method as Method, Solver as Solver, iterate as iterate, run as run
@@ -161,7 +162,7 @@ __all__ += [
     "reproduce_tables",
 ]
 # Types in the signatures of the names above.
-__all__ += ["Automatic", "HandednessAscent", "HullLagrangian"]
+__all__ += ["Automatic", "ComplexRelaxation", "HandednessAscent", "HullLagrangian"]
 __all__ += ["EdgeFit", "Outcome", "OutlierProof", "Rejection", "Support"]
 __all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
 __all__ += ["OrthogonalSolution", "Sweep"]

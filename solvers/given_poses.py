@@ -2,7 +2,8 @@
 
 `pgo_models.certificates` bounds at given poses. Here it is decided at which: the poses given, the
 stationary points that Newton reaches from them and from the chordal start, and for chi2 the minimum
-of a smaller cost. Where the relaxation is loose in space, handedness terms are sought as well.
+of a smaller cost. Where the relaxation is loose, what tells rotations from reflections follows:
+handedness terms in space, complex numbers in the plane.
 """
 
 import warnings
@@ -18,6 +19,7 @@ from pgo_models.certificates.certificate import (
     judge,
     with_terms,
 )
+from pgo_models.certificates.lower_bound import has_complex_form
 from pgo_models.errors import FAILURES, GraphWarning, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -26,8 +28,14 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from solvers.handedness.complex_relaxation import (
+    ComplexRelaxation,
+    ComplexState,
+    certificates_of_relaxation,
+)
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
+from solvers.result import Outcome
 from solvers.riemannian.polish import polish, relative_decrement
 from solvers.riemannian.shrunk_bound import bound_is_tight, with_shrunk_information
 
@@ -42,7 +50,8 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     is always that of the poses given. `certify_at` bounds at the poses as they are. Of a problem
     with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its tangent at the
     stationary point, and where that fails by smaller information matrices (`bound_by_shrinking`).
-    In space, handedness terms follow where the bound is still wide (`HandednessAscent`).
+    Where the bound is still wide, in space handedness terms follow (`HandednessAscent`), and in the
+    plane the relaxation with rotations as complex numbers (`ComplexRelaxation`).
 
     Parameters
     ----------
@@ -90,7 +99,8 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
         polished = certify_at(problem, polish(problem, poses), gap, stationarity)
         source = BoundSource.REFINED if is_stationary else BoundSource.POLISHED
         certificate = judge(problem, poses, replace(polished, source=source))
-    for improve in (_beside_the_chordal_start, _by_smaller_matrices, _by_terms):
+    steps = (_beside_the_chordal_start, _by_complex_numbers, _by_smaller_matrices, _by_terms)
+    for improve in steps:
         if not bound_is_tight(problem, certificate):
             certificate = _improved(improve, problem, poses, certificate)
     return certificate
@@ -132,6 +142,21 @@ def _by_smaller_matrices(
 ) -> Certificate:
     """The certificate, or a better one of chi2 by smaller information matrices."""
     return with_shrunk_information(problem, certificate)
+
+
+def _by_complex_numbers(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
+    """The certificate, or a better one by the relaxation with complex numbers, in the plane."""
+    if not has_complex_form(problem):
+        return certificate
+    method = ComplexRelaxation()
+    finished: Outcome[ComplexState] = RunMonitor().run(method, problem, certificate.poses)
+    gap = certificate.wanted_gap
+    candidates = certificates_of_relaxation(problem, method, finished.state, gap)
+    found = max(candidates, key=lambda known: known.lower_bound)
+    if found.lower_bound <= certificate.lower_bound:
+        return certificate
+    found = replace(found, stationarity=certificate.stationarity, source=BoundSource.COMPLEX)
+    return judge(problem, poses, found)
 
 
 def _by_terms(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:

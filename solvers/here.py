@@ -18,13 +18,18 @@ from pgo_models.certificates.certificate import (
     judge,
     with_terms,
 )
-from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.certificates.lower_bound import NO_BOUND, has_complex_form
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.rounding import round_factor
+from solvers.handedness.complex_relaxation import (
+    ComplexRelaxation,
+    ComplexState,
+    certificates_of_relaxation,
+)
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.place import AUTO, BROKEN_OFF, Attempt, Ending, FirstStage, Place, after_search
@@ -210,6 +215,18 @@ class Here(Place):
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
         return replace(best, certificate=with_shrunk_information(self.problem, best.proof))
+
+    def solve_in_complex_numbers(self, best: Attempt, method: ComplexRelaxation) -> Attempt:
+        """Solve the relaxation with complex numbers, and return the better poses and bound."""
+        problem = self.problem
+        if not has_complex_form(problem):
+            return best
+        finished: Outcome[ComplexState] = self.monitor.run(method, problem, best.known_poses)
+        stage = stage_of_search(finished)
+        self.stages.append(replace(stage, name=f"{stage.name}{self.where}"))
+        for found in certificates_of_relaxation(problem, method, finished.state, self.gap):
+            best = self.better(best, Attempt(found.poses, best.status, certificate=found))
+        return after_search(best, best.proof, stage)
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None

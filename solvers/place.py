@@ -18,6 +18,7 @@ from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
+from solvers.handedness.complex_relaxation import ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
@@ -56,6 +57,7 @@ class Step(enum.Enum):
     SECOND = "a second attempt"
     STAIRCASE = "the Riemannian staircase"
     SMALLER_MATRICES = "smaller information matrices"
+    COMPLEX = "the relaxation with complex numbers"
     TERMS = "handedness terms"
     HULLS = "the relaxation with hulls of rotations"
 
@@ -239,6 +241,13 @@ class Place(ABC):
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
         raise self._refusal(Step.SMALLER_MATRICES.value)
+
+    def solve_in_complex_numbers(self, best: Attempt, method: ComplexRelaxation) -> Attempt:
+        """Solve the relaxation with planar rotations as complex numbers.
+
+        Returned are the better poses and the better bound.
+        """
+        raise self._refusal(Step.COMPLEX.value)
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None

@@ -11,11 +11,12 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
 5. Another attempt, from a start that grows; and the end of Newton in the first one, which has few
    steps where a start that grows may follow.
 6. A second attempt, by a finer SOC or from another start.
-7. The semidefinite relaxation: poses that its solution rounds to, and its bound. For chi2, bounds
-   by smaller information matrices, whose cost is below chi2.
-8. Handedness terms, which are never negative on rotations and tell them from reflections: the cost
-   less these terms has a better bound. If need be they begin where the relaxation with convex hulls
-   of rotations is solved.
+7. The semidefinite relaxation: poses that its solution rounds to, and its bound. In the plane it is
+   the one with rotations as complex numbers, which is never worse. For chi2, bounds by smaller
+   information matrices, whose cost is below chi2.
+8. In space, handedness terms, which are never negative on rotations and tell them from reflections:
+   the cost less these terms has a better bound. If need be they begin where the relaxation with
+   convex hulls of rotations is solved.
 
 Steps 5 to 8 are taken while the answer is open: its certificate is wider than asked for and could
 improve, and neither the time limit nor Ctrl-C has ended the solve. A Newton that was cut short goes
@@ -28,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FAILURES, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -66,7 +68,9 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     if _was_cut_short(place, settings, first) and not growth_has_ended_it:
         best = unless_it_fails(Step.LAST_STEPS, _LastSteps(first), place, settings, best)
     best = improved(Step.SECOND, from_second_start, place, settings, best)  # step 6
-    best = improved(Step.STAIRCASE, from_relaxation, place, settings, best)  # step 7
+    best = improved(Step.COMPLEX, from_complex_numbers, place, settings, best)  # step 7
+    if best.proof.source is not BoundSource.COMPLEX:
+        best = improved(Step.STAIRCASE, from_relaxation, place, settings, best)
     best = improved(Step.SMALLER_MATRICES, by_smaller_matrices, place, settings, best)
     best = improved(Step.TERMS, _Terms(), place, settings, best)  # step 8
     return improved(Step.HULLS, _Hulls(), place, settings, best)
@@ -184,6 +188,12 @@ def from_relaxation(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
 def by_smaller_matrices(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Step 7 for chi2: the answer with the best bound that smaller information matrices give."""
     return place.bound_by_smaller_matrices(best)
+
+
+def from_complex_numbers(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """Step 7 in the plane: the better of the answer and what the relaxation rounds to."""
+    search = settings.handedness
+    return best if search is None else place.solve_in_complex_numbers(best, search.plane)
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,8 @@ class Pipeline:
     relative `gap`, another attempt starts from prefixes of the graph that grow, and a second one
     runs SOC to a fine tolerance and Newton again. The solve keeps the better poses and the better
     bound. Where it is still wider, the staircase solves the semidefinite relaxation from the best
-    poses, and Newton starts from what it rounds to. In space, handedness terms follow.
+    poses, and Newton starts from what it rounds to. In space, handedness terms follow. In the plane
+    the relaxation with rotations as complex numbers takes the place of the staircase.
 
     Parameters
     ----------
@@ -60,7 +61,8 @@ class Pipeline:
     staircase : Staircase or None
         The next stage, where the certificate is still wider; None leaves it out.
     handedness : HandednessSearch or None
-        The last stage, where the relaxation is not tight; None leaves it out.
+        What tells rotations from reflections, where the relaxation is not tight: the last stage in
+        space, and in the plane the relaxation in place of the staircase. None leaves it out.
 
     Raises
     ------
@@ -122,7 +124,8 @@ class Pipeline:
     def asks_for(self, step: Step, d: int) -> bool:
         """Whether a step after the first attempt is to be taken, where the answer is open.
 
-        Handedness terms are for graphs in space: in the plane they add nothing.
+        Handedness terms are for graphs in space. In the plane the relaxation with rotations as
+        complex numbers, which knows all that such terms could, takes the place of the staircase.
 
         Parameters
         ----------
@@ -136,7 +139,8 @@ class Pipeline:
         bool
             Whether there are settings for it.
         """
-        seeks_terms = self.handedness is not None and d == 3
+        tells_reflections = self.handedness is not None
+        seeks_terms = tells_reflections and d == 3
         return {
             Step.WHOLE: True,
             Step.GROWING: self.growing is not None,
@@ -144,6 +148,7 @@ class Pipeline:
             Step.SECOND: self.second_try,
             Step.STAIRCASE: self.staircase is not None,
             Step.SMALLER_MATRICES: self.staircase is not None,
+            Step.COMPLEX: tells_reflections and self.staircase is not None and d == 2,
             Step.TERMS: seeks_terms,
             Step.HULLS: seeks_terms,
         }[step]

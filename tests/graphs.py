@@ -17,6 +17,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
+from solvers.studies.tightness import noisy_lattice
 
 EPS = float(np.finfo(float).eps)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -85,6 +86,11 @@ def informed(
     if not coupled:
         information[:, :d, d:] = information[:, d:, :d] = 0.0
     return replace(graph, information=information)
+
+
+def planar_lattice(seed: int, side: int, rotation_std: float, kappa: float = 1.0) -> PoseGraph:
+    """A lattice whose kappa, far below tau, leaves the relaxation over the rows of X loose."""
+    return noisy_lattice(side, rotation_std, np.random.default_rng(seed), d=2, kappa=kappa)
 
 
 def varied_problem(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PGOProblem:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graphs import informed, varied_graph
+from graphs import informed, planar_lattice, varied_graph
 from networks import KEY, Network, give_edge
 
 import pgo_models as pgo
@@ -258,6 +258,12 @@ def certifies_by_terms(place: Place) -> bool:
     return answer.certificate.bound.terms is not None
 
 
+def certifies_in_complex_numbers(place: Place) -> bool:
+    answer = place.solve(planar_lattice(4, 4, 0.5), weighting=Weighting.ISOTROPIC)
+    refuse_what_the_note_names(answer, "the relaxation with complex numbers")
+    return answer.certificate.bound.is_complex
+
+
 def refuse_what_the_note_names(answer: Answer, step: str) -> None:
     """Raise a PGOError where a solution says that a step, or all after SOC, were not taken."""
     if step in answer.note or "no driver" in answer.note:
@@ -345,6 +351,7 @@ CAPABILITIES = (
     Capability("robust (PCM)", partial(finds_a_wrong_edge, solvers.PCM())),
     Capability("covariances", has_covariances),
     Capability("handedness terms", certifies_by_terms),
+    Capability("rotations as complex numbers", certifies_in_complex_numbers),
     Capability("a start that grows", grows),
     Capability("checkpoints", writes_checkpoints),
     Capability("`extend`", extends),

@@ -198,6 +198,7 @@ SETTINGS += (
     "Newton",
     "Staircase",
     "GrowingStart",
+    "ComplexRelaxation",
     "HandednessAscent",
     "HandednessSearch",
     "HullLagrangian",

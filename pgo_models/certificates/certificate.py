@@ -11,7 +11,7 @@ import enum
 import math
 from dataclasses import dataclass, replace
 
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
 from pgo_models.certificates.fit import Fit, fits_to_coordinates
 from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
 from pgo_models.certificates.lower_bound import (
@@ -19,6 +19,8 @@ from pgo_models.certificates.lower_bound import (
     LowerBound,
     best_bound,
     best_bound_with_terms,
+    has_complex_form,
+    prove_at,
 )
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
@@ -74,6 +76,10 @@ class BoundSource(enum.Enum):
         "where the semidefinite relaxation with hulls of rotations was solved, "
         "whose optimum is below F if it is not tight"
     )
+    COMPLEX = (
+        "where the relaxation with rotations as complex numbers was solved, "
+        "whose optimum is below F if it is not tight"
+    )
     SOFTENED = (
         "where smaller information matrices, whose cost is below chi2 at all poses, "
         "have their minimum"
@@ -82,7 +88,7 @@ class BoundSource(enum.Enum):
     @property
     def is_of_relaxation(self) -> bool:
         """Whether the multipliers are those of a semidefinite relaxation as solved."""
-        return self in (BoundSource.RELAXATION, BoundSource.HULLS)
+        return self in (BoundSource.RELAXATION, BoundSource.HULLS, BoundSource.COMPLEX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +122,8 @@ class Certificate(ReadOnly):
         F of these, the best value known.
     Lambda : (n, d, d) array
         Multipliers, which with eta and these poses are the proof: anyone can check it with
-        `prove_bound`. Those of `BoundSource.SOFTENED` are of the smaller matrices.
+        `prove_bound`, told whether `bound` is_complex. Those of `BoundSource.SOFTENED` are of the
+        smaller matrices.
     wanted_gap : float
         The gap that was asked for.
     verdict : Verdict
@@ -325,7 +332,8 @@ class Certificate(ReadOnly):
         less = f"less {rounding} for rounding"
         if self.weights_error > 0.0:
             less += f" and {rounded_up(self.weights_error, 2)} of it for that of the weights"
-        return f"proved {form}{shift}{cap}{self._terms_text}, {less}"
+        numbers = ", with rotations as complex numbers" if self.bound.is_complex else ""
+        return f"proved {form}{numbers}{shift}{cap}{self._terms_text}, {less}"
 
     @property
     def _terms_text(self) -> str:
@@ -341,7 +349,9 @@ def certify_at(
     """Judge poses by the bound of the multipliers at these poses as they are.
 
     It is valid anywhere, and sharp near an optimum. `solvers.certify` moves poses that are not
-    stationary to the stationary point nearby, and bounds there.
+    stationary to the stationary point nearby, and bounds there. Where the bound leaves a wider gap,
+    one proof more is tried: in the plane with rotations as complex numbers, in space with
+    handedness terms in closed form.
 
     Parameters
     ----------
@@ -390,8 +400,10 @@ def certify_at(
         BoundSource.GIVEN,
         ground=best,
     )
-    if problem.d == 2 or not certificate.can_improve:
+    if not certificate.can_improve:
         return certificate
+    if problem.d == 2:
+        return with_complex_numbers(problem, certificate, best)
     terms = closed_form_terms(problem.tangent_at(best), best)
     return certificate if terms is None else with_terms(problem, certificate, terms, best)
 
@@ -429,8 +441,30 @@ def with_terms(
     gap = certificate.wanted_gap
     tangent = problem.tangent_at(ground)
     bound = best_bound_with_terms(tangent, Lambda, ground, gap, certificate.objective, terms)
+    return with_better(problem, certificate, Lambda, bound)
+
+
+def with_complex_numbers(
+    problem: PGOProblem, certificate: Certificate, ground: Poses
+) -> Certificate:
+    """The certificate, or a better one that takes rotations of the plane as complex numbers.
+
+    It is grounded at the poses `ground`, with the multipliers there and eta = 0.
+    """
+    if not has_complex_form(problem):
+        return certificate
+    Lambda = scalar_multipliers(multipliers(problem, ground))
+    bound = prove_at(problem.tangent_at(ground), Lambda, ground, is_complex=True)
+    return certificate if bound is None else with_better(problem, certificate, Lambda, bound)
+
+
+def with_better(
+    problem: PGOProblem, certificate: Certificate, Lambda: Array, bound: LowerBound
+) -> Certificate:
+    """The certificate, or one of the same poses with a better bound, proved with these Lambda."""
     if bound.value <= certificate.bound.value:
         return certificate
+    gap = certificate.wanted_gap
     stationarity = certificate.stationarity
     return certify_with(
         problem, certificate.poses, Lambda, gap, stationarity, BoundSource.GIVEN, bound

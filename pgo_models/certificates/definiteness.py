@@ -25,7 +25,7 @@ from pgo_models.certificates.rounding_errors import matrix_errors
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import CholeskyFactor, NonZeros
+from pgo_models.problem.cholesky import CholeskyFactor, NonZeros, SymbolicCholesky
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
 
@@ -90,7 +90,7 @@ class DefiniteProof:
         return None
 
     def solve(self, product: Array) -> Array:
-        """About S^-1 product, (N, d), in the rows that are not left out, and zero in those.
+        """About S^-1 product, (N, k), in the rows that are not left out, and zero in those.
 
         It is a solve with the factor. Where that is marginal, conjugate gradients on the matrix
         without the margin follow, with the factor as preconditioner.
@@ -110,6 +110,33 @@ class DefiniteProof:
         return step
 
 
+@dataclass(frozen=True, eq=False)
+class StoredMatrix:
+    """A symmetric matrix in double precision that is to be proved definite without some rows."""
+
+    stored: csc_array  # (N, N); only its diagonal in the rows left out
+    diagonal: Array  # that a margin is a share of, (N,)
+    fixed: IntArray  # rows left out
+    entries: Array  # share of the diagonal that the rounding of the entries takes, (N,)
+    analysis: SymbolicCholesky  # of its pattern
+    diagonal_positions: IntArray  # of its diagonal among the values stored, (N,)
+
+    @property
+    def free_diagonal(self) -> Array:
+        """The diagonal, with zeros in the rows left out."""
+        diagonal = self.diagonal.copy()
+        diagonal[self.fixed] = 0.0
+        return diagonal
+
+    def factor_less(self, margin: Array) -> CholeskyFactor | None:
+        """Factor of the matrix less shares, (N,), of the diagonal; None where there is none."""
+        data = self.stored.data.copy()
+        data[self.diagonal_positions] -= margin * self.diagonal
+        less = csc_array((data, self.stored.indices, self.stored.indptr), shape=self.stored.shape)
+        less.has_canonical_format = True
+        return _factor(self.analysis, less)
+
+
 def prove_definite(
     problem: PGOProblem,
     Lambda: Array,
@@ -120,12 +147,7 @@ def prove_definite(
 ) -> DefiniteProof | None:
     """Proof that S + eta blockdiag(0, I) is definite without the rows `fixed`, or None.
 
-    The share `first_margin` of the diagonal is subtracted first; less where the matrix is not
-    definite with it, more where rounding needs more. `turned`, (N, d), are moves that leave F
-    almost as it is, as a turn of all poses but those left out. S holds them only weakly: their
-    energy is small, and the margin has to take little of it. A bound on the rounding of the
-    factorisation may be known for any number of non-zeros in the factor, or for the most that there
-    can be; where the margin for that takes little enough, the non-zeros are not counted.
+    The other arguments are those of `prove_stored`.
     """
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = eta
@@ -133,16 +155,28 @@ def prove_definite(
     if not is_in_range(stored.data, diagonal):
         return None
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
-
-    def attempt(margin: Array) -> CholeskyFactor | None:
-        data = stored.data.copy()
-        data[problem.diagonal_positions] -= margin * diagonal
-        return _factor(problem, problem.with_pattern_of_M(data))
-
-    free_diagonal = diagonal.copy()
-    free_diagonal[fixed] = 0.0
     entries = matrix_errors(problem, diagonal)
-    expected = problem.analysis.backward_error(NonZeros.COUNTED)
+    positions = problem.diagonal_positions
+    matrix = StoredMatrix(stored, diagonal, fixed, entries, problem.analysis, positions)
+    return prove_stored(matrix, first_margin, turned)
+
+
+def prove_stored(
+    matrix: StoredMatrix, first_margin: float = FIRST_MARGIN, turned: Array | None = None
+) -> DefiniteProof | None:
+    """Proof that the exact matrix behind a stored one is definite, or None.
+
+    The share `first_margin` of the diagonal is subtracted first; less where the matrix is not
+    definite with it, more where rounding needs more. `turned`, (N, k), are moves that leave F
+    almost as it is, as a turn of all poses but those left out. S holds them only weakly: their
+    energy is small, and the margin has to take little of it. A bound on the rounding of the
+    factorisation may be known for any number of non-zeros in the factor, or for the most that there
+    can be; where the margin for that takes little enough, the non-zeros are not counted.
+    """
+    stored = matrix.stored
+    entries = matrix.entries
+    free_diagonal = matrix.free_diagonal
+    expected = matrix.analysis.backward_error(NonZeros.COUNTED)
     is_counted = bool(np.isfinite(expected).all())
     if turned is not None:
         softness = _softness(stored, free_diagonal, turned)
@@ -151,13 +185,13 @@ def prove_definite(
         softest = float(np.min(SHRINK * softness.energies / weight_sums))
         first_margin = min(first_margin, max(softest, LEAST_MARGIN))
         if not is_counted:
-            uncounted = _factor_without_counts(problem, attempt, entries, first_margin, softness)
+            uncounted = _factor_without_counts(matrix, first_margin, softness)
             if uncounted is not None:
                 factor, margin, error = uncounted
                 return DefiniteProof(stored, factor, free_diagonal, margin, entries, False, error)
     if not is_counted:
         expected = np.zeros_like(entries)
-    chosen = search_margin(attempt, entries, expected, first_margin)
+    chosen = search_margin(matrix.factor_less, entries, expected, first_margin)
     if chosen is None:
         return None
     factor, margin, is_marginal = chosen
@@ -168,8 +202,8 @@ def prove_definite(
 class _Softness:
     """How weakly a matrix S holds moves v, one a column: rows left out count as zero."""
 
-    energies: Array  # (d,): v^T S v
-    weights: Array  # (N, d): margin @ weights is what a margin, (N,), takes of the energies
+    energies: Array  # (k,): v^T S v
+    weights: Array  # (N, k): margin @ weights is what a margin, (N,), takes of the energies
 
 
 def _softness(stored: csc_array, free_diagonal: Array, moves: Array) -> _Softness:
@@ -180,11 +214,7 @@ def _softness(stored: csc_array, free_diagonal: Array, moves: Array) -> _Softnes
 
 
 def _factor_without_counts(
-    problem: PGOProblem,
-    attempt: Callable[[Array], CholeskyFactor | None],
-    entries: Array,
-    first_margin: float,
-    softness: _Softness,
+    matrix: StoredMatrix, first_margin: float, softness: _Softness
 ) -> tuple[CholeskyFactor, Array, Array] | None:
     """Factor, margin and bound on the factor's rounding that holds before non-zeros are counted.
 
@@ -192,10 +222,10 @@ def _factor_without_counts(
     """
     room = ROOM * softness.energies
     for non_zeros in (NonZeros.ALL, NonZeros.MOST):
-        error = problem.analysis.backward_error(non_zeros)
-        margin = np.maximum(first_margin, ROUNDING_MULTIPLE * (entries + error))
+        error = matrix.analysis.backward_error(non_zeros)
+        margin = np.maximum(first_margin, ROUNDING_MULTIPLE * (matrix.entries + error))
         is_small = np.isfinite(margin).all() and (margin @ softness.weights <= room).all()
-        factor = attempt(margin) if is_small else None
+        factor = matrix.factor_less(margin) if is_small else None
         if factor is not None:
             return factor, margin, error
     return None
@@ -219,12 +249,12 @@ def is_definite_in_doubles(problem: PGOProblem, Lambda: Array, fixed: IntArray) 
     """
     stored, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
-    return _factor(problem, stored) is not None
+    return _factor(problem.analysis, stored) is not None
 
 
-def _factor(problem: PGOProblem, matrix: csc_array) -> CholeskyFactor | None:
+def _factor(analysis: SymbolicCholesky, matrix: csc_array) -> CholeskyFactor | None:
     try:
-        return problem.analysis.factorize(matrix)
+        return analysis.factorize(matrix)
     except NotPositiveDefiniteError:
         return None
 

@@ -59,6 +59,13 @@ def check_multipliers(problem: PGOProblem, Lambda: Array) -> None:
         )
 
 
+def scalar_multipliers(Lambda: Array) -> Array:
+    """Multiples of the identity with the traces of Lambda, (n, d, d), to rounding."""
+    d = Lambda.shape[1]
+    means = np.einsum("naa->n", Lambda) / d
+    return np.asarray(means[:, None, None] * np.eye(d))
+
+
 def multiplier_norms(Lambda: Array) -> Array:
     """||Lambda_i||_2, (n,), of symmetric (n, d, d)."""
     eigenvalues = np.linalg.eigvalsh(Lambda)

@@ -18,8 +18,10 @@ loses.
 
 P >= 0 is what the convex hull of SO(3) adds to the relaxation edge by edge (Saunderson, Parrilo &
 Willsky 2015); Olsson, Lochman, Malmport & Zach (2025) add it to the semidefinite program of
-rotation averaging. In the plane it adds nothing: the hull of SO(2) is a disc, and so is that of its
-reflections.
+rotation averaging. These terms are for space. In the plane rotations are the blocks (a, b; -b, a)
+with a^2 + b^2 = 1. That they have this form is linear, and is what
+`pgo_models.certificates.unknowns` has in place of terms; a^2 + b^2 <= 1, the rest of the hull,
+follows from R_i R_i^T = I.
 """
 
 from dataclasses import dataclass

@@ -48,6 +48,11 @@ nothing of poses: if S + eta blockdiag(0, I) is positive definite without the ro
 translation, F >= tr(Lambda) + constant - eta n d (weak duality: Rosen et al. 2019; Carlone et al.
 2015).
 
+**In the plane** Z is known better: its blocks have the form (a, b; -b, a) of sums and products of
+rotations, if those of X' have it. So S_r has to be positive on such Z alone, as a Hermitian matrix
+of the complex numbers a + b i (`pgo_models.certificates.unknowns`). All else in this proof stays as
+it is.
+
 **Rotations alone.** A problem without translations (`PGOProblem.has_translations`) is bounded in
 the same way. Its X has zeros in the rows t_i^T, X' as well, and M = blockdiag(M_tt, L), where M_tt
 is padding. So Z vanishes in these rows, too, and they are left out as the rows of pose r are: S_r
@@ -65,15 +70,11 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from pgo_models.certificates.definiteness import (
-    DefiniteProof,
-    is_definite_in_doubles,
-    prove_definite,
-    smallest_eta,
-)
-from pgo_models.certificates.dual_variables import check_multipliers
+from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, smallest_eta
+from pgo_models.certificates.dual_variables import check_multipliers, scalar_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
+from pgo_models.certificates.unknowns import ComplexUnknowns, RowUnknowns, Unknowns
 from pgo_models.errors import SettingError, door
 from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
@@ -123,6 +124,9 @@ class LowerBound(Summarised):
         asked only where the proof fails.
     terms : HandednessTerms or None
         What was taken off the cost before the proof, if anything.
+    is_complex : bool
+        Whether the proof takes rotations of the plane as complex numbers
+        (`pgo_models.certificates.unknowns`).
     """
 
     value: float
@@ -132,6 +136,7 @@ class LowerBound(Summarised):
     cap: float = math.inf
     is_definite: bool = False
     terms: HandednessTerms | None = None
+    is_complex: bool = False
 
 
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
@@ -139,7 +144,11 @@ NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
 
 @door
 def prove_bound(
-    problem: PGOProblem, Lambda: Array, eta: float = 0.0, poses: Poses | None = None
+    problem: PGOProblem,
+    Lambda: Array,
+    eta: float = 0.0,
+    poses: Poses | None = None,
+    is_complex: bool = False,
 ) -> float | None:
     """Prove a bound on F over all poses from multipliers, a shift eta and, if given, poses.
 
@@ -162,6 +171,9 @@ def prove_bound(
     poses : Poses, optional
         Where to ground the proof, at a pose in the middle of the graph. Without poses eta has to
         make S definite.
+    is_complex : bool
+        Whether rotations are taken as complex numbers, which needs poses in the plane. Then only
+        the traces of Lambda count.
 
     Returns
     -------
@@ -172,7 +184,8 @@ def prove_bound(
     Raises
     ------
     SettingError
-        When eta is negative or not finite, or Lambda has the wrong shape.
+        When eta is negative or not finite, or Lambda has the wrong shape; and for complex numbers
+        without poses, in space, or of rotations alone, which they give nothing.
 
     Examples
     --------
@@ -187,23 +200,39 @@ def prove_bound(
     >>> bool(prove_bound(problem, Lambda, eta=1e-6) < bound), prove_bound(problem, Lambda, eta=0.0)
     (True, None)
     """
+    if is_complex and (poses is None or not has_complex_form(problem)):
+        raise SettingError(
+            "is_complex=True needs poses in the plane, with translations among the unknowns"
+        )
+    Lambda = _symmetric(problem, Lambda)
     ground = None
     if poses is not None:
         poses = problem.at_best_translations(poses)
         problem = problem.tangent_at(poses)
-        ground = _grounded_at(problem, poses)
-    proven = _prove(problem, _symmetric(problem, Lambda), eta, ground)
+        ground = _grounded_at(problem, poses, is_complex)
+    if is_complex:
+        Lambda = scalar_multipliers(Lambda)
+    proven = _prove(problem, Lambda, eta, ground)
     return proven.value if proven is not None else None
 
 
-def prove_at(problem: PGOProblem, Lambda: Array, poses: Poses) -> LowerBound | None:
+def has_complex_form(problem: PGOProblem) -> bool:
+    """Whether proofs can gain by complex numbers: in the plane, unless of rotations alone."""
+    return problem.d == 2 and problem.has_translations
+
+
+def prove_at(
+    problem: PGOProblem, Lambda: Array, poses: Poses, is_complex: bool = False
+) -> LowerBound | None:
     """Bound grounded at the poses as they are, with eta = 0; None where S_r is not proved definite.
 
     The problem has to be quadratic: for chi2 the caller passes a tangent (`PGOProblem.tangent_at`),
-    whose bound is one on chi2.
+    whose bound is one on chi2. In complex numbers only the traces of Lambda count.
     """
-    ground = _grounded_at(problem, poses)
-    return _prove(problem, _symmetric(problem, Lambda), 0.0, ground)
+    Lambda = _symmetric(problem, Lambda)
+    if is_complex:
+        Lambda = scalar_multipliers(Lambda)
+    return _prove(problem, Lambda, 0.0, _grounded_at(problem, poses, is_complex))
 
 
 def best_bound(
@@ -237,8 +266,30 @@ def best_bound(
     if without_shift is not None and without_shift.value > 0.0:
         return without_shift
     best = search_forms(prove_with_eta, prove_grounded, smallest, trace, count)
-    is_definite = is_definite_in_doubles(problem, Lambda, ground.rows)
+    is_definite = ground.unknowns.is_definite_in_doubles(Lambda)
     return replace(best, is_definite=is_definite)
+
+
+def best_complex_bound(
+    problem: PGOProblem, Lambda: Array, poses: Poses, gap: float, objective: float
+) -> LowerBound:
+    """`best_bound` grounded at a pose, with the rotations of the plane as complex numbers.
+
+    Only the traces of Lambda count.
+    """
+    Lambda = scalar_multipliers(_symmetric(problem, Lambda))
+    count = problem.num_poses * problem.d
+    ground = _grounded_at(problem, poses, is_complex=True)
+
+    def prove_grounded(eta: float) -> LowerBound | None:
+        return _prove(problem, Lambda, eta, ground)
+
+    without_shift = prove_grounded(0.0)
+    if without_shift is not None and without_shift.value > 0.0:
+        return without_shift
+    smallest = smallest_shift(gap, objective, count)
+    best = search_bound(prove_grounded, smallest, _trace(Lambda), count)
+    return replace(best, is_definite=ground.unknowns.is_definite_in_doubles(Lambda))
 
 
 def best_bound_with_terms(
@@ -335,13 +386,18 @@ def squared_distances(moved: Array, rotations: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Ground:
-    """X' at which a proof begins, with pose r at (0, I) exactly, and the rows that are left out."""
+    """X' at which a proof begins, with pose r at (0, I) exactly, and its unknowns."""
 
     X: Array
-    rows: IntArray
+    unknowns: Unknowns
+
+    @property
+    def rows(self) -> IntArray:
+        """The rows that are left out."""
+        return self.unknowns.rows
 
 
-def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
+def _grounded_at(problem: PGOProblem, poses: Poses, is_complex: bool = False) -> _Ground:
     """X' of poses turned and shifted so that a pose in the middle of the graph is at (0, I)."""
     n = problem.num_poses
     d = problem.d
@@ -353,7 +409,8 @@ def _grounded_at(problem: PGOProblem, poses: Poses) -> _Ground:
     X[rows] = np.concatenate([np.zeros((1, d)), np.eye(d)])
     if not problem.has_translations:
         rows = np.union1d(np.arange(n), rows)
-    return _Ground(X, rows)
+    unknowns = ComplexUnknowns(problem, rows) if is_complex else RowUnknowns(problem, rows)
+    return _Ground(unknowns.starting_point(X), unknowns)
 
 
 def pose_rows(pose: int, n: int, d: int) -> IntArray:
@@ -411,12 +468,13 @@ def _prove_grounded(
     problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground
 ) -> LowerBound | None:
     """Form grounded at a pose; None where S_r + eta blockdiag(0, I) is not shown to be definite."""
-    proof = prove_definite(problem, Lambda, eta, ground.rows, turned=ground.X)
+    unknowns = ground.unknowns
+    proof = unknowns.prove_definite(Lambda, eta, ground.X)
     if proof is None:
         return None
 
     def move(point: _Point) -> tuple[_Point, float]:
-        return _moved(problem, Lambda, proof, point)
+        return _moved(unknowns, Lambda, proof, point)
 
     point = move_until_settled(_first_point(problem, Lambda, ground.X), move)
     slack = proof.slack()
@@ -428,15 +486,15 @@ def _prove_grounded(
     if evaluation is None:
         evaluation = evaluate_certificate(problem, Lambda, point.X, point.low)
     free = proof.free
-    product = evaluation.product[free]
-    product_error = evaluation.product_error[free]
+    product, product_error = unknowns.gradient(evaluation.product, evaluation.product_error)
     # The bound is value - tr(G_r^T H^-1 G_r) - eta sum_i ||R_i^T - P_i V||_F^2 with G = S X' after
     # the last move (this file's opening). Both losses, and the error of the value, are replaced by
     # upper bounds: H - diag(slack) is positive semidefinite.
-    quadratic = quadratic_loss(product, product_error, slack[free])
+    quadratic = quadratic_loss(product[free], product_error[free], slack[free])
     n = problem.num_poses
     distances = squared_distances(point.X[n:], ground.X[n:])
-    return grounded_bound(evaluation.value, evaluation.value_error, quadratic, eta, distances)
+    bound = grounded_bound(evaluation.value, evaluation.value_error, quadratic, eta, distances)
+    return replace(bound, is_complex=unknowns.is_complex)
 
 
 def grounded_bound(
@@ -523,32 +581,34 @@ def _first_point(problem: PGOProblem, Lambda: Array, X: Array) -> _Point:
 
 
 def _moved(
-    problem: PGOProblem, Lambda: Array, proof: DefiniteProof, point: _Point
+    unknowns: Unknowns, Lambda: Array, proof: DefiniteProof, point: _Point
 ) -> tuple[_Point, float]:
     """Point at X' - H^-1 S X', where H = S_r + eta blockdiag(0, I), and the gain."""
+    problem = unknowns.problem
     n = problem.num_poses
-    step = proof.solve(point.product)
-    gain = inner(step, point.product)
+    gradient, _ = unknowns.gradient(point.product, np.zeros_like(point.product))
+    step = proof.solve(gradient)
+    gain = inner(step, gradient)
     if gain > point.last_gain:
         # The factor is that of H less the margin. Gains that grow from move to move show that the
         # smallest eigenvalues of H are about as small as the margin, so that its inverse is far
         # from H^-1. A marginal proof solves with H itself, by conjugate gradients with the factor
         # as preconditioner.
-        step = replace(proof, is_marginal=True).solve(point.product)
-        gain = inner(step, point.product)
+        step = replace(proof, is_marginal=True).solve(gradient)
+        gain = inner(step, gradient)
+    Z = unknowns.rows_of(step)
     X = point.X.copy()
-    X[n:] -= step[n:]
-    low = point.low - step[:n]
+    X[n:] -= Z[n:]
+    low = point.low - Z[:n]
     evaluation = evaluate_certificate(problem, Lambda, X, low)
     free = proof.free
-    product = evaluation.product[free]
-    product_error = evaluation.product_error[free]
+    product, product_error = unknowns.gradient(evaluation.product, evaluation.product_error)
     # The margin stands in for the slack, which lies between about half of it and all of it. To know
     # the slack the factor may have to be taken apart, and these two losses only decide whether X'
     # is moved again.
     cheap_slack = (proof.margin * proof.diagonal)[free]
-    left = quadratic_loss(product, 0.0, cheap_slack)
-    quadratic = quadratic_loss(product, product_error, cheap_slack)
+    left = quadratic_loss(product[free], 0.0, cheap_slack)
+    quadratic = quadratic_loss(product[free], product_error[free], cheap_slack)
     moved = _Point(
         X=X,
         low=low,

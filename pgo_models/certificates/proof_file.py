@@ -10,7 +10,7 @@ import numpy as np
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
-from pgo_models.certificates.lower_bound import prove_at
+from pgo_models.certificates.lower_bound import LowerBound, prove_at
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError, door
 from pgo_models.figures import scaled_below
@@ -39,7 +39,8 @@ def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) 
     """Write what proves the bound of a certificate, as JSON; `verify_proof` checks it.
 
     All digits are written of poses, multipliers Lambda and the shift eta, and what they claim: the
-    cost of the poses, and the lower bound. Of rotations alone no translations are written. Of chi2
+    cost of the poses, and the lower bound; and whether rotations of the plane are taken as complex
+    numbers. Of rotations alone no translations are written. Of chi2
     the file has, edge by edge, how it is split into a quadratic form and a convex rest, whose
     tangent at the poses takes its place: the multipliers are those of this tangent.
 
@@ -130,12 +131,22 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         "ground": _name(graph, _ground(graph)),
         "poses": rows,
     }
-    terms = _terms_of_poses(graph, certificate.bound.terms)
+    return record | _entries_of_some_proofs(of_bound, certificate.bound, graph)
+
+
+def _entries_of_some_proofs(
+    problem: PGOProblem, bound: LowerBound, of_file: PoseGraph
+) -> dict[str, object]:
+    """What only some proofs have: complex numbers, handedness terms, splits of chi2."""
+    entries: dict[str, object] = {}
+    if bound.is_complex:
+        entries["complex"] = True
+    terms = _terms_of_poses(of_file, bound.terms)
     if terms is not None:
-        record["handedness"] = _rows_of_terms(graph, terms)
-    if isinstance(of_bound.weights, ExcessCost):
-        record["splits"] = _rows_of_splits(of_bound.graph, of_bound.weights)
-    return record
+        entries["handedness"] = _rows_of_terms(of_file, terms)
+    if isinstance(problem.weights, ExcessCost):
+        entries["splits"] = _rows_of_splits(problem.graph, problem.weights)
+    return entries
 
 
 def _terms_of_poses(graph: PoseGraph, terms: HandednessTerms | None) -> HandednessTerms | None:
@@ -241,7 +252,7 @@ def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
         tangent = problem.tangent_at(poses)
         if terms is not None:
             tangent = terms.taken_off(tangent)
-        bound = prove_at(tangent, Lambda, poses)
+        bound = prove_at(tangent, Lambda, poses, certificate.bound.is_complex)
         if bound is not None:
             lost = 0.0 if terms is None else terms.loss()
             candidates.append(_Proven(poses, Lambda, bound.value - lost))

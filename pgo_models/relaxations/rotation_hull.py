@@ -70,7 +70,8 @@ def edges_of(problem: PGOProblem) -> IntArray:
     """Pairs of poses that share an edge, (k, 2), each once; a SettingError in the plane."""
     if problem.d == 2:
         raise SettingError(
-            "the hull of rotations adds nothing in the plane; take another RelaxationForm"
+            "the hulls of rotations are for space; take another RelaxationForm. In the plane "
+            "certify takes rotations as complex numbers, which is all that the hull would add"
         )
     return distinct_pairs(problem.graph)
 

@@ -55,6 +55,7 @@ class Proof:
     # Upper triangles, row by row. Where there are none, those of a stationary point are taken.
     Lambda: dict[int, list[float]]
     terms: list[HandednessTerm]
+    is_complex: bool = False  # whether rotations of the plane are taken as complex numbers
     # Of the edges from a pose to another, in the order of the file of the graph. The verifier
     # chooses tau and J_ss itself where they are missing or do not fit.
     splits: dict[tuple[int, int], list[Split]] = field(default_factory=dict)
@@ -98,6 +99,7 @@ def read_proof(path: Path, d: int) -> Proof:
         R=R,
         Lambda=Lambda,
         terms=read_terms(path, record, d),
+        is_complex=read_is_complex(path, record, d),
         splits=read_splits(path, record, d),
     )
 
@@ -116,6 +118,14 @@ def read_terms(path: Path, record: dict[str, Any], d: int) -> list[HandednessTer
         )
         for row in rows
     ]
+
+
+def read_is_complex(path: Path, record: dict[str, Any], d: int) -> bool:
+    """Whether rotations are taken as complex numbers, as they can be in the plane alone."""
+    is_complex = record.get("complex", False)
+    if not isinstance(is_complex, bool) or (is_complex and d != 2):
+        raise FileFormatError(path, None, f"complex is not true or false, in 2D; {WAY_OUT}")
+    return is_complex
 
 
 def read_splits(path: Path, record: dict[str, Any], d: int) -> dict[tuple[int, int], list[Split]]:

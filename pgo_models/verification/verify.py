@@ -68,6 +68,18 @@ rotation E = T^T R_i^T R_j has the unit quaternion (w, v), Rodrigues' formula gi
 tr(delta^T W delta) = tr(W (2 I - E - E^T)) = v^T P v >= 0. A reflection is no such E: that is what
 these terms know, and S does not.
 
+**Complex numbers.** In the plane a proof may ask less of H. Rotations are matrices (a, b; -b, a),
+and so are products, sums and transposes of such matrices. Thus all blocks of X, of X' V and of Z
+have this form, and the steps from Z to (A) and (B) hold if H is positive on such Z alone. Let the
+numbers z of a pose be t_0, t_1, a and b, so that its rows of Z have the columns
+
+    (t_0; a; -b)  and  (t_1; b; a),    Z_c = U_c z for the column c = 0, 1.
+
+With H_z = sum_c U_c^T H U_c and g = sum_c U_c^T G_c, tr(Z^T H Z) = z^T H_z z and tr(G^T Z) = g^T z.
+V turns all pairs (t_0, t_1) and (a, b) of z by one angle, and as tr((Z V)^T H Z V) = tr(Z^T H Z),
+H_z does not change if it is turned: V cancels again. So the theorem holds with H_z > 0 in place of
+H > 0, and g_r^T H_z^-1 g_r in place of tr(G_r^T H^-1 G_r).
+
 **The arithmetic.** Numbers of the file are rational numbers. What is computed from them is a ball:
 a number with a bound on its error, by Arb through python-flint. A comparison of balls is True only
 if it holds for all numbers in them; where they overlap, a <= b and a > b are both False. So what is
@@ -410,9 +422,12 @@ def lower_bound(
     H = without_pose(form.S, proof.ground)
     if is_of_rotations(graph, proof):
         H, right_sides = without_translations(H, right_sides)
+    if proof.is_complex:
+        H, right_sides = in_complex_numbers(H, right_sides)
     products = eliminate(H, right_sides)
-    columns_of_G = range(d)
-    columns_of_shifted_G = range(d, 2 * d)
+    width = 1 if proof.is_complex else d
+    columns_of_G = range(width)
+    columns_of_shifted_G = range(width, 2 * width)
     loss_to_G = part(products, columns_of_G, columns_of_G).trace()
     loss_to_shifted_G = part(products, columns_of_shifted_G, columns_of_shifted_G).trace()
     bound_A = value_at_X - loss_to_G - FARTHEST * eta * (len(rotations) - 1)
@@ -531,6 +546,8 @@ def check_names(graph: Graph, proof: Proof) -> None:
         raise StepFailedError("the poses: a pose has no R, or a landmark has one")
     if proof.ground not in proof.R:
         raise StepFailedError(f"the poses: {pose_name(proof.ground)}, to be grounded, is none")
+    if proof.is_complex and is_of_rotations(graph, proof):
+        raise StepFailedError("the complex numbers: rotations alone are proven without them")
 
 
 def exact_rotation(rows: list[list[float]], name: str) -> arb_mat:
@@ -596,16 +613,52 @@ def without_translations(
     return H_of_rotations, of_rotations
 
 
+def in_complex_numbers(
+    H: dict[int, dict[int, arb_mat]], right_sides: dict[int, arb_mat]
+) -> tuple[dict[int, dict[int, arb_mat]], dict[int, arb_mat]]:
+    """H_z, and the columns g of G and of G', from H and the columns of both side by side."""
+    U = {node: columns_of_numbers(block.nrows()) for node, block in right_sides.items()}
+    H_z = {}
+    columns_g = {}
+    for i, row in H.items():
+        H_z[i] = {
+            j: sum_of_columns(U[i], block * U[j][0], block * U[j][1]) for j, block in row.items()
+        }
+        rows = range(right_sides[i].nrows())
+        G_0, G_1, shifted_0, shifted_1 = (
+            part(right_sides[i], rows, range(column, column + 1)) for column in range(4)
+        )
+        g = sum_of_columns(U[i], G_0, G_1)
+        columns_g[i] = beside(g, sum_of_columns(U[i], shifted_0, shifted_1))
+    return H_z, columns_g
+
+
+def sum_of_columns(U: tuple[arb_mat, arb_mat], of_0: arb_mat, of_1: arb_mat) -> arb_mat:
+    """U_0^T of_0 + U_1^T of_1."""
+    return U[0].transpose() * of_0 + U[1].transpose() * of_1
+
+
+def columns_of_numbers(num_rows: int) -> tuple[arb_mat, arb_mat]:
+    """U_0 and U_1 of a pose, whose rows are three, or of a landmark, which has one."""
+    U_0 = [[1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]]
+    U_1 = [[0, 1, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]]
+    size = 4 if num_rows == 3 else 2
+    return (
+        arb_mat([row[:size] for row in U_0[:num_rows]]),
+        arb_mat([row[:size] for row in U_1[:num_rows]]),
+    )
+
+
 def eliminate(H: dict[int, dict[int, arb_mat]], G: dict[int, arb_mat]) -> arb_mat:
     """G^T H^-1 G, once H is shown to be positive definite; both are used up.
 
     Minus its trace is the minimum of tr(Z^T H Z) + 2 tr(G^T Z), which is taken over the rows Z_k of
     one pose at a time. The terms with Z_k are
 
-        tr(Z_k^T P Z_k) + 2 tr(Z_k^T U),   P = H_kk,   U = G_k + sum_{i != k} H_ki Z_i.
+        tr(Z_k^T P Z_k) + 2 tr(Z_k^T C),   P = H_kk,   C = G_k + sum_{i != k} H_ki Z_i.
 
-    If the pivot P is positive definite, their minimum over Z_k, at Z_k = -P^-1 U, is -tr(U^T P^-1
-    U). Multiplied out, that is the constant -tr(G_k^T P^-1 G_k), and terms in the other Z_i, which
+    If the pivot P is positive definite, their minimum over Z_k, at Z_k = -P^-1 C, is -tr(C^T P^-1
+    C). Multiplied out, that is the constant -tr(G_k^T P^-1 G_k), and terms in the other Z_i, which
     change their form to
 
         H_ij <- H_ij - H_ik P^-1 H_kj,   G_i <- G_i - H_ik P^-1 G_k.

@@ -31,6 +31,7 @@ from solvers.distributed.robots.translations import reduce_translations
 from solvers.distributed.robots_alone import tree_traffic
 from solvers.distributed.robust import SharedGNC, inliers_of
 from solvers.handedness.ascent import AscentState
+from solvers.handedness.complex_relaxation import ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.here import Here
@@ -172,6 +173,10 @@ class RobotsOfGraph(DriverPlace):
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Try smaller information matrices, in one place."""
         return self.here.bound_by_smaller_matrices(best)
+
+    def solve_in_complex_numbers(self, best: Attempt, method: ComplexRelaxation) -> Attempt:
+        """Solve the relaxation with complex numbers in one place."""
+        return self.here.solve_in_complex_numbers(best, method)
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None

@@ -74,7 +74,7 @@ class RobotsWithFiles(DriverPlace):
     @property
     def missing(self) -> frozenset[Step]:
         """Steps for which one process needs the whole graph."""
-        steps = {Step.GROWING, Step.HULLS, Step.TERMS}
+        steps = {Step.GROWING, Step.COMPLEX, Step.HULLS, Step.TERMS}
         if self.driver.has_two_costs:
             steps.add(Step.SMALLER_MATRICES)
         return frozenset(steps)

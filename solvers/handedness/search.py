@@ -12,6 +12,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.rotation_hull import matrices_at
 from solvers.handedness.ascent import AscentState, HandednessAscent
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
+from solvers.handedness.complex_relaxation import ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian
 from solvers.loop import RunMonitor
 from solvers.result import Outcome, Stage
@@ -21,7 +22,9 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class HandednessSearch:
-    """Settings of the search for terms that close the gap of a loose relaxation in space.
+    """Settings of what tells rotations from reflections where the relaxation is loose.
+
+    In space terms are sought, in the plane the relaxation with complex numbers is solved.
 
     Parameters
     ----------
@@ -32,7 +35,9 @@ class HandednessSearch:
         the best bound that multipliers and terms have, poses that the staircase may miss, and terms
         that the ascent begins with once more. None leaves it out.
     most_hull_poses : int
-        Poses up to which the relaxation is solved; it takes about 55 CPU seconds of 1,000 poses.
+        Poses up to which that relaxation is solved; it takes about 55 CPU seconds of 1,000 poses.
+    plane : ComplexRelaxation
+        The relaxation with rotations as complex numbers, for graphs in the plane.
 
     Raises
     ------
@@ -43,6 +48,7 @@ class HandednessSearch:
     ascent: HandednessAscent = field(default_factory=HandednessAscent)
     hulls: HullLagrangian | None = field(default_factory=HullLagrangian)
     most_hull_poses: int = 3000
+    plane: ComplexRelaxation = field(default_factory=ComplexRelaxation)
 
     def __post_init__(self) -> None:
         check_settings(self, not_negative=["most_hull_poses"])

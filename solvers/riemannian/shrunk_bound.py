@@ -12,7 +12,12 @@ import numpy as np
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, judge, judge_cost
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, prove_at
+from pgo_models.certificates.lower_bound import (
+    NO_BOUND,
+    LowerBound,
+    has_complex_form,
+    prove_at,
+)
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.certificates.shrunk_information import shrink_information
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
@@ -67,7 +72,10 @@ def _try_cap(problem: PGOProblem, cap: float, best: ShrunkBound) -> tuple[bool, 
     except (GraphError, NotPositiveDefiniteError):
         return False, best
     Lambda = multipliers(smaller, minimum)
-    bound = prove_at(smaller.tangent_at(minimum), Lambda, minimum)
+    tangent = smaller.tangent_at(minimum)
+    bound = prove_at(tangent, Lambda, minimum)
+    if bound is None and has_complex_form(smaller):
+        bound = prove_at(tangent, Lambda, minimum, is_complex=True)
     if bound is None:
         return False, best
     if bound.value <= best.bound.value:

@@ -96,22 +96,24 @@ def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator
     )
 
 
-def noisy_lattice(side: int, rotation_std: float, rng: np.random.Generator) -> PoseGraph:
-    """side^3 poses at a distance of 1 m with an edge between neighbours, and rotation noise.
+def noisy_lattice(
+    side: int, rotation_std: float, rng: np.random.Generator, d: int = 3, kappa: float = 10.0
+) -> PoseGraph:
+    """side^d poses at a distance of 1 m with an edge between neighbours, and rotation noise.
 
-    Truth rotations are uniform on SO(3), the rotation noise is in radians, that of translations
-    0.1 m. The weights are kappa = 10 and tau = 100 on every edge.
+    Truth rotations are uniform on SO(d), the rotation noise is in radians, that of translations
+    0.1 m. The weights are kappa and tau = 100 on every edge.
     """
-    n = side**3
-    index = np.arange(n).reshape(side, side, side)
+    n = side**d
+    index = np.arange(n).reshape((side,) * d)
     position = np.stack(np.unravel_index(np.arange(n), index.shape), axis=1).astype(float)
-    truth = Poses(random_rotations(n, 3, rng), position)
-    first = [np.take(index, range(side - 1), axis=axis).ravel() for axis in range(3)]
-    second = [np.take(index, range(1, side), axis=axis).ravel() for axis in range(3)]
+    truth = Poses(random_rotations(n, d, rng), position)
+    first = [np.take(index, range(side - 1), axis=axis).ravel() for axis in range(d)]
+    second = [np.take(index, range(1, side), axis=axis).ravel() for axis in range(d)]
     noise = NoiseModel(translation_std=0.1, rotation_std=rotation_std)
     i = np.concatenate(first)
     j = np.concatenate(second)
-    return observe("lattice", truth, i, j, noise, 10.0, 100.0, rng)
+    return observe("lattice", truth, i, j, noise, kappa, 100.0, rng)
 
 
 @door

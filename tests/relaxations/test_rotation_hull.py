@@ -132,5 +132,5 @@ def test_where_no_terms_suffice_solve_has_the_bound_of_the_hulls(tmp_path: Path)
 
 @pytest.mark.parametrize("form", HULLS)
 def test_in_the_plane_hulls_are_refused(form: RelaxationForm) -> None:
-    with pytest.raises(SettingError, match="adds nothing in the plane"):
+    with pytest.raises(SettingError, match="hulls of rotations are for space"):
         solve_relaxation(varied_problem(0, 4, 2), form)

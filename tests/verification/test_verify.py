@@ -20,6 +20,7 @@ from graphs import (
     best_known,
     exact_graph,
     informed,
+    planar_lattice,
     varied_graph,
     wound_ring,
 )
@@ -28,9 +29,9 @@ from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
 
 import solvers
 from pgo_models.certificates.certificate import BoundSource, certify_at
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
-from pgo_models.certificates.lower_bound import LowerBound
+from pgo_models.certificates.lower_bound import LowerBound, prove_at
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import FileFormatError
 from pgo_models.geometry.poses import Poses
@@ -39,7 +40,7 @@ from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import chi2
-from pgo_models.graphs.scenes import victoria_park
+from pgo_models.graphs.scenes import NoiseModel, victoria_park
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification import verify
@@ -182,6 +183,8 @@ def test_every_tag_of_the_plane(line: str, tmp_path: Path) -> None:
     for weighting in COSTS if has_rotations else COSTS_OF_POSES:
         certificate, proof = proof_of(path, weighting)
         assert_verified(verify_proof(path, proof), certificate)
+        if weighting is not Weighting.ROTATIONS:
+            assert_verified(verify_proof(path, edited(proof, complex=True)), certificate)
 
 
 TRIANGLE = "10 1 0 1 0 0  20 0 0 1 0  30 0 0 2  40 1 0  50 0  60"
@@ -221,6 +224,114 @@ def test_a_cost_of_zero_is_verified_as_zero(tmp_path: Path) -> None:
     assert "no better bound is proven" in found.verdict
     assert found.objective is not None
     assert found.objective < 1e-20
+
+
+# Rotations of the plane as complex numbers.
+
+
+@pytest.fixture(scope="module")
+def complex_proofs(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Path, float]]:
+    """Files of loose planar graphs, their proofs, and their least cost, from above."""
+    found = []
+    lattice = planar_lattice(2, 4, 0.5)
+    coupled = informed(7, 12, 2, True, 0.5, NoiseModel(0.3, 1.0))
+    loose = planar_lattice(4, 4, 0.5)
+    for graph, weighting in (
+        (lattice, Weighting.ISOTROPIC),
+        (coupled, Weighting.INFORMATION),
+        (loose, Weighting.ISOTROPIC),
+    ):
+        path = written(tmp_path_factory.mktemp("proof"), graph)
+        certificate, proof = proof_of(path, weighting)
+        assert certificate.bound.is_complex
+        assert certificate.is_certified == (graph is not loose)
+        found.append((path, proof, certificate.poses_objective * (1 + 1e-12)))
+        assert_verified(verify_proof(path, proof), certificate)
+    return found
+
+
+def test_a_proof_in_complex_numbers_says_so(complex_proofs: list[tuple[Path, Path, float]]) -> None:
+    """Without them H of the certified lattice is indefinite."""
+    path, proof, _ = complex_proofs[0]
+    assert json.loads(proof.read_text())["complex"] is True
+    failed = verify_proof(path, edited(proof, complex=False))
+    assert failed.failure.startswith("the elimination: H is not positive definite")
+    for wrong in (1, "true", None):
+        with pytest.raises(FileFormatError, match="complex is not true or false"):
+            verify_proof(path, edited(proof, complex=wrong))
+
+
+def test_complex_numbers_in_space_and_of_rotations_alone_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, varied_graph(0, 5, 3))
+    _, proof = proof_of(path)
+    with pytest.raises(FileFormatError, match="complex is not true or false, in 2D"):
+        verify_proof(path, edited(proof, complex=True))
+    path = written(tmp_path, varied_graph(0, 5, 2))
+    _, proof = proof_of(path, Weighting.ROTATIONS)
+    failed = verify_proof(path, edited(proof, complex=True))
+    assert failed.failure.startswith("the complex numbers")
+
+
+@given(st.data(), st.integers(0, 2), st.sampled_from([1e-7, 1e-4, 0.1, 1.0, -10.0, 1e6]))
+@settings(max_examples=examples(80))
+def test_a_complex_proof_that_was_changed_proves_nothing_false(
+    complex_proofs: list[tuple[Path, Path, float]], data: st.DataObject, case: int, change: float
+) -> None:
+    """Of Lambda only the trace counts."""
+    path, proof, least = complex_proofs[case]
+    record = json.loads(proof.read_text())
+    pose = data.draw(st.sampled_from(record["poses"]))
+    what = data.draw(st.sampled_from(["t", "R", "Lambda", "eta", "ground", "lower_bound"]))
+    if what in ("eta", "lower_bound"):
+        record[what] += abs(change)
+    elif what == "ground":
+        record["ground"] = pose["id"]
+    elif what == "R":
+        pose["R"][data.draw(st.integers(0, 1))][data.draw(st.integers(0, 1))] += change
+    elif what in pose:
+        place = data.draw(st.sampled_from([0, len(pose[what]) - 1]))
+        pose[what][place] += change
+    path_of_change = proof.with_name("changed.json")
+    path_of_change.write_text(json.dumps(record))
+    found = verify_proof(path, path_of_change)
+    if found.bound is not None:
+        assert found.bound.lower() <= least
+    if found.is_verified:
+        assert found.bound is not None
+        assert found.bound <= least
+        assert found.bound >= record["lower_bound"]
+    is_used = what in pose and pose["id"] != record["ground"]
+    if what in ("t", "Lambda") and abs(change) >= 0.1 and is_used:
+        assert not found.is_verified
+    if what == "R" and abs(change) >= 1e-4:
+        assert found.failure.startswith("the poses")
+
+
+@given(SEEDS, st.integers(3, 7), st.booleans(), st.sampled_from(COSTS_OF_POSES))
+@settings(max_examples=examples(24))
+def test_bounds_in_complex_numbers_are_those_of_balls(
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    n: int,
+    coupled: bool,
+    weighting: Weighting,
+) -> None:
+    """The bound in doubles is at most that in balls, also where all rows would do."""
+    graph = informed(seed, n, 2, coupled, 0.5, NoiseModel(0.3, 0.8))
+    path = written(tmp_path_factory.mktemp("proof"), graph)
+    problem = PGOProblem(read_g2o(path), weighting=weighting)
+    solution = solvers.solve(problem)
+    best = problem.at_best_translations(solution.poses)
+    Lambda = scalar_multipliers(multipliers(problem, best))
+    bound = prove_at(problem.tangent_at(best), Lambda, best, is_complex=True)
+    assume(bound is not None)
+    certificate = replace(certify_at(problem, best), bound=bound, Lambda=Lambda, poses=best)
+    save_proof(problem, certificate, path.with_suffix(".json"))
+    found = verify_proof(path, path.with_suffix(".json"))
+    assert found.is_verified
+    assert found.bound is not None
+    assert found.bound >= bound.value - 1e-10 * solution.objective
+    assert found.bound <= solution.objective * (1 + 1e-12) + certificate.rounding_level
 
 
 # What is changed in a proof or a file is either harmless or noticed.
