@@ -180,9 +180,9 @@ def test_machines_that_share_their_measurements_need_two_rounds(fleet: Fleet) ->
 
 
 def test_a_late_robot_is_waited_for_and_one_that_never_comes_is_named(fleet: Fleet) -> None:
-    fleet.start("a", "--wait", "25")
-    time.sleep(8.0)
-    fleet.start("b", "--wait", "15")
+    fleet.start("a", "--wait", "16")
+    time.sleep(7.0)
+    fleet.start("b", "--wait", "9")
     for name in ("a", "b"):
         code, told = fleet.ended(name)
         assert code == 0
@@ -209,7 +209,7 @@ def test_a_robot_that_is_cut_off_for_twenty_seconds_goes_on(fleet: Fleet) -> Non
 def test_ctrl_c_keeps_what_is_known(fleet: Fleet) -> None:
     fleet.start("a")
     fleet.start("b")
-    time.sleep(12.0)
+    time.sleep(9.0)
     fleet.processes["a"].send_signal(signal.SIGINT)
     code, told = fleet.ended("a")
     assert code != 0
