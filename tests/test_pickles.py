@@ -206,6 +206,7 @@ SETTINGS += (
     "PCM",
     "GaussSeidel",
     "LevenbergMarquardt",
+    "Mesa",
     "Faults",
     "Robots",
     "InProcess",
