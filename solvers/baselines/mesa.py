@@ -38,6 +38,7 @@ _DAMPING = 1e-5  # first one of Levenberg-Marquardt, relative to the diagonal
 _DAMPING_FACTOR = 10.0  # on it after a refused step; its inverse after one that was taken
 _MIN_DAMPING = 1e-9  # a robot that shares no pose may move its world freely
 _MAX_DAMPING = 1e12
+_MOST_RAISED = 1e6  # rho over its first value, at most
 _ROUNDING = 1e-14  # relative change of a robot's cost that counts as none
 _NUM_SUMS = 5  # numbers that all robots sum up to know whether a run has ended
 
@@ -106,10 +107,12 @@ class MesaState(Summarised):
         Damping of every robot's next step, relative to the diagonal.
     ledger : Ledger
         Rounds and messages so far.
+    raised : float
+        The penalties over their first values.
     disagreement : float
         Relative distance of copies from originals, as `primal_residual`.
     change : float
-        Relative change of the held poses in the last round; inf before the first one.
+        Relative change of the held poses in the last round, times `raised`; inf before the first.
     """
 
     k: int
@@ -122,6 +125,7 @@ class MesaState(Summarised):
     rho_t: float
     damping: Array
     ledger: Ledger
+    raised: float = 1.0
     disagreement: float = 0.0
     change: float = np.inf
 
@@ -136,9 +140,10 @@ class Mesa:
     a round whether the run has ended. The poses of a state are those that their owners have.
 
     `primal_residual` is the distance of copies from originals, and `dual_residual` the change of
-    all held poses in the last round: the larger of the rotations' root mean square, radians, and of
-    the translations' norm over that of all translations. Where both are zero with a penalty that
-    stays, the owners' poses are a stationary point of F.
+    all held poses in the last round, times rho over its first value: a penalty that grows holds
+    poses where they are, whatever F is there. Both are the larger of the rotations' root mean
+    square, radians, and of the translations' norm over that of all translations. Where both are
+    zero the owners' poses are a stationary point of F.
 
     Four things differ from the paper. There, pairs communicate one at a time and in any order; here
     all do in each round. There, robots begin by minimising alone; here they begin at the common
@@ -161,7 +166,8 @@ class Mesa:
         Whether rho_R is `penalty` times twice the median kappa, and rho_t `penalty` times the
         median tau. Both medians are known before the first round, off the ledger.
     growth : float, at least 1
-        Factor on rho after every round.
+        Factor on rho after every round, up to a million times the first value. 1.05 is that of the
+        authors' code for this prior.
     multiplier_step : float in (0, 2)
         Factor on q in (c). In the authors' code q is the distance to the other robot's pose, which
         is the limit 2.
@@ -250,17 +256,19 @@ class Mesa:
         ledger = state.ledger
         if len(held.traffic.sender):
             ledger = ledger.after_round(held.traffic)
+        growth = min(self.growth, _MOST_RAISED / state.raised)
         return replace(
             local,
             k=state.k + 1,
             z=z,
-            B_R=(state.B_R + self.multiplier_step * q_R) / self.growth,  # (c)
-            B_t=(state.B_t + self.multiplier_step * q_t) / self.growth,
-            rho_R=state.rho_R * self.growth,
-            rho_t=state.rho_t * self.growth,
+            B_R=(state.B_R + self.multiplier_step * q_R) / growth,  # (c)
+            B_t=(state.B_t + self.multiplier_step * q_t) / growth,
+            rho_R=growth * state.rho_R,
+            rho_t=growth * state.rho_t,
+            raised=growth * state.raised,
             ledger=ledger.after_all_reduce(_NUM_SUMS),
             disagreement=2.0 * max(norm(q_R) / math.sqrt(max(len(q_R), 1)), norm(q_t) / size),
-            change=max(norm(w) / math.sqrt(len(w)), norm(v) / size),
+            change=state.raised * max(norm(w) / math.sqrt(len(w)), norm(v) / size),
         )
 
     def measure(self, problem: PGOProblem, state: MesaState) -> Measurement:

@@ -111,6 +111,16 @@ def test_settings_change_the_way_and_not_the_end(changes: dict[str, float]) -> N
     assert_optimal(problem, run(tight(robots, **changes), problem))
 
 
+def test_a_penalty_that_grows_does_not_pass_for_an_optimum() -> None:
+    # It holds the poses where they are, which is no convergence.
+    problem = PGOProblem(grid(np.random.default_rng(1)))
+    solver = Mesa(partition(problem.graph, 3), growth=1.5, max_iterations=300)
+    result = run(solver, problem)
+    assert result.status is Status.MAX_ITERATIONS
+    assert result.state.raised <= 1e6
+    assert result.objective > solve(problem).objective * (1 + SLACK)
+
+
 # Steps.
 
 
