@@ -207,6 +207,7 @@ SETTINGS += (
     "PCM",
     "GaussSeidel",
     "LevenbergMarquardt",
+    "Mesa",
     "Faults",
     "Robots",
     "InProcess",

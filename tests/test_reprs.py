@@ -29,6 +29,7 @@ METHODS: list[Any] = [
     solvers.Staircase(),
     solvers.GaussSeidel(),
     solvers.LevenbergMarquardt(),
+    solvers.Mesa(),
     solvers.GNC(),
     solvers.IRLS(),
     solvers.ExtendedSOC(lambda unknown: pgo.ModelChange()),
