@@ -159,7 +159,8 @@ def test_matrices_of_sensors_beside_their_poses_are_within_their_errors(
     assert is_between(graph.information[0], of_file, graph.weights_error)
     # The turned matrix grows with the square of the lever, and its smallest eigenvalue falls so.
     lever = 1.0 + float(t @ t)
-    assert 0.0 < graph.weights_error < 1e-13 * lever**2 * 10.0**decades
+    # The error is of use as long as it is far below the gaps that are asked for.
+    assert 0.0 < graph.weights_error < 1e-12 * lever**2 * 10.0**decades
 
 
 def test_bearings_have_small_errors_and_information_none() -> None:
