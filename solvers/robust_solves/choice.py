@@ -59,13 +59,16 @@ class Choice:
     def is_enough(self) -> bool:
         """Whether no further attempt is needed.
 
-        The cheapest attempt has to be certified, and the edges that it keeps may not form a tree.
+        The cheapest attempt has to be certified, and the edges that it keeps may not form a tree. A
+        certificate that needs complex numbers does not do: that the usual relaxation is loose is a
+        sign of edges that contradict each other.
         Where attempts are cheap, or it rejects more than half of the closures, another one has to
         agree with it, or four have to be made.
         """
         cheapest = self.cheapest
         is_tree = int(cheapest.kept.sum()) < self.doubted.problem.num_poses
-        if is_tree or not cheapest.certificate.is_certified:
+        certificate = cheapest.certificate
+        if is_tree or not certificate.is_certified or certificate.bound.is_complex:
             return False
         keeps_most = 2 * self._num_closures_kept(cheapest) >= self.doubted.num_closures
         if keeps_most and not self.doubted.is_cheap:

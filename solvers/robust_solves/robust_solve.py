@@ -181,7 +181,8 @@ class _RobustSolve:
         """
         known = self.doubted.known
         residuals = solution.edge_residuals
-        if not solution.is_certified or residuals.is_overall_misfit:
+        is_strained = solution.certificate.bound.is_complex  # see `Choice.is_enough`
+        if is_strained or not solution.is_certified or residuals.is_overall_misfit:
             return False
         problem = self.doubted.problem
         quantile = max(self.doubted.quantile, 1.0 - FALSE_ALARM / problem.graph.num_edges)
