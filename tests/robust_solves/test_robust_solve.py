@@ -225,7 +225,7 @@ def test_pairwise_consistency_alone_and_before(clean):
 
 @pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")  # of landmarks seen once
 def test_a_landmark_keeps_its_best_sighting():
-    graph = pgo.victoria_park(np.random.default_rng(0), num_poses=60)
+    graph = pgo.victoria_park(np.random.default_rng(0), num_poses=40)
     alone = graph.landmarks[np.bincount(graph.j, minlength=graph.num_poses)[graph.landmarks] == 1]
     graph = graph.subgraph(np.setdiff1d(np.arange(graph.num_poses), alone))
     sights = np.flatnonzero(np.isin(graph.j, graph.landmarks))
