@@ -27,7 +27,13 @@ from pgo_models.graphs.g2o_folder import (
 )
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
 from pgo_models.graphs.g2o_readings import Reading
-from pgo_models.graphs.g2o_rows import information_of, measurements_of, numbers_of, poses_of
+from pgo_models.graphs.g2o_rows import (
+    information_of,
+    lines_of,
+    measurements_of,
+    numbers_of,
+    poses_of,
+)
 from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.missing_poses import with_missing_poses
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
@@ -36,7 +42,6 @@ from pgo_models.graphs.written_digits import most_digits, written_errors
 
 MOST_SYMBOLS = len(LETTERS)  # robots whose poses can be named by GTSAM symbols
 COMPRESSED = ".gz"  # suffix of a file that is compressed by gzip
-_ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
 # Entries of two rotations that may differ by normalisation of their quaternions.
 _SAME_ROTATION = 1e-9
 
@@ -786,7 +791,7 @@ def _vertex_lines(graph: PoseGraph, poses: Poses, mine: BoolArray) -> Iterator[s
         chosen = np.flatnonzero(is_written & is_of_kind)
         ids = graph.pose_ids[chosen, None]
         numbers = _numbers(poses[chosen], kind)
-        yield from _lines(tag, ids, numbers)
+        yield from lines_of(tag, ids, numbers)
 
 
 def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
@@ -821,7 +826,7 @@ def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
         # The line of a prior names the measured pose alone, which is the second end of the edge.
         ids = end_ids[chosen, -kind.num_ids :]
         offset = "0 " * kind.num_offsets
-        yield from _lines(tag, ids, numbers, offset)
+        yield from lines_of(tag, ids, numbers, offset)
 
 
 def _numbers(poses: Poses, kind: Tag) -> Array:
@@ -829,15 +834,3 @@ def _numbers(poses: Poses, kind: Tag) -> Array:
     if kind.is_point:
         return poses.t
     return numbers_of(poses.R, poses.t)
-
-
-def _lines(tag: str, ids: IntArray, numbers: Array, offset: str = "") -> Iterator[str]:
-    """Lines `tag ids offset numbers`; `repr` of a double gives the digits that bring it back."""
-    for first in range(0, len(ids), _ROWS_AT_A_TIME):
-        rows = slice(first, first + _ROWS_AT_A_TIME)
-        ids_of_rows = ids[rows].tolist()
-        numbers_of_rows = numbers[rows].tolist()
-        for row_ids, row in zip(ids_of_rows, numbers_of_rows, strict=True):
-            words_of_ids = " ".join(map(str, row_ids))
-            words = " ".join(map(repr, row))
-            yield f"{tag} {words_of_ids} {offset}{words}\n"

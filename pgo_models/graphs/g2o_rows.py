@@ -1,5 +1,7 @@
 """Rows of the numbers on VERTEX and EDGE lines of g2o: poses and information matrices of them."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from pgo_models.geometry.arrays import triangle_places
@@ -10,6 +12,9 @@ from pgo_models.geometry.rotations import (
     quaternions_from_rotations,
     rotations_from_quaternions,
 )
+from pgo_models.graphs.pose_graph import IntArray
+
+_ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
 
 
 def poses_of(d: int, numbers: Array) -> tuple[Array, Array]:
@@ -41,6 +46,18 @@ def numbers_of(R: Array, t: Array) -> Array:
     """Rows x y theta, or x y z qx qy qz qw, of rotations and translations: `poses_of` backwards."""
     rotations = log_map(R) if t.shape[1] == 2 else quaternions_from_rotations(R)
     return np.concatenate([t, rotations], axis=1)
+
+
+def lines_of(tag: str, ids: IntArray, numbers: Array, offset: str = "") -> Iterator[str]:
+    """Lines `tag ids offset numbers`; `repr` of a double gives the digits that bring it back."""
+    for first in range(0, len(ids), _ROWS_AT_A_TIME):
+        rows = slice(first, first + _ROWS_AT_A_TIME)
+        ids_of_rows = ids[rows].tolist()
+        numbers_of_rows = numbers[rows].tolist()
+        for row_ids, row in zip(ids_of_rows, numbers_of_rows, strict=True):
+            words_of_ids = " ".join(map(str, row_ids))
+            words = " ".join(map(repr, row))
+            yield f"{tag} {words_of_ids} {offset}{words}\n"
 
 
 def _num_measured(d: int) -> int:

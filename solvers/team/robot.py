@@ -16,13 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pgo_models.errors import GraphError, PGOError, SettingError, door, extra_module
+from pgo_models.errors import PGOError, SettingError, door, extra_module
 from pgo_models.files import replace_when_done
-from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.g2o_parser import parse_lines
-from pgo_models.graphs.g2o_rows import numbers_of
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.own_files import SOLVE_PARTS
 from solvers.distributed.robots.own_file import READ_HERE
@@ -35,6 +32,7 @@ from solvers.robust.rejection import Support
 from solvers.solution import Solution
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent
 from solvers.team.driving import Drive
+from solvers.team.measurements import Measurements
 from solvers.team.messages import (
     MESSAGES,
     Ask,
@@ -53,8 +51,6 @@ RETRY = 1.0
 # Share of its patience after which a robot says again that it is there.
 _SHARE_OF_PATIENCE = 0.25
 _FEWEST_KEY_BYTES = 16
-_EDGE_TAGS = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
-_VERTEX_TAGS = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 
 
 class Message(NamedTuple):
@@ -76,11 +72,6 @@ class TeamLedger:
     received: Mapping[str, int] = field(default_factory=dict)
     messages: int = 0
     dropped: int = 0
-
-    @property
-    def both(self) -> tuple[Mapping[str, int], Mapping[str, int]]:
-        """Bytes sent, and bytes received."""
-        return self.sent, self.received
 
     def after_sending(self, message: Message) -> TeamLedger:
         """Return the ledger after one more message."""
@@ -117,7 +108,7 @@ class Saved:
     team: tuple[str, ...]
     weighting: Weighting
     sharing: Sharing
-    lines: tuple[str, ...]
+    measurements: Measurements
     term: Term
     outcome: Outcome | None
     known: OwnAnswer | None
@@ -230,8 +221,7 @@ class Robot:
             raise SettingError("a robust solve of a team needs sharing=Sharing.MEASUREMENTS")
         self._patience = patience
         self.retry = retry
-        self._lines: list[str] = []
-        self._d: int | None = None
+        self._measurements = Measurements()
         # The others: when each was last heard of, and the revision of its measurements.
         self._last_heard: dict[str, float] = {}
         self._revisions: dict[str, int] = {}
@@ -275,14 +265,7 @@ class Robot:
         fixed : bool
             Whether the frame of the answer is that of this pose.
         """
-        if R is None or t is None:
-            self._lines.append(f"{_PENDING_VERTEX} {pose_id}")
-        else:
-            d = self._dimension_of(t)
-            numbers = " ".join(map(repr, _numbers(R, t, d)))
-            self._lines.append(f"{_VERTEX_TAGS[d]} {pose_id} {numbers}")
-        if fixed:
-            self._lines.append(f"FIX {pose_id}")
+        self._measurements.add_pose(pose_id, R, t, fixed)
 
     @door
     def add_edge(
@@ -320,11 +303,7 @@ class Robot:
         GraphError
             For shapes that are of no pose.
         """
-        d = self._dimension_of(t)
-        matrix = _information(information, kappa, tau, d)
-        upper = matrix[np.triu_indices(len(matrix))]
-        numbers = " ".join(map(repr, [*_numbers(R, t, d), *upper.tolist()]))
-        self._lines.append(f"{_EDGE_TAGS[d]} {i} {j} {numbers}")
+        self._measurements.add_edge(i, j, R, t, information, kappa, tau)
 
     @door
     def read(self, path: Path | str) -> None:
@@ -335,33 +314,12 @@ class Robot:
         path : Path or str
             Path of the file. Errors are those of `read_g2o`.
         """
-        text = Path(path).read_text(encoding="utf-8")
-        lines = parse_lines(Path(path), [text if text.endswith("\n") else f"{text}\n"])
-        self._d = lines.d
-        self._lines += text.splitlines()
+        self._measurements.read(Path(path))
 
     @property
     def revision(self) -> int:
         """How many lines its measurements are, so that others notice when it has more."""
-        return len(self._lines)
-
-    def _dimension_of(self, t: Array) -> int:
-        d = len(np.atleast_1d(t))
-        if d not in (2, 3) or self._d not in (None, d):
-            raise GraphError(f"t has {d} numbers; give 2 in the plane or 3 in space, always alike")
-        self._d = d
-        return d
-
-    def _text(self) -> str:
-        """The measurements as a g2o file."""
-        assert self._d is not None
-        tag = _VERTEX_TAGS[self._d]
-        numbers = "0 0 0" if self._d == 2 else "0 0 0 0 0 0 1"
-        lines = []
-        for line in self._lines:
-            pending = line.startswith(_PENDING_VERTEX)
-            lines.append(f"{tag} {line.split()[1]} {numbers}" if pending else line)
-        return "\n".join(lines) + "\n"
+        return len(self._measurements.lines)
 
     # Answers
 
@@ -443,7 +401,8 @@ class Robot:
             facts += [("covered", ", ".join(outcome.covered)), ("note", outcome.note)]
             facts += [("stages", ", ".join(outcome.stages)), ("rounds", str(outcome.rounds))]
         facts.append(("absent", ", ".join(self.absent)))
-        sent, received = (sum(counts.values()) for counts in self.ledger.both)
+        sent = sum(self.ledger.sent.values())
+        received = sum(self.ledger.received.values())
         traffic = f"{sent} sent, {received} received, {self.ledger.dropped} messages dropped"
         facts.append(("bytes", traffic))
         return [(label, text) for label, text in facts if text]
@@ -501,16 +460,9 @@ class Robot:
         """
         if self._known is None:
             raise SettingError(f"{self.name} has no poses yet; a solve has to end before")
-        poses = self._known.poses
-        tag = _VERTEX_TAGS[poses.d]
-        lines = []
-        ids = self._known.ids.tolist()
-        for pose_id, row in zip(ids, numbers_of(poses.R, poses.t).tolist(), strict=True):
-            lines.append(f"{tag} {pose_id} {' '.join(map(repr, row))}")
-        others = (_PENDING_VERTEX, *_VERTEX_TAGS.values())
-        lines += [line for line in self._lines if not line.startswith(others)]
+        text = self._measurements.text_at(self._known.ids, self._known.poses)
         with replace_when_done(path) as temporary:
-            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            temporary.write_text(text, encoding="utf-8")
 
     def __repr__(self) -> str:
         size = f"{self.revision} lines"
@@ -611,7 +563,7 @@ class Robot:
         return tuple(awake)
 
     def _say_hello(self, now: float, awake: tuple[str, ...]) -> None:
-        """Say hello to those that are not awake often, to all now and then, and when asked to."""
+        """Say hello, often to those that are not awake, now and then and with more lines to all."""
         is_due = now - self._hello_at >= _SHARE_OF_PATIENCE * self._patience
         is_due |= self._said_revision != self.revision
         seeks = now - self._sought_at >= self.retry
@@ -724,7 +676,7 @@ class Robot:
             self._send(sender, Hello(self.revision, self._term), Priority.URGENT)
             return
         if self._part is None:
-            if self._d is None:
+            if self._measurements.d is None:
                 return
             self._part = _Part(self._new_agent(ask.place), self.revision)
         part = self._part
@@ -757,7 +709,7 @@ class Robot:
 
     def _new_agent(self, place: int) -> TeamAgent:
         """The part of this robot in a solve, with its measurements as they are now."""
-        return TeamAgent(place, self.name, self._text(), self._sharing)
+        return TeamAgent(place, self.name, self._measurements.text(), self._sharing)
 
     # On disk
 
@@ -774,7 +726,7 @@ class Robot:
             self.team,
             self._weighting,
             self._sharing,
-            tuple(self._lines),
+            self._measurements,
             self._term,
             self.outcome,
             self._known,
@@ -830,19 +782,15 @@ class Robot:
             patience=patience,
             retry=retry,
         )
-        robot._lines = list(saved.lines)
+        saved_measurements = saved.measurements
+        robot._measurements = Measurements(list(saved_measurements.lines), saved_measurements.d)
         robot._term = saved.term
         robot.outcome = saved.outcome
-        if robot._lines:
-            in_space = any(line.startswith(_IN_SPACE) for line in robot._lines)
-            robot._d = 3 if in_space else 2
         robot._known = saved.known
         return robot
 
 
-_SAVED = (OwnAnswer, Saved, Sharing, Weighting)
-_PENDING_VERTEX = "POSE"
-_IN_SPACE = ("EDGE_SE3", "VERTEX_SE3", "VERTEX3", "EDGE3")
+_SAVED = (Measurements, OwnAnswer, Saved, Sharing, Weighting)
 
 
 def _check_settings(
@@ -858,29 +806,6 @@ def _check_settings(
         )
     if not (patience > 0.0 and retry > 0.0):
         raise SettingError(f"patience is {patience} and retry {retry}; give positive seconds")
-
-
-def _numbers(R: Array, t: Array, d: int) -> list[float]:
-    """Numbers of a pose as on a line of a g2o file."""
-    pose = Poses(real_array(R, "R")[None], real_array(t, "t")[None])
-    numbers: list[float] = numbers_of(pose.R, pose.t)[0].tolist()
-    return numbers
-
-
-def _information(
-    information: Array | None, kappa: float | None, tau: float | None, d: int
-) -> Array:
-    """Matrix of an edge, or that of its precisions, as `write_g2o` writes it."""
-    size = 3 if d == 2 else 6
-    if information is not None:
-        matrix = real_array(information, "information")
-        if matrix.shape != (size, size):
-            raise GraphError(f"information has shape {matrix.shape}; give {(size, size)}")
-        return matrix
-    if kappa is None or tau is None:
-        raise SettingError("an edge needs information, or kappa and tau")
-    rotation = [kappa] if d == 2 else [2.0 * kappa] * 3
-    return np.diag([*[tau] * d, *rotation])
 
 
 def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, int]) -> Outcome:

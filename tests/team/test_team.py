@@ -14,7 +14,7 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import SettingError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
@@ -280,7 +280,7 @@ def test_messages_without_the_key_changed_ones_and_those_for_others_are_dropped(
     receiver = robots["r1"]
     for data in (false.data, changed, b"", b"PGO1", right.data[:40], b"PGO0" + right.data[4:]):
         receiver.receive(data, 0.0)
-    assert receiver.ledger == receiver.ledger
+    assert receiver.ledger.messages == 0
     assert receiver.ledger.dropped == 6
     assert receiver.ledger.received == {}
     robots["r0"].receive(right.data, 0.0)  # its own
@@ -305,6 +305,19 @@ def test_a_saved_robot_keeps_its_measurements_poses_and_outcome() -> None:
     assert again.ledger.messages == TeamLedger().messages
     with pytest.raises(SettingError, match="no saved robot"):
         solvers.Robot.load(b"something else", KEY)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_robot_is_saved_before_its_lines_tell_the_dimension(d: int) -> None:
+    robot = solvers.Robot("a", ["a"], KEY)
+    robot.add_pose(0)
+    again = solvers.Robot.load(robot.save(), KEY)
+    again.add_pose(1)
+    again.add_edge(0, 1, np.eye(d), np.ones(d), kappa=1.0, tau=2.0)
+    once_more = solvers.Robot.load(again.save(), KEY)
+    assert once_more.revision == again.revision == 3
+    with pytest.raises(GraphError, match="always alike"):
+        once_more.add_edge(0, 1, np.eye(5 - d), np.ones(5 - d), kappa=1.0, tau=2.0)
 
 
 def test_robots_without_a_common_edge_say_so() -> None:

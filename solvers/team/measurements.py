@@ -1,0 +1,122 @@
+"""The measurements of a robot of a team, as the lines of a g2o file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import GraphError, SettingError
+from pgo_models.geometry.arrays import real_array
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.g2o_parser import parse_lines
+from pgo_models.graphs.g2o_rows import lines_of, numbers_of
+from pgo_models.graphs.pose_graph import IntArray, isotropic_information
+
+_EDGE_TAGS = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
+_VERTEX_TAGS = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
+_ORIGIN = {2: "0 0 0", 3: "0 0 0 0 0 0 1"}
+# Begins the line of a pose without an estimate, which becomes a VERTEX line when the dimension is
+# known.
+_WITHOUT_ESTIMATE = "POSE "
+
+
+@dataclass(eq=False)
+class Measurements:
+    """Lines of a g2o file, in the order in which they have come, each with its end.
+
+    Parameters
+    ----------
+    lines : list of str
+        The lines.
+    d : int, optional
+        Dimension; None as long as no line has told it.
+    """
+
+    lines: list[str] = field(default_factory=list)
+    d: int | None = None
+
+    def add_pose(self, pose_id: int, R: Array | None, t: Array | None, fixed: bool) -> None:
+        """Add a pose, as `Robot.add_pose` has it."""
+        if R is None or t is None:
+            self.lines.append(f"{_WITHOUT_ESTIMATE}{pose_id}\n")
+        else:
+            tag = _VERTEX_TAGS[self._dimension_of(t)]
+            self.lines += lines_of(tag, np.array([[pose_id]]), _numbers(R, t))
+        if fixed:
+            self.lines.append(f"FIX {pose_id}\n")
+
+    def add_edge(
+        self,
+        i: int,
+        j: int,
+        R: Array,
+        t: Array,
+        information: Array | None,
+        kappa: float | None,
+        tau: float | None,
+    ) -> None:
+        """Add a measurement, as `Robot.add_edge` has it."""
+        d = self._dimension_of(t)
+        matrix = _information(information, kappa, tau, d)
+        upper = matrix[np.triu_indices(len(matrix))]
+        numbers = np.concatenate([_numbers(R, t), upper[None]], axis=1)
+        self.lines += lines_of(_EDGE_TAGS[d], np.array([[i, j]]), numbers)
+
+    def read(self, path: Path) -> None:
+        """Add the lines of a file, which `read_g2o` could read."""
+        text = path.read_text(encoding="utf-8")
+        if not text.endswith("\n"):
+            text += "\n"
+        self.d = parse_lines(path, [text]).d
+        self.lines += text.splitlines(keepends=True)
+
+    def text(self) -> str:
+        """All lines, in which a pose without an estimate is at the origin."""
+        assert self.d is not None
+        lines = []
+        for line in self.lines:
+            if line.startswith(_WITHOUT_ESTIMATE):
+                pose_id = line.removeprefix(_WITHOUT_ESTIMATE).rstrip()
+                line = f"{_VERTEX_TAGS[self.d]} {pose_id} {_ORIGIN[self.d]}\n"
+            lines.append(line)
+        return "".join(lines)
+
+    def text_at(self, ids: IntArray, poses: Poses) -> str:
+        """VERTEX lines of poses, and the other lines as they are."""
+        vertices = lines_of(_VERTEX_TAGS[poses.d], ids[:, None], numbers_of(poses.R, poses.t))
+        replaced = (_WITHOUT_ESTIMATE, *_VERTEX_TAGS.values())
+        others = [line for line in self.lines if not line.startswith(replaced)]
+        return "".join([*vertices, *others])
+
+    def _dimension_of(self, t: Array) -> int:
+        """The dimension of a position, which is that of all others."""
+        d = len(np.atleast_1d(t))
+        if d not in (2, 3) or self.d not in (None, d):
+            raise GraphError(f"t has {d} numbers; give 2 in the plane or 3 in space, always alike")
+        self.d = d
+        return d
+
+
+def _numbers(R: Array, t: Array) -> Array:
+    """The row of numbers of a pose, (1, k)."""
+    pose = Poses(real_array(R, "R")[None], real_array(t, "t")[None])
+    return numbers_of(pose.R, pose.t)
+
+
+def _information(
+    information: Array | None, kappa: float | None, tau: float | None, d: int
+) -> Array:
+    """Matrix of an edge, or that of its precisions, as `write_g2o` writes it."""
+    if information is not None:
+        size = 3 if d == 2 else 6
+        matrix = real_array(information, "information")
+        if matrix.shape != (size, size):
+            raise GraphError(f"information has shape {matrix.shape}; give {(size, size)}")
+        return matrix
+    if kappa is None or tau is None:
+        raise SettingError("an edge needs information, or kappa and tau")
+    kappas, taus = real_array([kappa], "kappa"), real_array([tau], "tau")
+    return np.asarray(isotropic_information(kappas, taus, d)[0])
