@@ -8,19 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import GraphError, SettingError
+from pgo_models.files import read_text
 from pgo_models.geometry.arrays import real_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.g2o_rows import lines_of, numbers_of
+from pgo_models.graphs.g2o_tags import SKIPPED_TAGS
 from pgo_models.graphs.pose_graph import IntArray, isotropic_information
 
 _EDGE_TAGS = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 _VERTEX_TAGS = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
+_LANDMARK_TAGS = {2: "VERTEX_XY", 3: "VERTEX_TRACKXYZ"}
 _ORIGIN = {2: "0 0 0", 3: "0 0 0 0 0 0 1"}
-# Begins the line of a pose without an estimate, which becomes a VERTEX line when the dimension is
-# known.
-_WITHOUT_ESTIMATE = "POSE "
+# Tag of a pose without an estimate, whose line becomes a VERTEX line when the dimension is known.
+_WITHOUT_ESTIMATE = "POSE"
 
 
 @dataclass(eq=False)
@@ -41,7 +43,7 @@ class Measurements:
     def add_pose(self, pose_id: int, R: Array | None, t: Array | None, fixed: bool) -> None:
         """Add a pose, as `Robot.add_pose` has it."""
         if R is None or t is None:
-            self.lines.append(f"{_WITHOUT_ESTIMATE}{pose_id}\n")
+            self.lines.append(f"{_WITHOUT_ESTIMATE} {pose_id}\n")
         else:
             tag = _VERTEX_TAGS[self._dimension_of(t)]
             self.lines += lines_of(tag, np.array([[pose_id]]), _numbers(R, t))
@@ -67,7 +69,7 @@ class Measurements:
 
     def read(self, path: Path) -> None:
         """Add the lines of a file, which `read_g2o` could read."""
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
         if not text.endswith("\n"):
             text += "\n"
         self.d = parse_lines(path, [text]).d
@@ -79,16 +81,21 @@ class Measurements:
         lines = []
         for line in self.lines:
             if line.startswith(_WITHOUT_ESTIMATE):
-                pose_id = line.removeprefix(_WITHOUT_ESTIMATE).rstrip()
+                pose_id = line.removeprefix(_WITHOUT_ESTIMATE).strip()
                 line = f"{_VERTEX_TAGS[self.d]} {pose_id} {_ORIGIN[self.d]}\n"
             lines.append(line)
         return "".join(lines)
 
     def text_at(self, ids: IntArray, poses: Poses) -> str:
-        """VERTEX lines of poses, and the other lines as they are."""
-        vertices = lines_of(_VERTEX_TAGS[poses.d], ids[:, None], numbers_of(poses.R, poses.t))
-        replaced = (_WITHOUT_ESTIMATE, *_VERTEX_TAGS.values())
-        others = [line for line in self.lines if not line.startswith(replaced)]
+        """VERTEX lines of poses and landmarks, and all lines but those of VERTEX as they are."""
+        d = poses.d
+        is_landmark = np.isin(ids, parse_lines(Path("measurements"), [self.text()]).landmarks)
+        own = poses[~is_landmark]
+        vertices = [
+            *lines_of(_VERTEX_TAGS[d], ids[~is_landmark, None], numbers_of(own.R, own.t)),
+            *lines_of(_LANDMARK_TAGS[d], ids[is_landmark, None], poses.t[is_landmark]),
+        ]
+        others = [line for line in self.lines if not _is_of_vertex(line)]
         return "".join([*vertices, *others])
 
     def _dimension_of(self, t: Array) -> int:
@@ -98,6 +105,12 @@ class Measurements:
             raise GraphError(f"t has {d} numbers; give 2 in the plane or 3 in space, always alike")
         self.d = d
         return d
+
+
+def _is_of_vertex(line: str) -> bool:
+    """Whether a line is that of a pose or landmark, under any of the tags for it."""
+    tag = line.split()[0] if line.strip() else ""
+    return tag == _WITHOUT_ESTIMATE or ("VERTEX" in tag and tag not in SKIPPED_TAGS)
 
 
 def _numbers(R: Array, t: Array) -> Array:

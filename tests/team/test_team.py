@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +15,11 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
+from solvers.team.agent import Sharing
 from solvers.team.robot import TeamLedger
 
 pytest.importorskip("greenlet")
@@ -305,6 +307,35 @@ def test_a_saved_robot_keeps_its_measurements_poses_and_outcome() -> None:
     assert again.ledger.messages == TeamLedger().messages
     with pytest.raises(SettingError, match="no saved robot"):
         solvers.Robot.load(b"something else", KEY)
+
+
+LINES = """VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1 0 0
+VERTEX_XY 5 1 1
+EDGE_SE2 0 1 1 0 0 100 0 0 100 0 100
+EDGE_SE2_XY 0 5 1 1 100 0 100
+EDGE_SE2_XY 1 5 0 1.01 100 0 100
+"""
+
+
+def test_a_robot_writes_what_it_has_read_at_its_poses(tmp_path: Path) -> None:
+    read = tmp_path / "read.g2o.gz"
+    read.write_bytes(gzip.compress(LINES.encode()))
+    robot = solvers.Robot("a", ["a"], KEY, sharing=Sharing.MEASUREMENTS)
+    with pytest.raises(FileFormatError, match="no such file"):
+        robot.read(tmp_path / "other.g2o")
+    robot.read(read)
+    Network({"a": robot}, np.random.default_rng(0)).wait(20.0)
+    written = tmp_path / "written.g2o"
+    robot.write(written)
+    graph = pgo.read_g2o(read)
+    again = pgo.read_g2o(written)
+    assert again.landmarks.tolist() == graph.landmarks.tolist() == [2]
+    assert again.pose_ids.tolist() == graph.pose_ids.tolist() == sorted(robot.poses)
+    assert again.initial is not None
+    for pose, (_, t) in enumerate(robot.poses.values()):
+        np.testing.assert_array_equal(again.initial.t[pose], t)
+    np.testing.assert_array_equal(again.t_ij, graph.t_ij)
 
 
 @pytest.mark.parametrize("d", [2, 3])
