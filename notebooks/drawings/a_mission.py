@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from plotly.graph_objects import Figure
 
-    from solvers.team.messages import Outcome, Term
+    from solvers.team.messages import TeamOutcome, Term
 
 Trace = dict[str, object]
 Places = dict[int, "NDArray[np.float64]"]
@@ -30,7 +30,7 @@ _DARK = 0.55  # share of the largest number above which the letters on it are wh
 class Known(Protocol):
     """What a robot knows at a moment: outcome, why a later solve failed, and its poses by id."""
 
-    outcome: Outcome | None
+    outcome: TeamOutcome | None
     failure: str
     poses: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]]
 

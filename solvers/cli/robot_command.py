@@ -21,7 +21,7 @@ from solvers.cli.shell import (
 )
 
 if TYPE_CHECKING:
-    from solvers.team.messages import Outcome
+    from solvers.team.messages import TeamOutcome
     from solvers.team.robot import Robot
 
 _INDENT = 13  # columns of the labels
@@ -132,7 +132,7 @@ class _Reporter:
     def __init__(self, is_silent: bool) -> None:
         self._is_silent = is_silent
         self._said: set[str] = set()
-        self._outcome: Outcome | None = None
+        self._outcome: TeamOutcome | None = None
         self._failure = ""
 
     def __call__(self, robot: "Robot") -> None:

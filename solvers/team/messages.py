@@ -67,7 +67,7 @@ class Reply:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class TeamOutcome:
     """How a solve of the team has ended.
 
     Parameters
@@ -135,7 +135,7 @@ class Heard:
     term: Term
 
 
-MESSAGES = (Hello, Ask, Reply, Outcome, Heard, Term)
+MESSAGES = (Hello, Ask, Reply, TeamOutcome, Heard, Term)
 
 
 def error_as_message(error: PGOError) -> tuple[str, str]:

@@ -38,9 +38,9 @@ from solvers.team.messages import (
     Ask,
     Heard,
     Hello,
-    Outcome,
     Priority,
     Reply,
+    TeamOutcome,
     Term,
     error_as_message,
 )
@@ -110,7 +110,7 @@ class Saved:
     sharing: Sharing
     measurements: Measurements
     term: Term
-    outcome: Outcome | None
+    outcome: TeamOutcome | None
     known: OwnAnswer | None
 
 
@@ -152,9 +152,9 @@ class Robot:
 
     Attributes
     ----------
-    outcome : Outcome, optional
+    outcome : TeamOutcome, optional
         How the last solve that succeeded has ended.
-    last : Outcome, optional
+    last : TeamOutcome, optional
         How the last solve has ended, also if it has failed (`failure` says why).
     ledger : TeamLedger
         Bytes by robot.
@@ -234,11 +234,11 @@ class Robot:
         self._part: _Part | None = None
         self._drive: Drive | None = None
         self._tried: dict[str, int] | None = None  # revisions of the robots in the last solve
-        self._unheard: dict[str, Outcome] = {}  # robots that have not confirmed the outcome
+        self._unheard: dict[str, TeamOutcome] = {}  # robots that have not confirmed the outcome
         self._out: list[Message] = []
         self._known: OwnAnswer | None = None
-        self.last: Outcome | None = None
-        self.outcome: Outcome | None = None
+        self.last: TeamOutcome | None = None
+        self.outcome: TeamOutcome | None = None
         self.ledger = TeamLedger()
 
     # Measurements
@@ -518,7 +518,7 @@ class Robot:
             self._obey(sender, message)
         elif isinstance(message, Reply):
             self._take_reply(sender, message, now)
-        elif isinstance(message, Outcome):
+        elif isinstance(message, TeamOutcome):
             self._take_outcome(sender, message)
         elif isinstance(message, Heard):
             outcome = self._unheard.get(sender)
@@ -693,13 +693,13 @@ class Robot:
             return Reply(ask.term, ask.call, part.revision, None, error_as_message(error))
         return Reply(ask.term, ask.call, part.revision, answer)
 
-    def _take_outcome(self, sender: str, outcome: Outcome) -> None:
+    def _take_outcome(self, sender: str, outcome: TeamOutcome) -> None:
         if outcome.term == self._term and outcome.term.driver == sender:
             if self.last is None or self.last.term != outcome.term:
                 self._end_with(outcome)
             self._send(sender, Heard(outcome.term), Priority.NORMAL)
 
-    def _end_with(self, outcome: Outcome) -> None:
+    def _end_with(self, outcome: TeamOutcome) -> None:
         """Keep an outcome and the poses with it; where a solve has failed, those before it."""
         self.last = outcome
         answer = None if self._part is None else self._part.agent.answer
@@ -808,11 +808,11 @@ def _check_settings(
         raise SettingError(f"patience is {patience} and retry {retry}; give positive seconds")
 
 
-def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, int]) -> Outcome:
+def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, int]) -> TeamOutcome:
     """The outcome of a solve that has ended."""
     ended = drive.outcome
     if isinstance(ended, FolderSolution):
-        return Outcome(
+        return TeamOutcome(
             drive.term,
             ended.certificate,
             revisions,
@@ -826,7 +826,7 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, i
         d = ended.poses.d
         nobodys = Poses.identity(0, d)
         robust = ended.robust
-        return Outcome(
+        return TeamOutcome(
             drive.term,
             replace(ended.certificate, poses=nobodys, Lambda=np.zeros((0, d, d))),
             revisions,
@@ -841,4 +841,4 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, i
     # What robots with own files lack, a team that shares its measurements has; and parts may meet.
     text = str(ended).replace(READ_HERE, "robots that share their measurements can")
     text = text.replace(SOLVE_PARTS, "an edge between them joins them")
-    return Outcome(drive.term, None, revisions, absent, note=f"failed: {text}")
+    return TeamOutcome(drive.term, None, revisions, absent, note=f"failed: {text}")
