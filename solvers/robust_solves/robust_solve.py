@@ -24,7 +24,7 @@ from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
 from solvers.robust.revision import Fit, drop_contradicted, error_scale
-from solvers.robust.weighted_edges import held_together, known_inliers
+from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
     Estimate,
@@ -96,11 +96,12 @@ def go_on_robustly(
 ) -> Solution:
     """Solution of a graph that has grown, from its start, without the edges that are wrong.
 
-    `kept` (m,) are the edges that were kept before, and `new` (m,) those that were not there. All
-    that are neither kept nor known are candidates: they are tested in clusters against the map,
-    which may also lose clusters that it has kept, or exchange one for another (`ClusterSearch`). So
-    a later closure can revise an earlier decision. There is one attempt, which is cheap; a robust
-    solve of the whole graph makes several. With PCM the pairwise consistent edges are those kept.
+    `kept` (m,) are the edges that were kept before, with the known inliers and what else the poses
+    need (`held_together`), and `new` (m,) those that were not there. All that are neither kept nor
+    known are candidates: they are tested in clusters against the map, which may also lose clusters
+    that it has kept, or exchange one for another (`ClusterSearch`). So a later closure can revise
+    an earlier decision. There is one attempt, which is cheap; a robust solve of the whole graph
+    makes several. With PCM the pairwise consistent edges are those kept.
     Errors are those of `solve_robustly`.
     """
     job = _RobustSolve.of(robust, request)
@@ -230,10 +231,6 @@ class _RobustSolve:
 
     def answer_by_update(self, kept: BoolArray) -> Solution:
         """The solution that goes on from the edges `kept`, (m,), and the start, once revised."""
-        doubted = self.doubted
-        assert self.start is not None
-        ratio = doubted.problem.edge_costs(self.start) / doubted.thresholds
-        kept = held_together(doubted.problem.graph, kept | doubted.known, ratio)
         plan = Plan("the solution before", None, kept)
         self.estimates.append(self.places.attempt(plan, self.start))
         if self.estimates[-1].status not in OUT_OF_TIME:
