@@ -41,15 +41,13 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
-from solvers.riemannian.newton_step import ROUNDING, scaled_decrement
+from solvers.riemannian.newton_step import scaled_decrement
 from solvers.riemannian.polish import polish
 from solvers.riemannian.trust_region import Precision, first_radius, trust_region_step
 
 # First shift of the rows of rotations for the preconditioner, as a share of their mean diagonal
 # entry in M: it makes M, which is singular, definite.
 _SHIFT = 1e-6
-_FORCING = 0.1
-_FLOOR = 0.01  # of the tolerance: conjugate gradients go no deeper
 # Size of the numbers beyond the first column at the start: a way out of a saddle point.
 _AWAY = 0.1
 _SEED = 0
@@ -205,12 +203,12 @@ class ComplexRelaxation:
     def step(self, problem: PGOProblem, state: ComplexState) -> ComplexState:
         """One iteration of the trust region."""
         point = state.point
-        scale = max(point.value, state.rounding_level)
-        precision = Precision(
-            forcing=min(_FORCING, math.sqrt(state.decrement)),
-            floor=4.0 * scale * _FLOOR * self.tolerance,
-            rounding=ROUNDING * scale + state.rounding_level,
-            max_iterations=self.max_inner_iterations,
+        precision = Precision.at(
+            point.value,
+            state.decrement,
+            self.tolerance,
+            state.rounding_level,
+            self.max_inner_iterations,
         )
         step = trust_region_step(state.cost, point, state.radius, precision)
         if step.point is None:

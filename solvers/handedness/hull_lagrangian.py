@@ -21,7 +21,6 @@ so that it solves graphs for which the models of cvxpy are too large.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -53,7 +52,6 @@ from pgo_models.relaxations.rotation_hull import (
 from pgo_models.relaxations.rounding import round_factor
 from solvers.result import Measurement, Status
 from solvers.riemannian.climb import DualBound, climb
-from solvers.riemannian.newton_step import ROUNDING
 from solvers.riemannian.staircase import EscapeDirection, escape_direction, precondition
 from solvers.riemannian.trust_region import Precision, first_radius, trust_region_step
 
@@ -65,7 +63,6 @@ _FIRST_MOVE = 0.3  # of the start, at random: at rank 3 the start is a saddle of
 _ENOUGH = 1e-3
 _COARSEST = 1e-7
 _FINEST = 1e-11
-_FORCING = 0.1
 _MOST_STEPS = 30  # of the trust region, in an iteration
 _MOST_PRODUCTS = 60  # with the Hessian, in a step of it
 _MOST_CLIMBS = 2  # in an iteration
@@ -361,12 +358,7 @@ def _minimised(
             break
         if radius is None:
             radius = first_radius(squared)
-        precision = Precision(
-            forcing=min(_FORCING, math.sqrt(decrement)),
-            floor=0.0,
-            rounding=ROUNDING * scale + rounding_level,
-            max_iterations=_MOST_PRODUCTS,
-        )
+        precision = Precision.at(point.cost, decrement, 0.0, rounding_level, _MOST_PRODUCTS)
         step = trust_region_step(function, point, radius, precision)
         radius = step.radius
         if step.point is not None:

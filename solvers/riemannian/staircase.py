@@ -5,7 +5,6 @@ eigenvalue at a stationary point, its eigenvector in one more column of Y leads 
 2019, algorithms 1 to 3; Boumal 2015).
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,13 +34,11 @@ from solvers.riemannian.climb import (
     staircase_status,
     turning_length,
 )
-from solvers.riemannian.newton_step import ROUNDING, scaled_decrement
+from solvers.riemannian.newton_step import scaled_decrement
 from solvers.riemannian.trust_region import Precision, first_radius, trust_region_step
 
 # of the mean diagonal entry of M over the rotations: makes Q, which is singular, definite
 _SHIFT = 1e-6
-_FORCING = 0.1
-_FLOOR = 0.01  # of the tolerance: conjugate gradients go no deeper
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +160,12 @@ class Staircase:
     def _descend(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """One iteration of the trust region."""
         point = state.point
-        scale = max(point.value, state.rounding_level)
-        precision = Precision(
-            forcing=min(_FORCING, math.sqrt(state.decrement)),
-            floor=4.0 * scale * _FLOOR * self.tolerance,
-            rounding=ROUNDING * scale + state.rounding_level,
-            max_iterations=self.max_inner_iterations,
+        precision = Precision.at(
+            point.value,
+            state.decrement,
+            self.tolerance,
+            state.rounding_level,
+            self.max_inner_iterations,
         )
         function = _LiftedCost(problem, state.preconditioner)
         step = trust_region_step(function, point, state.radius, precision)

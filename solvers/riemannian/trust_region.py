@@ -1,5 +1,7 @@
 """A step of a Riemannian trust region on St(d, r)^n (Absil, Mahony & Sepulchre, algorithm 10)."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -9,8 +11,11 @@ import numpy as np
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import retract
+from solvers.riemannian.newton_step import ROUNDING
 from solvers.riemannian.truncated_cg import TruncatedStep, truncated_conjugate_gradients
 
+_FORCING = 0.1  # the largest share of the residual that conjugate gradients leave
+_FLOOR = 0.01  # of the tolerance: conjugate gradients go no deeper
 _FIRST_RADIUS = 100.0  # times the preconditioned gradient, which soft directions outgrow
 # ratios of actual to promised decrease
 _ACCEPTED = 0.1
@@ -66,6 +71,28 @@ class Precision:
     floor: float
     rounding: float
     max_iterations: int
+
+    @classmethod
+    def at(
+        cls,
+        value: float,
+        decrement: float,
+        tolerance: float,
+        rounding_level: float,
+        max_iterations: int,
+    ) -> Precision:
+        """Precision of a step from a point of some value: the finer, the smaller the decrement.
+
+        `decrement` is <g, P g> / 4 over the value, for the gradient g and the preconditioner P, and
+        `tolerance` is the one at which steps end. Below `rounding_level` a value is as good as 0.
+        """
+        scale = max(value, rounding_level)
+        return cls(
+            forcing=min(_FORCING, math.sqrt(decrement)),
+            floor=4.0 * scale * _FLOOR * tolerance,
+            rounding=ROUNDING * scale + rounding_level,
+            max_iterations=max_iterations,
+        )
 
 
 @dataclass(frozen=True, eq=False)
