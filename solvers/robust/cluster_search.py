@@ -14,8 +14,8 @@ lower the truncated cost of `revision`, which decides of exchanges.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,19 +25,17 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import FALSE_ALARM, RightCosts
-from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust.clusters import closure_clusters
 from solvers.robust.distances import FirstOrder
-from solvers.robust.revision import Fit, inlier_problem, is_held, truncated_cost
+from solvers.robust.edge_sets import EdgeSets, with_edges
+from solvers.robust.linear_search import LinearSearch
+from solvers.robust.revision import Fit, inlier_problem, is_held
 from solvers.robust.weighted_edges import first_poses, held_together
 
 # Probability with which a right cluster passes the test.
 _QUANTILE = 0.99
-# Newton steps in which poses follow a cluster, at most.
-_MOST_STEPS = 20
 # A cluster is tried if its first-order distance is at most this many times its threshold. Those of
 # right clusters of nine graphs at odometry, among nine wrong closures of ten, are 0.95 at most.
 _NEAR = 2.0
@@ -55,8 +53,6 @@ _MOST_ROUNDS = 3
 # so many of them are looked at.
 _FAR = 4.0
 _MOST_SAMPLED = 100
-# Relative decrease of a cost that is more than rounding.
-_LEAST_DECREASE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,51 +79,60 @@ class _Candidates:
 
 @dataclass(frozen=True, eq=False)
 class ClusterSearch:
-    """Search among the edges of `problem` that are not `known`, (m,).
+    """Search among sets of the edges that are not known.
 
-    `allowed` (m,) are the thresholds of the truncated cost, times the scale s, which is `scale`.
-    The search ends early, with the best it has, once `has_time` is false. `new` (m,) are edges that
-    have come since others were decided upon: a run of closures with one of them may stand in place
-    of kept ones although it is far from the map.
+    `new` (m,) are edges that have come since others were decided upon: a run of closures with one
+    of them may stand in place of kept ones although it is far from the map. Where `is_single`,
+    every edge is a cluster of its own.
     """
 
-    problem: PGOProblem
-    known: BoolArray
-    allowed: Array
-    scale: float
-    has_time: Callable[[], bool]
+    sets: EdgeSets
     new: BoolArray | None = None
+    is_single: bool = False
 
     @cached_property
     def clusters(self) -> list[IntArray]:
         """Clusters of the edges that are not known."""
-        return closure_clusters(self.problem.graph, self.known, self.scale)
+        if self.is_single:
+            return list(np.flatnonzero(~self.sets.known)[:, None])
+        return closure_clusters(self.sets.problem.graph, self.sets.known, self.sets.scale)
 
     @cached_property
     def right_costs(self) -> RightCosts:
         """Distribution of what right edges cost."""
-        return RightCosts.of(self.problem)
+        return RightCosts.of(self.sets.problem)
 
     @cached_property
     def chains(self) -> Chains:
         """Chains of the known edges."""
-        return Chains.of(self.problem.graph, self.known)
+        return Chains.of(self.sets.problem.graph, self.sets.known)
 
     def improved(self, kept: BoolArray, poses: Poses) -> Fit:
         """Edges to keep, and their poses, from those of an estimate with the edges `kept`, (m,).
 
-        Clusters are added and removed, then one is exchanged, and so on while exchanges lower the
-        truncated cost.
+        Clusters are added, removed and exchanged; then single edges are, as a cluster may have a
+        wrong one; then any edges, by the linear theory. What that finds is improved in turn.
         """
-        fit = self._settled(kept, poses)
-        least_cost = np.inf
+        fit = self.sets.settled(kept, poses)
+        while True:
+            fit = self._at_rest(fit)
+            if any(len(cluster) > 1 for cluster in self.clusters):
+                singly = replace(self, is_single=True)._at_rest(fit)
+                fit = min(fit, singly, key=self.sets.cost)
+            exchanged = LinearSearch.of(self.sets).exchanged(fit)
+            if exchanged is None:
+                return fit
+            fit = exchanged
+
+    def _at_rest(self, fit: Fit) -> Fit:
+        """The fit that no addition, removal or exchange of a cluster improves."""
+        best: Fit | None = None
         while True:
             fit = self._without_misfits(self._with_clusters(fit))
             exchanged = self._exchanged(fit)
-            if exchanged is None or self.cost(exchanged) >= (1.0 - _LEAST_DECREASE) * least_cost:
+            if exchanged is None or (best and not self.sets.is_better(exchanged, best)):
                 return fit
-            least_cost = self.cost(exchanged)
-            fit = exchanged
+            best = fit = exchanged
 
     def expected_by_chance(self, fit: Fit) -> float:
         """Most wrong edges to expect that fit the map by chance, from those that nearly do.
@@ -140,7 +145,7 @@ class ClusterSearch:
         """
         candidates = self._candidates(fit, _FAR)
         chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
-        p = self.problem.d + tangent_dimension(self.problem.d)
+        p = self.sets.problem.d + tangent_dimension(self.sets.problem.d)
         near = [k for k in chosen.tolist() if 1.0 < candidates.ratio(k) <= _FAR]
         sizes = np.array([len(candidates.groups[k]) for k in near])
         num_near = float(sizes.sum() + 2.0 * np.sqrt(np.sum(sizes**2)))
@@ -152,7 +157,7 @@ class ClusterSearch:
     def _with_clusters(self, fit: Fit) -> Fit:
         """The fit with the rejected clusters that it can follow, the one of least cost first."""
         trials: dict[int, int] = {}
-        while self.has_time():
+        while self.sets.has_time():
             fit = self._with_fitting(fit)
             larger = self._with_next_clusters(fit, self._candidates(fit), trials)
             if larger is None:
@@ -166,8 +171,8 @@ class ClusterSearch:
         Their T is less.
         """
         groups = self._groups(~fit.kept)
-        costs = self.problem.edge_costs(fit.poses)
-        thresholds = self.scale * self.right_costs.thresholds(groups, _QUANTILE)
+        costs = self.sets.problem.edge_costs(fit.poses)
+        thresholds = self.sets.scale * self.right_costs.thresholds(groups, _QUANTILE)
         fitting = [
             group
             for group, threshold in zip(groups, thresholds, strict=True)
@@ -175,8 +180,8 @@ class ClusterSearch:
         ]
         if not fitting:
             return fit
-        larger = self._settled(_with_edges(fit.kept, np.concatenate(fitting)), fit.poses)
-        return larger if self.cost(larger) <= self.cost(fit) else fit
+        larger = self.sets.settled(with_edges(fit.kept, np.concatenate(fitting)), fit.poses)
+        return larger if self.sets.cost(larger) <= self.sets.cost(fit) else fit
 
     def _candidates(self, fit: Fit, most: float = _NEAR) -> _Candidates:
         """Rejected clusters within `most` times their thresholds to first order, at least.
@@ -188,13 +193,15 @@ class ClusterSearch:
         clusters = [cluster[~fit.kept[cluster]] for cluster in self.clusters]
         names = [name for name, cluster in enumerate(clusters) if len(cluster)]
         groups = [clusters[name] for name in names]
-        thresholds = self.scale * self.right_costs.thresholds(groups, _QUANTILE)
-        inliers = inlier_problem(self.problem, fit.kept)
+        thresholds = self.sets.scale * self.right_costs.thresholds(groups, _QUANTILE)
+        inliers = inlier_problem(self.sets.problem, fit.kept)
         first_order = FirstOrder(self.chains, inliers, fit.poses)
         sizes = np.array([len(group) for group in groups], dtype=int)
-        d = self.problem.d
+        d = self.sets.problem.d
         dof = sizes * (d + tangent_dimension(d))
-        largest = np.asarray(self.scale * scipy.special.chdtri(dof, 1.0 - _QUANTILE), dtype=float)
+        largest = np.asarray(
+            self.sets.scale * scipy.special.chdtri(dof, 1.0 - _QUANTILE), dtype=float
+        )
         farthest, ratio = np.zeros(0, dtype=int), np.zeros(0)
         if groups:
             edges = np.concatenate(groups)
@@ -204,7 +211,9 @@ class ClusterSearch:
             by_cluster = np.repeat(np.arange(len(groups)), sizes)
             last = np.lexsort([distances, by_cluster])[beginnings + sizes - 1]
             farthest = edges[last]
-        promise = np.array([self.allowed[group].sum() for group in groups]) - ratio * thresholds
+        promise = (
+            np.array([self.sets.allowed[group].sum() for group in groups]) - ratio * thresholds
+        )
         order = np.argsort(-promise, kind="stable")
         order = order[ratio[order] <= most]
         return _Candidates(names, groups, thresholds, first_order, farthest, largest, order)
@@ -217,11 +226,11 @@ class ClusterSearch:
         So many are added that the map hardly stiffens: one for every ten closures kept, at least
         one. `trials` counts how often each cluster has failed, and is brought up to date.
         """
-        num_left = max(1, int((fit.kept & ~self.known).sum()) // _CLOSURES_PER_CLUSTER)
+        num_left = max(1, int((fit.kept & ~self.sets.known).sum()) // _CLOSURES_PER_CLUSTER)
         num_failures = 0
         larger: Fit | None = None
         waiting = [k for k in candidates.order if trials.get(candidates.names[k], 0) < _MOST_TRIALS]
-        while num_left and waiting and num_failures < self._most_failures and self.has_time():
+        while num_left and waiting and num_failures < self._most_failures and self.sets.has_time():
             near: list[int] = []
             while waiting and len(near) < num_left:
                 k = waiting.pop(0)
@@ -254,32 +263,32 @@ class ClusterSearch:
             larger = self._with_cluster(fit, candidates.groups[k], candidates.thresholds[k])
             return (fit, chosen) if larger is None else (larger, [])
         edges = np.concatenate([candidates.groups[k] for k in chosen])
-        threshold = float(self.scale * self.right_costs.thresholds([edges], _QUANTILE)[0])
-        together = self._settled(_with_edges(fit.kept, edges), fit.poses)
+        threshold = float(self.sets.scale * self.right_costs.thresholds([edges], _QUANTILE)[0])
+        together = self.sets.settled(with_edges(fit.kept, edges), fit.poses)
         if together.cost - fit.cost <= threshold:
             return together, []
         middle = len(chosen) // 2
         first, failed = self._with_each(fit, candidates, chosen[:middle])
-        if not self.has_time():
+        if not self.sets.has_time():
             return first, [*failed, *chosen[middle:]]
         second, failed_later = self._with_each(first, candidates, chosen[middle:])
         return second, [*failed, *failed_later]
 
     def _with_cluster(self, fit: Fit, cluster: IntArray, threshold: float) -> Fit | None:
         """The fit with a cluster, if its T is at most the threshold."""
-        kept = _with_edges(fit.kept, cluster)
-        larger = self._settled(kept, fit.poses)
+        kept = with_edges(fit.kept, cluster)
+        larger = self.sets.settled(kept, fit.poses)
         if larger.cost - fit.cost > threshold:
             # Newton's method may end elsewhere from poses that have drifted far.
-            start = chordal_start(inlier_problem(self.problem, kept))
-            larger = min(larger, self._settled(kept, start), key=lambda other: other.cost)
+            start = chordal_start(inlier_problem(self.sets.problem, kept))
+            larger = min(larger, self.sets.settled(kept, start), key=lambda other: other.cost)
         return larger if larger.cost - fit.cost <= threshold else None
 
     # Removing clusters
 
     def _without_misfits(self, fit: Fit) -> Fit:
         """The fit without the clusters that cost more than chance explains, the worst one first."""
-        while self.has_time():
+        while self.sets.has_time():
             smaller = self._without_worst(fit)
             if smaller is None:
                 return fit
@@ -290,17 +299,17 @@ class ClusterSearch:
         """The fit without the cluster of the largest T over its threshold, if that is above 1."""
         groups = self._groups(fit.kept)
         quantile = 1.0 - FALSE_ALARM / max(1, len(groups))
-        thresholds = self.scale * self.right_costs.thresholds(groups, quantile)
-        costs = self.problem.edge_costs(fit.poses)
+        thresholds = self.sets.scale * self.right_costs.thresholds(groups, quantile)
+        costs = self.sets.problem.edge_costs(fit.poses)
         ratio = np.array([costs[group].sum() for group in groups]) / thresholds
         worst: Fit | None = None
         largest = 1.0
         for k in np.argsort(-ratio, kind="stable")[:_MOST_REMOVALS].tolist():
             kept = fit.kept.copy()
             kept[groups[k]] = False
-            if not is_held(self.problem.graph, kept):
+            if not is_held(self.sets.problem.graph, kept):
                 continue
-            smaller = self._settled(kept, fit.poses)
+            smaller = self.sets.settled(kept, fit.poses)
             rise = (fit.cost - smaller.cost) / thresholds[k]
             if rise > largest:
                 worst = smaller
@@ -311,21 +320,20 @@ class ClusterSearch:
 
     def _exchanged(self, fit: Fit) -> Fit | None:
         """A fit of less truncated cost, by a rejected cluster that excludes some of those kept."""
-        limit = (1.0 - _LEAST_DECREASE) * self.cost(fit)
         candidates = self._candidates(fit)
         for k in candidates.order[: self._most_failures].tolist():
-            if not self.has_time():
+            if not self.sets.has_time():
                 return None
             if candidates.ratio(k) <= _NEAR:
                 other = self._in_place_of_misfits(fit, candidates.groups[k])
-                if self.cost(other) < limit:
+                if self.sets.is_better(other, fit):
                     return other
         for run in self._rivals(fit):
-            if not self.has_time():
+            if not self.sets.has_time():
                 return None
             # The map can bend between two clusters that contradict each other.
             other = self._without_misfits(self._in_place_of_misfits(fit, run))
-            if self.cost(other) < limit:
+            if self.sets.is_better(other, fit):
                 return other
         return None
 
@@ -351,45 +359,30 @@ class ClusterSearch:
     @cached_property
     def _at_odometry(self) -> _Candidates | None:
         """Clusters near the map of the known edges; None where these do not hold the poses."""
-        graph = self.problem.graph
-        if not is_held(graph, self.known):
+        graph = self.sets.problem.graph
+        if not is_held(graph, self.sets.known):
             return None
-        return self._candidates(self._settled(self.known, first_poses(graph, self.known)))
+        return self._candidates(
+            self.sets.settled(self.sets.known, first_poses(graph, self.sets.known))
+        )
 
     def _in_place_of_misfits(self, fit: Fit, cluster: IntArray) -> Fit:
         """The fit with a cluster, and then with the edges within their thresholds alone."""
-        other = self._settled(_with_edges(fit.kept, cluster), fit.poses)
+        other = self.sets.settled(with_edges(fit.kept, cluster), fit.poses)
         for _ in range(_MOST_ROUNDS):
-            ratio = self.problem.edge_costs(other.poses) / self.allowed
-            kept = held_together(self.problem.graph, self.known | (ratio <= 1.0), ratio)
+            ratio = self.sets.problem.edge_costs(other.poses) / self.sets.allowed
+            kept = held_together(self.sets.problem.graph, self.sets.known | (ratio <= 1.0), ratio)
             if np.array_equal(kept, other.kept):
                 return other
-            other = self._settled(kept, other.poses)
+            other = self.sets.settled(kept, other.poses)
         return other
 
     @property
     def _most_failures(self) -> int:
         """Clusters that are tried in a row without success, or for an exchange, at most."""
-        return max(1, min(_MOST_FAILURES, _MOST_WORK // self.problem.num_poses))
-
-    def cost(self, fit: Fit) -> float:
-        """Truncated cost of the poses of a fit."""
-        return truncated_cost(self.problem, self.known, self.allowed, fit.poses)
+        return max(1, min(_MOST_FAILURES, _MOST_WORK // self.sets.problem.num_poses))
 
     def _groups(self, chosen: BoolArray) -> list[IntArray]:
         """Clusters of the chosen edges, (m,), alone."""
         groups = [cluster[chosen[cluster]] for cluster in self.clusters]
         return [group for group in groups if len(group)]
-
-    def _settled(self, kept: BoolArray, poses: Poses) -> Fit:
-        """The fit of edges kept, (m,), at the poses to which Newton steps lead."""
-        inliers = inlier_problem(self.problem, kept)
-        settled = polish(inliers, poses, max_steps=_MOST_STEPS)
-        return Fit(kept, settled, inliers.objective(settled))
-
-
-def _with_edges(kept: BoolArray, edges: IntArray) -> BoolArray:
-    """Edges kept, (m,), and some more."""
-    larger = kept.copy()
-    larger[edges] = True
-    return larger

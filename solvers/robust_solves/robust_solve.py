@@ -21,7 +21,9 @@ from solvers.result import OUT_OF_TIME, Status
 from solvers.riemannian.polish import polish
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.consistency import PCM, pairwise_consistent
+from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.gnc import GNC
+from solvers.robust.linear_search import LinearSearch
 from solvers.robust.rejection import Rejection
 from solvers.robust.revision import Fit, drop_contradicted, error_scale
 from solvers.robust.weighted_edges import known_inliers
@@ -68,6 +70,8 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        the other loss. Each attempt is revised: clusters of closures are added, removed and
        exchanged (`ClusterSearch`), then edges are dropped that all others contradict
        (`drop_contradicted`). It ends early when no further attempt is needed (`Choice.is_enough`).
+       Where few closures hold the map of the cheapest one, each is left out in turn
+       (`LinearSearch.without_one`).
     3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
        whether it is certified or not. Newton and all further steps of the pipeline
        (`solvers.plan`) solve for the edges kept.
@@ -88,6 +92,8 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     if isinstance(robust, PCM):
         return job.answer_by_consistency(robust.quantile)
     ending = job.make_attempts(robust)
+    if ending not in OUT_OF_TIME:
+        job.try_without_suspects()
     return job.answer_by_attempts(ending)
 
 
@@ -279,6 +285,26 @@ class _RobustSolve:
         except FAILURES as error:
             self.failures.append(f"a revision failed ({error}); what it began with stands")
 
+    def try_without_suspects(self) -> None:
+        """Leave each closure that the cheapest attempt keeps out in turn, if it keeps few.
+
+        A map that few closures hold bends to fit a wrong one. What is better is revised, and all
+        are left out anew.
+        """
+        try:
+            while self._has_time():
+                cheapest = self.choice.cheapest
+                fit = Fit.of(self.doubted.problem, cheapest.kept, cheapest.poses)
+                search = self._search(self.choice)
+                other = LinearSearch.of(search.sets).without_one(fit)
+                if other is None:
+                    return
+                better = search.improved(other.kept, other.poses)
+                place = self.estimates.index(cheapest)
+                self.estimates[place] = self.places.revised(cheapest, better.kept, better.poses)
+        except FAILURES as error:
+            self.failures.append(f"leaving closures out failed ({error}); the answer stands")
+
     def _leads_nowhere_new(self, plan: Plan) -> bool:
         """Whether a plan begins its revision where another attempt has, or lacks its start.
 
@@ -326,9 +352,8 @@ class _RobustSolve:
         doubted = self.doubted
         scale = choice.threshold_scale
         allowed = scale * doubted.thresholds
-        return ClusterSearch(
-            doubted.problem, doubted.known, allowed, scale, self._has_time, self.new
-        )
+        sets = EdgeSets(doubted.problem, doubted.known, allowed, scale, self._has_time)
+        return ClusterSearch(sets, self.new)
 
     def _by_chance(self, solution: Solution, kept: BoolArray) -> float:
         """Number of wrong closures that are expected to fit by chance.

@@ -14,6 +14,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
 from solvers.robust.cluster_search import ClusterSearch
+from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.revision import drop_contradicted, inlier_problem
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves import attempts as robust_attempts, robust_solve
@@ -394,9 +395,8 @@ def test_closures_that_the_map_can_follow_come_back(seed, claim):
     poses = solvers.solve(inlier_problem(problem, kept)).poses
     far = problem.edge_costs(poses) > 5.0 * pgo.chi2_thresholds(problem) * claim
     assert (far & ~kept & ~wrong).any()
-    search = ClusterSearch(
-        problem, known, claim * pgo.chi2_thresholds(problem), claim, lambda: True
-    )
+    allowed = claim * pgo.chi2_thresholds(problem)
+    search = ClusterSearch(EdgeSets(problem, known, allowed, claim, lambda: True))
     np.testing.assert_array_equal(search.improved(kept, poses).kept, ~wrong)
 
 

@@ -1,0 +1,159 @@
+"""Choice of closures in the linear theory: its model, its search, and maps that were bent."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from wrong_edges import spoiled
+
+import pgo_models as pgo
+from pgo_models.geometry.rotations import exp_map
+from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.hessian import TangentLayout
+from solvers.riemannian.polish import polish
+from solvers.robust.chains import measured_covariances
+from solvers.robust.consistency import odometry
+from solvers.robust.edge_sets import EdgeSets, with_edges
+from solvers.robust.linear_choice import LinearChoice, _linearised
+from solvers.robust.linear_search import LinearSearch
+from solvers.robust.revision import inlier_problem
+
+ALLOWED = 10.0
+
+
+def sparse_world(d: int, size: float = 1e-3) -> pgo.PGOProblem:
+    """A trajectory with a dozen closures and small errors, so that the linear theory holds."""
+    graph = pgo.grid_world(
+        1,
+        60,
+        np.random.default_rng(3),
+        d=d,
+        loop_closure_probability=0.15,
+        noise=NoiseModel(size, size),
+    )
+    return pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+
+
+def model_at(
+    problem: pgo.PGOProblem, num_kept: int
+) -> tuple[LinearChoice, EdgeSets, np.ndarray, np.ndarray, pgo.Poses]:
+    """The model at the map of some closures, with all that it is of."""
+    graph = problem.graph
+    known = odometry(graph)
+    closures = np.flatnonzero(~known)[:10]
+    kept = np.arange(num_kept)
+    sets = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: True)
+    fit = sets.settled(with_edges(known, closures[kept]), pgo.odometry_start(graph))
+    measured = measured_covariances(graph)[closures]
+    staying = inlier_problem(problem, known)
+    model = LinearChoice.of(staying, graph, (closures, measured), kept, fit.poses, ALLOWED)
+    return model, sets, closures, kept, fit.poses
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_derivative_of_the_errors_is_that_of_moves(d: int) -> None:
+    graph = sparse_world(d, 0.1).graph
+    edges = np.flatnonzero(~odometry(graph))
+    poses = pgo.odometry_start(graph)
+    errors, derivative, ends = _linearised(graph, edges, poses)
+    layout = TangentLayout(graph.num_poses, d)
+    p = layout.side // graph.num_poses
+    rng = np.random.default_rng(0)
+    moves = rng.standard_normal((graph.num_poses, p))
+    step = 1e-6
+    turn = exp_map(step * moves[:, d:])
+    moved = pgo.Poses(poses.R @ turn, poses.t + step * moves[:, :d])
+    after, _, _ = _linearised(graph, edges, moved)
+    predicted = (derivative @ moves[ends].ravel()).reshape(errors.shape)
+    # The derivative of the logarithm is the identity up to half the error itself.
+    size = np.abs(errors[:, d:]).max()
+    np.testing.assert_allclose(
+        (after - errors) / step, predicted, atol=(1e-4 + size) * np.abs(moves).max(), rtol=0
+    )
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("num_kept", [0, 4])
+def test_what_a_closure_costs_in_the_model_is_what_the_map_says(d: int, num_kept: int) -> None:
+    model, sets, closures, kept, poses = model_at(sparse_world(d), num_kept)
+    cost, changes = model._changes(kept)
+    before = sets.settled(with_edges(sets.known, closures[kept]), poses)
+    expected = before.cost + ALLOWED * (len(closures) - num_kept)
+    assert cost == pytest.approx(expected, rel=1e-2)
+    for e in range(len(closures)):
+        edges = with_edges(sets.known, closures[np.setxor1d(kept, [e])])
+        inliers = inlier_problem(sets.problem, edges)
+        rise = inliers.objective(polish(inliers, poses)) - before.cost
+        sign = -1.0 if e in kept else 1.0
+        assert changes[e] + sign * ALLOWED == pytest.approx(rise, rel=1e-2, abs=1e-2)
+
+
+def test_the_search_nearly_always_finds_the_best_of_all_sets() -> None:
+    """Eight closures whose errors go together: all 256 sets are compared."""
+    num_found = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        k, p = 8, 3
+        root = rng.standard_normal((k * p, k * p))
+        covariance = (root @ root.T / (k * p) + 0.1 * np.eye(k * p)).reshape(k, p, k, p)
+        errors = rng.standard_normal((k, p)) * rng.choice([1.0, 4.0], k)[:, None]
+        model = LinearChoice(errors, covariance, ALLOWED)
+
+        def cost(chosen: tuple[int, ...], model: LinearChoice = model) -> float:
+            return model._changes(np.array(chosen, dtype=int))[0]
+
+        sets = itertools.chain.from_iterable(
+            itertools.combinations(range(k), size) for size in range(k + 1)
+        )
+        least = min(map(cost, sets))
+        best = model.best(np.zeros(0, dtype=int))
+        num_found += cost(tuple(best)) <= (1.0 + 1e-9) * least
+        without = model.best(best, excluded=int(best[0]))
+        assert best[0] not in without
+    assert num_found >= 7
+
+
+def test_a_map_that_was_bent_to_a_wrong_closure_comes_back() -> None:
+    """One of the closures kept is wrong, and most right ones are out: no single change helps."""
+    num_back = 0
+    for seed in range(4):
+        noise = NoiseModel(0.02, 0.05)
+        right = pgo.grid_world(
+            1, 300, np.random.default_rng(seed), d=2, loop_closure_probability=0.02, noise=noise
+        )
+        graph, is_wrong = spoiled(right, 0.5, "random", seed)
+        problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+        known = odometry(graph)
+        sets = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: True)
+        planted = sets.settled(~is_wrong, graph.truth)
+        wrong = np.flatnonzero(is_wrong)[:1]
+        fit = sets.settled(with_edges(known, wrong), pgo.odometry_start(graph))
+        search = LinearSearch.of(sets)
+        while True:
+            other = search.exchanged(fit)
+            if other is None:
+                break
+            assert sets.is_better(other, fit)
+            fit = other
+        num_back += sets.cost(fit) <= 1.001 * sets.cost(planted)
+    assert num_back >= 3
+
+
+def test_without_one_leaves_a_wrong_closure_out() -> None:
+    noise = NoiseModel(0.02, 0.05)
+    right = pgo.grid_world(
+        1, 300, np.random.default_rng(1), d=2, loop_closure_probability=0.02, noise=noise
+    )
+    graph, is_wrong = spoiled(right, 0.3, "random", 1)
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+    known = odometry(graph)
+    ran_out = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: False)
+    wrong = np.flatnonzero(is_wrong)[:1]
+    fit = ran_out.settled(with_edges(known, wrong), pgo.odometry_start(graph))
+    assert LinearSearch.of(ran_out).without_one(fit) is None
+    sets = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: True)
+    other = LinearSearch.of(sets).without_one(fit)
+    assert other is not None
+    assert sets.is_better(other, fit)
