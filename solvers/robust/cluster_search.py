@@ -36,6 +36,8 @@ from solvers.robust.weighted_edges import first_poses, held_together
 
 # Probability with which a right cluster passes the test.
 _QUANTILE = 0.99
+# That of an edge that comes back in the end, where few wrong ones lie between the two.
+_LIKELY_QUANTILE = 0.999
 # A cluster is tried if its first-order distance is at most this many times its threshold. Those of
 # right clusters of nine graphs at odometry, among nine wrong closures of ten, are 0.95 at most.
 _NEAR = 2.0
@@ -151,6 +153,32 @@ class ClusterSearch:
         num_near = float(sizes.sum() + 2.0 * np.sqrt(np.sum(sizes**2)))
         share_looked_at = len(chosen) / max(1, len(candidates.order))
         return float(num_near / (_FAR ** (0.5 * p) - 1.0) / max(share_looked_at, 1e-300))
+
+    def with_likely(self, fit: Fit) -> Fit:
+        """The fit with rejected edges beyond the quantile 0.99 that are likely right.
+
+        Between this and the quantile 0.999 lie 0.9 % of the right edges. How many wrong ones lie
+        there is estimated as in `expected_by_chance`.
+        """
+        p = self.sets.problem.d + tangent_dimension(self.sets.problem.d)
+        farther, nearer = scipy.special.chdtri(p, [1.0 - _LIKELY_QUANTILE, 1.0 - _QUANTILE])
+        num_kept = int((fit.kept & ~self.sets.known).sum())
+        num_right = (_LIKELY_QUANTILE - _QUANTILE) * num_kept
+        num_wrong = self.expected_by_chance(fit) * ((farther / nearer) ** (0.5 * p) - 1.0)
+        if num_wrong > num_right:
+            return fit
+        singly = replace(self, is_single=True)
+        candidates = singly._candidates(fit, farther / nearer)
+        thresholds = self.sets.scale * self.right_costs.thresholds(
+            candidates.groups, _LIKELY_QUANTILE
+        )
+        for k in candidates.order[:_MOST_FAILURES].tolist():
+            if not self.sets.has_time():
+                break
+            if candidates.ratio(k) <= farther / nearer:
+                larger = singly._with_cluster(fit, candidates.groups[k], thresholds[k])
+                fit = fit if larger is None else larger
+        return fit
 
     # Adding clusters
 

@@ -10,8 +10,9 @@ import numpy as np
 from pgo_models.certificates.certificate import Verdict
 from pgo_models.certificates.fit import Fit
 from pgo_models.figures import rounded_up
-from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.summaries import Summarised
 from solvers.robust.outlier_record import OutlierProof
 
@@ -20,10 +21,10 @@ from solvers.robust.outlier_record import OutlierProof
 NEAR = 4.0
 # Edges that are named in a row of the summary, at most.
 _MAX_NAMED = 5
-# An attempt is a rival where its truncated cost is so little above that of the answer, relative,
-# and it keeps so many edges that the answer rejects: more than one, and more than this share of the
-# closures kept. The same share of rejected edges may be near their thresholds.
-_RIVAL_COST = 0.02
+# An attempt is a rival where its truncated cost is above that of the answer by the thresholds of so
+# few edges, and it keeps so many that the answer rejects: more than one, and more than this share
+# of the closures kept. The same share of rejected edges may be near their thresholds.
+_RIVAL_EDGES = 2.0
 _TOLERATED_SHARE = 0.05
 
 
@@ -146,6 +147,22 @@ class Rejection(Summarised):
         return int(self.kept.sum()) - (self.problem.num_poses - 1)
 
     @property
+    def num_rejected_near(self) -> float:
+        """Number of rejected edges near their thresholds that are not there by chance.
+
+        Edges near are within x = 4 times their thresholds. Wrong motions that lie anywhere are
+        within half of that with the share 2^(-p / 2), the ratio of the volumes, with p = 3 or 6
+        numbers of a motion; right edges that were rejected are within it, all but a few. So of n
+        edges near, r of them right, the half nearest to zero has r + (n - r) 2^(-p / 2).
+        """
+        d = self.problem.d
+        p = d + tangent_dimension(d)
+        share = float(2.0 ** (-0.5 * p))
+        num_near = int((self.rejected & self.doubtful).sum())
+        num_nearer = int((self.rejected & self.doubtful & (self.ratio < 0.5 * NEAR)).sum())
+        return max(0.0, (num_nearer - share * num_near) / (1.0 - share))
+
+    @property
     def doubts(self) -> tuple[str, ...]:
         """What speaks against the edges kept, in a few words each."""
         doubts = []
@@ -154,9 +171,9 @@ class Rejection(Summarised):
         if self.by_chance > _TOLERATED_SHARE * self.num_closures_kept:
             number = rounded_up(self.by_chance, 2)
             doubts.append(f"up to {number} wrong closures are expected to fit this map by chance")
-        num_near = int((self.rejected & self.doubtful).sum())
+        num_near = self.num_rejected_near
         if num_near > self._num_tolerated:
-            doubts.append(f"{num_near} rejected edges are near their thresholds")
+            doubts.append(f"about {num_near:.0f} right edges are rejected near their thresholds")
         rival = self._rival
         if rival is not None:
             kept_by = f"kept by an attempt of nearly the same cost, {rival.name}"
@@ -322,7 +339,11 @@ class Rejection(Summarised):
     @property
     def _rival(self) -> Attempt | None:
         """The cheapest attempt of nearly the same cost that keeps many rejected edges, if any."""
-        max_cost = (1.0 + _RIVAL_COST) * self.cost
+        thresholds = chi2_thresholds(self.problem, self.quantile)[~self.known]
+        if len(thresholds) == 0:
+            return None
+        threshold = self.threshold_scale * float(np.median(thresholds))
+        max_cost = self.cost + _RIVAL_EDGES * threshold
         rivals = [
             attempt
             for attempt in self.attempts

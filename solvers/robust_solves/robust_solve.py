@@ -92,8 +92,6 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     if isinstance(robust, PCM):
         return job.answer_by_consistency(robust.quantile)
     ending = job.make_attempts(robust)
-    if ending not in OUT_OF_TIME:
-        job.try_without_suspects()
     return job.answer_by_attempts(ending)
 
 
@@ -285,26 +283,6 @@ class _RobustSolve:
         except FAILURES as error:
             self.failures.append(f"a revision failed ({error}); what it began with stands")
 
-    def try_without_suspects(self) -> None:
-        """Leave each closure that the cheapest attempt keeps out in turn, if it keeps few.
-
-        A map that few closures hold bends to fit a wrong one. What is better is revised, and all
-        are left out anew.
-        """
-        try:
-            while self._has_time():
-                cheapest = self.choice.cheapest
-                fit = Fit.of(self.doubted.problem, cheapest.kept, cheapest.poses)
-                search = self._search(self.choice)
-                other = LinearSearch.of(search.sets).without_one(fit)
-                if other is None:
-                    return
-                better = search.improved(other.kept, other.poses)
-                place = self.estimates.index(cheapest)
-                self.estimates[place] = self.places.revised(cheapest, better.kept, better.poses)
-        except FAILURES as error:
-            self.failures.append(f"leaving closures out failed ({error}); the answer stands")
-
     def _leads_nowhere_new(self, plan: Plan) -> bool:
         """Whether a plan begins its revision where another attempt has, or lacks its start.
 
@@ -373,12 +351,45 @@ class _RobustSolve:
 
     def answer_by_attempts(self, ending: Status) -> Solution:
         """The solution of the edges kept by the cheapest attempt."""
-        cheapest = self.choice.cheapest
-        solution = cheapest.solution if ending in OUT_OF_TIME else self._solution_of(cheapest)
+        is_out_of_time = ending in OUT_OF_TIME
+        chosen = self.choice.cheapest if is_out_of_time else self._improved_cheapest()
+        solution = chosen.solution if is_out_of_time else self._solution_of(chosen)
         stages = [estimate.stage for estimate in self.estimates]
-        status = ending if ending in OUT_OF_TIME else solution.status
+        status = ending if is_out_of_time else solution.status
         solution = replace(solution, stages=(*stages, *solution.stages), status=status)
-        return self._result(solution, cheapest.kept, cheapest.scale, cheapest.attempt.name)
+        return self._result(solution, chosen.kept, chosen.scale, chosen.attempt.name)
+
+    def _improved_cheapest(self) -> Estimate:
+        """The cheapest attempt, improved by what is too slow for each, or to be done once.
+
+        Where few closures hold its map, which then bends to fit a wrong one, each is left out in
+        turn, unless the graph has grown; what is better is revised, and all are left out anew. In
+        the end edges come back that are likely right although they are beyond the quantile, which
+        may raise the truncated cost.
+        """
+        cheapest = self.choice.cheapest
+        try:
+            while self.new is None and self._has_time():
+                search = self._search(self.choice)
+                other = LinearSearch.of(search.sets).without_one(self._fit_of(cheapest))
+                if other is None:
+                    break
+                cheapest = self._replaced(cheapest, search.improved(other.kept, other.poses))
+            with_likely = self._search(self.choice).with_likely(self._fit_of(cheapest))
+            if not np.array_equal(with_likely.kept, cheapest.kept):
+                cheapest = self._replaced(cheapest, with_likely)
+        except FAILURES as error:
+            self.failures.append(f"the last search failed ({error}); what it began with stands")
+        return cheapest
+
+    def _fit_of(self, estimate: Estimate) -> Fit:
+        return Fit.of(self.doubted.problem, estimate.kept, estimate.poses)
+
+    def _replaced(self, estimate: Estimate, fit: Fit) -> Estimate:
+        """The solution of the edges of a fit, in place of an estimate."""
+        revised = self.places.revised(estimate, fit.kept, fit.poses)
+        self.estimates[self.estimates.index(estimate)] = revised
+        return revised
 
     def _solution_of(self, estimate: Estimate) -> Solution:
         """Solution of the edges kept, by all steps that may improve it.
