@@ -26,6 +26,7 @@ from pgo_models.problem.cholesky import (
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.ordering import counts_of_blocks, pose_order, row_order
+from pgo_models.problem.right_costs import RightCosts
 from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.problem.weighting import (
     Weighting,
@@ -137,6 +138,12 @@ class PGOProblem(ReadOnly):
     def information(self) -> Array:
         """Information matrices of chi2, (m, k, k)."""
         return proper_information(self.graph)
+
+    @cached_property
+    def right_costs(self) -> RightCosts:
+        """Distribution of what the edges cost where their errors are those of their matrices."""
+        is_chi2 = self.weighting is Weighting.INFORMATION or self.weights.is_chi2
+        return RightCosts.of(self.graph, self.weights, is_chi2)
 
     @property
     def has_translations(self) -> bool:

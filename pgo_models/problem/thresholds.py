@@ -5,7 +5,6 @@ They are made for either weighting, F or chi2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +13,11 @@ import scipy  # and scipy.special when it is used
 from pgo_models.errors import check_quantile, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import LEAST_SCALED, gaussian_information, scaled_blocks
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import edge_errors
 from pgo_models.problem.edge_cost import isotropic_cost
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from pgo_models.problem.right_costs import RightCosts
 from pgo_models.summaries import Summarised
 
 # Probability of any misfit when all measurement errors have the covariances of their matrices.
@@ -130,14 +128,15 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
         has_translations = problem.has_translations
     if not has_translations:
         translation = np.zeros_like(translation)
-    w = _chi2_weights(problem)
-    scale = _median_ratio(cost, w)
+    right_costs = _right_costs_of(problem)
+    scale = _median_ratio(cost, right_costs)
     quantile = 1.0 - FALSE_ALARM / max(graph.num_edges, 1)
-    allowed = scale * _quantiles(w, quantile)
+    allowed = scale * right_costs.quantiles(quantile)
     # All edges together: the sum is taken for a scaled chi^2 with the same mean and variance.
-    redundancy = _redundancy(graph, w, has_translations)
-    mean = redundancy * np.sum(w)
-    half_variance = redundancy * np.sum(w**2)
+    redundancy = _redundancy(graph, right_costs.rank, has_translations)
+    sum_w, sum_w2, _ = right_costs.sums.sum(axis=0)
+    mean = redundancy * sum_w
+    half_variance = redundancy * sum_w2
     overall = 0.0
     dof = 1.0
     if mean > 0.0:
@@ -149,9 +148,16 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     )
 
 
-def _median_ratio(cost: Array, w: Array) -> float:
+def _right_costs_of(problem: PGOProblem | PoseGraph) -> RightCosts:
+    """Distribution of the costs of right edges; for a graph the cost is F."""
+    if isinstance(problem, PGOProblem):
+        return problem.right_costs
+    return RightCosts.of(problem, isotropic_cost(problem.tau, problem.kappa))
+
+
+def _median_ratio(cost: Array, right_costs: RightCosts) -> float:
     """Median over the edges of the cost over its median, at least 1."""
-    median_cost = _quantiles(w, 0.5)
+    median_cost = right_costs.quantiles(0.5)
     is_counted = median_cost > 0.0
     if not is_counted.any():
         return 1.0
@@ -159,15 +165,14 @@ def _median_ratio(cost: Array, w: Array) -> float:
     return max(1.0, float(np.median(ratios)))
 
 
-def _redundancy(graph: PoseGraph, w: Array, has_translations: bool) -> float:
-    """1 - u / r for u unknowns and measurements of rank r."""
+def _redundancy(graph: PoseGraph, rank: int, has_translations: bool) -> float:
+    """1 - u / rank for u unknowns."""
     d = graph.d if has_translations else 0
     p = tangent_dimension(graph.d)
     num_points = len(graph.landmarks)
     num_other_poses = graph.num_poses - num_points
     # One pose is fixed.
     unknowns = (d + p) * (num_other_poses - 1) + d * num_points
-    rank = int(np.sum(w > 0.0))
     return 1.0 - unknowns / max(rank, 1)
 
 
@@ -217,106 +222,4 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     True
     """
     check_quantile(quantile)
-    return _quantiles(_chi2_weights(problem), quantile)
-
-
-@dataclass(frozen=True, eq=False)
-class RightCosts:
-    """Distribution of what right edges cost together: sums of the w of `chi2_thresholds`.
-
-    Parameters
-    ----------
-    sums : Array, (m, 3)
-        sum w, sum w^2 and sum w^3 of every edge.
-    """
-
-    sums: Array
-
-    @classmethod
-    def of(cls, problem: PGOProblem) -> RightCosts:
-        """Distribution of the costs of a problem's edges, which are taken for independent."""
-        return cls(_power_sums(_chi2_weights(problem)))
-
-    def thresholds(self, groups: Sequence[IntArray], quantile: float) -> Array:
-        """Quantiles of the costs that groups of right edges have together, (k,).
-
-        For k edges with matrices of full rank it is that of chi^2 with k d (d + 1) / 2 degrees of
-        freedom. Adding the edges of a group to the right map raises the least cost by no more with
-        this probability, however far the map moves.
-        """
-        sums = np.array([self.sums[group].sum(axis=0) for group in groups]).reshape(-1, 3)
-        return _quantiles_of_sums(sums, quantile)
-
-
-def _quantiles(w: Array, quantile: float) -> Array:
-    """Quantiles of sums of w chi^2_1, (m,)."""
-    return _quantiles_of_sums(_power_sums(w), quantile)
-
-
-def _power_sums(w: Array) -> Array:
-    """Sums of w, w^2 and w^3, (m, 3)."""
-    return np.stack([np.sum(w**k, axis=1) for k in (1, 2, 3)], axis=1)
-
-
-def _quantiles_of_sums(sums: Array, quantile: float) -> Array:
-    """Quantiles of sums of w chi^2_1, (m,), of which the power sums are known, (m, 3)."""
-    c_1, c_2, c_3 = sums.T
-    # An edge without weight has c_1 = c_2 = c_3 = 0.
-    ratio = c_3 / np.where(c_2 > 0.0, c_2, 1.0)
-    divisor = np.where(ratio > 0.0, ratio, 1.0)
-    dof = c_2 / divisor**2
-    chi2_quantile = scipy.special.chdtri(np.maximum(dof, 1.0), 1.0 - quantile)
-    return np.asarray(c_1 + ratio * (chi2_quantile - dof))
-
-
-def _chi2_weights(problem: PGOProblem | PoseGraph) -> Array:
-    """Weights w, (m, k), of the chi^2_1 that the edges' costs are sums of.
-
-    Those of chi2 are ones, as many as the rank.
-    """
-    if isinstance(problem, PoseGraph):
-        graph = problem
-        weights = isotropic_cost(problem.tau, problem.kappa)
-        is_chi2 = False
-    else:
-        graph = problem.graph
-        weights = problem.weights
-        is_chi2 = problem.weighting is Weighting.INFORMATION or weights.is_chi2
-    d = graph.d
-    scaled, scale = scaled_blocks(_measured_information(graph))
-    eigenvalues, eigenvectors = np.linalg.eigh(scaled)
-    is_known = eigenvalues > LEAST_SCALED
-    if is_chi2:
-        return is_known.astype(float)
-    # A root of Sigma = root root^T, where the information is known.
-    inverse_roots = is_known / np.sqrt(np.where(is_known, eigenvalues, 1.0))
-    root = scale[:, :, None] * eigenvectors * inverse_roots[:, None, :]
-    root_t = root[:, :d]
-    root_r = root[:, d:]
-    # The matrix root^T blockdiag(tau I, V) root.
-    W = weights.W(d)
-    trace = np.einsum("mkk->m", W)[:, None, None]
-    V = trace if d == 2 else trace * np.eye(3) - W
-    is_seen_t, _ = weights.is_seen()
-    tau = np.where(is_seen_t, weights.tau, 0.0)
-    of_translations = tau[:, None, None] * np.swapaxes(root_t, 1, 2) @ root_t
-    of_rotations = np.swapaxes(root_r, 1, 2) @ V @ root_r
-    w = np.linalg.eigvalsh(of_translations + of_rotations)
-    least = LEAST_SCALED * w[:, -1:]
-    return np.where(w > least, w, 0.0)
-
-
-def _measured_information(graph: PoseGraph) -> Array:
-    """Information matrices, (m, d + p, d + p), without those that fix rotations of landmarks.
-
-    A landmark has no rotation; its first edge holds the rotation of its pose, which is no
-    measurement.
-    """
-    d = graph.d
-    information = gaussian_information(graph)
-    if len(graph.first_sights) == 0:
-        return information
-    information = information.copy()
-    information[graph.first_sights, d:] = 0.0
-    information[graph.first_sights, :, d:] = 0.0
-    return information
+    return problem.right_costs.quantiles(quantile)

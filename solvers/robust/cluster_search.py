@@ -25,7 +25,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.thresholds import FALSE_ALARM, RightCosts
+from pgo_models.problem.right_costs import RightCosts
+from pgo_models.problem.thresholds import FALSE_ALARM
 from solvers.robust.chains import Chains
 from solvers.robust.clusters import closure_clusters
 from solvers.robust.distances import FirstOrder
@@ -99,10 +100,10 @@ class ClusterSearch:
             return list(np.flatnonzero(~self.sets.known)[:, None])
         return closure_clusters(self.sets.problem.graph, self.sets.known, self.sets.scale)
 
-    @cached_property
+    @property
     def right_costs(self) -> RightCosts:
         """Distribution of what right edges cost."""
-        return RightCosts.of(self.sets.problem)
+        return self.sets.problem.right_costs
 
     @cached_property
     def chains(self) -> Chains:

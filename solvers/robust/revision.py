@@ -122,19 +122,24 @@ def drop_contradicted(
     improbable = chi2_thresholds(problem, 1.0 - FALSE_ALARM / num_tested) / allowed
     clear_factor = _CLEARLY_CONTRADICTED if num_tested >= _NUM_FOR_CLEAR else np.inf
 
-    def is_contradicted(suspect: _Removal, following: _Removal) -> bool:
-        is_clear = suspect.loss > clear_factor * following.loss
-        is_far = suspect.loss > _CONTRADICTED * following.loss
+    def is_contradicted(suspect: _Removal, next_loss: float) -> bool:
+        is_clear = suspect.loss > clear_factor * next_loss
+        is_far = suspect.loss > _CONTRADICTED * next_loss
         is_improbable = suspect.loss > improbable[suspect.edge]
         return is_clear or bool(is_far and is_improbable)
 
     fit = Fit.of(problem, kept, poses)
     suspect = _remove_worst(problem, known, allowed, fit, settle)
     while suspect is not None:
-        following = _remove_worst(problem, known, allowed, suspect.fit, settle)
-        if following is None or not is_contradicted(suspect, following):
-            break
         if suspect.loss <= suspect.fit.error_scale(problem):
+            break
+        # The loss of the next edge is at least its residual: where that is too large already, its
+        # removal need not be tried.
+        least_loss = float(_ratios(problem, known, allowed, suspect.fit).max())
+        if not is_contradicted(suspect, least_loss):
+            break
+        following = _remove_worst(problem, known, allowed, suspect.fit, settle)
+        if following is None or not is_contradicted(suspect, following.loss):
             break
         fit = suspect.fit
         suspect = following
@@ -145,7 +150,7 @@ def _remove_worst(
     problem: PGOProblem, known: BoolArray, allowed: Array, fit: Fit, settle: Settle
 ) -> _Removal | None:
     """The fit without the edge of the largest residual; None where poses need it to connect."""
-    ratio = np.where(fit.kept & ~known, problem.edge_costs(fit.poses) / allowed, 0.0)
+    ratio = _ratios(problem, known, allowed, fit)
     worst = int(ratio.argmax())
     others = fit.kept.copy()
     others[worst] = False
@@ -154,3 +159,8 @@ def _remove_worst(
     poses = settle(inlier_problem(problem, others), fit.poses)
     without = Fit.of(problem, others, poses)
     return _Removal(worst, without, (fit.cost - without.cost) / allowed[worst])
+
+
+def _ratios(problem: PGOProblem, known: BoolArray, allowed: Array, fit: Fit) -> Array:
+    """Costs over thresholds of the edges kept that are not known, (m,); zeros for the others."""
+    return np.where(fit.kept & ~known, problem.edge_costs(fit.poses) / allowed, 0.0)

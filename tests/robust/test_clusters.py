@@ -10,7 +10,6 @@ from wrong_edges import ring_road, spoiled
 import pgo_models as pgo
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.thresholds import RightCosts
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust.cluster_search import ClusterSearch
@@ -92,7 +91,7 @@ def test_the_rise_by_right_closures_has_its_quantile() -> None:
         for edges in (kept, np.ones_like(kept)):
             inliers = inlier_problem(problem, edges)
             costs.append(inliers.objective(polish(inliers, graph.truth)))
-        median = RightCosts.of(problem).thresholds([cluster], 0.5)[0]
+        median = problem.right_costs.thresholds([cluster], 0.5)[0]
         ratios.append((costs[1] - costs[0]) / median)
     # 40 draws above the median or below: within three deviations of half of them
     assert abs(np.mean(np.array(ratios) > 1.0) - 0.5) < 3 * 0.5 / np.sqrt(40)
@@ -103,7 +102,7 @@ def test_the_joint_threshold_of_full_matrices_is_that_of_chi2() -> None:
     problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
     groups = [np.arange(1), np.arange(5)]
     expected = scipy.special.chdtri([6, 30], 0.01)
-    np.testing.assert_allclose(RightCosts.of(problem).thresholds(groups, 0.99), expected, rtol=1e-9)
+    np.testing.assert_allclose(problem.right_costs.thresholds(groups, 0.99), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("d", [2, 3])
