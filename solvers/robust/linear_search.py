@@ -51,7 +51,12 @@ class LinearSearch:
         """A better fit, without one of the closures kept, to which the map may have been bent."""
         if not self._can_choose(fit):
             return None
-        for suspect in np.flatnonzero(fit.kept[self.closures]).tolist():
+        try:
+            model = self._model(fit, self._staying(fit))
+            suspects = model.suspects(np.flatnonzero(fit.kept[self.closures]))
+        except (NotPositiveDefiniteError, np.linalg.LinAlgError):
+            return None
+        for suspect in suspects.tolist():
             other = self._chosen(fit, suspect, _MOST_CHOICES_WITHOUT)
             if other is not None:
                 return other

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -86,12 +87,15 @@ class DoubtedProblem:
     @property
     def is_affordable(self) -> bool:
         """Whether a factorisation with all edges takes seconds: by its pattern, for CHOLMOD."""
-        problem = self.problem
-        if (problem.backend or default_backend()) is not CholeskyBackend.CHOLMOD:
-            return False
-        graph = problem.graph
-        counts = most_counts(analyze_poses(graph, pose_order(graph)), problem.d + 1)
-        return float(np.sum(counts.in_column**2)) <= _AFFORDABLE_OPERATIONS
+        backend = self.problem.backend or default_backend()
+        return backend is CholeskyBackend.CHOLMOD and not self.is_large
+
+    @cached_property
+    def is_large(self) -> bool:
+        """Whether a factorisation with all edges takes more than seconds, by its pattern."""
+        graph = self.problem.graph
+        counts = most_counts(analyze_poses(graph, pose_order(graph)), self.problem.d + 1)
+        return float(np.sum(counts.in_column**2)) > _AFFORDABLE_OPERATIONS
 
     def with_edges(self, kept: BoolArray) -> PGOProblem:
         """The problem with the kept edges, (m,), alone; see `inlier_problem`."""
@@ -117,21 +121,16 @@ class Plan:
 
 
 def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
-    """Plans of the attempts, the most promising first; each is made when it is asked for."""
+    """Plans of the attempts, the most promising first; each is made when it is asked for.
+
+    On a large graph tight thresholds come first: with weights on most edges, as at the beginning of
+    other attempts, a Newton step may take minutes.
+    """
     graph = doubted.problem.graph
     known = doubted.known
     candidates = doubted.every_edge
     if settings.consistent:
         candidates = known | pairwise_consistent(graph, known)
-    yield Plan("as set", settings, candidates)
-    tree = held_together(graph, known, np.zeros(graph.num_edges))
-    yield Plan("known inliers", None, tree)
-    if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
-        consistent = known | pairwise_consistent(graph, known)
-        if len(graph.components(consistent)) == 1:
-            preselected = replace(settings, consistent=True)
-            yield Plan("pairwise consistent edges", preselected, consistent)
-    slow = [Plan("smaller steps", with_smaller_steps(settings), candidates)]
     tight = [
         Plan(
             f"thresholds times {factor:g} at first",
@@ -140,8 +139,22 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
         )
         for factor in _TIGHT_SCALES
     ]
-    # Tight thresholds reject many edges, and a large graph with fewer edges is faster.
-    yield from slow + tight if doubted.is_cheap else tight + slow
+    if doubted.is_large:
+        yield from reversed(tight)
+    yield Plan("as set", settings, candidates)
+    tree = held_together(graph, known, np.zeros(graph.num_edges))
+    yield Plan("known inliers", None, tree)
+    if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
+        consistent = known | pairwise_consistent(graph, known)
+        if len(graph.components(consistent)) == 1:
+            preselected = replace(settings, consistent=True)
+            yield Plan("pairwise consistent edges", preselected, consistent)
+    slow = Plan("smaller steps", with_smaller_steps(settings), candidates)
+    if doubted.is_large:
+        yield slow
+    else:
+        # Tight thresholds reject many edges, and a graph with fewer edges is faster.
+        yield from [slow, *tight] if doubted.is_cheap else [*tight, slow]
     yield Plan("from least squares with every edge", settings, candidates, True)
     yield Plan(*_with_other_loss(settings), candidates)
 

@@ -63,7 +63,8 @@ class Choice:
         certificate that needs complex numbers does not do: that the usual relaxation is loose is a
         sign of edges that contradict each other.
         Where attempts are cheap, or it rejects more than half of the closures, another one has to
-        agree with it, or four have to be made.
+        agree with it, or four have to be made; on a large graph, where each takes minutes, one is
+        enough.
         """
         cheapest = self.cheapest
         is_tree = int(cheapest.kept.sum()) < self.doubted.problem.num_poses
@@ -71,7 +72,7 @@ class Choice:
         if is_tree or not certificate.is_certified or certificate.bound.is_complex:
             return False
         keeps_most = 2 * self._num_closures_kept(cheapest) >= self.doubted.num_closures
-        if keeps_most and not self.doubted.is_cheap:
+        if self.doubted.is_large or (keeps_most and not self.doubted.is_cheap):
             return True
         return self._is_agreed(cheapest) or len(self.estimates) >= _SEVERAL_ATTEMPTS
 

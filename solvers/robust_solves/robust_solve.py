@@ -66,12 +66,12 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        more than they may. It is the answer, too, if all edges alike cost more than they may.
     2. Attempts (`plans_in_order`). Graduated non-convexity is run as set; then there are the known
        inliers alone; then it is run on the pairwise consistent edges; with more and smaller steps;
-       with tight thresholds, which the edges kept then widen; from the least-squares solution; with
-       the other loss. Each attempt is revised: clusters of closures are added, removed and
-       exchanged (`ClusterSearch`), then edges are dropped that all others contradict
-       (`drop_contradicted`). It ends early when no further attempt is needed (`Choice.is_enough`).
-       Where few closures hold the map of the cheapest one, each is left out in turn
-       (`LinearSearch.without_one`).
+       with tight thresholds, which the edges kept then widen (first on a large graph); from the
+       least-squares solution; with the other loss. Each attempt is revised: clusters of closures
+       are added, removed and exchanged (`ClusterSearch`), then edges are dropped that all others
+       contradict (`drop_contradicted`). It ends early when no further attempt is needed
+       (`Choice.is_enough`). Where few closures hold the map of the cheapest one, each is left out
+       in turn (`LinearSearch.without_one`).
     3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
        whether it is certified or not. Newton and all further steps of the pipeline
        (`solvers.plan`) solve for the edges kept.

@@ -10,10 +10,12 @@ limit; a row a run is printed and appended to --rows, which --summary reads. pre
 closures kept, the share that is right; recall: of the right ones, the share kept; ATE: metres to
 the optimum of the same cost without wrong edges.
 
-`--verdicts` runs ours alone on the cases of `VERDICTS`, in the cost of the files, and prints for
-each its truncated cost over that of the planted truth, precision, recall, the exit code of
-`pgo solve` and the line of the verdict, the worst run first. A run is silent where precision or
-recall is below 0.95 and the exit code is 0.
+`--verdicts` runs ours alone on the cases of `VERDICTS`, or on those of --graphs, --shares, --kinds
+and --seeds, in the cost of the files. It appends each run to --rows, and takes from there those
+that were made before. It prints each run with its truncated cost over that of the planted truth,
+precision, recall, the exit code of `pgo solve` and the line of the verdict, the worst first, and
+then a row for each graph. A run is silent where precision or recall is below 0.95 and the exit code
+is 0.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import absolute_trajectory_error
+from pgo_models.graphs.precisions import indefinite_edges
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.robust.consistency import odometry
 from solvers.robust.revision import truncated_cost
@@ -71,6 +74,8 @@ VERDICTS = [
         for name in ("ring_road", "kitti_07", "kitti_00", "MIT", "CSAIL", "smallGrid3D", "intel")
     ),
 ]
+# Graph, share, kind, seed.
+Case = tuple[str, float, str, int]
 VERDICT_HEADS = (
     "graph",
     "share",
@@ -81,6 +86,15 @@ VERDICT_HEADS = (
     "s",
     "exit",
     "verdict",
+)
+GRAPH_HEADS = (
+    "graph",
+    "runs",
+    "cost at most 1.001",
+    "P and R at least 0.99",
+    "alarmed of these",
+    "silent",
+    "mean s",
 )
 
 
@@ -128,11 +142,11 @@ def spoil(source: Path, out: Path, share: float, kind: str, seed: int) -> list[i
 
 
 def posed(path: Path, information: bool) -> pgo.PGOProblem:
-    """Problem of a file in the cost that is compared."""
-    return pgo.PGOProblem(
-        pgo.read_g2o(path),
-        weighting=pgo.Weighting.INFORMATION if information else pgo.Weighting.ISOTROPIC,
-    )
+    """Problem of a file in the cost that is compared; F where its matrices are indefinite."""
+    graph = pgo.read_g2o(path)
+    has_chi2 = information and not indefinite_edges(graph).any()
+    weighting = pgo.Weighting.INFORMATION if has_chi2 else pgo.Weighting.ISOTROPIC
+    return pgo.PGOProblem(graph, weighting=weighting)
 
 
 def ours(path: Path, information: bool) -> dict[str, Any]:
@@ -331,7 +345,7 @@ def planted_cost(source: Path, problem: pgo.PGOProblem, scale: float) -> float:
     return truncated_cost(problem, odometry(problem.graph), thresholds, right)
 
 
-def verdict_of(case: tuple[str, float, str, int], limit: float) -> dict[str, Any] | None:
+def verdict_of(case: Case, limit: float) -> dict[str, Any] | None:
     """A run of `--verdicts`, with its truncated cost over that of the planted truth."""
     name, share, kind, seed = case
     with tempfile.TemporaryDirectory() as folder:
@@ -347,12 +361,21 @@ def verdict_of(case: tuple[str, float, str, int], limit: float) -> dict[str, Any
     return {**run, "ratio": run["cost"] / planted, "quality": min(run["precision"], run["recall"])}
 
 
-def verdicts(limit: float) -> None:
+def verdicts(cases: list[Case], rows: Path | None, limit: float) -> None:
     """Print the table of `--verdicts`, the worst runs first, and how many runs were silent."""
-    cases = [(name, *case) for name, *lists in VERDICTS for case in itertools.product(*lists)]
+    made: dict[Case, dict[str, Any] | None] = {}
+    if rows is not None and rows.exists():
+        for line in rows.read_text().splitlines():
+            row = json.loads(line)
+            made[tuple(row["case"])] = row["run"]
     runs = []
     for case in cases:
-        run = verdict_of(case, limit)
+        if case not in made:
+            made[case] = verdict_of(case, limit)
+            if rows is not None:
+                with rows.open("a") as file:
+                    file.write(json.dumps({"case": case, "run": made[case]}) + "\n")
+        run = made[case]
         if run is None:
             print(f"not finished: {case}", file=sys.stderr, flush=True)
             continue
@@ -363,13 +386,22 @@ def verdicts(limit: float) -> None:
         quality = f"{run['precision']:.3f} / {run['recall']:.3f}"
         figures = f"{run['ratio']:.5f}", quality, f"{run['seconds']:.1f}", run["exit"]
         print(f"| {' | '.join(map(str, [*case, *figures, run['headline']]))} |")
-    cheap = sum(run["ratio"] <= 1.001 for _, run in runs)
-    good = [run for _, run in runs if run["quality"] >= LOST]
-    silent = sum(run["quality"] < SILENT and run["exit"] == 0 for _, run in runs)
+    print(f"\n| {' | '.join(GRAPH_HEADS)} |\n|{'---|' * len(GRAPH_HEADS)}")
+    for name in dict.fromkeys(case[0] for case in cases):
+        num_cases = sum(case[0] == name for case in cases)
+        _print_summary(name, [run for case, run in runs if case[0] == name], num_cases)
+    _print_summary("all", [run for _, run in runs], len(cases))
+
+
+def _print_summary(name: str, runs: list[dict[str, Any]], num_cases: int) -> None:
+    """Print the row of a graph."""
+    cheap = sum(run["ratio"] <= 1.001 for run in runs)
+    good = [run for run in runs if run["quality"] >= LOST]
+    silent = sum(run["quality"] < SILENT and run["exit"] == 0 for run in runs)
     alarmed = sum(run["exit"] != 0 for run in good)
-    print(f"{len(runs)} runs of {len(cases)}; at most 1.001 times the planted cost: {cheap}")
-    print(f"precision and recall of {LOST} or more: {len(good)}, alarmed of these: {alarmed}")
-    print(f"silent: {silent}")
+    seconds = sum(run["seconds"] for run in runs) / max(1, len(runs))
+    counts = f"{len(runs)} of {num_cases}", cheap, len(good), alarmed, silent, f"{seconds:.1f}"
+    print(f"| {' | '.join(map(str, [name, *counts]))} |")
 
 
 def arguments() -> argparse.Namespace:
@@ -400,7 +432,11 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     options = arguments()
     if options.verdicts:
-        verdicts(5 * options.limit)
+        lists = [(name, options.shares, options.kinds, options.seeds) for name in options.graphs]
+        of_options = [(name, *case) for name, *each in lists for case in itertools.product(*each)]
+        of_table = [(name, *case) for name, *each in VERDICTS for case in itertools.product(*each)]
+        cases = of_table if options.graphs == NAMES.split() else of_options
+        verdicts(cases, options.rows, 5 * options.limit)
         return
     if options.child:
         run = ours if options.child == "ours" else theirs
