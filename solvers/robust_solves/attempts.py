@@ -139,11 +139,14 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
         )
         for factor in _TIGHT_SCALES
     ]
-    if doubted.is_large:
-        yield from reversed(tight)
-    yield Plan("as set", settings, candidates)
+    as_set = Plan("as set", settings, candidates)
     tree = held_together(graph, known, np.zeros(graph.num_edges))
-    yield Plan("known inliers", None, tree)
+    known_alone = Plan("known inliers", None, tree)
+    if doubted.is_large:
+        less_tight, tightest = tight
+        yield from [tightest, known_alone, less_tight, as_set]
+    else:
+        yield from [as_set, known_alone]
     if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
         consistent = known | pairwise_consistent(graph, known)
         if len(graph.components(consistent)) == 1:

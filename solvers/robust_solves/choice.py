@@ -11,6 +11,7 @@ from solvers.robust_solves.attempts import DoubtedProblem, Estimate
 
 # Attempts at most, where they are cheap or most closures were rejected, and no two agree.
 _SEVERAL_ATTEMPTS = 4
+_SEVERAL_IF_LARGE = 2
 # Factor on the error scale of the edges kept: real errors have heavier tails than Gaussian ones,
 # and an attempt that keeps the best edges alone has smaller ones. In cubicle no right edge costs
 # ten times its threshold so scaled.
@@ -63,8 +64,7 @@ class Choice:
         certificate that needs complex numbers does not do: that the usual relaxation is loose is a
         sign of edges that contradict each other.
         Where attempts are cheap, or it rejects more than half of the closures, another one has to
-        agree with it, or four have to be made; on a large graph, where each takes minutes, one is
-        enough.
+        agree with it, or four have to be made, two on a large graph, where others take minutes.
         """
         cheapest = self.cheapest
         is_tree = int(cheapest.kept.sum()) < self.doubted.problem.num_poses
@@ -72,9 +72,10 @@ class Choice:
         if is_tree or not certificate.is_certified or certificate.bound.is_complex:
             return False
         keeps_most = 2 * self._num_closures_kept(cheapest) >= self.doubted.num_closures
-        if self.doubted.is_large or (keeps_most and not self.doubted.is_cheap):
+        if keeps_most and not self.doubted.is_cheap and not self.doubted.is_large:
             return True
-        return self._is_agreed(cheapest) or len(self.estimates) >= _SEVERAL_ATTEMPTS
+        several = _SEVERAL_IF_LARGE if self.doubted.is_large else _SEVERAL_ATTEMPTS
+        return self._is_agreed(cheapest) or len(self.estimates) >= several
 
     def _is_agreed(self, estimate: Estimate) -> bool:
         """Whether another attempt keeps nearly the same edges."""
