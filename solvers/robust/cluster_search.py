@@ -159,7 +159,8 @@ class ClusterSearch:
         """The fit with rejected edges beyond the quantile 0.99 that are likely right.
 
         Between this and the quantile 0.999 lie 0.9 % of the right edges. How many wrong ones lie
-        there is estimated as in `expected_by_chance`.
+        there is estimated as in `expected_by_chance`. An edge below the quantile 0.99 was rejected
+        for another reason, and stays so.
         """
         p = self.sets.problem.d + tangent_dimension(self.sets.problem.d)
         farther, nearer = scipy.special.chdtri(p, [1.0 - _LIKELY_QUANTILE, 1.0 - _QUANTILE])
@@ -170,15 +171,14 @@ class ClusterSearch:
             return fit
         singly = replace(self, is_single=True)
         candidates = singly._candidates(fit, farther / nearer)
-        thresholds = self.sets.scale * self.right_costs.thresholds(
-            candidates.groups, _LIKELY_QUANTILE
-        )
+        most = self.sets.scale * self.right_costs.thresholds(candidates.groups, _LIKELY_QUANTILE)
         for k in candidates.order[:_MOST_FAILURES].tolist():
             if not self.sets.has_time():
                 break
             if candidates.ratio(k) <= farther / nearer:
-                larger = singly._with_cluster(fit, candidates.groups[k], thresholds[k])
-                fit = fit if larger is None else larger
+                larger = singly._with_cluster(fit, candidates.groups[k], most[k])
+                if larger is not None and larger.cost - fit.cost > candidates.thresholds[k]:
+                    fit = larger
         return fit
 
     # Adding clusters
