@@ -358,10 +358,11 @@ tell("nearly", doubted, is_near, loose.truth)
 print(doubted.robust.headline)
 
 # %% [markdown]
-# This map is wrong, the certificate of the edges kept is exact, and nothing in the costs is
-# suspicious. The verdict is `DOUBTFUL` all the same, and its first words are the reasons: from the
-# rejected closures that nearly fit, it estimates how many wrong ones fit the map by chance, and
-# these are more than the closures that hold it. Whoever reads the verdict knows not to use this map.
+# All right closures are kept, and two wrong ones with them. The certificate of the edges kept is
+# exact, and nothing in the costs is suspicious. The verdict is `DOUBTFUL` all the same, and its first
+# words are the reason: from the rejected closures that nearly fit, it estimates how many wrong ones
+# fit the map by chance, and these may be most of the closures that hold it. Whoever reads the verdict
+# knows that this map needs another look.
 #
 # ## The second failure is proven
 #
@@ -548,12 +549,11 @@ for metres in shifts:
 shift_film(shifts, answers, np.array(pairs), is_bad, base.truth)
 
 # %% [markdown]
-# Up to 3 m the verdict is `CERTIFIED`, and the map is wrong. From 4 m to 6 m no right closure is kept
-# beside the run, several of them stay near their thresholds, and the verdict becomes `DOUBTFUL`: the
-# failure is of the first kind again. From 7 m on the deformation costs more than the twelve
-# closures, and GNC rejects them. Just below, at 6.5 m, it rejects them together with a right one,
-# at a truncated cost above that of the right map. GNC is a heuristic, and here it misses the best
-# choice of edges; the verdict is `DOUBTFUL`.
+# Up to 5 m the verdict is `CERTIFIED`, and the map is wrong: it is bent so that all but one or two of
+# the right closures fit as well, and its truncated cost is far below that of the right map. At 6 m and
+# at 6.5 m it is still the cheaper one, but the edges kept cost more together than right ones may, and
+# the verdict becomes `DOUBTFUL`: the failure is of the first kind again. From 7 m on the twelve
+# closures are rejected.
 
 # %% [markdown]
 # ## Exercises
@@ -658,8 +658,8 @@ assert d_squared + num_right * limit < 12 * limit
 assert doubted.robust.is_certified
 assert doubted.verdict.name == "DOUBTFUL"
 assert doubted.robust.kept[is_near].any()
-assert doubted.robust.rejected[~is_near].any()
-assert doubted.robust.by_chance > doubted.robust.num_closures_kept
+assert not doubted.robust.rejected[~is_near].any()
+assert doubted.robust.by_chance > 0.5 * doubted.robust.num_closures_kept
 assert not doubted.edge_residuals.is_doubtful
 assert (answer.robust.rejected == is_gross).all()
 assert in_W.sum() == 10
@@ -667,7 +667,7 @@ assert not (in_W & ~is_gross).any()
 assert (proof.proven_wrong == in_W).all()
 assert not solvers.prove_outliers(silent).robust.proof.proven_wrong.any()
 assert [answer.verdict.name for answer in answers] == (
-    ["CERTIFIED"] * 4 + ["DOUBTFUL"] * 4 + ["CERTIFIED"] * 2
+    ["CERTIFIED"] * 6 + ["DOUBTFUL"] * 2 + ["CERTIFIED"] * 2
 )
-assert [answer.robust.kept[is_bad].all() for answer in answers] == [True] * 7 + [False] * 3
-assert pairs[7][0] > pairs[7][1]
+assert [answer.robust.kept[is_bad].all() for answer in answers] == [True] * 8 + [False] * 2
+assert pairs[7][0] < pairs[7][1]
