@@ -126,7 +126,8 @@ class _Search:
 
     `cost` is U, an upper bound. `classes` has the closures that are not proven wrong; any two of a
     class are proven inconsistent. `single` are first-order distances of all edges, (m,), and
-    `proven` the lower bound of each closure or pair that was solved for.
+    `proven` the lower bound of each closure or pair that was solved for. `pairs` are closures and
+    the first-order distances of all pairs of these, once they are computed.
     """
 
     problem: PGOProblem
@@ -139,6 +140,7 @@ class _Search:
     single: Array
     deadline: float
     proven: dict[tuple[int, ...], float] = field(default_factory=dict)
+    pairs: tuple[IntArray, Array] | None = None
 
     @classmethod
     def of(
@@ -203,12 +205,14 @@ class _Search:
 
         Closures that the answer keeps stand in different classes; others join one of them.
         """
-        doubted = np.array([e for members in self.classes for e in members], dtype=np.int64)
+        doubted = np.array(sorted(e for members in self.classes for e in members), dtype=np.int64)
         if not 1 < len(doubted) <= _MOST_PAIRED:
             return
-        distance = _pair_distances(self.chains, doubted)
-        place = {int(e): k for k, e in enumerate(doubted)}
+        distance = self.distances_between(doubted)
         s = self.most_cost
+        if not (distance > _MARGIN * s).any():
+            return
+        place = {int(e): k for k, e in enumerate(doubted)}
         ordered = sorted(self.classes, key=lambda members: not self.kept[members].any())
         joined: list[list[int]] = []
         for members in ordered:
@@ -223,6 +227,17 @@ class _Search:
             else:
                 joined.append(members)
         self.classes = joined
+
+    def distances_between(self, edges: IntArray) -> Array:
+        """First-order distances, (k, k), of pairs of edges, ascending; computed the first time.
+
+        Later calls ask for some of the edges of the first one.
+        """
+        if self.pairs is None:
+            self.pairs = edges, _pair_distances(self.chains, edges)
+        paired, distances = self.pairs
+        places = np.searchsorted(paired, edges)
+        return distances[np.ix_(places, places)]
 
     def is_proven(self, edges: tuple[int, ...], s: float) -> bool:
         """Whether known inliers and these closures are proven to cost more than s."""

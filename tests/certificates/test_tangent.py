@@ -10,7 +10,7 @@ import pytest
 from budget import examples
 from exact_arithmetic import Exact, exact, nearest_rotations, total, transposed
 from graphs import DIMENSIONS, SEEDS, informed, random_poses
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 from roads import Shape, road
 
 import solvers
@@ -338,7 +338,10 @@ def defined_chi2(graph: PoseGraph, poses: Poses) -> float:
     return cost
 
 
+# Of matrices that are nearly singular the relaxation in complex numbers has no preconditioner.
+@pytest.mark.filterwarnings("ignore:a search for a better bound failed")
 @settings(max_examples=examples(20))
+@example(seed=0, n=6, d=2, lost=1, share=1.0)
 @given(
     seed=SEEDS,
     n=st.integers(2, 8),
