@@ -22,22 +22,20 @@ import numpy as np
 import scipy  # and scipy.special when it is used
 
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
+from pgo_models.geometry.rotations import BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.right_costs import RightCosts
 from pgo_models.problem.thresholds import FALSE_ALARM
+from solvers.robust.candidates import QUANTILE, Candidates
 from solvers.robust.chains import Chains
 from solvers.robust.clusters import closure_clusters
-from solvers.robust.distances import FirstOrder
 from solvers.robust.edge_sets import EdgeSets, with_edges
 from solvers.robust.linear_search import LinearSearch
 from solvers.robust.revision import Fit, inlier_problem, is_held
 from solvers.robust.weighted_edges import first_poses, held_together
 
-# Probability with which a right cluster passes the test.
-_QUANTILE = 0.99
-# That of an edge that comes back in the end, where few wrong ones lie between the two.
+# Probability with which a right edge comes back in the end, where few wrong ones lie between this
+# and `QUANTILE`.
 _LIKELY_QUANTILE = 0.999
 # A cluster is tried if its first-order distance is at most this many times its threshold. Those of
 # right clusters of nine graphs at odometry, among nine wrong closures of ten, are 0.95 at most.
@@ -59,28 +57,6 @@ _MOST_SAMPLED = 100
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidates:
-    """Clusters without the edges kept: their names, edges, and thresholds (k,) of T.
-
-    `farthest` (k,) is the edge of every cluster that is farthest from the map to first order,
-    `first_order` what knows its distance, `largest` (k,) the quantile of this in chi^2. `order` are
-    those that may fit, the one of most promise first.
-    """
-
-    names: list[int]
-    groups: list[IntArray]
-    thresholds: Array
-    first_order: FirstOrder
-    farthest: IntArray
-    largest: Array
-    order: IntArray
-
-    def ratio(self, k: int) -> float:
-        """First-order distance of a cluster's farthest edge, over its quantile."""
-        return self.first_order.distance(int(self.farthest[k])) / float(self.largest[k])
-
-
-@dataclass(frozen=True, eq=False)
 class ClusterSearch:
     """Search among sets of the edges that are not known.
 
@@ -99,11 +75,6 @@ class ClusterSearch:
         if self.is_single:
             return list(np.flatnonzero(~self.sets.known)[:, None])
         return closure_clusters(self.sets.problem.graph, self.sets.known, self.sets.scale)
-
-    @property
-    def right_costs(self) -> RightCosts:
-        """Distribution of what right edges cost."""
-        return self.sets.problem.right_costs
 
     @cached_property
     def chains(self) -> Chains:
@@ -163,15 +134,16 @@ class ClusterSearch:
         for another reason, and stays so.
         """
         p = self.sets.problem.d + tangent_dimension(self.sets.problem.d)
-        farther, nearer = scipy.special.chdtri(p, [1.0 - _LIKELY_QUANTILE, 1.0 - _QUANTILE])
+        farther, nearer = scipy.special.chdtri(p, [1.0 - _LIKELY_QUANTILE, 1.0 - QUANTILE])
         num_kept = int((fit.kept & ~self.sets.known).sum())
-        num_right = (_LIKELY_QUANTILE - _QUANTILE) * num_kept
+        num_right = (_LIKELY_QUANTILE - QUANTILE) * num_kept
         num_wrong = self.expected_by_chance(fit) * ((farther / nearer) ** (0.5 * p) - 1.0)
         if num_wrong > num_right:
             return fit
         singly = replace(self, is_single=True)
         candidates = singly._candidates(fit, farther / nearer)
-        most = self.sets.scale * self.right_costs.thresholds(candidates.groups, _LIKELY_QUANTILE)
+        right_costs = self.sets.right_costs
+        most = self.sets.scale * right_costs.thresholds(candidates.groups, _LIKELY_QUANTILE)
         for k in candidates.order[:_MOST_FAILURES].tolist():
             if not self.sets.has_time():
                 break
@@ -201,7 +173,7 @@ class ClusterSearch:
         """
         groups = self._groups(~fit.kept)
         costs = self.sets.problem.edge_costs(fit.poses)
-        thresholds = self.sets.scale * self.right_costs.thresholds(groups, _QUANTILE)
+        thresholds = self.sets.scale * self.sets.right_costs.thresholds(groups, QUANTILE)
         fitting = [
             group
             for group, threshold in zip(groups, thresholds, strict=True)
@@ -212,43 +184,12 @@ class ClusterSearch:
         larger = self.sets.settled(with_edges(fit.kept, np.concatenate(fitting)), fit.poses)
         return larger if self.sets.cost(larger) <= self.sets.cost(fit) else fit
 
-    def _candidates(self, fit: Fit, most: float = _NEAR) -> _Candidates:
-        """Rejected clusters within `most` times their thresholds to first order, at least.
-
-        The one of most promise comes first.
-
-        A cluster promises its thresholds in the truncated cost, less its T.
-        """
-        clusters = [cluster[~fit.kept[cluster]] for cluster in self.clusters]
-        names = [name for name, cluster in enumerate(clusters) if len(cluster)]
-        groups = [clusters[name] for name in names]
-        thresholds = self.sets.scale * self.right_costs.thresholds(groups, _QUANTILE)
-        inliers = inlier_problem(self.sets.problem, fit.kept)
-        first_order = FirstOrder(self.chains, inliers, fit.poses)
-        sizes = np.array([len(group) for group in groups], dtype=int)
-        d = self.sets.problem.d
-        dof = sizes * (d + tangent_dimension(d))
-        largest = np.asarray(
-            self.sets.scale * scipy.special.chdtri(dof, 1.0 - _QUANTILE), dtype=float
-        )
-        farthest, ratio = np.zeros(0, dtype=int), np.zeros(0)
-        if groups:
-            edges = np.concatenate(groups)
-            distances = first_order.least_distances(edges)
-            beginnings = np.cumsum(sizes) - sizes
-            ratio = np.maximum.reduceat(distances, beginnings) / largest
-            by_cluster = np.repeat(np.arange(len(groups)), sizes)
-            last = np.lexsort([distances, by_cluster])[beginnings + sizes - 1]
-            farthest = edges[last]
-        promise = (
-            np.array([self.sets.allowed[group].sum() for group in groups]) - ratio * thresholds
-        )
-        order = np.argsort(-promise, kind="stable")
-        order = order[ratio[order] <= most]
-        return _Candidates(names, groups, thresholds, first_order, farthest, largest, order)
+    def _candidates(self, fit: Fit, most: float = _NEAR) -> Candidates:
+        """Rejected clusters within `most` times their thresholds to first order, at least."""
+        return Candidates.of(self.sets, self.chains, self.clusters, fit, most)
 
     def _with_next_clusters(
-        self, fit: Fit, candidates: _Candidates, trials: dict[int, int]
+        self, fit: Fit, candidates: Candidates, trials: dict[int, int]
     ) -> Fit | None:
         """The fit with the first candidates that pass the test; None if none does.
 
@@ -280,7 +221,7 @@ class ClusterSearch:
         return larger
 
     def _with_each(
-        self, fit: Fit, candidates: _Candidates, chosen: list[int]
+        self, fit: Fit, candidates: Candidates, chosen: list[int]
     ) -> tuple[Fit, list[int]]:
         """The fit with those of some candidates that pass the test, and those that do not.
 
@@ -292,7 +233,7 @@ class ClusterSearch:
             larger = self._with_cluster(fit, candidates.groups[k], candidates.thresholds[k])
             return (fit, chosen) if larger is None else (larger, [])
         edges = np.concatenate([candidates.groups[k] for k in chosen])
-        threshold = float(self.sets.scale * self.right_costs.thresholds([edges], _QUANTILE)[0])
+        threshold = float(self.sets.scale * self.sets.right_costs.thresholds([edges], QUANTILE)[0])
         together = self.sets.settled(with_edges(fit.kept, edges), fit.poses)
         if together.cost - fit.cost <= threshold:
             return together, []
@@ -328,7 +269,7 @@ class ClusterSearch:
         """The fit without the cluster of the largest T over its threshold, if that is above 1."""
         groups = self._groups(fit.kept)
         quantile = 1.0 - FALSE_ALARM / max(1, len(groups))
-        thresholds = self.sets.scale * self.right_costs.thresholds(groups, quantile)
+        thresholds = self.sets.scale * self.sets.right_costs.thresholds(groups, quantile)
         costs = self.sets.problem.edge_costs(fit.poses)
         ratio = np.array([costs[group].sum() for group in groups]) / thresholds
         worst: Fit | None = None
@@ -386,7 +327,7 @@ class ClusterSearch:
                 return
 
     @cached_property
-    def _at_odometry(self) -> _Candidates | None:
+    def _at_odometry(self) -> Candidates | None:
         """Clusters near the map of the known edges; None where these do not hold the poses."""
         graph = self.sets.problem.graph
         if not is_held(graph, self.sets.known):

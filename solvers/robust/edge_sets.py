@@ -9,6 +9,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.right_costs import RightCosts
 from solvers.riemannian.polish import polish
 from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
@@ -31,6 +32,11 @@ class EdgeSets:
     allowed: Array
     scale: float
     has_time: Callable[[], bool]
+
+    @property
+    def right_costs(self) -> RightCosts:
+        """Distribution of what right edges cost."""
+        return self.problem.right_costs
 
     def settled(self, kept: BoolArray, poses: Poses) -> Fit:
         """The fit of edges kept, (m,), at the poses to which Newton steps lead."""

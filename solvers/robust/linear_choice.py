@@ -139,10 +139,10 @@ class LinearChoice:
 class SweptChoice:
     """A choice of closures, which is changed in place, one closure at a time.
 
-    With the chosen closures S and the others J, and K the covariance, the sweep operator
+    With the chosen closures S and the others J, and V the covariance, the sweep operator
     (Goodnight, "A tutorial on the SWEEP operator", The American Statistician 1979) keeps
-    K_JJ - K_JS K_SS^-1 K_SJ and -K_SS^-1 on the diagonal of `matrix`, (k p, k p), and
-    u_J - K_JS K_SS^-1 u_S and K_SS^-1 u_S in `errors`, (k, p). `chosen` (k,) says which are in S;
+    V_JJ - V_JS V_SS^-1 V_SJ and -V_SS^-1 on the diagonal of `matrix`, (k p, k p), and
+    u_J - V_JS V_SS^-1 u_S and V_SS^-1 u_S in `errors`, (k, p). `chosen` (k,) says which are in S;
     `cost` is F(S) and `allowed` for each of the others.
     """
 
