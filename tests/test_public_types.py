@@ -23,6 +23,7 @@ INSIDE = {
     "EdgeCost": "cost of reweighted edges, which solvers put in place of a Weighting",
     "Incidence": "index of the edges at a pose, behind the matrices of a problem",
     "SymbolicCholesky": "ordering of a factorisation, kept by a problem to save work",
+    "RightCosts": "sums over the edges, which chi2_thresholds takes quantiles of",
     "TangentLayout": "order of the rows of a Hessian, behind Marginals",
     "PrimalRelaxation": "cvxpy model behind a RelaxationSolution",
     "DualRelaxation": "cvxpy model behind a RelaxationSolution",
