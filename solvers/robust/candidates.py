@@ -8,15 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # and scipy.special when it is used
 
-from pgo_models.geometry.rotations import Array, tangent_dimension
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from solvers.robust.chains import Chains
 from solvers.robust.distances import FirstOrder
-from solvers.robust.edge_sets import EdgeSets
+from solvers.robust.edge_sets import QUANTILE, EdgeSets
 from solvers.robust.revision import Fit, inlier_problem
-
-# Probability with which a right cluster passes the test.
-QUANTILE = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +33,7 @@ class Candidates:
     order: IntArray
 
     @classmethod
-    def of(
-        cls,
-        sets: EdgeSets,
-        chains: Chains,
-        clusters: Sequence[IntArray],
-        fit: Fit,
-        most: float,
-    ) -> Candidates:
+    def of(cls, sets: EdgeSets, clusters: Sequence[IntArray], fit: Fit, most: float) -> Candidates:
         """Rejected parts of clusters, those of `order` within `most` times their thresholds.
 
         That is to first order, and at least. A cluster promises its thresholds in the truncated
@@ -54,10 +43,9 @@ class Candidates:
         names = [name for name, cluster in enumerate(rejected) if len(cluster)]
         groups = [rejected[name] for name in names]
         thresholds = sets.scale * sets.right_costs.thresholds(groups, QUANTILE)
-        first_order = FirstOrder(chains, inlier_problem(sets.problem, fit.kept), fit.poses)
+        first_order = FirstOrder(sets.chains, inlier_problem(sets.problem, fit.kept), fit.poses)
         sizes = np.array([len(group) for group in groups], dtype=int)
-        d = sets.problem.d
-        quantiles = scipy.special.chdtri(sizes * (d + tangent_dimension(d)), 1.0 - QUANTILE)
+        quantiles = scipy.special.chdtri(sizes * sets.motion_dimension, 1.0 - QUANTILE)
         largest = np.asarray(sets.scale * quantiles, dtype=float)
         farthest, ratio = np.zeros(0, dtype=int), np.zeros(0)
         if groups:

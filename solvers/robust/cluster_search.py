@@ -22,14 +22,13 @@ import numpy as np
 import scipy  # and scipy.special when it is used
 
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import BoolArray, tangent_dimension
+from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM
-from solvers.robust.candidates import QUANTILE, Candidates
-from solvers.robust.chains import Chains
+from solvers.robust.candidates import Candidates
 from solvers.robust.clusters import closure_clusters
-from solvers.robust.edge_sets import EdgeSets, with_edges
+from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
 from solvers.robust.linear_search import LinearSearch
 from solvers.robust.revision import Fit, inlier_problem, is_held
 from solvers.robust.weighted_edges import first_poses, held_together
@@ -74,12 +73,17 @@ class ClusterSearch:
         """Clusters of the edges that are not known."""
         if self.is_single:
             return list(np.flatnonzero(~self.sets.known)[:, None])
-        return closure_clusters(self.sets.problem.graph, self.sets.known, self.sets.scale)
+        return closure_clusters(self.sets.chains, self.sets.known, self.sets.scale)
 
     @cached_property
-    def chains(self) -> Chains:
-        """Chains of the known edges."""
-        return Chains.of(self.sets.problem.graph, self.sets.known)
+    def linear(self) -> LinearSearch:
+        """The search by the linear theory among the same edges."""
+        return LinearSearch.of(self.sets)
+
+    @cached_property
+    def singly(self) -> ClusterSearch:
+        """The same search with every edge as a cluster of its own: new ones come in runs alone."""
+        return replace(self, new=None, is_single=True)
 
     def improved(self, kept: BoolArray, poses: Poses) -> Fit:
         """Edges to keep, and their poses, from those of an estimate with the edges `kept`, (m,).
@@ -91,9 +95,8 @@ class ClusterSearch:
         while True:
             fit = self._at_rest(fit)
             if any(len(cluster) > 1 for cluster in self.clusters):
-                singly = replace(self, is_single=True)._at_rest(fit)
-                fit = min(fit, singly, key=self.sets.cost)
-            exchanged = LinearSearch.of(self.sets).exchanged(fit)
+                fit = min(fit, self.singly._at_rest(fit), key=self.sets.cost)
+            exchanged = self.linear.exchanged(fit)
             if exchanged is None:
                 return fit
             fit = exchanged
@@ -104,7 +107,9 @@ class ClusterSearch:
         while True:
             fit = self._without_misfits(self._with_clusters(fit))
             exchanged = self._exchanged(fit)
-            if exchanged is None or (best and not self.sets.is_better(exchanged, best)):
+            if exchanged is None:
+                return fit
+            if best is not None and not self.sets.is_better(exchanged, best):
                 return fit
             best = fit = exchanged
 
@@ -119,7 +124,7 @@ class ClusterSearch:
         """
         candidates = self._candidates(fit, _FAR)
         chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
-        p = self.sets.problem.d + tangent_dimension(self.sets.problem.d)
+        p = self.sets.motion_dimension
         near = [k for k in chosen.tolist() if 1.0 < candidates.ratio(k) <= _FAR]
         sizes = np.array([len(candidates.groups[k]) for k in near])
         num_near = float(sizes.sum() + 2.0 * np.sqrt(np.sum(sizes**2)))
@@ -133,24 +138,26 @@ class ClusterSearch:
         there is estimated as in `expected_by_chance`. An edge below the quantile 0.99 was rejected
         for another reason, and stays so.
         """
-        p = self.sets.problem.d + tangent_dimension(self.sets.problem.d)
+        p = self.sets.motion_dimension
         farther, nearer = scipy.special.chdtri(p, [1.0 - _LIKELY_QUANTILE, 1.0 - QUANTILE])
+        candidates = self.singly._candidates(fit, farther / nearer)
+        tried = candidates.order[:_MOST_FAILURES].tolist()
+        near = [k for k in tried if candidates.ratio(k) <= farther / nearer]
+        if not near:
+            return fit
         num_kept = int((fit.kept & ~self.sets.known).sum())
         num_right = (_LIKELY_QUANTILE - QUANTILE) * num_kept
         num_wrong = self.expected_by_chance(fit) * ((farther / nearer) ** (0.5 * p) - 1.0)
         if num_wrong > num_right:
             return fit
-        singly = replace(self, is_single=True)
-        candidates = singly._candidates(fit, farther / nearer)
         right_costs = self.sets.right_costs
         most = self.sets.scale * right_costs.thresholds(candidates.groups, _LIKELY_QUANTILE)
-        for k in candidates.order[:_MOST_FAILURES].tolist():
+        for k in near:
             if not self.sets.has_time():
                 break
-            if candidates.ratio(k) <= farther / nearer:
-                larger = singly._with_cluster(fit, candidates.groups[k], most[k])
-                if larger is not None and larger.cost - fit.cost > candidates.thresholds[k]:
-                    fit = larger
+            larger = self._with_cluster(fit, candidates.groups[k], most[k])
+            if larger is not None and larger.cost - fit.cost > candidates.thresholds[k]:
+                fit = larger
         return fit
 
     # Adding clusters
@@ -186,7 +193,7 @@ class ClusterSearch:
 
     def _candidates(self, fit: Fit, most: float = _NEAR) -> Candidates:
         """Rejected clusters within `most` times their thresholds to first order, at least."""
-        return Candidates.of(self.sets, self.chains, self.clusters, fit, most)
+        return Candidates.of(self.sets, self.clusters, fit, most)
 
     def _with_next_clusters(
         self, fit: Fit, candidates: Candidates, trials: dict[int, int]

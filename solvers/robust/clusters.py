@@ -13,7 +13,7 @@ import numpy as np
 import scipy  # and scipy.special and scipy.spatial when they are used
 
 from pgo_models.geometry.rotations import BoolArray, tangent_dimension
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray
 from solvers.robust.chains import (
     Chains,
     Closures,
@@ -36,8 +36,8 @@ _QUANTILE = 0.99
 _SEED = 0
 
 
-def closure_clusters(graph: PoseGraph, known: BoolArray, scale: float = 1.0) -> list[IntArray]:
-    """Edges of every cluster of the edges that are not `known`, (m,).
+def closure_clusters(chains: Chains, known: BoolArray, scale: float = 1.0) -> list[IntArray]:
+    """Edges of every cluster of the edges that are not `known`, (m,), as the chains are.
 
     Two closures are neighbours if their first ends are at most 12 poses apart, and their second
     ends, too. Neighbours agree if the cycle of both and of the known edges between their ends
@@ -47,6 +47,7 @@ def closure_clusters(graph: PoseGraph, known: BoolArray, scale: float = 1.0) -> 
     closure is a cluster of its own. `scale` is that of the errors, in the squares of what the
     matrices claim. An edge that measures no whole motion is a cluster of its own, too.
     """
+    graph = chains.graph
     doubted = np.flatnonzero(~known)
     whole = is_whole(graph)[doubted]
     alone: list[IntArray] = [doubted[[k]] for k in np.flatnonzero(~whole)]
@@ -55,7 +56,7 @@ def closure_clusters(graph: PoseGraph, known: BoolArray, scale: float = 1.0) -> 
         return alone
     dof = graph.d + tangent_dimension(graph.d)
     threshold = scale * float(scipy.special.chdtri(dof, 1.0 - _QUANTILE))
-    links = _links(Chains.of(graph, known), tested, threshold)
+    links = _links(chains, tested, threshold)
     size = len(tested)
     adjacency = scipy.sparse.csr_array((np.ones(len(links[0])), links), shape=(size, size))
     _, label = scipy.sparse.csgraph.connected_components(adjacency, directed=False)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.right_costs import RightCosts
 from solvers.riemannian.polish import polish
+from solvers.robust.chains import Chains
 from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
+# Probability with which a right cluster, or edge, passes a test.
+QUANTILE = 0.99
 # Newton steps in which poses follow a change of the edges kept, at most.
 _MOST_STEPS = 20
 # Relative decrease of a cost that is more than rounding.
@@ -32,6 +36,16 @@ class EdgeSets:
     allowed: Array
     scale: float
     has_time: Callable[[], bool]
+
+    @cached_property
+    def chains(self) -> Chains:
+        """Chains of the known edges."""
+        return Chains.of(self.problem.graph, self.known)
+
+    @property
+    def motion_dimension(self) -> int:
+        """Numbers of a motion: 3 in the plane, 6 in space."""
+        return self.problem.d + tangent_dimension(self.problem.d)
 
     @property
     def right_costs(self) -> RightCosts:

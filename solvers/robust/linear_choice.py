@@ -108,7 +108,7 @@ class LinearChoice:
             if not is_allowed.any():
                 break
             e = int(np.where(is_allowed, changes, np.inf).argmin())
-            current.change(e, float(changes[e]))
+            current.change(e)
             free_at[e] = step + min(_TENURE, k // 4)
         return np.flatnonzero(best)
 
@@ -120,7 +120,7 @@ class LinearChoice:
             self.covariance.copy(), self.errors.copy(), none, self.allowed, k * self.allowed
         )
         for e in chosen.tolist():
-            choice.change(e, float(choice.changes()[e]))
+            choice.change(e)
         return choice
 
     def suspects(self, chosen: IntArray) -> IntArray:
@@ -156,27 +156,25 @@ class SweptChoice:
         """How the cost changes when each closure, (k,), comes or goes."""
         k, p = self.errors.shape
         blocks = self.matrix.reshape(k, p, k, p)[np.arange(k), :, np.arange(k)]
-        sign = np.where(self.chosen, -1.0, 1.0)
-        rise = _squared(self.errors, sign[:, None, None] * blocks)
-        return sign * (rise - self.allowed)
+        return _squared(self.errors, blocks) - np.where(self.chosen, -self.allowed, self.allowed)
 
-    def change(self, e: int, cost_change: float) -> None:
-        """Take closure e in, or out if it is chosen, which changes the cost so."""
+    def change(self, e: int) -> None:
+        """Take closure e in, or out if it is chosen."""
         p = self.errors.shape[1]
         block = slice(e * p, (e + 1) * p)
+        sign = -1.0 if self.chosen[e] else 1.0
         inverse_block = np.linalg.inv(self.matrix[block, block])
         rows = inverse_block @ self.matrix[block]
         columns = self.matrix[:, block].copy()
         error = inverse_block @ self.errors[e]
+        self.cost += float(self.errors[e] @ error) - sign * self.allowed
         self.matrix -= columns @ rows
         self.errors -= (columns @ error).reshape(self.errors.shape)
-        sign = -1.0 if self.chosen[e] else 1.0
         self.matrix[block] = sign * rows
         self.matrix[:, block] = sign * columns @ inverse_block
         self.matrix[block, block] = -inverse_block
         self.errors[e] = sign * error
         self.chosen[e] = not self.chosen[e]
-        self.cost += cost_change
 
 
 def _squared(errors: Array, variance: Array) -> Array:

@@ -12,15 +12,13 @@ import numpy as np
 import scipy  # and scipy.special when it is used
 
 from pgo_models.errors import NotPositiveDefiniteError
-from pgo_models.geometry.rotations import BoolArray, tangent_dimension
+from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from solvers.robust.chains import is_whole, measured_covariances
-from solvers.robust.edge_sets import EdgeSets, with_edges
+from solvers.robust.chains import is_whole
+from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
 from solvers.robust.linear_choice import LinearChoice
 from solvers.robust.revision import Fit, inlier_problem, is_held
 
-# Probability with which a right closure costs no more than its threshold.
-_QUANTILE = 0.99
 # Closures among which the theory chooses, at most, as its matrix is dense; and closures that a map
 # keeps: one that more of them hold hardly bends.
 _MOST_CLOSURES = 400
@@ -29,6 +27,8 @@ _MOST_KEPT = 40
 _MOST_CHOICES = 6
 # Choices in a row where a closure is left out.
 _MOST_CHOICES_WITHOUT = 3
+# Where the edges that stay leave poses loose, or two closures measure the same.
+_NO_MODEL = (NotPositiveDefiniteError, np.linalg.LinAlgError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,28 +45,23 @@ class LinearSearch:
 
     def exchanged(self, fit: Fit) -> Fit | None:
         """A better fit, with any of the closures in place of any others."""
-        return self._chosen(fit, None, _MOST_CHOICES) if self._can_choose(fit) else None
+        model = self._first_model(fit)
+        return None if model is None else self._chosen(fit, model, None, _MOST_CHOICES)
 
     def without_one(self, fit: Fit) -> Fit | None:
         """A better fit, without one of the closures kept, to which the map may have been bent."""
-        if not self._can_choose(fit):
+        model = self._first_model(fit)
+        if model is None:
             return None
-        try:
-            model = self._model(fit, self._staying(fit))
-            suspects = model.suspects(np.flatnonzero(fit.kept[self.closures]))
-        except (NotPositiveDefiniteError, np.linalg.LinAlgError):
-            return None
-        for suspect in suspects.tolist():
-            other = self._chosen(fit, suspect, _MOST_CHOICES_WITHOUT)
+        for suspect in model.suspects(self._kept(fit)).tolist():
+            other = self._chosen(fit, model, suspect, _MOST_CHOICES_WITHOUT)
             if other is not None:
                 return other
         return None
 
-    def _can_choose(self, fit: Fit) -> bool:
-        """Whether there are closures to choose from, not too many, and other edges hold the map."""
-        num_kept = int(fit.kept[self.closures].sum())
-        are_few = 0 < len(self.closures) <= _MOST_CLOSURES and num_kept <= _MOST_KEPT
-        return are_few and is_held(self.sets.problem.graph, self._staying(fit))
+    def _kept(self, fit: Fit) -> IntArray:
+        """Places in `closures` of those that a fit keeps."""
+        return np.flatnonzero(fit.kept[self.closures])
 
     def _staying(self, fit: Fit) -> BoolArray:
         """Edges that are not chosen among, (m,)."""
@@ -74,37 +69,49 @@ class LinearSearch:
         staying[self.closures] = False
         return staying
 
-    def _chosen(self, fit: Fit, excluded: int | None, most_choices: int) -> Fit | None:
+    def _first_model(self, fit: Fit) -> LinearChoice | None:
+        """The model at a fit; None where there is too much or nothing to choose from.
+
+        The edges that are not chosen among have to hold the poses.
+        """
+        are_few = 0 < len(self.closures) <= _MOST_CLOSURES and len(self._kept(fit)) <= _MOST_KEPT
+        if not are_few or not is_held(self.sets.problem.graph, self._staying(fit)):
+            return None
+        try:
+            return self._model(fit)
+        except _NO_MODEL:
+            return None
+
+    def _chosen(
+        self, fit: Fit, first_model: LinearChoice, excluded: int | None, most_choices: int
+    ) -> Fit | None:
         """A better fit by choices in a row, the first of which may be worse."""
-        staying = self._staying(fit)
         current = fit
         for _ in range(most_choices):
             if not self.sets.has_time():
                 return None
-            kept = np.flatnonzero(current.kept[self.closures])
+            kept = self._kept(current)
             try:
-                chosen = self._model(current, staying).best(kept, excluded)
-            except (NotPositiveDefiniteError, np.linalg.LinAlgError):
+                model = first_model if current is fit else self._model(current)
+                chosen = model.best(kept, excluded)
+            except _NO_MODEL:
                 return None
             if np.isin(chosen, kept).all():
                 # Nothing comes in: whether edges have to go is for other tests to say.
                 return None
-            edges = with_edges(staying, self.closures[chosen])
+            edges = with_edges(self._staying(fit), self.closures[chosen])
             current = self.sets.settled(edges, current.poses)
             if self.sets.is_better(current, fit):
                 return current
         return None
 
-    def _model(self, fit: Fit, staying: BoolArray) -> LinearChoice:
-        problem = self.sets.problem
-        d = problem.d
-        dof = d + tangent_dimension(d)
-        allowed = self.sets.scale * float(scipy.special.chdtri(dof, 1.0 - _QUANTILE))
+    def _model(self, fit: Fit) -> LinearChoice:
+        sets = self.sets
         return LinearChoice.of(
-            inlier_problem(problem, staying),
-            problem.graph,
-            (self.closures, measured_covariances(problem.graph)[self.closures]),
-            np.flatnonzero(fit.kept[self.closures]),
+            inlier_problem(sets.problem, self._staying(fit)),
+            sets.problem.graph,
+            (self.closures, sets.chains.measured[self.closures]),
+            self._kept(fit),
             fit.poses,
-            allowed,
+            sets.scale * float(scipy.special.chdtri(sets.motion_dimension, 1.0 - QUANTILE)),
         )

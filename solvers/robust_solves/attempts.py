@@ -142,22 +142,22 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     as_set = Plan("as set", settings, candidates)
     tree = held_together(graph, known, np.zeros(graph.num_edges))
     known_alone = Plan("known inliers", None, tree)
+    slow = Plan("smaller steps", with_smaller_steps(settings), candidates)
     if doubted.is_large:
         less_tight, tightest = tight
-        yield from [tightest, known_alone, less_tight, as_set]
+        first = [tightest, known_alone, less_tight, as_set]
+        last = [slow]
     else:
-        yield from [as_set, known_alone]
+        first = [as_set, known_alone]
+        # Tight thresholds reject many edges, and a graph with fewer edges is faster.
+        last = [slow, *tight] if doubted.is_cheap else [*tight, slow]
+    yield from first
     if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
         consistent = known | pairwise_consistent(graph, known)
         if len(graph.components(consistent)) == 1:
             preselected = replace(settings, consistent=True)
             yield Plan("pairwise consistent edges", preselected, consistent)
-    slow = Plan("smaller steps", with_smaller_steps(settings), candidates)
-    if doubted.is_large:
-        yield slow
-    else:
-        # Tight thresholds reject many edges, and a graph with fewer edges is faster.
-        yield from [slow, *tight] if doubted.is_cheap else [*tight, slow]
+    yield from last
     yield Plan("from least squares with every edge", settings, candidates, True)
     yield Plan(*_with_other_loss(settings), candidates)
 

@@ -23,7 +23,6 @@ from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.gnc import GNC
-from solvers.robust.linear_search import LinearSearch
 from solvers.robust.rejection import Rejection
 from solvers.robust.revision import Fit, drop_contradicted, error_scale
 from solvers.robust.weighted_edges import known_inliers
@@ -71,7 +70,7 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        are added, removed and exchanged (`ClusterSearch`), then edges are dropped that all others
        contradict (`drop_contradicted`). It ends early when no further attempt is needed
        (`Choice.is_enough`). Where few closures hold the map of the cheapest one, each is left out
-       in turn (`LinearSearch.without_one`).
+       in turn (`linear_search`).
     3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
        whether it is certified or not. Newton and all further steps of the pipeline
        (`solvers.plan`) solve for the edges kept.
@@ -351,15 +350,20 @@ class _RobustSolve:
 
     def answer_by_attempts(self, ending: Status) -> Solution:
         """The solution of the edges kept by the cheapest attempt."""
+        chosen = self.choice.cheapest
+        if ending not in OUT_OF_TIME:
+            try:
+                chosen = self._finished(chosen)
+            except KeyboardInterrupt:  # outside a run: runs end with a status instead
+                ending = Status.INTERRUPTED
         is_out_of_time = ending in OUT_OF_TIME
-        chosen = self.choice.cheapest if is_out_of_time else self._improved_cheapest()
         solution = chosen.solution if is_out_of_time else self._solution_of(chosen)
         stages = [estimate.stage for estimate in self.estimates]
         status = ending if is_out_of_time else solution.status
         solution = replace(solution, stages=(*stages, *solution.stages), status=status)
         return self._result(solution, chosen.kept, chosen.scale, chosen.attempt.name)
 
-    def _improved_cheapest(self) -> Estimate:
+    def _finished(self, cheapest: Estimate) -> Estimate:
         """The cheapest attempt, improved by what is too slow for each, or to be done once.
 
         Where few closures hold its map, which then bends to fit a wrong one, each is left out in
@@ -367,26 +371,24 @@ class _RobustSolve:
         the end edges come back that are likely right although they are beyond the quantile, which
         may raise the truncated cost.
         """
-        cheapest = self.choice.cheapest
         try:
-            while self.new is None and self._has_time():
+            while self._has_time() and cheapest.status not in OUT_OF_TIME:
                 search = self._search(self.choice)
-                other = LinearSearch.of(search.sets).without_one(self._fit_of(cheapest))
+                fit = Fit.of(self.doubted.problem, cheapest.kept, cheapest.poses)
+                other = None if self.new is not None else search.linear.without_one(fit)
                 if other is None:
-                    break
-                cheapest = self._replaced(cheapest, search.improved(other.kept, other.poses))
-            with_likely = self._search(self.choice).with_likely(self._fit_of(cheapest))
-            if not np.array_equal(with_likely.kept, cheapest.kept):
-                cheapest = self._replaced(cheapest, with_likely)
+                    return self._replaced(cheapest, search.with_likely(fit))
+                improved = search.improved(other.kept, other.poses)
+                better = min(improved, other, key=search.sets.cost)
+                cheapest = self._replaced(cheapest, better)
         except FAILURES as error:
             self.failures.append(f"the last search failed ({error}); what it began with stands")
         return cheapest
 
-    def _fit_of(self, estimate: Estimate) -> Fit:
-        return Fit.of(self.doubted.problem, estimate.kept, estimate.poses)
-
     def _replaced(self, estimate: Estimate, fit: Fit) -> Estimate:
-        """The solution of the edges of a fit, in place of an estimate."""
+        """The solution of the edges of a fit, in place of an estimate that keeps others."""
+        if np.array_equal(fit.kept, estimate.kept):
+            return estimate
         revised = self.places.revised(estimate, fit.kept, fit.poses)
         self.estimates[self.estimates.index(estimate)] = revised
         return revised

@@ -34,7 +34,7 @@ def street(seed: int, share: float = 0.5, kind: str = "random") -> tuple[pgo.Pos
 def test_a_cluster_is_right_or_wrong_as_a_whole(kind: str) -> None:
     graph, is_wrong = street(0, 0.8, kind)
     known = odometry(graph)
-    clusters = closure_clusters(graph, known)
+    clusters = closure_clusters(Chains.of(graph, known), known)
     np.testing.assert_array_equal(np.sort(np.concatenate(clusters)), np.flatnonzero(~known))
     right = [cluster for cluster in clusters if not is_wrong[cluster].any()]
     assert all(is_wrong[cluster].all() for cluster in clusters if is_wrong[cluster].any())
@@ -49,7 +49,8 @@ def test_where_closures_agree_by_chance_clusters_are_small(kind: str) -> None:
         1, 125, np.random.default_rng(0), d=3, loop_closure_probability=0.5, noise=noise
     )
     graph, is_wrong = spoiled(right, 0.9, kind, 0)
-    clusters = closure_clusters(graph, odometry(graph))
+    known = odometry(graph)
+    clusters = closure_clusters(Chains.of(graph, known), known)
     right_with_wrong = [
         (~is_wrong[cluster]).sum() for cluster in clusters if is_wrong[cluster].any()
     ]
@@ -68,7 +69,7 @@ def test_closures_of_a_road_driven_back_are_one_cluster_whichever_way_they_are_w
     i[turned], j[turned] = j[turned], i[turned].copy()
     reversed_graph = pgo.PoseGraph(graph.num_poses, i, j, R, t, graph.kappa, graph.tau)
     of_both = [
-        sorted(map(tuple, closure_clusters(each, odometry(each))))
+        sorted(map(tuple, closure_clusters(Chains.of(each, odometry(each)), odometry(each))))
         for each in (graph, reversed_graph)
     ]
     assert of_both[0] == of_both[1]

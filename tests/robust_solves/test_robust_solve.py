@@ -125,6 +125,18 @@ def test_ctrl_c_between_the_loops_keeps_the_best_attempt(clean, where, monkeypat
     assert solution.robust.rejected.sum() >= 0.9 * is_wrong.sum()
 
 
+def test_ctrl_c_in_the_last_search_keeps_the_answer(clean, monkeypatch):
+    graph, is_wrong = spoiled(clean, 0.3, "random", seed=0)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ClusterSearch, "with_likely", interrupted)
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert solution.status is solvers.Status.INTERRUPTED
+    np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
+
+
 def test_of_a_solve_out_of_time_nothing_is_said_to_fit(clean):
     graph, _ = spoiled(clean, 0.3, "random", seed=0)
     solution = solvers.solve(graph, robust=solvers.GNC(), time_limit=1e-6)
