@@ -89,12 +89,13 @@ class ClusterSearch:
         """Edges to keep, and their poses, from those of an estimate with the edges `kept`, (m,).
 
         Clusters are added, removed and exchanged; then single edges are, as a cluster may have a
-        wrong one; then any edges, by the linear theory. What that finds is improved in turn.
+        wrong one, unless edges come in a stream, whose updates have to be fast; then any edges, by
+        the linear theory. What that finds is improved in turn.
         """
         fit = self.sets.settled(kept, poses)
         while True:
             fit = self._at_rest(fit)
-            if any(len(cluster) > 1 for cluster in self.clusters):
+            if self.new is None and any(len(cluster) > 1 for cluster in self.clusters):
                 fit = min(fit, self.singly._at_rest(fit), key=self.sets.cost)
             exchanged = self.linear.exchanged(fit)
             if exchanged is None:

@@ -351,7 +351,7 @@ class _RobustSolve:
     def answer_by_attempts(self, ending: Status) -> Solution:
         """The solution of the edges kept by the cheapest attempt."""
         chosen = self.choice.cheapest
-        if ending not in OUT_OF_TIME:
+        if ending not in OUT_OF_TIME and self.new is None:
             try:
                 chosen = self._finished(chosen)
             except KeyboardInterrupt:  # outside a run: runs end with a status instead
@@ -367,15 +367,15 @@ class _RobustSolve:
         """The cheapest attempt, improved by what is too slow for each, or to be done once.
 
         Where few closures hold its map, which then bends to fit a wrong one, each is left out in
-        turn, unless the graph has grown; what is better is revised, and all are left out anew. In
-        the end edges come back that are likely right although they are beyond the quantile, which
-        may raise the truncated cost.
+        turn; what is better is revised, and all are left out anew. In the end edges come back that
+        are likely right although they are beyond the quantile, which may raise the truncated cost.
+        An update of a graph that has grown goes without, as it has to be fast.
         """
         try:
             while self._has_time() and cheapest.status not in OUT_OF_TIME:
                 search = self._search(self.choice)
                 fit = Fit.of(self.doubted.problem, cheapest.kept, cheapest.poses)
-                other = None if self.new is not None else search.linear.without_one(fit)
+                other = search.linear.without_one(fit)
                 if other is None:
                     return self._replaced(cheapest, search.with_likely(fit))
                 improved = search.improved(other.kept, other.poses)
