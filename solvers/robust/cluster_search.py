@@ -8,8 +8,8 @@ its residuals, but
 
 On a right map T of k right closures is chi^2 with k d (d + 1) / 2 degrees of freedom to first
 order, however far the map moves. A cluster is added where T is at most the quantile 0.99, times the
-scale s of the errors; a cluster kept is removed where its T is beyond what chance explains. Both
-lower the truncated cost of `revision`, which decides of exchanges.
+scale s of the errors; a cluster kept is removed where its T is beyond what chance explains, even
+if a large one costs more in the truncated cost of `revision`, which decides of exchanges.
 """
 
 from __future__ import annotations
@@ -209,11 +209,7 @@ class ClusterSearch:
         larger: Fit | None = None
         waiting = [k for k in candidates.order if trials.get(candidates.names[k], 0) < _MOST_TRIALS]
         while num_left and waiting and num_failures < self._most_failures and self.sets.has_time():
-            near: list[int] = []
-            while waiting and len(near) < num_left:
-                k = waiting.pop(0)
-                if candidates.ratio(k) <= _NEAR:
-                    near.append(k)
+            near = _take_near(candidates, waiting, num_left)
             if not near:
                 break
             before = fit if larger is None else larger
@@ -364,3 +360,13 @@ class ClusterSearch:
         """Clusters of the chosen edges, (m,), alone."""
         groups = [cluster[chosen[cluster]] for cluster in self.clusters]
         return [group for group in groups if len(group)]
+
+
+def _take_near(candidates: Candidates, waiting: list[int], most: int) -> list[int]:
+    """The first candidates that are near, `most` of them at most; those looked at wait no more."""
+    near: list[int] = []
+    while waiting and len(near) < most:
+        k = waiting.pop(0)
+        if candidates.ratio(k) <= _NEAR:
+            near.append(k)
+    return near

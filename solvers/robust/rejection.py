@@ -173,7 +173,8 @@ class Rejection(Summarised):
             doubts.append(f"up to {number} wrong closures are expected to fit this map by chance")
         num_near = self.num_rejected_near
         if num_near > self._num_tolerated:
-            doubts.append(f"about {num_near:.0f} right edges are rejected near their thresholds")
+            among = "are expected among the edges rejected near their thresholds"
+            doubts.append(f"about {num_near:.0f} right ones {among}")
         rival = self._rival
         if rival is not None:
             kept_by = f"kept by an attempt of nearly the same cost, {rival.name}"

@@ -236,7 +236,8 @@ def test_what_speaks_against_the_edges_kept() -> None:
     assert robust.support is Support.CHECKED
     near = replace(robust, ratio=np.where(is_wrong, 1.5, robust.ratio))
     num_wrong = int(is_wrong.sum())
-    doubt = f"about {num_wrong} right edges are rejected near their thresholds"
+    among = "are expected among the edges rejected near their thresholds"
+    doubt = f"about {num_wrong} right ones {among}"
     assert doubt in near.headline
     # Wrong motions that lie anywhere: of a ball of dimension 3 or 6 most lies far from the middle.
     volumes = (np.arange(num_wrong) + 0.5) / num_wrong
