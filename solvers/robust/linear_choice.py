@@ -9,14 +9,15 @@ is, up to a constant and to first order,
     F(S) = u_S^T (C_S + A_S H^-1 A_S^T)^-1 u_S,     u = r - A H^-1 g,
 
 with g half the gradient of the edges that stay. At stationary poses of these and the closures kept,
-g = -sum over the kept of A_e^T C_e^-1 r_e. The set of the least F(S) + sum of c^2 over the others
-is looked for by tabu search (Glover, "Tabu search, part I", ORSA Journal on Computing 1989): in
-every step the best change of one closure is made, even if it raises the cost, and that closure
-stays as it is for some steps.
+g = -sum over the kept of A_e^T C_e^-1 r_e. With c^2 the threshold of the truncated cost, the set of
+the least F(S) + sum of c^2 over the others is looked for by tabu search (Glover, "Tabu search, part
+I", ORSA Journal on Computing 1989): in every step the best change of one closure is made, even if
+it raises the cost, and that closure stays as it is for some steps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,18 +30,16 @@ from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from solvers.robust.chains import Motions, inverse, product
 
-# Steps of the search, those in a row without a better set, and those for which a closure stays.
+# Steps of the search, those in a row without a better set, and those for which a closure stays as
+# it is at most.
 _MOST_STEPS = 300
 _MOST_WITHOUT_SUCCESS = 100
-_TENURE = 8
-# A map was bent to a closure where its loss is at least this share of its threshold, and its
-# residual at most this share of its loss. Wrong closures kept by maps of MIT have 0.5 to 1.1 and
-# 0.03.
+_TENURE = 7
+# The loss of a closure is what F falls by without it. A map was bent to a closure whose loss is at
+# least this share of its threshold, and its residual at most this share of its loss. Wrong closures
+# kept by maps of MIT have 0.5 to 1.1 and 0.03.
 _LEAST_LOSS = 0.4
 _SMALL_RESIDUAL = 0.2
-# Share of its own variance by which the variance of an error is taken for larger: that of two
-# closures that measure the same is singular otherwise.
-_LEAST_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,8 @@ class LinearChoice:
     ) -> LinearChoice:
         """Model of `closures`, (k,) edges of the graph and their covariances (k, p, p).
 
-        `kept` are places of those that the stationary poses are of, beside the edges that stay.
+        The poses are stationary for the edges that stay and the closures `kept`, (s,) places among
+        the k.
         A NotPositiveDefiniteError where these do not hold the poses.
         """
         edges, measured = closures
@@ -81,11 +81,19 @@ class LinearChoice:
         forces = np.linalg.solve(measured, errors[:, :, None])[:, :, 0]
         residuals = np.einsum("ka,ka->k", errors, forces)
         errors = errors + np.einsum("kasb,sb->ka", moved[:, :, kept], forces[kept])
-        moved[np.arange(k), :, np.arange(k)] += (1.0 + _LEAST_VARIANCE) * measured
+        moved[np.arange(k), :, np.arange(k)] += measured
         return cls(errors, moved.reshape(k * p, k * p), allowed, residuals)
 
-    def best(self, chosen: IntArray, excluded: int | None = None) -> IntArray:
-        """The best set found from the closures chosen, (s,), without one that is excluded."""
+    def best(
+        self,
+        chosen: IntArray,
+        excluded: int | None = None,
+        has_time: Callable[[], bool] = lambda: True,
+    ) -> IntArray:
+        """The best set found from the closures chosen, (s,), without one that is excluded.
+
+        The search ends early once `has_time` is false.
+        """
         k = len(self.errors)
         if excluded is not None:
             chosen = np.setdiff1d(chosen, [excluded])
@@ -99,9 +107,10 @@ class LinearChoice:
                 least_cost = current.cost
                 best = current.chosen.copy()
                 best_step = step
-            if step - best_step >= _MOST_WITHOUT_SUCCESS:
+            if step - best_step >= _MOST_WITHOUT_SUCCESS or not has_time():
                 break
             changes = current.changes()
+            # A closure that has to stay as it is may change all the same for a new best set.
             is_allowed = (free_at <= step) | (current.cost + changes < least_cost)
             if excluded is not None:
                 is_allowed[excluded] = False
@@ -109,7 +118,7 @@ class LinearChoice:
                 break
             e = int(np.where(is_allowed, changes, np.inf).argmin())
             current.change(e)
-            free_at[e] = step + min(_TENURE, k // 4)
+            free_at[e] = step + 1 + max(1, min(_TENURE, k // 4))
         return np.flatnonzero(best)
 
     def choose(self, chosen: IntArray) -> SweptChoice:
@@ -141,9 +150,9 @@ class SweptChoice:
 
     With the chosen closures S and the others J, and V the covariance, the sweep operator
     (Goodnight, "A tutorial on the SWEEP operator", The American Statistician 1979) keeps
-    V_JJ - V_JS V_SS^-1 V_SJ and -V_SS^-1 on the diagonal of `matrix`, (k p, k p), and
-    u_J - V_JS V_SS^-1 u_S and V_SS^-1 u_S in `errors`, (k, p). `chosen` (k,) says which are in S;
-    `cost` is F(S) and `allowed` for each of the others.
+    V_JJ - V_JS V_SS^-1 V_SJ and -V_SS^-1 on the diagonal of `matrix`, (k p, k p), V_SS^-1 V_SJ
+    beside them, and u_J - V_JS V_SS^-1 u_S and V_SS^-1 u_S in `errors`, (k, p). `chosen` (k,) says
+    which are in S; `cost` is F(S) and `allowed` for each of the others.
     """
 
     matrix: Array
@@ -156,7 +165,7 @@ class SweptChoice:
         """How the cost changes when each closure, (k,), comes or goes."""
         k, p = self.errors.shape
         blocks = self.matrix.reshape(k, p, k, p)[np.arange(k), :, np.arange(k)]
-        return _squared(self.errors, blocks) - np.where(self.chosen, -self.allowed, self.allowed)
+        return _squared(self.errors, blocks) + np.where(self.chosen, self.allowed, -self.allowed)
 
     def change(self, e: int) -> None:
         """Take closure e in, or out if it is chosen."""
@@ -178,7 +187,7 @@ class SweptChoice:
 
 
 def _squared(errors: Array, variance: Array) -> Array:
-    """Squared Mahalanobis length of every error, (k,)."""
+    """e^T V^-1 e of every error, (k,), which is negative where V is negative definite."""
     weighted = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
     return np.asarray(np.einsum("ka,ka->k", errors, weighted))
 
@@ -187,7 +196,8 @@ def _linearised(graph: PoseGraph, edges: IntArray, poses: Poses) -> tuple[Array,
     """Errors r (k, p) of edges, their derivative (k p, q p), and the q poses that they join.
 
     r is (R_ij^T (R_i^T (t_j - t_i) - t_ij), log(R_ij^T R_i^T R_j)), in the frame of the measured
-    end, which is that of information matrices. Moves of a pose are (v, w) as in `Marginals`.
+    end, which is that of information matrices. Moves of a pose are (v, w) as in `Marginals`. The
+    derivative of the logarithm is taken to be the identity, as it is where the error is zero.
     """
     d = graph.d
     p = d + tangent_dimension(d)

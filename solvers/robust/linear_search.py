@@ -20,14 +20,13 @@ from solvers.robust.linear_choice import LinearChoice
 from solvers.robust.revision import Fit, inlier_problem, is_held
 
 # Closures among which the theory chooses, at most, as its matrix is dense; and closures that a map
-# keeps: one that more of them hold hardly bends.
+# keeps at most: more make it too stiff to bend.
 _MOST_CLOSURES = 400
 _MOST_KEPT = 40
-# Choices in a row, as long as the truncated cost has not fallen.
+# Choices in a row before the search gives up, and where a closure is left out.
 _MOST_CHOICES = 6
-# Choices in a row where a closure is left out.
 _MOST_CHOICES_WITHOUT = 3
-# Where the edges that stay leave poses loose, or two closures measure the same.
+# Where the edges that stay leave poses loose, or rounding makes a matrix singular.
 _NO_MODEL = (NotPositiveDefiniteError, np.linalg.LinAlgError)
 
 
@@ -44,7 +43,7 @@ class LinearSearch:
         return cls(sets, np.flatnonzero(~sets.known & is_whole(sets.problem.graph)))
 
     def exchanged(self, fit: Fit) -> Fit | None:
-        """A better fit, with any of the closures in place of any others."""
+        """A better fit, with any closures in place of any of those kept."""
         model = self._first_model(fit)
         return None if model is None else self._chosen(fit, model, None, _MOST_CHOICES)
 
@@ -85,7 +84,7 @@ class LinearSearch:
     def _chosen(
         self, fit: Fit, first_model: LinearChoice, excluded: int | None, most_choices: int
     ) -> Fit | None:
-        """A better fit by choices in a row, the first of which may be worse."""
+        """A better fit by choices in a row, of which all but the last may be worse."""
         current = fit
         for _ in range(most_choices):
             if not self.sets.has_time():
@@ -93,7 +92,7 @@ class LinearSearch:
             kept = self._kept(current)
             try:
                 model = first_model if current is fit else self._model(current)
-                chosen = model.best(kept, excluded)
+                chosen = model.best(kept, excluded, self.sets.has_time)
             except _NO_MODEL:
                 return None
             if np.isin(chosen, kept).all():
