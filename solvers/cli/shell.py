@@ -181,7 +181,10 @@ class Interruption:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Watch for signals while the block runs."""
+        """Watch for signals while the block runs.
+
+        Once one has arrived, those after the block are ignored: only a line is left to print.
+        """
 
         def interrupt(number: int, frame: FrameType | None) -> None:
             earlier = self._last
@@ -190,8 +193,12 @@ class Interruption:
                 self.signal = self.signal or signal.Signals(number)
                 raise KeyboardInterrupt
 
-        with _handled_by(interrupt):
+        before = _new_handlers(interrupt)
+        try:
             yield
+        finally:
+            for number, earlier in before.items():
+                signal.signal(number, earlier if self.signal is None else signal.SIG_IGN)
 
 
 class Outlet:
@@ -329,7 +336,7 @@ def save_then_show(
     # The stack calls all its entries, the last one first, even if one of them raises an error.
     with ExitStack() as stack:
         stack.callback(print_result)
-        stack.enter_context(_handled_by(signal.SIG_IGN))
+        stack.enter_context(_unheard_signals())
         stack.enter_context(saving.bar)
         for path, save in reversed(targets):
             stack.callback(saving.write, path, save)
@@ -373,16 +380,21 @@ def _failure_to_write(path: Path, save: Callable[[Path], object]) -> str:
 
 
 @contextmanager
-def _handled_by(
-    handler: Callable[[int, FrameType | None], object] | signal.Handlers,
-) -> Iterator[None]:
-    """Give the signals another handler while the block runs."""
-    handled = list(_SIGNALS)
-    if HANGUP is not None and signal.getsignal(HANGUP) is signal.SIG_IGN:
-        handled.remove(HANGUP)  # nohup asks for it to be ignored
-    before = {number: signal.signal(number, handler) for number in handled}
+def _unheard_signals() -> Iterator[None]:
+    """Ignore the signals while the block runs."""
+    before = _new_handlers(signal.SIG_IGN)
     try:
         yield
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)
+
+
+def _new_handlers(
+    handler: Callable[[int, FrameType | None], object] | signal.Handlers,
+) -> dict[signal.Signals, Any]:
+    """Give the signals another handler, and return their earlier ones."""
+    handled = list(_SIGNALS)
+    if HANGUP is not None and signal.getsignal(HANGUP) is signal.SIG_IGN:
+        handled.remove(HANGUP)  # nohup asks for it to be ignored
+    return {number: signal.signal(number, handler) for number in handled}
