@@ -198,6 +198,11 @@ def arrays_in(record: object, name: str = "value") -> Iterator[tuple[str, Array]
         yield name, np.asarray(0.0 if isinstance(record, Enum) else record)  # a word is a number
 
 
+def bytes_of(value: Array) -> int:
+    """Bytes of a number, which takes eight, or of an array."""
+    return value.nbytes if value.ndim else 8
+
+
 class Recording:
     """Robots of this process, and all that was said: an engine that is its own pool."""
 

@@ -24,7 +24,7 @@ from solvers.distributed.robots.agent import order_front, take_front
 from solvers.distributed.robots.elimination import FrontParts, HeldFront
 from solvers.distributed.robots.records import ALONG_TREE
 from solvers.network.counted_pool import Count, CountedPool
-from solvers.network.ledger import DRIVER
+from solvers.network.ledger import BYTES_PER_NUMBER, DRIVER
 from solvers.network.messages import Idle
 
 Q = TypeVar("Q")
@@ -259,11 +259,11 @@ class FrontOwners:
         for number, request in requests.items():
             links += self._links(number, request, answers[number])
         level = self.tree[next(iter(requests))].level
-        sender, receiver, numbers = np.array(links).T
-        self._network.count(sender, receiver, numbers, is_round=False, level=level)
+        sender, receiver, sizes = np.array(links).T
+        self._network.count(sender, receiver, sizes, is_round=False, level=level)
 
     def _links(self, number: int, request: Any, answer: Any) -> list[tuple[int, int, int]]:  # noqa: ANN401 - as ordered
-        """Sender, receiver and numbers of what a front is sent and answers."""
+        """Sender, receiver and bytes of what a front is sent and answers."""
         own = self.owner[number]
         front = self.tree[number]
         of_robots = [self._robots[robot] for robot in front.robots]
@@ -272,14 +272,15 @@ class FrontOwners:
         _, content = request
         if isinstance(content, FrontParts):  # its parts; the driver's; |y|^2 to the driver
             links = [
-                (sender, own, part.size) for sender, part in zip(below, content.parts, strict=True)
+                (sender, own, part.nbytes)
+                for sender, part in zip(below, content.parts, strict=True)
             ]
-            links.append((DRIVER, own, content.own.size if content.own is not None else 0))
-            links.append((own, DRIVER, int(isinstance(answer, tuple))))
+            links.append((DRIVER, own, content.own.nbytes if content.own is not None else 0))
+            links.append((own, DRIVER, BYTES_PER_NUMBER * isinstance(answer, tuple)))
             return links
         x_E, on_parts = answer
-        to_below = [(own, receiver, x.size) for receiver, x in zip(below, on_parts, strict=True)]
-        return [(own, DRIVER, x_E.size), *to_below]
+        to_below = [(own, receiver, x.nbytes) for receiver, x in zip(below, on_parts, strict=True)]
+        return [(own, DRIVER, x_E.nbytes), *to_below]
 
 
 def _held_front(tree: Sequence[Front], front: Front, touched: Sequence[IntArray]) -> HeldFront:

@@ -10,8 +10,8 @@ import numpy as np
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.network.engine import WorkerPool
 from solvers.network.faults import LossyChannel
-from solvers.network.ledger import BYTES_PER_NUMBER, DRIVER, Ledger, Traffic
-from solvers.network.messages import count_numbers, restore, snapshot_bytes, take_snapshot
+from solvers.network.ledger import DRIVER, Ledger, Traffic
+from solvers.network.messages import count_bytes, restore, snapshot_bytes, take_snapshot
 from solvers.network.moments import Moments, obey_after
 from solvers.network.recovery import RecoveringPool
 
@@ -88,8 +88,8 @@ class CountedPool:
         """Count requests, unless there are none, and answers."""
         request_sizes = [0] * len(robots)
         if requests:
-            request_sizes = [count_numbers(requests[a], self.elsewhere) for a in robots.tolist()]
-        answer_sizes = [count_numbers(answers[a], self.elsewhere) for a in robots.tolist()]
+            request_sizes = [count_bytes(requests[a], self.elsewhere) for a in robots.tolist()]
+        answer_sizes = [count_bytes(answers[a], self.elsewhere) for a in robots.tolist()]
         parent = np.full(len(robots), DRIVER)
         if self.tree is not None:
             outwards, parent = self.tree
@@ -111,7 +111,7 @@ class CountedPool:
         """
         messages = by_link(sent)
         links = np.array(list(messages), dtype=np.int64).reshape(-1, 2)
-        sizes = [count_numbers(value) for value in messages.values()]
+        sizes = [count_bytes(value) for value in messages.values()]
         self.count(links[:, 0], links[:, 1], sizes, is_round=True)
         arrived = messages if channel is None else channel.carry(messages)
         return delivered(arrived, len(sent))
@@ -129,15 +129,15 @@ class CountedPool:
         self,
         sender: IntArray,
         receiver: IntArray,
-        numbers: Sequence[int] | IntArray,
+        sizes: Sequence[int] | IntArray,
         is_round: bool,
         level: int = 0,
     ) -> None:
-        """Count an exchange of messages with `numbers` numbers each, (q,).
+        """Count an exchange of messages of `sizes` bytes each, (q,).
 
         Empty messages, and those of a worker to itself, are left out.
         """
-        num_bytes = BYTES_PER_NUMBER * np.array(numbers, dtype=np.int64)
+        num_bytes = np.array(sizes, dtype=np.int64)
         is_sent = (num_bytes > 0) & (sender != receiver)
         exchange = sender[is_sent], receiver[is_sent], num_bytes[is_sent]
         key = np.append(np.concatenate(exchange), level).tobytes()

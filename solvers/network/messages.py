@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError
+from solvers.network.ledger import BYTES_PER_NUMBER
 
 Snapshot = Mapping[str, NDArray[Any]]
 
@@ -88,24 +89,26 @@ def raise_first_error(answers: list[Any]) -> list[Any]:
     return answers
 
 
-def count_numbers(record: object, ignored_fields: Collection[str] = ()) -> int:
-    """Count the numbers that a request or an answer carries between a worker and the driver.
+def count_bytes(record: object, ignored_fields: Collection[str] = ()) -> int:
+    """Count the bytes that a request or an answer carries between a worker and the driver.
+
+    A number takes eight, and in an array as many as there.
 
     A mapping holds messages for other workers, which are counted when they are exchanged. Fields in
     `ignored_fields` are counted elsewhere, and fields whose names begin with `measured` are off the
     ledger.
     """
     if isinstance(record, np.ndarray):
-        return record.size
+        return record.nbytes
     if record is None or isinstance(record, Mapping):
         return 0
     if isinstance(record, tuple):
-        return sum(count_numbers(item, ignored_fields) for item in record)
+        return sum(count_bytes(item, ignored_fields) for item in record)
     fields = getattr(type(record), "__dataclass_fields__", None)
     if fields is None:
-        return int(np.size(record))  # type: ignore[arg-type] # a number or an array
+        return BYTES_PER_NUMBER * int(np.size(record))  # type: ignore[arg-type] # a number or an array
     total = 0
     for name in fields:
         if name not in ignored_fields and not name.startswith("measured"):
-            total += count_numbers(getattr(record, name), ignored_fields)
+            total += count_bytes(getattr(record, name), ignored_fields)
     return total

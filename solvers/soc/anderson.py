@@ -92,22 +92,22 @@ class AndersonShare:
     def observe(self, residual: Array, image: Array, keep: int) -> tuple[Array, AndersonShare]:
         """Part of the sums, and the share with the newest of at most `keep` differences.
 
-        `residual`, (rows, d), may carry weights; `image`, (rows, d), does not. The sums, (1 + 2
-        q,), are ||residual||^2; newest . difference for the q differences, the newest last;
-        difference . residual for them.
+        `residual`, (rows, d), may carry weights; `image`, (rows, d), does not. The sums, (1,) or (2
+        + q,), are ||residual||^2, and if there are q > 0 differences ||newest||^2 and difference .
+        residual for all of them, the newest last.
         """
         share = self.after(residual, image, keep)
         differences = share.residual_differences
-        if differences and residual.size <= _MAX_SIZE_OF_COPY:
-            newest_and_residual = np.array([differences[-1], residual]).reshape(2, -1)
+        square = inner(residual, residual)
+        if not differences:
+            return np.array([square]), share
+        if residual.size <= _MAX_SIZE_OF_COPY:
             flat_differences = np.array(differences).reshape(len(differences), -1)
-            products = np.einsum("kr,er->ek", flat_differences, newest_and_residual).ravel()
+            products = np.einsum("kr,r->k", flat_differences, residual.ravel())
         else:
-            others = (*differences[-1:], residual)
-            products = np.array(
-                [inner(difference, other) for other in others for difference in differences]
-            )
-        return np.append(inner(residual, residual), products), share
+            products = np.array([inner(difference, residual) for difference in differences])
+        newest = differences[-1]
+        return np.concatenate([[square, inner(newest, newest)], products]), share
 
     def after(self, residual: Array, image: Array, keep: int) -> AndersonShare:
         """Return the share with the newest of at most `keep` differences."""
@@ -126,7 +126,7 @@ class AndersonShare:
         """Rows of image - sum_k gamma_k dg_k, and the share.
 
         Without coefficients the step is plain, and where `gamma` is None the share forgets its
-        differences.
+        differences. All who have a row compute it in the same order, and so to the same bits.
         """
         assert self.image is not None
         if gamma is None:
@@ -135,19 +135,23 @@ class AndersonShare:
             return self.image, self
         differences = self.image_differences[-len(gamma) :]
         if self.image.size <= _MAX_SIZE_OF_COPY:
-            return self.image - np.einsum("k,k...->...", gamma, np.array(differences)), self
-        following = self.image.copy()
-        for coefficient, difference in zip(gamma, differences, strict=True):
-            following -= coefficient * difference
-        return following, self
+            scaled = np.array(differences)
+            scaled *= np.reshape(gamma, (-1,) + (1,) * self.image.ndim)
+            return self.image - scaled.sum(axis=0), self
+        total = gamma[0] * differences[0]
+        for coefficient, difference in zip(gamma[1:], differences[1:], strict=True):
+            total += coefficient * difference
+        return self.image - total, self
 
 
 @dataclass(frozen=True, eq=False)
 class AndersonSums:
-    """What all parties know: the Gram matrix of the differences, and the smallest residual."""
+    """What all parties know of the steps since the last restart."""
 
-    gram: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    smallest: float = np.inf  # since the last restart
+    gram: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of the differences
+    # Difference . residual for the differences, with the last residual.
+    products: Array = field(default_factory=lambda: np.zeros(0))
+    smallest: float = np.inf  # length of the smallest residual
 
     def coefficients(
         self, settings: Anderson | None, sums: Array
@@ -163,20 +167,21 @@ class AndersonSums:
         if length > settings.restart_ratio * self.smallest:
             return None, AndersonSums(smallest=length)
         smallest = min(self.smallest, length)
-        num_differences = len(sums) // 2
-        if not num_differences:
+        if len(sums) == 1:
             return np.zeros(0), AndersonSums(smallest=smallest)
-        products_of_newest = sums[1 : 1 + num_differences]
-        products_with_residual = sums[1 + num_differences :]
+        products = sums[2:]
+        num_differences = len(products)
         # The last rows and columns of the old matrix, without the difference that is dropped.
         first_kept = len(self.gram) - num_differences + 1
         gram = np.empty((num_differences, num_differences))
         gram[:-1, :-1] = self.gram[first_kept:, first_kept:]
-        gram[-1, :] = products_of_newest
-        gram[:, -1] = products_of_newest
+        # newest = f - f_last, so that df_k . newest follows from df_k . f and df_k . f_last.
+        gram[-1, :-1] = products[:-1] - self.products[first_kept:]
+        gram[:-1, -1] = gram[-1, :-1]
+        gram[-1, -1] = sums[1]
         damped = gram + settings.regularization * np.trace(gram) * np.eye(num_differences)
-        gamma = np.linalg.lstsq(damped, products_with_residual, rcond=None)[0]
-        return gamma, AndersonSums(gram, smallest)
+        gamma = np.linalg.lstsq(damped, products, rcond=None)[0]
+        return gamma, AndersonSums(gram, products, smallest)
 
 
 @dataclass(frozen=True, eq=False)

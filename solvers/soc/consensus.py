@@ -36,6 +36,7 @@ from solvers.soc.copies import (
     CopiesState,
     CopyLayout,
     InitReply,
+    Messages,
     RescaleCopies,
     Rows,
     SeparatorPenalty,
@@ -44,6 +45,7 @@ from solvers.soc.copies import (
 )
 from solvers.soc.penalty import MultiplierPenalty, PenaltyOrder
 from solvers.soc.recursion_block import Agreement, Rotations
+from solvers.soc.rounded_rows import WHOLE
 from solvers.soc.safeguard import Due, SharedSteps, next_penalty
 from solvers.soc.separator_stiffness import TRANSLATION_PENALTY, adapted_penalty, fell_most
 from solvers.soc.settings import SOCSettings
@@ -95,8 +97,8 @@ class ConsensusState(SharedSteps):
         Sum of `rotation_squares`, to which the gradient is relative.
     ahead : array or None
         Sums of the next step (a), unless the penalties change before.
-    rows : sequence of Rows
-        Rows of the next step (a), as their receivers have them.
+    rows : sequence of Messages
+        Messages with the rows of the next step (a), by receiver.
     robots : tuple of ConsensusRobot
         The robots with their rows, in one process.
     moment : Moment or None
@@ -108,7 +110,7 @@ class ConsensusState(SharedSteps):
     gradient: float
     rotation_square: float
     ahead: Array | None = None
-    rows: Sequence[Rows] = ()
+    rows: Sequence[Messages] = ()
     robots: tuple[ConsensusRobot, ...] = ()
     moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
 
@@ -152,8 +154,8 @@ class Consensus:
         """
         sent_poses = robots.begin(is_first=before is None)
         received_poses = robots.exchange(sent_poses)
-        norms = robots.ask(ConsensusRobot.multiplier_norms, received_poses, Count.GATHER)
-        ratio = np.concatenate([answer.norms / answer.scale for answer in norms])
+        ratios = robots.ask(ConsensusRobot.multiplier_ratios, received_poses, Count.GATHER)
+        ratio = np.concatenate(ratios)
         has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)
         is_stationary = (has_multipliers and robots.num_robots > 1) or before is not None
         order = self._penalty_order(ratio, is_stationary)
@@ -178,6 +180,8 @@ class Consensus:
         if not math.isfinite(merit):
             return state.broken()
         gamma, anderson = state.sums.coefficients(self._common_acceleration, state.ahead)
+        if gamma is not None and self.soc.bytes_per_number < WHOLE:
+            gamma = gamma.astype(np.float32)
         agreement = Agreement(gamma, state.is_best(merit))
         orders = [(agreement, rows) for rows in state.rows]
         # (b) projection and (c) Bregman update, and (a) of the next iteration
@@ -302,7 +306,7 @@ def _with_solution(
 ) -> ConsensusState:
     """State with the result of step (a), whose rows are delivered to the neighbours."""
     rows = robots.exchange([answer.rows for answer in answers])
-    sums = np.sum([answer.sums for answer in answers], axis=0)
+    sums = np.sum([answer.part.sums for answer in answers], axis=0)
     return replace(state, ahead=sums, rows=rows)
 
 

@@ -26,7 +26,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.stationarity import gradient_squares, rotation_squares
 from solvers.soc import copies
-from solvers.soc.anderson import AndersonShare, AndersonSums, over_relax
+from solvers.soc.anderson import AndersonSums, over_relax
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
 from solvers.soc.recursion_block import (
@@ -37,6 +37,7 @@ from solvers.soc.recursion_block import (
     nearest_rotations,
     stationary_B,
 )
+from solvers.soc.rounded_rows import WHOLE, PartOfSums, RowChange
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
 
@@ -59,8 +60,8 @@ class ConsensusRobot:
         """Start at omega with the robot's translations."""
         return self.begin(self.poses)
 
-    def multiplier_norms(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.Norms]:
-        """Take the owners' poses; return ||Lambda_i||_2 and m_i of the robot's own."""
+    def multiplier_ratios(self, rows: copies.Rows) -> tuple[ConsensusRobot, Array]:
+        """Take the owners' poses; return ||Lambda_i||_2 / m_i of the robot's own."""
         layout = self.layout
         X = self._with_rows_of_others(self.state.X.copy(), rows)
         n = layout.problem.num_poses
@@ -73,7 +74,7 @@ class ConsensusRobot:
         diagonal = np.concatenate([of_translations, of_rotations], axis=1)
         following = self._with(X=X, Lambda=Lambda, diagonal=diagonal)
         norms = multiplier_norms(Lambda[layout.own])
-        return following, copies.Norms(norms, following._scale[layout.own])
+        return following, norms / following._scale[layout.own]
 
     def penalize(
         self, order: PenaltyOrder
@@ -89,12 +90,14 @@ class ConsensusRobot:
             B = stationary_B(unstack_transposes(state.X[n:]), state.Lambda, np.ones(n))
             pull = stack_transposes(B).reshape(n, d * d)
         force = -2.0 * layout.problem.apply_M(state.X)
+        none = np.zeros_like(force)
+        force, sent = self._as_sent(force, none, order.settings.bytes_per_number)
         of_poses = np.concatenate([rho[:, None], state.diagonal, pull], axis=1)
         no_poses = np.zeros(0, dtype=np.int64)
         messages = {}
-        for robot, rows in layout.common.items():
+        for robot, rows in sent.items():
             own = layout.sent.get(robot, no_poses)
-            messages[robot] = copies.NeighbourMessage(of_poses[own], force[rows])
+            messages[robot] = copies.NeighbourMessage(of_poses[own], rows)
         return self._with(rho=rho, pull=pull, force=force, settings=order.settings), messages
 
     def stiffness(
@@ -115,7 +118,7 @@ class ConsensusRobot:
             diagonal[theirs] = of_poses[:, 1 : d + 2]
             pull[theirs] = of_poses[:, d + 2 :]
         for robot, rows in layout.common.items():
-            total_force[rows] += messages[robot].force
+            total_force[rows] += _taken(messages[robot].force, np.zeros((len(rows), d)))
         separators = layout.separators
         half_scale = 0.5 * diagonal[separators, 0] / num_copies[separators]
         penalty = np.concatenate([np.zeros(n), np.repeat(rho / num_copies, d)])
@@ -176,25 +179,55 @@ class ConsensusRobot:
         """
         X, omega, _B, drift = self._solved_after_local_passes()
         x = np.where(self.layout.held, X, 0.0)
-        block, sums = self.block.after_solve(x, omega, drift)
+        before = self.block
+        step = over_relax(x, omega, before.settings.alpha) - omega + drift
+        # Neighbours have s, or the first time with these penalties omega.
+        known = before.omega if before.anderson.image is None else before.s
+        image, sent = self._as_sent(before.s + step, known, before.settings.bytes_per_number)
+        shared = self.layout.shared
+        step[shared] = image[shared] - before.s[shared]
+        block, sums = before.after_map(x, step, image)
         alone = block.settings.alone
         own_sums = self.state.sums
-        s = block.anderson.image
         if alone is not None:
             gamma: Array | None = None
             if np.isfinite(sums).all():
                 gamma, own_sums = own_sums.coefficients(alone, sums)
             block = block.extrapolated(Agreement(gamma, is_best=False))
             sums = sums[:1]
-            s = block.s
-        assert s is not None
-        rows = {robot: s[rows] for robot, rows in self.layout.common.items()}
-        return self._with(ahead=(X, block, own_sums)), copies.SolveReply(sums, rows)
+            sent = self._common_rows(block.s)
+        part = PartOfSums.of(sums, block.settings.bytes_per_number)
+        return self._with(ahead=(X, block, own_sums)), copies.SolveReply(part, sent)
 
-    def step(self, order: tuple[Agreement, copies.Rows]) -> tuple[ConsensusRobot, copies.StepReply]:
+    def _as_sent(
+        self, X: Array, known: Array, bytes_per_number: int
+    ) -> tuple[Array, copies.Messages]:
+        """X, (rows, d), as the neighbours will have it, and the messages that tell them.
+
+        What is sent is the change from `known`, which they have. X is sent whole where it is not
+        rounded, or not finite.
+        """
+        shared = self.layout.shared
+        change = None
+        if bytes_per_number < WHOLE:
+            change = RowChange.of(X[shared] - known[shared], bytes_per_number)
+        if change is None:
+            return X, self._common_rows(X)
+        X = X.copy()
+        X[shared] = change.added_to(known[shared])
+        places = self.layout.common_among_shared
+        return X, {robot: change.some(rows) for robot, rows in places.items()}
+
+    def _common_rows(self, X: Array) -> copies.Rows:
+        """Rows of X for every neighbour, of the poses that both hold."""
+        return {robot: X[rows] for robot, rows in self.layout.common.items()}
+
+    def step(
+        self, order: tuple[Agreement, copies.Messages]
+    ) -> tuple[ConsensusRobot, copies.StepReply]:
         """One iteration: (b) and (c) with the neighbours' rows, and (a) of the next one."""
-        agreement, images = order
-        ahead, rows = self._accelerated(agreement, images)  # s = x_ahead + B, here and there
+        agreement, messages = order
+        ahead, rows = self._accelerated(agreement, messages)  # s = x_ahead + B, here and there
         omega = ahead._agreed_omega(rows)  # (b) projection, of the mean over the copies
         block, squares = ahead.block.agreed(omega)  # (c) Bregman update, B = s - omega
         robot = ahead._with(block=block)
@@ -203,7 +236,7 @@ class ConsensusRobot:
         return following, copies.StepReply(squares, stationarity, reply_of_solve)
 
     def _accelerated(
-        self, agreement: Agreement, images: copies.Rows
+        self, agreement: Agreement, messages: copies.Messages
     ) -> tuple[ConsensusRobot, copies.Rows]:
         """Take the step (a) that was done ahead; extrapolate its s, and the neighbours' rows of s.
 
@@ -221,10 +254,13 @@ class ConsensusRobot:
             memory = before.settings.memory
         received = {}
         rows = {}
-        for robot, image in images.items():
-            share = self.state.received.get(robot, AndersonShare())
-            share = share.after(np.zeros((0, 0)), image, memory)
-            rows[robot], received[robot] = share.extrapolated(agreement.gamma)
+        for robot, message in messages.items():
+            known = self.state.received.get(robot)
+            if known is None:
+                known = copies.ReceivedRows(before.omega[self.layout.common[robot]])
+            share = known.share.after(np.zeros((0, 0)), _taken(message, known.s), memory)
+            rows[robot], share = share.extrapolated(agreement.gamma)
+            received[robot] = copies.ReceivedRows(rows[robot], share)
         return self._with(X=X, block=block, sums=own_sums, received=received), rows
 
     def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
@@ -367,8 +403,7 @@ class ConsensusRobot:
         return X
 
     def _sending(self, block: RecursionBlock) -> tuple[ConsensusRobot, copies.Rows]:
-        sent = {robot: block.s[rows] for robot, rows in self.layout.common.items()}
-        return self._with(block=block), sent
+        return self._with(block=block), self._common_rows(block.s)
 
     @property
     def _scale(self) -> Array:
@@ -427,3 +462,8 @@ class ConsensusRobot:
             rotation_rows = self.layout.rows(fixed)[len(fixed) :]
             omega[rotation_rows] = block.omega[rotation_rows]
         return omega
+
+
+def _taken(message: Array | RowChange, known: Array) -> Array:
+    """Rows that a neighbour sent, from what it took for known."""
+    return message.added_to(known) if isinstance(message, RowChange) else message

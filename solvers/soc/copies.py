@@ -14,9 +14,11 @@ from pgo_models.problem.matrices import columns_of
 from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
 from solvers.soc.recursion_block import RecursionBlock, StepSettings
+from solvers.soc.rounded_rows import PartOfSums, RowChange
 from solvers.soc.subgraph import PartProblem, Subgraph
 
 Rows = Mapping[int, Array]  # to or from every neighbour
+Messages = Mapping[int, Array | RowChange]  # of rows, or of their change since the last message
 # An asynchronous run makes progress when a merit falls to this share of the smallest so far; it
 # stagnates when that has not happened for so many turns.
 _PROGRESS = 0.9
@@ -47,7 +49,7 @@ class NeighbourMessage:
     # (q, 1 + (d + 1) + d^2): rho_i, the diagonal of M and the unscaled multiplier of the poses that
     # the sender owns.
     of_own: Array
-    force: Array  # ((d + 1) q, d): -2 M_a X on the rows of all
+    force: Array | RowChange  # ((d + 1) q, d): -2 M_a X on the rows of all
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ class RescaleCopies:
 class SolveReply:
     """What step (a) gives."""
 
-    sums: Array  # of this robot, for the acceleration
-    rows: Rows  # of s for every neighbour, before the extrapolation that all do together
+    part: PartOfSums  # of this robot, for the acceleration
+    rows: Messages  # of s for every neighbour, before the extrapolation that all do together
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +191,18 @@ class CopyLayout:
         return np.asarray(is_private & bool(self.subgraph.common))
 
     @cached_property
+    def shared(self) -> IntArray:
+        """Rows of the separators."""
+        return self.rows(self.separators)
+
+    @cached_property
+    def common_among_shared(self) -> Mapping[int, IntArray]:
+        """Where, among `shared`, the rows are that are held in common with every neighbour."""
+        position = np.full(len(self.copies), -1)
+        position[self.shared] = np.arange(len(self.shared))
+        return {robot: position[rows] for robot, rows in self.common.items()}
+
+    @cached_property
     def common(self) -> Mapping[int, IntArray]:
         """Rows of the poses held in common with every neighbour."""
         return {robot: self.rows(poses) for robot, poses in self.subgraph.common}
@@ -255,6 +269,17 @@ class Waiting:
 
 
 @dataclass(frozen=True, eq=False)
+class ReceivedRows:
+    """Rows of a neighbour's s that the robot shares, and what the acceleration remembers of them.
+
+    The neighbour has the same bits.
+    """
+
+    s: Array
+    share: AndersonShare = field(default_factory=AndersonShare)
+
+
+@dataclass(frozen=True, eq=False)
 class CopiesState:
     """What orders leave with a robot; rows are those of `CopyLayout`.
 
@@ -282,7 +307,7 @@ class CopiesState:
         omega and s when the penalties were set.
     sums : AndersonSums
         Of a robot that accelerates alone.
-    received : mapping from robots to AndersonShare
+    received : mapping from robots to ReceivedRows
         Rows of the neighbours, which are extrapolated here as there.
     ahead : tuple or None
         X, block and sums after the next step (a).
@@ -301,6 +326,6 @@ class CopiesState:
     block: RecursionBlock | None = None
     origin: tuple[Array, Array] | None = None
     sums: AndersonSums = field(default_factory=AndersonSums)
-    received: Mapping[int, AndersonShare] = field(default_factory=dict)
+    received: Mapping[int, ReceivedRows] = field(default_factory=dict)
     ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None
     waiting: Waiting | None = None

@@ -21,6 +21,7 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.problem.matrices import inner
 from solvers.soc.anderson import Anderson, AndersonShare, over_relax
+from solvers.soc.rounded_rows import WHOLE
 
 
 class Rotations(enum.Enum):
@@ -41,6 +42,7 @@ class StepSettings:
     alpha: float = 1.0  # over-relaxation
     memory: int = 0  # differences that the acceleration keeps; 0 for no acceleration
     local_passes: int = 1
+    bytes_per_number: int = WHOLE  # of the rows that robots send each other
     alone: Anderson | None = None  # the acceleration, where every robot extrapolates on its own
     rotations: Rotations = Rotations.PROJECTED
 
@@ -112,8 +114,12 @@ class RecursionBlock:
         """
         omega = self.omega if omega is None else omega
         step = over_relax(x, omega, self.settings.alpha) - omega + drift
+        return self.after_map(x, step, self.s + step)
+
+    def after_map(self, x: Array, step: Array, image: Array) -> tuple[RecursionBlock, Array]:
+        """Block with x, and the sums, where the fixed-point map takes s to `image` = s + step."""
         residual = np.sqrt(self.rho)[:, None] * step
-        sums, anderson = self.anderson.observe(residual, self.s + step, self.settings.memory)
+        sums, anderson = self.anderson.observe(residual, image, self.settings.memory)
         return replace(self, x=x, anderson=anderson), sums
 
     def extrapolated(self, agreement: Agreement) -> RecursionBlock:

@@ -16,6 +16,7 @@ from solvers.soc.anderson import Anderson
 from solvers.soc.penalty import BoydPenalty, MultiplierPenalty, PenaltyOrder, PenaltyRule
 from solvers.soc.r_step import BackEnd, RStep
 from solvers.soc.recursion_block import StepSettings
+from solvers.soc.rounded_rows import WHOLE
 from solvers.soc.safeguard import Steps
 
 # The default `separator_penalty`: this times the square root of the translation penalty, but no
@@ -45,6 +46,7 @@ class SOCSettings:
     acceleration: Anderson | None = field(default_factory=Anderson)
     r_step: BackEnd = RStep.FACTORIZED
     local_passes: int = 10
+    bytes_per_number: int = 2
     translation_penalty: float | None = None
     separator_penalty: float | None = None
     tolerance: float = 1e-5
@@ -62,6 +64,8 @@ class SOCSettings:
             not_negative=["separator_penalty", "max_iterations"],
             at_least_one=["local_passes"],
         )
+        if self.bytes_per_number not in (1, 2, WHOLE):
+            raise SettingError(f"bytes_per_number must be 1, 2 or 8, got {self.bytes_per_number}")
         if self.coupling is Coupling.JOINT and self._has_many_robots:
             raise SettingError(f"JOINT has one robot, got {self.robots}; use Coupling.CONSENSUS")
         if self.coupling is Coupling.CONSENSUS and self.robots is None:
@@ -100,9 +104,13 @@ class SOCSettings:
         """The settings that every robot needs for its steps."""
         acceleration = self.acceleration
         if acceleration is None:
-            return StepSettings(self.alpha, memory=0, local_passes=self.local_passes)
-        alone = acceleration if acceleration.per_robot else None
-        return StepSettings(self.alpha, acceleration.memory, self.local_passes, alone)
+            return StepSettings(self.alpha, 0, self.local_passes, self.bytes_per_number)
+        if acceleration.per_robot:
+            memory = acceleration.memory
+            return StepSettings(self.alpha, memory, self.local_passes, WHOLE, acceleration)
+        return StepSettings(
+            self.alpha, acceleration.memory, self.local_passes, self.bytes_per_number
+        )
 
     def penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:
         """Rule of rho, from ||Lambda_i||_2 / m_i of all poses, (n,)."""

@@ -52,6 +52,11 @@ class SOC(SOCSettings):
         Of CONSENSUS alone: how often a robot does (a) to (c) in a round; all but the last of them
         move only the poses that no other robot holds, and cost no message. 1 is the plain
         recursion.
+    bytes_per_number : 1, 2 or 8
+        Of CONSENSUS alone: of the rows that robots send each other. With 2, the default, a robot
+        sends the change of its rows, a number of it as a whole multiple of a 32767th of the
+        largest, and sums for the acceleration in four bytes (`solvers.soc.rounded_rows`); 8 is full
+        precision. Where each robot accelerates alone, rows are sent in full.
     translation_penalty : float or None
         Of CONSENSUS alone: penalty of the translations of separators, the poses that several robots
         hold, as a multiple of their diagonal in M, the matrix of the cost F = tr(X^T M X). The

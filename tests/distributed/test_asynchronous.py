@@ -9,7 +9,16 @@ import pytest
 from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
 from hypothesis import given, settings, strategies as st
-from robots import PARTITIONERS, Partitioner, Recording, arrays_in, driver_at, metis, spoil
+from robots import (
+    PARTITIONERS,
+    Partitioner,
+    Recording,
+    arrays_in,
+    bytes_of,
+    driver_at,
+    metis,
+    spoil,
+)
 
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import Partition, partition
@@ -81,6 +90,7 @@ def test_without_faults_the_states_are_those_of_the_plain_recursion(
         acceleration=None,
         alpha=alpha,
         local_passes=local_passes,
+        bytes_per_number=8,
     )
     method = AsynchronousSOC(soc, alpha=alpha, damping=damping)
     state = method.init(driver, None)
@@ -232,7 +242,7 @@ def test_a_round_is_one_message_a_link_and_no_all_reduce() -> None:
     assert after.rounds == before.rounds + 7
     assert after.all_reduces == before.all_reduces
     sent = [answer for order, _, up in engine.log[-7:] for answer in up]
-    num_bytes = sum(8 * np.size(value) for answer in sent for _, value in arrays_in(answer))
+    num_bytes = sum(bytes_of(value) for answer in sent for _, value in arrays_in(answer))
     assert after.num_bytes - before.num_bytes == num_bytes  # what is lost was sent
 
 

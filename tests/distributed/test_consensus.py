@@ -226,10 +226,11 @@ def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_a_long_accelerated_run_ends_where_one_place_ends(d: int) -> None:
+@pytest.mark.parametrize("bytes_per_number", [1, 2, 8])
+def test_a_long_accelerated_run_ends_where_one_place_ends(d: int, bytes_per_number: int) -> None:
     problem = varied_problem(1, 30, d)
     parts = metis(problem.graph, 4)
-    soc = SOC(robots=parts)
+    soc = SOC(robots=parts, bytes_per_number=bytes_per_number)
     driver = driver_at(problem, parts, None, Recording())
     central = run(soc, problem)
     distributed = run(ConsensusSOC(soc), driver)
@@ -242,7 +243,7 @@ def test_a_long_accelerated_run_ends_where_one_place_ends(d: int) -> None:
             [getattr(record.measurement, figure) for record in distributed.history.records[1:]],
             [getattr(record.measurement, figure) for record in central.history.records[1:]],
             rtol=1e-4,
-            atol=1e-9,
+            atol=1e-9 if bytes_per_number == 8 else 1e-6,  # a number may be rounded up or down
         )
 
 

@@ -21,6 +21,7 @@ from robots import (
     Partitioner,
     Recording,
     arrays_in,
+    bytes_of,
     corner_cases,
     driver_at,
     metis,
@@ -199,8 +200,8 @@ def test_the_ledger_counts_what_was_sent(
             continue
         for robot in range(number):
             for total, message in ((received, down[robot]), (sent, up[robot])):
-                size = 8 * sum(
-                    np.size(value)
+                size = sum(
+                    bytes_of(value)
                     for name, value in arrays_in(message)
                     if not name.startswith("measured")
                 )

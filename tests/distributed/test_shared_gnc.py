@@ -24,7 +24,7 @@ from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.robust import SharedGNC
 from solvers.network.counted_pool import Count
 from solvers.network.engine import InProcess
-from solvers.network.messages import count_numbers
+from solvers.network.messages import count_bytes
 from solvers.network.serialization import deserialize, serialize
 from solvers.robots import Checkpoint
 from solvers.robust.gnc import GNC
@@ -108,7 +108,7 @@ def test_sums_and_costs_are_those_of_the_whole_graph(wrong, loss: RobustLoss) ->
 
 
 def test_what_is_asked_and_told_does_not_grow_with_the_edges() -> None:
-    numbers = []
+    sizes = []
     for length in (40, 80):
         graph = pgo.grid_world(1, length, np.random.default_rng(1), d=2)
         problem = pgo.PGOProblem(graph)
@@ -118,9 +118,9 @@ def test_what_is_asked_and_told_does_not_grow_with_the_edges() -> None:
         sums = order_interior(sum_ratios, agent, order)
         reply = order_interior(reweigh, agent, order)
         boundary = (graph.d + 1) * len(subgraph.part.boundary)
-        assert count_numbers(reply) == boundary + 2 + graph.d * boundary
-        numbers.append((count_numbers(order), count_numbers(sums)))
-    assert numbers == [(4, 7), (4, 7)]
+        assert count_bytes(reply) == 8 * (boundary + 2 + graph.d * boundary)
+        sizes.append((count_bytes(order), count_bytes(sums)))
+    assert sizes == [(32, 56), (32, 56)]
 
 
 def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:

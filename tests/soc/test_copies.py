@@ -38,10 +38,12 @@ FEWER = settings(max_examples=examples(40))  # each example splits a graph and s
 def started(
     problem: PGOProblem, parts: Partition, poses: Poses, soc: SOC | None = None
 ) -> ConsensusState:
-    """Robots at poses with penalties; B in balance as under a MultiplierPenalty."""
-    return LocalConsensus(replace(soc if soc is not None else SOC(), robots=parts)).init(
-        problem, poses
-    )
+    """Robots at poses with penalties; B in balance as under a MultiplierPenalty.
+
+    What they send is not rounded.
+    """
+    settings = replace(soc if soc is not None else SOC(), robots=parts, bytes_per_number=8)
+    return LocalConsensus(settings).init(problem, poses)
 
 
 def drawn(seed: int, n: int, d: int, partitioner: Partitioner) -> tuple[PGOProblem, ConsensusState]:

@@ -166,6 +166,7 @@ def test_consensus_is_its_recursion_robot_by_robot(
         alpha=alpha,
         acceleration=None,
         local_passes=local_passes,
+        bytes_per_number=8,
         translation_penalty=0.1,
     )
     states = iterate(soc, problem)
@@ -358,6 +359,7 @@ def test_couplings_follow_from_the_robots() -> None:
         ({"alpha": 2.0}, r"alpha must be in \(0, 2\)"),
         ({"alpha": np.nan}, r"alpha must be in \(0, 2\)"),
         ({"local_passes": 0}, "local_passes must be at least 1, got 0"),
+        ({"bytes_per_number": 4}, "bytes_per_number must be 1, 2 or 8, got 4"),
         ({"translation_penalty": 0.0}, "translation_penalty must be positive"),
         ({"separator_penalty": -1.0}, "separator_penalty must not be negative"),
         ({"tolerance": 0.0}, "tolerance must be positive"),
@@ -391,7 +393,13 @@ def test_robots_of_another_graph_are_refused() -> None:
 def test_states_of_every_coupling_have_the_letters_of_algorithm_1(num_robots: int) -> None:
     problem = varied_problem(0, 12, 3)
     robots = partition(problem.graph, num_robots)
-    plain = SOC(robots=robots, acceleration=None, local_passes=1, penalty=FixedPenalty(30.0))
+    plain = SOC(
+        robots=robots,
+        acceleration=None,
+        local_passes=1,
+        bytes_per_number=8,
+        penalty=FixedPenalty(30.0),
+    )
     for state, following in pairwise(islice(iterate(plain, problem), 6)):
         expected = state.B + following.x - following.omega  # (c)
         np.testing.assert_allclose(following.B, expected, rtol=0, atol=1e-12)

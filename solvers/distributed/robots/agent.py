@@ -30,7 +30,7 @@ from solvers.network.moments import Recall
 from solvers.network.serialization import deserialize, serialize
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import CopiesState, CopyLayout, Rows, TurnSettings, Waiting
+from solvers.soc.copies import CopiesState, CopyLayout, ReceivedRows, Rows, TurnSettings, Waiting
 from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
 from solvers.soc.subgraph import Subgraph
 
@@ -87,6 +87,7 @@ CLASSES = (
     Anderson,
     AndersonShare,
     AndersonSums,
+    ReceivedRows,
     RobotProof,
     HandednessTerms,
     RobotAscent,

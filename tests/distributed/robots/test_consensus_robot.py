@@ -14,6 +14,7 @@ from robots import (
     Partitioner,
     Recording,
     arrays_in,
+    bytes_of,
     contiguous,
     metis,
     name_of,
@@ -52,20 +53,19 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
         "alpha",
         "memory",
         "local_passes",
+        "bytes_per_number",
         "per_robot",
     ),
     *(
         "regularization",
         "restart_ratio",
-        "norms",
-        "scale",
         "translation",
         "rotation",
         "factor",
         "size",
         "ratio",
     ),
-    *("gamma", "is_best", "sums", "squares", "gradient", "cost", "rotations", "value"),
+    *("gamma", "is_best", "first", "ratios", "squares", "gradient", "cost", "rotations", "value"),
 }
 Copies = ConsensusRobot
 ROUNDS = (  # orders that are, or end, a round
@@ -97,7 +97,7 @@ POSES = ("R", "t", "in_cover")
 ALL_REDUCES = (
     *(
         Copies.travel,
-        Copies.multiplier_norms,
+        Copies.multiplier_ratios,
         Copies.stiffness,
         Copies.start,
         Copies.solve,
@@ -182,15 +182,15 @@ def test_the_ledger_counts_what_was_sent(
         for robot in range(number):
             for name, value in arrays_in(down[robot]):
                 # from robots: counted where it is sent
-                received[:, robot] += 8 * np.size(value) * (">" not in name)
+                received[:, robot] += bytes_of(value) * (">" not in name)
             for name, value in arrays_in(up[robot]):
                 if name == "measured":
                     continue
-                sent[:, robot] += 8 * np.size(value)
+                sent[:, robot] += bytes_of(value)
                 if ">" in name:
                     link = robot, int(name.partition(">")[2])
-                    received[:, link[1]] += 8 * np.size(value)
-                    links[link] = links.get(link, 0) + 8 * np.size(value)
+                    received[:, link[1]] += bytes_of(value)
+                    links[link] = links.get(link, 0) + bytes_of(value)
     np.testing.assert_array_equal(ledger.bytes_sent, sent[0])
     np.testing.assert_array_equal(ledger.bytes_received, received[0])
     between = {
@@ -244,10 +244,10 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
                     kind, between, other = name.partition(">")
                     if not between:
                         assert name in (STAR if order not in ENDS else POSES), (order, name)
-                        if name in ("value", "gamma", "sums", "squares"):
-                            assert np.size(value) <= (
-                                3 + d if order.endswith("travel") else 2 if per_robot else 11
-                            )
+                        if name in ("gamma", "ratios", "squares"):
+                            assert np.size(value) <= (2 if per_robot else 6)
+                        if name == "value" and order.endswith("travel"):
+                            assert np.size(value) <= 3 + d
                         continue
                     poses = common[int(other)]
                     owner = share.robot if is_sent else int(other)
@@ -256,12 +256,17 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
                     allowed = {
                         "force": rows,
                         "rows": rows,
+                        "multiples": rows,
+                        "units": {(2,)},
                         "value": rows,
                         "of_own": {(known, 1 + (d + 1) + d * d)},
                     }
                     assert np.shape(value) in allowed[kind], (order, name)
                     seen.add(kind)
-    assert seen == {"value", "force", "of_own", "rows"}
+    # Robots that accelerate alone send their rows in full.
+    assert seen == {"value", "of_own"} | (
+        {"force", "rows"} if per_robot else {"multiples", "units"}
+    )
     assert engine.times(begin_copies) == 2
 
 
