@@ -150,8 +150,14 @@ def sparse_interface_of(
 
 def share(patch: pytest.MonkeyPatch) -> None:
     """Every front but the root is a robot's, however small it is."""
+    eliminate_all(patch)
     patch.setattr(multifrontal, "LEAST_SEPARATORS", 0)
     patch.setattr(multifrontal, "LEAST_FRONTS", 0)
+
+
+def eliminate_all(patch: pytest.MonkeyPatch) -> None:
+    """Robots leave no poses to the driver, whether that is cheaper or not."""
+    patch.setattr(robots_of_graph, "choose_elimination", tuple)
 
 
 @contextmanager

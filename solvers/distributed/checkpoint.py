@@ -46,7 +46,7 @@ from solvers.soc.copies import SeparatorPenalty
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
-from solvers.soc.rounded_rows import RowChange
+from solvers.soc.rounding import RowChange
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 

@@ -1,7 +1,11 @@
-"""How far robots eliminate: all of their interiors, or less where their areas interleave.
+"""How far robots eliminate: all of their interiors, or less.
 
-Where the fronts of groups of robots would take the driver long, robots leave it the poses that
-would couple many others (`solvers.soc.subdomains`), if its sparse system is then cheaper.
+Eliminating the last poses of an interior couples all poses around it, and the robot's Schur
+complement becomes dense. Robots may leave these poses to the driver (`solvers.soc.subdomains`),
+whose system is then larger and sparse. Robots of one graph do so where their messages become
+shorter and the driver has little to do all the same. They and robots with files of their own, which
+otherwise keep interiors to themselves, do so where the fronts of groups of robots would take the
+driver long and its sparse system is cheaper.
 """
 
 from __future__ import annotations
@@ -25,8 +29,13 @@ from solvers.soc.subgraph import RobotSummary, Subgraph
 ENOUGH_FLOPS = 5e9
 # Poses that a robot couples at most by eliminating one where it leaves poses to the driver. Between
 # 8 and 32 the driver of 16 robots in the plane, 20,000 poses that interleave, takes 0.80e9 to
-# 0.96e9 operations, and the robots send 3.8 to 7.8 MB.
-MOST_COUPLED = 16
+# 0.96e9 operations, and the robots send 3.8 to 7.8 MB. With 4, 8, 16 and 32 a certified solve by 25
+# robots sends 15.8, 16.6, 21.4 and 32.4 MB on sphere2500 (81.3 where all is eliminated), and with
+# 4, 8 and 16 it sends 4.2, 3.9 and 4.1 MB on M3500.
+MOST_COUPLED = 8
+# How often driver and robots exchange vectors on the boundaries with one factor: a solve makes five
+# factors in 11 to 22 rounds.
+_EXCHANGES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +84,14 @@ class CoverSystem:
         return CoverPattern.of(self.touched, self.coupled, len(self.cover), self.width - 1)
 
     @property
+    def num_sent(self) -> int:
+        """Numbers sent for one factor: Schur complements, and vectors on boundaries both ways."""
+        d = self.width - 1
+        num_entries = sum(self.interface((1, d)).num_entries)
+        num_touched = sum(len(poses) for poses in self.touched)
+        return num_entries + 2 * _EXCHANGES * d * (d + 1) * num_touched
+
+    @property
     def middle(self) -> int:
         """Position in the cover of a pose in the middle, by the number of steps between poses.
 
@@ -113,13 +130,27 @@ def may_leave_poses(system: CoverSystem) -> bool:
 
 
 def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
-    """Return the subgraphs with the cover for which the driver takes fewer operations."""
+    """Return the subgraphs of one graph with the cover that suits driver and robots better.
+
+    The larger one is tried where messages are longer than a list of all edges. It is chosen where
+    they then become shorter and the driver takes few operations, or fewer than before.
+    """
     system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
-    if not may_leave_poses(system):
+    num_edges = sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs)
+    are_short = system.num_sent <= num_edges * numbers_of_edge(subgraphs[0].graph.d)
+    has_cholmod = default_backend() is CholeskyBackend.CHOLMOD
+    if not has_cholmod or (are_short and system.flops < ENOUGH_FLOPS):
         return tuple(subgraphs)
     larger = leave_poses(subgraphs, MOST_COUPLED)
     sparse = CoverSystem.of([subgraph.summary for subgraph in larger])
-    return larger if sparse.flops < system.flops else tuple(subgraphs)
+    is_shorter = sparse.num_sent < system.num_sent and sparse.flops < ENOUGH_FLOPS
+    is_quicker = sparse.flops < system.flops and system.flops >= ENOUGH_FLOPS
+    return larger if is_shorter or is_quicker else tuple(subgraphs)
+
+
+def numbers_of_edge(d: int) -> int:
+    """Numbers of an edge in a list: a relative pose, and two weights."""
+    return d * (d + 1) // 2 + 2
 
 
 def leave_poses(subgraphs: Sequence[Subgraph], most_coupled: int) -> tuple[Subgraph, ...]:

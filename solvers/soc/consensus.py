@@ -45,7 +45,7 @@ from solvers.soc.copies import (
 )
 from solvers.soc.penalty import MultiplierPenalty, PenaltyOrder
 from solvers.soc.recursion_block import Agreement, Rotations
-from solvers.soc.rounded_rows import WHOLE
+from solvers.soc.rounding import WHOLE, ShortNumbers
 from solvers.soc.safeguard import Due, SharedSteps, next_penalty
 from solvers.soc.separator_stiffness import TRANSLATION_PENALTY, adapted_penalty, fell_most
 from solvers.soc.settings import SOCSettings
@@ -180,9 +180,10 @@ class Consensus:
         if not math.isfinite(merit):
             return state.broken()
         gamma, anderson = state.sums.coefficients(self._common_acceleration, state.ahead)
+        told: Array | ShortNumbers | None = gamma
         if gamma is not None and self.soc.bytes_per_number < WHOLE:
-            gamma = gamma.astype(np.float32)
-        agreement = Agreement(gamma, state.is_best(merit))
+            told = ShortNumbers.of(gamma)
+        agreement = Agreement(told, state.is_best(merit))
         orders = [(agreement, rows) for rows in state.rows]
         # (b) projection and (c) Bregman update, and (a) of the next iteration
         answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)

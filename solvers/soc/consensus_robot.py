@@ -37,7 +37,7 @@ from solvers.soc.recursion_block import (
     nearest_rotations,
     stationary_B,
 )
-from solvers.soc.rounded_rows import WHOLE, PartOfSums, RowChange
+from solvers.soc.rounding import WHOLE, PartOfSums, RowChange
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
 

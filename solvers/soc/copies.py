@@ -14,7 +14,7 @@ from pgo_models.problem.matrices import columns_of
 from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
 from solvers.soc.recursion_block import RecursionBlock, StepSettings
-from solvers.soc.rounded_rows import PartOfSums, RowChange
+from solvers.soc.rounding import PartOfSums, RowChange
 from solvers.soc.subgraph import PartProblem, Subgraph
 
 Rows = Mapping[int, Array]  # to or from every neighbour

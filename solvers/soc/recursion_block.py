@@ -21,7 +21,7 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.problem.matrices import inner
 from solvers.soc.anderson import Anderson, AndersonShare, over_relax
-from solvers.soc.rounded_rows import WHOLE
+from solvers.soc.rounding import WHOLE, ShortNumbers
 
 
 class Rotations(enum.Enum):
@@ -51,8 +51,14 @@ class StepSettings:
 class Agreement:
     """What all parties learn from the sums of step (a)."""
 
-    gamma: Array | None  # (q,): coefficients of the acceleration; None restarts it
+    coefficients: Array | ShortNumbers | None  # (q,): of the acceleration; None restarts it
     is_best: bool  # whether the s before this step has the smallest merit
+
+    @property
+    def gamma(self) -> Array | None:
+        """Coefficients gamma of the acceleration, (q,), as all parties have them."""
+        given = self.coefficients
+        return given.numbers if isinstance(given, ShortNumbers) else given
 
 
 @dataclass(frozen=True, eq=False)

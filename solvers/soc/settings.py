@@ -16,7 +16,7 @@ from solvers.soc.anderson import Anderson
 from solvers.soc.penalty import BoydPenalty, MultiplierPenalty, PenaltyOrder, PenaltyRule
 from solvers.soc.r_step import BackEnd, RStep
 from solvers.soc.recursion_block import StepSettings
-from solvers.soc.rounded_rows import WHOLE
+from solvers.soc.rounding import WHOLE
 from solvers.soc.safeguard import Steps
 
 # The default `separator_penalty`: this times the square root of the translation penalty, but no

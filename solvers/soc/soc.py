@@ -55,7 +55,7 @@ class SOC(SOCSettings):
     bytes_per_number : 1, 2 or 8
         Of CONSENSUS alone: of the rows that robots send each other. With 2, the default, a robot
         sends the change of its rows, a number of it as a whole multiple of a 32767th of the
-        largest, and sums for the acceleration in four bytes (`solvers.soc.rounded_rows`); 8 is full
+        largest, and sums for the acceleration in four bytes (`solvers.soc.rounding`); 8 is full
         precision. Where each robot accelerates alone, rows are sent in full.
     translation_penalty : float or None
         Of CONSENSUS alone: penalty of the translations of separators, the poses that several robots

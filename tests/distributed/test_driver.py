@@ -24,6 +24,7 @@ from robots import (
     bytes_of,
     corner_cases,
     driver_at,
+    eliminate_all,
     metis,
 )
 
@@ -88,6 +89,7 @@ def test_the_chordal_start_is_the_central_one(
 def test_the_translations_are_asked_for_again_when_their_first_factorisation_failed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    eliminate_all(monkeypatch)
     problem = varied_problem(4, 15, 3)
     driver = open_driver(problem, metis(problem.graph, 3), InProcess(), 4e9)
     start = random_poses(15, 3, 0)
@@ -262,8 +264,9 @@ def lower(g: int, width: int) -> tuple[int]:
 @pytest.mark.parametrize("noise", [MILD_NOISE, LOUD_NOISE])
 @pytest.mark.parametrize(("d", "soc"), [(2, AUTO), (2, WARM_START), (3, AUTO)])
 def test_what_crosses_has_the_size_of_the_separators(
-    d: int, soc: FirstStage, noise: NoiseModel
+    d: int, soc: FirstStage, noise: NoiseModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    eliminate_all(monkeypatch)
     solution, engine = solved(7, 40, d, metis, noise, soc)
     graph = solution.problem.graph
     parts = solution.robots
@@ -291,7 +294,7 @@ def test_what_crosses_has_the_size_of_the_separators(
             "scale": {(inside,)},
             **{name: {((d + 1) * g,)} for name in ("fixed", "sizes")},
             **{name: {((d + 1) * g, d)} for name in ("point", "product", "error")},
-            "gamma": {(k,) for k in range(memory + 1)},
+            "coefficients": {(k,) for k in range(memory + 1)},
             "sums": {(k,) for k in range(2 * memory + 2)},
         }
         sums = allowed["sums"]
@@ -317,7 +320,7 @@ def test_what_crosses_has_the_size_of_the_separators(
                     seen.add(name)
     assert {"schur", "b", "x", "value", "force"} <= seen
     if any(stage.name == "SOC" for stage in solution.stages):
-        assert {"sums", "gamma", "norms", "scale"} <= seen
+        assert {"sums", "coefficients", "norms", "scale"} <= seen
     else:
         assert solution.stages[0].name == "averaged start"
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graphs import varied_graph
-from robots import Killed, Recording, arrays_in, share
+from robots import Killed, Recording, arrays_in, eliminate_all, share
 
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
@@ -156,6 +156,7 @@ def test_every_front_but_the_root_has_a_robot_of_its_group(shared: None) -> None
 def test_large_fronts_are_robots_and_few_or_small_ones_the_driver_s(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    eliminate_all(monkeypatch)
     graph = grid_world(16, 60, np.random.default_rng(0), d=2)
     parts = partition(graph, 16, PartitionMethod.METIS)
     for least, few, expected in ((30, 3, True), (30, 100, False), (10**6, 3, False)):

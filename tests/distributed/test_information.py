@@ -12,7 +12,7 @@ import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, informed, varied_graph
 from hypothesis import given, settings, strategies as st
-from robots import driver_at
+from robots import driver_at, eliminate_all
 
 import solvers
 from pgo_models.certificates.certificate import Verdict
@@ -161,6 +161,7 @@ def test_robots_count_the_constants_of_their_tangents_and_their_errors(
 def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(
     eta: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    eliminate_all(monkeypatch)
     problem = of_file(3, 12, 3, coupled=True)
     seen = []
     rounding = Interface.rounding

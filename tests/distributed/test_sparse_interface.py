@@ -103,12 +103,26 @@ def test_robots_leave_poses_where_their_areas_interleave(monkeypatch: pytest.Mon
         assert isinstance(driver.interface(1), SparseInterface) is is_sparse
 
 
-def test_without_many_operations_nothing_is_left() -> None:
-    graph = grid_world(4, 60, np.random.default_rng(0), d=2)
+def test_robots_leave_poses_where_their_messages_become_shorter() -> None:
+    graph = grid_world(8, 30, np.random.default_rng(0), d=2)
     shares = split_graph(PGOProblem(graph), partition(graph, 4))
-    assert choose_elimination(shares) == tuple(shares)
+    chosen = choose_elimination(shares)
+    assert all(share.is_sparse for share in chosen)
+    before, after = (CoverSystem.of([s.summary for s in some]) for some in (shares, chosen))
+    assert after.num_sent < before.num_sent
     driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess(), memory=0)
     assert not isinstance(driver.interface(1), SparseInterface)
+    driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
+    assert isinstance(driver.interface(1), SparseInterface)
+
+
+def test_nothing_is_left_where_all_messages_are_shorter_than_the_edges(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = grid_world(4, 400, np.random.default_rng(0), d=2)
+    shares = split_graph(PGOProblem(graph), partition(graph, 4, PartitionMethod.METIS))
+    monkeypatch.setattr(elimination_choice, "leave_poses", None)  # is not called
+    assert choose_elimination(shares) == tuple(shares)
 
 
 def test_memory_is_known_before_it_is_spent() -> None:

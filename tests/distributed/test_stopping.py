@@ -201,7 +201,7 @@ def test_the_stopping_test_is_on_the_ledger() -> None:
         for _, part in arrays_in(message)
     )
     assert after.all_reduces == before.all_reduces + 1
-    down = 8 * sum(1 + (0 if order[0].gamma is None else order[0].gamma.size) for order in orders)
+    down = sum(8 + 2 * len(order[0].gamma) for order in orders)
     assert after.num_bytes - before.num_bytes == rows + 8 * 5 * num_robots + down
 
 

@@ -335,7 +335,11 @@ def test_rescaling_keeps_the_unscaled_multiplier(
     changes = 0
     for split in (None, robots):
         soc = SOC(
-            penalty=BalancedPenalty(scale=100.0), robots=split, acceleration=None, local_passes=1
+            penalty=BalancedPenalty(scale=100.0),
+            robots=split,
+            acceleration=None,
+            local_passes=1,
+            bytes_per_number=8,
         )
         states = list(islice(iterate(soc, problem), 60))
         for before, after in pairwise(states):

@@ -65,7 +65,19 @@ STAR = {  # to and from whoever sums up: settings, figures of all poses in no or
         "size",
         "ratio",
     ),
-    *("gamma", "is_best", "first", "ratios", "squares", "gradient", "cost", "rotations", "value"),
+    *(
+        "mantissas",
+        "exponents",
+        "coefficients",
+        "is_best",
+        "first",
+        "ratios",
+        "squares",
+        "gradient",
+        "cost",
+        "rotations",
+        "value",
+    ),
 }
 Copies = ConsensusRobot
 ROUNDS = (  # orders that are, or end, a round
@@ -244,7 +256,7 @@ def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
                     kind, between, other = name.partition(">")
                     if not between:
                         assert name in (STAR if order not in ENDS else POSES), (order, name)
-                        if name in ("gamma", "ratios", "squares"):
+                        if name in ("mantissas", "exponents", "ratios", "squares"):
                             assert np.size(value) <= (2 if per_robot else 6)
                         if name == "value" and order.endswith("travel"):
                             assert np.size(value) <= 3 + d

@@ -1,4 +1,4 @@
-"""Messages of CONSENSUS in few bytes: steps of rows as small integers, and sums in float32.
+"""Messages of CONSENSUS in few bytes: steps of rows as small integers, and sums in few digits.
 
 Neighbours have a robot's rows of s, and it sends them the step of the fixed-point map from there,
 in whole multiples of a unit: the largest step divided by 127 (one byte a number) or 32767 (two).
@@ -61,6 +61,29 @@ def _of_rows(units: Array, rows: Array) -> Array:
     d = rows.shape[1]
     q = len(rows) // (d + 1)
     return np.repeat(units, [q, d * q])[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class ShortNumbers:
+    """Numbers in two bytes each, m 2^e with a mantissa m of one: two digits, whatever their size.
+
+    Coefficients of the acceleration need no more, as long as all parties have the same.
+    """
+
+    mantissas: NDArray[np.int8]
+    exponents: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, numbers: Array) -> ShortNumbers:
+        """Round numbers, (q,), to 1/128 of themselves at most."""
+        fractions, exponents = np.frexp(numbers)  # 1/2 <= |fraction| < 1
+        mantissas = np.clip(np.rint(128.0 * fractions), -127, 127)
+        return cls(mantissas.astype(np.int8), np.clip(exponents, -128, 127).astype(np.int8))
+
+    @property
+    def numbers(self) -> Array:
+        """The numbers as they were rounded, (q,)."""
+        return np.ldexp(self.mantissas / 128.0, self.exponents)
 
 
 @dataclass(frozen=True, eq=False)

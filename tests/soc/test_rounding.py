@@ -16,7 +16,7 @@ from solvers.network.ledger import DRIVER
 from solvers.network.messages import count_bytes
 from solvers.result import Status
 from solvers.soc.anderson import AndersonShare
-from solvers.soc.rounded_rows import PartOfSums, RowChange
+from solvers.soc.rounding import PartOfSums, RowChange, ShortNumbers
 from solvers.soc.soc import SOC
 
 BYTES = st.sampled_from([1, 2])
@@ -66,6 +66,17 @@ def test_sums_of_any_size_have_the_digits_of_float32(seed, k, exponent):
     np.testing.assert_array_equal(none.sums, 0.0)
 
 
+@given(seed=SEEDS, q=st.integers(0, 8), exponent=st.integers(-37, 37))
+def test_coefficients_of_any_size_have_two_digits(seed, q, exponent):
+    exact = 10.0**exponent * np.random.default_rng(seed).standard_normal(q)
+    short = ShortNumbers.of(exact)
+    np.testing.assert_allclose(short.numbers, exact, rtol=1 / 128)
+    assert count_bytes(short) == 2 * q
+    np.testing.assert_array_equal(ShortNumbers.of(np.zeros(3)).numbers, 0.0)
+    powers = np.array([1.0, -0.5, 2.0, 0.99999, -0.99999])
+    np.testing.assert_allclose(ShortNumbers.of(powers).numbers, powers, rtol=1 / 128)
+
+
 @pytest.mark.parametrize("rows", [4, 2000])
 def test_all_who_have_a_row_extrapolate_it_to_the_same_bits(rows):
     rng = np.random.default_rng(rows)
@@ -113,5 +124,5 @@ def test_two_bytes_take_the_rounds_of_eight_and_far_fewer_bytes(d: int) -> None:
         objective = result.history.records[-1].measurement.objective
         ends[num_bytes] = (result.iterations, between_robots, objective)
     assert ends[2][0] <= 1.1 * ends[8][0]
-    assert ends[2][1] <= 0.4 * ends[8][1]
+    assert ends[2][1] <= 0.45 * ends[8][1]
     assert ends[2][2] == pytest.approx(ends[8][2], rel=1e-9)
