@@ -75,6 +75,7 @@ class PartitionReport:
     separators: IntArray  # (num_robots,): poses of every robot that have an edge to another
     cover: int  # poses of the vertex cover, for which the driver of SUBSTRUCTURED solves
     copies: int  # copies of separator poses that robots hold of others' poses
+    d: int  # dimension of the space
 
     @property
     def balance(self) -> float:
@@ -91,6 +92,8 @@ class PartitionReport:
         """Labels and figures, as they are printed."""
         sizes = f"{self.sizes.min()} to {self.sizes.max()}"
         share = self.num_cut_edges / self.num_edges
+        # A pose has d (d + 1) numbers; the shortest that are sent take two bytes (`SOC`).
+        least = 2 * self.d * (self.d + 1) * self.copies
         range_of_separators = f"{self.separators.min()} to {self.separators.max()}"
         return [
             ("robots", f"{self.num_robots}"),
@@ -99,6 +102,7 @@ class PartitionReport:
             ("separators", f"{self.separators.sum()} ({range_of_separators} a robot)"),
             ("vertex cover", f"{self.cover}"),
             ("copies", f"{self.copies}"),
+            ("iteration", f"{least:,} bytes at least, every copy once with two bytes a number"),
         ]
 
 
@@ -125,4 +129,5 @@ def report_partition(partition: Partition, graph: PoseGraph) -> PartitionReport:
         separators=np.bincount(owners, minlength=partition.num_robots),
         cover=len(vertex_cover(partition, graph)),
         copies=len(copies),
+        d=graph.d,
     )

@@ -22,6 +22,7 @@ from solvers.distributed.interface import Interface
 from solvers.distributed.multifrontal import FrontOwners, flops_of_fronts
 from solvers.distributed.robots.subdomain_blocks import Widths
 from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
+from solvers.network.ledger import BYTES_PER_NUMBER
 from solvers.soc.subgraph import RobotSummary, Subgraph
 
 # Operations of a factorisation by fronts from which another way is tried; LAPACK takes about 0.15
@@ -136,8 +137,7 @@ def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
     they then become shorter and the driver takes few operations, or fewer than before.
     """
     system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
-    num_edges = sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs)
-    are_short = system.num_sent <= num_edges * numbers_of_edge(subgraphs[0].graph.d)
+    are_short = BYTES_PER_NUMBER * system.num_sent <= bytes_of_edges(subgraphs)
     has_cholmod = default_backend() is CholeskyBackend.CHOLMOD
     if not has_cholmod or (are_short and system.flops < ENOUGH_FLOPS):
         return tuple(subgraphs)
@@ -148,9 +148,11 @@ def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
     return larger if is_shorter or is_quicker else tuple(subgraphs)
 
 
-def numbers_of_edge(d: int) -> int:
-    """Numbers of an edge in a list: a relative pose, and two weights."""
-    return d * (d + 1) // 2 + 2
+def bytes_of_edges(subgraphs: Sequence[Subgraph]) -> int:
+    """Bytes of a list of all edges, each a relative pose and two weights."""
+    d = subgraphs[0].graph.d
+    num_edges = sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs)
+    return BYTES_PER_NUMBER * num_edges * (d * (d + 1) // 2 + 2)
 
 
 def leave_poses(subgraphs: Sequence[Subgraph], most_coupled: int) -> tuple[Subgraph, ...]:

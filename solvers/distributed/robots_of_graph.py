@@ -18,7 +18,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.driver_place import AttemptWithFaults, DriverPlace, chosen_soc
-from solvers.distributed.elimination_choice import choose_elimination
+from solvers.distributed.elimination_choice import bytes_of_edges, choose_elimination
 from solvers.distributed.handedness import (
     RobotsPoint,
     begin_without_terms,
@@ -64,7 +64,10 @@ def open_driver(
     grounded = middle_separator(problem.graph, subgraphs)
     summaries = [subgraph.summary for subgraph in subgraphs]
     start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
-    return Driver(summaries, problem.num_poses, start, memory, grounded)
+    driver = Driver(summaries, problem.num_poses, start, memory, grounded)
+    ledger = driver.network.ledger
+    driver.network.ledger = replace(ledger, graph_bytes=bytes_of_edges(subgraphs))
+    return driver
 
 
 @dataclass(frozen=True, eq=False)

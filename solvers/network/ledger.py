@@ -74,6 +74,9 @@ class Ledger(Summarised):
         Bytes of the snapshots for recovery and checkpoints, which robots send to the driver's
         process. They are not part of an algorithm's communication, and are in none of the other
         figures.
+    graph_bytes : int
+        Bytes of a list of all edges, each with a relative pose of d (d + 1) / 2 numbers and two
+        weights: what it would take to gather the graph in one place. 0 where no process knows it.
 
     Examples
     --------
@@ -89,6 +92,7 @@ class Ledger(Summarised):
     all_reduce_bytes: int = 0
     counted: tuple[tuple[Traffic, int], ...] = ()
     snapshot_bytes: int = 0
+    graph_bytes: int = 0
 
     def after_round(self, *exchanged: Traffic) -> Ledger:
         """Return the ledger after one more round with these exchanges.
@@ -190,6 +194,7 @@ class Ledger(Summarised):
             all_reduce_bytes=self.all_reduce_bytes + other.all_reduce_bytes,
             counted=tuple(counted.items()),
             snapshot_bytes=self.snapshot_bytes + other.snapshot_bytes,
+            graph_bytes=max(self.graph_bytes, other.graph_bytes),
         )
 
     @property
@@ -265,7 +270,10 @@ class Ledger(Summarised):
         both_ways = self.bytes_sent + self.bytes_received
         of_one = f"of one robot {both_ways.min():,} to {both_ways.max():,}"
         counts = f"{self.rounds} rounds, {self.all_reduces} all-reduces, {self.messages} messages"
-        facts = [("network", counts), ("bytes", f"{self.num_bytes:,}; {of_one}")]
+        sent = f"{self.num_bytes:,}"
+        if self.graph_bytes:
+            sent += f", {self.num_bytes / self.graph_bytes:.2g} times a list of all edges"
+        facts = [("network", counts), ("bytes", f"{sent}; {of_one}")]
         if self.snapshot_bytes:
             target = "to the driver's process, interior poses among them"
             facts.append(("snapshots", f"{self.snapshot_bytes:,} bytes {target}"))

@@ -55,6 +55,7 @@ def network_json(ledger: Ledger, robots: Partition) -> dict[str, object]:
         "messages": ledger.messages,
         "bytes": ledger.num_bytes,
         "snapshot_bytes": ledger.snapshot_bytes,
+        "graph_bytes": ledger.graph_bytes,
         "bytes_sent": ledger.bytes_sent.tolist(),
         "bytes_received": ledger.bytes_received.tolist(),
     }

@@ -105,7 +105,9 @@ def test_a_report_shows_the_same_facts_as_text_and_as_html() -> None:
     report = report_partition(partition(graph, 3), graph)
     text = str(report)
     html = report._repr_html_()
-    assert len(text.splitlines()) == 6
+    assert len(text.splitlines()) == 7
+    least = 2 * graph.d * (graph.d + 1) * report.copies
+    assert f"{least:,} bytes at least" in text
     for line in text.splitlines():
         assert line[13:] in html
 
