@@ -40,7 +40,6 @@ from solvers.request import Pipeline
 from solvers.result import Record, Stage, Status
 from solvers.robots import Robots
 from solvers.soc.r_step import RStep
-from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 
@@ -145,8 +144,8 @@ def solve_folder(
 
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it. An
     edge between two robots may be in the file of either, or of both. Start, SOC, Newton,
-    certificate and staircase are those of `solve(.., robots=..)`. CONSENSUS, robust losses, priors,
-    landmarks, checkpoints and an ascent of handedness terms need `solve`. A robot that is lost
+    certificate and staircase are those of `solve(.., robots=..)`. Robust losses, priors, landmarks,
+    checkpoints and an ascent of handedness terms need `solve`. A robot that is lost
     reads its file again, and is sent again all that it had received. The frame is that of the first
     pose with a FIX line, or else of the first pose of all, where its file has it.
 
@@ -179,8 +178,8 @@ def solve_folder(
     Raises
     ------
     SettingError
-        When the first stage is no SUBSTRUCTURED SOC that factors its subproblems, or the weighting
-        is that of rotations alone.
+        When the first stage is no SOC that factors its subproblems, or the weighting is that of
+        rotations alone.
     PGOError
         As of `solve`, and for files that cannot be read as of `read_g2o`.
 
@@ -264,10 +263,8 @@ def _check_first_stage(soc: FirstStage) -> None:
     """Raise a SettingError for a first stage that robots with own files cannot run."""
     if soc is None or soc is AUTO:
         return
-    if type(soc) is not SOC or soc.effective_coupling is Coupling.CONSENSUS:
-        raise SettingError(
-            f"robots with files of their own run SUBSTRUCTURED SOC, got {soc}; {READ_HERE}"
-        )
+    if type(soc) is not SOC:
+        raise SettingError(f"robots with files of their own run SOC(..), got {soc}; {READ_HERE}")
     if soc.robots is not None or soc.r_step is not RStep.FACTORIZED:
         raise SettingError(
             f"robots are those of the files, and factor their subproblems, got {soc}; {READ_HERE}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +28,8 @@ class Network:
     now: float = 0.0
     asleep: set[str] = field(default_factory=set)
     carried: int = 0  # bytes that have arrived
+    # Whether a message, by sender, receiver and bytes, is lost, beside those lost at random.
+    is_lost: Callable[[str, str, bytes], bool] = lambda sender, receiver, data: False
     _on_the_way: list[tuple[float, int, str, bytes]] = field(default_factory=list)
     _count: int = 0
 
@@ -60,6 +63,8 @@ class Network:
         for message in robot.outbox():
             copies = 1 + (self.rng.random() < self.repeated)
             for _ in range(copies):
+                if self.is_lost(name, message.to, message.data):
+                    continue
                 if self.rng.random() >= self.lost:
                     self._count += 1
                     when = self.now + self.delay * self.rng.exponential()
@@ -80,6 +85,7 @@ def robots_of(
     weighting: pgo.Weighting = pgo.Weighting.ISOTROPIC,
     sharing: solvers.Sharing = solvers.Sharing.INTERFACE,
     robust: solvers.GNC | None = None,
+    pipeline: solvers.Pipeline | None = None,
 ) -> dict[str, solvers.Robot]:
     """A robot for every part of a graph, with its own poses and the edges that begin at them."""
     owners = pgo.partition(graph, num_robots).robot
@@ -89,6 +95,7 @@ def robots_of(
             name,
             names,
             KEY,
+            pipeline=pipeline,
             weighting=weighting,
             sharing=sharing,
             robust=robust,

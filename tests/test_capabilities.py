@@ -84,6 +84,8 @@ def own_files(
     unknown = set(options) - {"callback", "time_limit", "robots"}
     if unknown:
         raise pgo.PGOError(f"solve_folder has no option {unknown.pop()}")
+    if isinstance(pipeline.soc, solvers.SOC):  # who owns which poses is in the files
+        pipeline = replace(pipeline, soc=replace(pipeline.soc, robots=None))
     with tempfile.TemporaryDirectory() as folder:
         robots = np.arange(graph.num_poses) * 2 // graph.num_poses
         if graph.world is not None:

@@ -14,6 +14,7 @@ import pytest
 import typer
 
 from solvers.cli import app as cli, options as cli_options
+from solvers.cli.robot_command import MethodOfTeam
 
 ROOT = Path(__file__).parent.parent
 SITE = ROOT / "notebooks" / "site"
@@ -152,6 +153,7 @@ CHOICES = {
     "--r-step": cli_options.BackEndName,
     "--robust": cli_options.Robust,
 }
+CHOICES_OF_COMMANDS = {("robot", "--method"): MethodOfTeam}
 
 
 def section_of(command: str) -> str:
@@ -176,7 +178,8 @@ def test_the_page_of_the_command_line_has_every_option_with_its_choices(name):
     for option in options:
         names, effect = shown[option.opts[0]]
         assert names == set(option.opts)
-        for choice in CHOICES.get(option.opts[0], ()):
+        of_all = CHOICES.get(option.opts[0], ())
+        for choice in CHOICES_OF_COMMANDS.get((name, option.opts[0]), of_all):
             assert f"`{choice.value}`" in effect, f"{option.opts[0]} {choice.value}"
 
 

@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
@@ -84,6 +85,11 @@ def chosen_pipeline(
     if method is FirstStage.CONSENSUS:
         soc = replace(soc, coupling=Coupling.CONSENSUS)
     return Pipeline(soc=soc, gap=gap)
+
+
+def pipeline_of_robots(method: FirstStage) -> Pipeline:
+    """Pipeline of robots with files of their own, with one of the methods `ON_ROBOTS`."""
+    return chosen_pipeline(method, None, None, DEFAULT_GAP, None, None)
 
 
 def chosen_memory(method: FirstStage, driver_memory: float | None) -> float:

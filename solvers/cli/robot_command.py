@@ -1,5 +1,6 @@
 """`pgo robot`: one robot of a team, on its own machine, with its own file."""
 
+import enum
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,8 +10,8 @@ import typer
 from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.files import check_writable
 from pgo_models.problem.weighting import Weighting
-from solvers.cli.choices import chosen_robust
-from solvers.cli.options import Cost, CostOption, Robust
+from solvers.cli.choices import chosen_robust, pipeline_of_robots
+from solvers.cli.options import Cost, CostOption, FirstStage, Robust
 from solvers.cli.shell import (
     DONE,
     NOT_CERTIFIED,
@@ -30,6 +31,14 @@ _WEIGHTINGS = {
     Cost.CHI2: Weighting.INFORMATION,
     Cost.ISOTROPIC: Weighting.ISOTROPIC,
 }
+
+
+class MethodOfTeam(enum.Enum):
+    """First stage of robots that keep their measurements."""
+
+    SUBSTRUCTURED = "substructured"
+    CONSENSUS = "consensus"
+    NEWTON = "newton"
 
 
 def robot_command(
@@ -57,6 +66,10 @@ def robot_command(
         Path | None, typer.Option("--out", "-o", help="Write this robot's poses and edges as .g2o.")
     ] = None,
     cost: CostOption = None,
+    method: Annotated[
+        MethodOfTeam | None,
+        typer.Option(help="First stage of robots that keep their measurements; newton for none."),
+    ] = None,
     share_measurements: Annotated[
         bool,
         typer.Option(
@@ -88,11 +101,14 @@ def robot_command(
         check_writable(out)
     if cost not in _WEIGHTINGS:
         raise SettingError("robots of a team minimise chi2 or F; give --cost chi2 or isotropic")
+    if method is not None and share_measurements:
+        raise SettingError("--method is for robots that keep their measurements; leave it out")
     names = [word.strip() for word in team.split(",")]
     robot = Robot(
         name,
         names,
         _secret(key),
+        pipeline=None if method is None else pipeline_of_robots(FirstStage(method.value)),
         weighting=_WEIGHTINGS[cost],
         sharing=Sharing.MEASUREMENTS if share_measurements else Sharing.INTERFACE,
         robust=chosen_robust(robust),

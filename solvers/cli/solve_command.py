@@ -258,7 +258,7 @@ def solve_command(
         raise SettingError("--prove-outliers is of a robust solve; add --robust gnc")
     network.check_without_driver(stages, outputs.proof, graph)
     if network.reads_own_files(graph):
-        _refuse_what_needs_the_graph(given, outputs, source.chosen_cost, method)
+        _refuse_what_needs_the_graph(given, outputs, source.chosen_cost)
         raise typer.Exit(_solve_own_files(source, stages, network, display, outputs))
     outputs.check_pages()
     with JobBar(1, None if takes_long_to_read(graph) else False, f"reading {graph}"):
@@ -518,18 +518,11 @@ def _given_options(arguments: dict[str, object]) -> set[str]:
     return {name for name, value in arguments.items() if value is not None and value is not False}
 
 
-def _refuse_what_needs_the_graph(
-    given: set[str], outputs: Outputs, cost: Cost | None, method: FirstStage | None
-) -> None:
+def _refuse_what_needs_the_graph(given: set[str], outputs: Outputs, cost: Cost | None) -> None:
     """Raise a SettingError for an option that robots with own files cannot serve.
 
     Nobody has the whole graph then.
     """
-    if method is FirstStage.CONSENSUS:
-        raise SettingError(
-            "--method consensus is not run by robots with files of their own; leave it out, "
-            "or have the graph read in one process: --split given --method consensus"
-        )
     others = sorted(given - choices.FOR_OWN_FILES)
     out = outputs.out
     if not others and (len(out) > 1 or (out and out[0].suffix)):

@@ -272,7 +272,7 @@ class Ledger(Summarised):
         counts = f"{self.rounds} rounds, {self.all_reduces} all-reduces, {self.messages} messages"
         sent = f"{self.num_bytes:,}"
         if self.graph_bytes:
-            sent += f", {self.num_bytes / self.graph_bytes:.2g} times a list of all edges"
+            sent += f", {self.num_bytes / self.graph_bytes:.2g} times all edges"
         facts = [("network", counts), ("bytes", f"{sent}; {of_one}")]
         if self.snapshot_bytes:
             target = "to the driver's process, interior poses among them"

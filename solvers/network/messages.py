@@ -5,6 +5,7 @@ Requests and answers are numbers, arrays and records.
 
 import enum
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,6 +37,19 @@ class Worker(Protocol):
         snapshot : mapping of str to array
             Arrays by name, of the shapes that `snapshot` returned.
         """
+
+
+@dataclass(frozen=True)
+class Token:
+    """Stands for a message that a robot sends another itself: number `number` of its answer.
+
+    The answer is that to order number `call`. The message has so many bytes.
+    """
+
+    sender: int
+    call: int
+    number: int
+    num_bytes: int
 
 
 class Idle(enum.Enum):
@@ -102,6 +116,8 @@ def count_bytes(record: object, ignored_fields: Collection[str] = ()) -> int:
         return record.nbytes
     if record is None or isinstance(record, Mapping):
         return 0
+    if isinstance(record, Token):
+        return record.num_bytes
     if isinstance(record, tuple):
         return sum(count_bytes(item, ignored_fields) for item in record)
     fields = getattr(type(record), "__dataclass_fields__", None)

@@ -68,8 +68,6 @@ class SOCSettings:
             raise SettingError(f"bytes_per_number must be 1, 2 or 8, got {self.bytes_per_number}")
         if self.coupling is Coupling.JOINT and self._has_many_robots:
             raise SettingError(f"JOINT has one robot, got {self.robots}; use Coupling.CONSENSUS")
-        if self.coupling is Coupling.CONSENSUS and self.robots is None:
-            raise SettingError("CONSENSUS needs robots; see pgo_models.partition()")
 
     @property
     def effective_coupling(self) -> Coupling:

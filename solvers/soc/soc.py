@@ -9,12 +9,13 @@ omega, B and rho in common.
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.result import Measurement, Status
 from solvers.soc.joint import Joint, SOCState
-from solvers.soc.settings import SOCSettings
+from solvers.soc.settings import Coupling, SOCSettings
 
 if TYPE_CHECKING:
     from solvers.soc.consensus import ConsensusState, LocalConsensus
@@ -38,7 +39,8 @@ class SOC(SOCSettings):
         `robots` and CONSENSUS with them. SUBSTRUCTURED has the iterates of JOINT: this class runs
         it as JOINT, and `solve(.., robots=..)` runs it on robots.
     robots : Partition or None
-        Which robot owns which poses.
+        Which robot owns which poses. `solve(.., robots=..)` and robots with files of their own know
+        it without.
     penalty : PenaltyRule
         Rule of the ADMM penalty rho: MultiplierPenalty, FixedPenalty, BalancedPenalty, or an own
         one.
@@ -117,6 +119,8 @@ class SOC(SOCSettings):
         that of a stationary point (`ConsensusRobot.start`).
         """
         problem.check_quadratic("SOC", convex=True)
+        if self.coupling is Coupling.CONSENSUS and self.robots is None:
+            raise SettingError("CONSENSUS needs robots; see pgo_models.partition()")
         poses = start if start is not None else chordal_start(problem)
         if self.is_split:
             return self._consensus.init(problem, poses)

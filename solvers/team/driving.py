@@ -61,6 +61,15 @@ class Drive:
     _answers: list[Any] = field(default_factory=list)
     _page: Any = None
 
+    @property
+    def needed(self) -> Sequence[str]:
+        """Robots without which the solve cannot go on.
+
+        Robots that share their interface wait for letters of each other, too.
+        """
+        shares_all = self.agent.sharing is Sharing.MEASUREMENTS
+        return list(self.waiting) if shares_all else self.members[1:]
+
     def begin(self) -> None:
         """Run the page until it waits for answers, or ends."""
         self._page = extra_module("greenlet", "team").greenlet(self._solve)
@@ -136,7 +145,8 @@ class Drive:
         self._answers = [None] * len(requests)
         for place, (name, request) in enumerate(zip(self.members, requests, strict=True)):
             if place > 0 and request is not Idle.IDLE:
-                self.waiting[name] = Ask(self.term, self.call, place, named, request)
+                members = self.members if self.call == 0 else ()
+                self.waiting[name] = Ask(self.term, self.call, place, named, request, members)
         self._answers[:1] = obey([self.agent], order, requests[:1])
         if self.waiting:
             self._page.parent.switch()

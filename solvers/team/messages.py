@@ -43,13 +43,17 @@ class Hello:
 
 @dataclass(frozen=True, eq=False)
 class Ask:
-    """Order number `call` of a solve, with its request; `place` is the robot's number in it."""
+    """Order number `call` of a solve, with its request; `place` is the robot's number in it.
+
+    `members` are the robots of the solve by their places, in order number 0.
+    """
 
     term: Term
     call: int
     place: int
     order: Order
     request: Any
+    members: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,25 @@ class Reply:
     revision: int
     answer: Any
     error: tuple[str, str] | None = None  # name and text of a PGOError
+
+
+@dataclass(frozen=True, eq=False)
+class Letter:
+    """What a robot tells another one in its answer to order number `call`."""
+
+    term: Term
+    call: int
+    place: int  # of the sender
+    content: Mapping[int, Any]
+
+
+@dataclass(frozen=True)
+class LetterLost:
+    """The letter of order number `call` has not arrived at the robot with this place."""
+
+    term: Term
+    call: int
+    place: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +158,7 @@ class Heard:
     term: Term
 
 
-MESSAGES = (Hello, Ask, Reply, TeamOutcome, Heard, Term)
+MESSAGES = (Hello, Ask, Reply, Letter, LetterLost, TeamOutcome, Heard, Term)
 
 
 def error_as_message(error: PGOError) -> tuple[str, str]:

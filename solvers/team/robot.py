@@ -3,8 +3,9 @@
 Whoever has a network gives the robot what arrives (`receive`) and the time (`tick`), and sends what
 it has to say (`outbox`). Every robot keeps its own measurements. The robot whose name comes first
 among those that are awake drives: it runs the solve of robots with files of their own
-(`solvers.folder_solve`), learns the interface between the robots, and passes on what they tell each
-other. Any robot can be the one. Messages may be lost, late, repeated, or come in any order.
+(`solvers.folder_solve`), and learns the interface between the robots. What two robots tell each
+other goes from one to the other. Any robot can drive. Messages may be lost, late, repeated, or come
+in any order.
 """
 
 from __future__ import annotations
@@ -32,12 +33,15 @@ from solvers.robust.rejection import Support
 from solvers.solution import Solution
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent
 from solvers.team.driving import Drive
+from solvers.team.letters import LetterName, Letters
 from solvers.team.measurements import Measurements
 from solvers.team.messages import (
     MESSAGES,
     Ask,
     Heard,
     Hello,
+    Letter,
+    LetterLost,
     Priority,
     Reply,
     TeamOutcome,
@@ -116,12 +120,18 @@ class Saved:
 
 @dataclass(eq=False)
 class _Part:
-    """The part of this robot in a solve: its agent, and its last answer, which may be lost."""
+    """The part of this robot in a solve: its agent, and its last answer, which may be lost.
+
+    `waiting` is an order that waits for letters of other robots; `members` are these by place.
+    """
 
     agent: TeamAgent
     revision: int
+    letters: Letters
+    members: tuple[str, ...]
     call: int = -1
     reply: Reply | None = None
+    waiting: Ask | None = None
 
 
 class Robot:
@@ -510,7 +520,10 @@ class Robot:
         sender = envelope.sender
         self.ledger = self.ledger.after_receiving(sender, data)
         self._last_heard[sender] = now
-        message = envelope.message
+        self._take(sender, envelope.message, now)
+
+    def _take(self, sender: str, message: object, now: float) -> None:
+        """Take a message of the team."""
         if isinstance(message, Hello):
             self._revisions[sender] = max(message.revision, self._revisions.get(sender, 0))
             self._learn_term(message.term)
@@ -518,6 +531,10 @@ class Robot:
             self._obey(sender, message)
         elif isinstance(message, Reply):
             self._take_reply(sender, message, now)
+        elif isinstance(message, Letter):
+            self._take_letter(message)
+        elif isinstance(message, LetterLost):
+            self._repeat_letter(message)
         elif isinstance(message, TeamOutcome):
             self._take_outcome(sender, message)
         elif isinstance(message, Heard):
@@ -614,8 +631,8 @@ class Robot:
         self._tried = self._current_revisions(awake)
         self._term = Term(self._term.number + 1, self.name)
         agent = self._new_agent(0)
-        self._part = _Part(agent, self.revision)
         members = (self.name, *(name for name in awake if name != self.name))
+        self._part = _Part(agent, self.revision, Letters(0), members)
         self._drive = Drive(
             self._term, members, agent, self._pipeline, self._weighting, self._robust
         )
@@ -625,10 +642,10 @@ class Robot:
     def _go_on_driving(self, now: float, awake: tuple[str, ...]) -> None:
         """Ask again where no answer came, and give up where a robot has gone."""
         assert self._drive is not None
-        for name, ask in list(self._drive.waiting.items()):
-            if name not in awake:
-                self._give_up()
-                return
+        if not set(self._drive.needed) <= set(awake):
+            self._give_up()
+            return
+        for name, ask in self._drive.waiting.items():
             if now - self._sent_at.get(name, -np.inf) >= self.retry:
                 self._sent_at[name] = now
                 self._send(name, ask, Priority.URGENT)
@@ -671,27 +688,70 @@ class Robot:
         if ask.term > self._term:
             self._learn_term(ask.term)
         if self._part is None and ask.call > 0:
-            # This robot has begun anew and has lost its part: the solve has to begin again, too.
-            self._term = Term(ask.term.number + 1, self.name)
-            self._send(sender, Hello(self.revision, self._term), Priority.URGENT)
+            self._have_all_begin_again(ask.term)
             return
         if self._part is None:
             if self._measurements.d is None:
                 return
-            self._part = _Part(self._new_agent(ask.place), self.revision)
+            agent = self._new_agent(ask.place)
+            self._part = _Part(agent, self.revision, Letters(ask.place), ask.members)
         part = self._part
         if ask.call == part.call + 1:
-            part.call = ask.call
-            part.reply = self._answer(part, ask)
-        if ask.call == part.call and part.reply is not None:
+            lost = self._answer(part, ask)
+            if part.waiting is not None:  # asked again: the letters should be here by now
+                for name in lost:
+                    message = LetterLost(ask.term, name.call, part.letters.place)
+                    self._send(part.members[name.place], message, Priority.URGENT)
+            part.waiting = ask if lost else None
+        elif ask.call == part.call and part.reply is not None:
             self._send(sender, part.reply, Priority.URGENT)
 
-    def _answer(self, part: _Part, ask: Ask) -> Reply:
+    def _have_all_begin_again(self, term: Term) -> None:
+        """Tell the robot that drives that this one has begun anew and has lost its part."""
+        self._term = Term(term.number + 1, self.name)
+        self._send(term.driver, Hello(self.revision, self._term), Priority.URGENT)
+
+    def _answer(self, part: _Part, ask: Ask) -> set[LetterName]:
+        """Obey an order and send the answer, and letters with it, unless letters are missing."""
+        request, missing = part.letters.put_in(ask.request)
+        if missing:
+            return missing
+        part.call = ask.call
         try:
-            answer = ask.order.function()(part.agent, ask.request)
+            answer = ask.order.function()(part.agent, request)
         except PGOError as error:
-            return Reply(ask.term, ask.call, part.revision, None, error_as_message(error))
-        return Reply(ask.term, ask.call, part.revision, answer)
+            part.reply = Reply(ask.term, ask.call, part.revision, None, error_as_message(error))
+        else:
+            answer, letters = part.letters.take_out(ask.call, answer)
+            part.reply = Reply(ask.term, ask.call, part.revision, answer)
+            for name in letters:
+                self._send_letter(part, ask.term, name)
+        self._send(ask.term.driver, part.reply, Priority.URGENT)
+        return missing
+
+    def _send_letter(self, part: _Part, term: Term, name: LetterName) -> None:
+        letter = Letter(term, name.call, part.letters.place, part.letters.sent[name])
+        self._send(part.members[name.place], letter, Priority.URGENT)
+
+    def _take_letter(self, letter: Letter) -> None:
+        """Keep a letter, and obey the order that has waited for it."""
+        part = self._part
+        if part is None or letter.term != self._term:
+            return
+        part.letters.received[LetterName(letter.place, letter.call)] = letter.content
+        if part.waiting is not None and not self._answer(part, part.waiting):
+            part.waiting = None
+
+    def _repeat_letter(self, lost: LetterLost) -> None:
+        """Send a letter again."""
+        if lost.term != self._term:
+            return
+        if self._part is None:
+            self._have_all_begin_again(lost.term)
+            return
+        name = LetterName(lost.place, lost.call)
+        if name in self._part.letters.sent:
+            self._send_letter(self._part, lost.term, name)
 
     def _take_outcome(self, sender: str, outcome: TeamOutcome) -> None:
         if outcome.term == self._term and outcome.term.driver == sender:

@@ -73,12 +73,6 @@ def test_what_to_do_without_a_driver_is_said_at_once(
         assert pgo_command("solve", *words, *way_out.split(), "--driver-memory", "0")[0] == 3
 
 
-def test_consensus_by_robots_with_files_of_their_own_needs_a_split(pgo_command):
-    code, out, err = pgo_command("solve", "robots", "--engine", "ray", "--method", "consensus")
-    assert (code, out) == (1, "")
-    assert "--split given --method consensus" in err
-
-
 def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
     folder = tmp_path / "robots"
     shutil.copytree(ROOT / "data" / "robots", folder)
@@ -186,7 +180,9 @@ def test_robots_show_what_crossed_the_network(pgo_command, tmp_path):
     )
     total, least, most = (
         int(figure.replace(",", ""))
-        for figure in re.search(r"^bytes +(\S+); of one robot (\S+) to (\S+)$", out, re.M).groups()
+        for figure in re.search(
+            r"^bytes +(\S+), \S+ times all edges; of one robot (\S+) to (\S+)$", out, re.M
+        ).groups()
     )
     network = json.loads((tmp_path / "result.json").read_text())["network"]
     assert (network["rounds"], network["messages"], network["bytes"]) == (rounds, messages, total)

@@ -402,15 +402,48 @@ def solve_limited(folder: Path, out: Path) -> FolderSolution:
     return replace(solution, stages=solution.stages[-1:])
 
 
+@pytest.mark.parametrize("weighting", [pgo.Weighting.ISOTROPIC, pgo.Weighting.OWN])
+def test_robots_agree_by_consensus_as_robots_of_one_graph_do(
+    weighting: pgo.Weighting, tmp_path: Path
+) -> None:
+    graph = informed(2, 40, 3, coupled=True, spread=0.5)
+    graph = graph.with_robots(pgo.partition(graph, 4).robot)
+    write_g2o_folder(graph, tmp_path / "in")
+    soc = solvers.SOC(coupling=Coupling.CONSENSUS, tolerance=1e-3)
+    pipeline = solvers.Pipeline(soc=soc)
+    solution = solve_folder(tmp_path / "in", pipeline, weighting=weighting)
+    assert solution.certificate.is_certified
+    graph = read_g2o(tmp_path / "in")
+    problem = pgo.PGOProblem(graph, weighting=weighting)
+    expected = solvers.solve(problem, pipeline, robots=pgo.partition(graph))
+    assert solution.certificate.objective == pytest.approx(expected.objective, rel=1e-9)
+    assert [stage.name for stage in solution.stages] == [stage.name for stage in expected.stages]
+    assert solution.stages[1].iterations == pytest.approx(expected.stages[1].iterations, abs=2)
+
+
+def test_consensus_needs_somebody_who_owns_the_poses() -> None:
+    soc = solvers.SOC(coupling=Coupling.CONSENSUS)
+    for solve in (
+        solvers.run,
+        lambda method, graph: solvers.solve(graph, solvers.Pipeline(method)),
+    ):
+        with pytest.raises(
+            SettingError, match=r"CONSENSUS needs robots; see pgo_models\.partition"
+        ):
+            solve(soc, pgo.load("grid"))
+    solution = solvers.solve(pgo.load("grid"), solvers.Pipeline(soc), robots=3)
+    assert solution.certificate.is_certified
+
+
 # Errors and their messages.
 
 
 def test_what_takes_the_whole_graph_is_refused(tmp_path: Path) -> None:
     robots = pgo.partition(read_g2o(ROBOTS), 4)
-    for soc in (solvers.SOC(robots=robots), solvers.PaperSOC()):
-        with pytest.raises(SettingError, match="own run SUBSTRUCTURED SOC"):
-            solve_folder(ROBOTS, solvers.Pipeline(soc=soc))
+    with pytest.raises(SettingError, match=r"own run SOC\(\.\.\), got PaperSOC"):
+        solve_folder(ROBOTS, solvers.Pipeline(soc=solvers.PaperSOC()))
     for soc in (
+        solvers.SOC(robots=robots),
         solvers.SOC(robots=robots, coupling=Coupling.SUBSTRUCTURED),
         solvers.SOC(r_step=solvers.RStep.FISTA),
     ):

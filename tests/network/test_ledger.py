@@ -74,7 +74,7 @@ def test_snapshots_are_counted_apart() -> None:
 
 def test_bytes_are_compared_with_a_list_of_all_edges() -> None:
     ledger = Ledger(2, graph_bytes=40).after_round(Traffic(*np.array([[0], [1], [80]])))
-    assert dict(ledger.facts())["bytes"].startswith("80, 2 times a list of all edges; of one robot")
+    assert dict(ledger.facts())["bytes"].startswith("80, 2 times all edges; of one robot")
     assert ledger.joined(ledger).graph_bytes == 40
     assert "edges" not in dict(Ledger(2).facts())["bytes"]
 

@@ -432,6 +432,9 @@ def test_robots_of_a_folder_read_and_write_files_of_their_own(tmp_path, actors, 
     assert "as their own files have them" in output
     for name in ("0.g2o", "1.g2o", "2.g2o", "3.g2o"):
         assert (out / name).read_text() == (tmp_path / "here" / name).read_text()
+    code, output, _ = pgo_command("solve", folder, "--engine", "ray", "--method", "consensus")
+    assert code == 0
+    assert ", 0 all-reduces" not in output
     for refused in (
         ("--report", tmp_path / "x.html"),
         ("--json",),

@@ -365,7 +365,6 @@ def test_couplings_follow_from_the_robots() -> None:
         ({"tolerance": 0.0}, "tolerance must be positive"),
         ({"tolerance": np.nan}, "tolerance must be positive"),
         ({"max_iterations": -1}, "max_iterations must not be negative"),
-        ({"coupling": Coupling.CONSENSUS}, r"CONSENSUS needs robots; see pgo_models\.partition"),
         (
             {
                 "coupling": Coupling.JOINT,

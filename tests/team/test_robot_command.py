@@ -144,9 +144,10 @@ def central() -> solvers.Solution:
     return solvers.solve(pgo.PGOProblem(WORLD, weighting=pgo.Weighting.ISOTROPIC))
 
 
-def test_three_machines_have_one_certified_map(fleet: Fleet) -> None:
+@pytest.mark.parametrize("words", [[], ["--method", "consensus"]])
+def test_three_machines_have_one_certified_map(fleet: Fleet, words: list[str]) -> None:
     for name in NAMES:
-        fleet.start(name)
+        fleet.start(name, *words)
     best = central()
     for name in NAMES:
         code, told = fleet.ended(name)
@@ -155,6 +156,7 @@ def test_three_machines_have_one_certified_map(fleet: Fleet) -> None:
         assert told["covered"] == list(NAMES)
         assert told["absent"] == []
         assert told["objective"] == pytest.approx(best.objective, rel=1e-6)
+        assert "SOC" in told["stages"]  # type: ignore[operator]
         solved = (fleet.machines[name].folder / "solved.g2o").read_text()
         given = (fleet.machines[name].folder / "mine.g2o").read_text()
         for tag in ("VERTEX_SE3", "EDGE_SE3"):
@@ -177,6 +179,7 @@ def test_machines_that_share_their_measurements_need_two_rounds(fleet: Fleet) ->
         assert told["rounds"] == 2
         assert told["rejected"] == []
         assert told["objective"] == pytest.approx(best.objective, rel=1e-6)
+        assert "SOC" in told["stages"]  # type: ignore[operator]
 
 
 def test_a_late_robot_is_waited_for_and_one_that_never_comes_is_named(fleet: Fleet) -> None:
@@ -224,6 +227,7 @@ def test_ctrl_c_keeps_what_is_known(fleet: Fleet) -> None:
         (["--listen", "here"], "'here' is no address; give HOST:PORT"),
         (["--name", "z"], "'z' is not in the team"),
         (["--cost", "unit"], "give --cost chi2 or isotropic"),
+        (["--method", "paper"], "'paper' is not one of 'substructured', 'consensus', 'newton'"),
     ],
 )
 def test_wrong_words_are_answered_in_a_sentence(

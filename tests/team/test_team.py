@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import gzip
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,18 @@ from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
-from solvers.team.agent import Sharing
-from solvers.team.robot import TeamLedger
+from solvers.distributed.robots.own_file import Told
+from solvers.network.messages import Token
+from solvers.soc.copies import NeighbourMessage
+from solvers.soc.rounding import RowChange
+from solvers.team.agent import OwnAnswer, Sharing
+from solvers.team.messages import MESSAGES, Letter, Reply
+from solvers.team.robot import Envelope, TeamLedger
+from solvers.team.wire import opened
 
 pytest.importorskip("greenlet")
+
+PEERS = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.CONSENSUS, tolerance=5e-3))
 
 
 def world(d: int = 2, n: int = 40) -> PoseGraph:
@@ -82,7 +91,8 @@ def test_messages_may_be_lost_late_repeated_and_in_any_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = world(n=20)
     lost, repeated = rng.uniform(0.0, 0.4, 2)
-    network = Network(robots_of(graph, 3), rng, lost, repeated, delay=rng.uniform(0.0, 0.3))
+    robots = robots_of(graph, 3, pipeline=PEERS if seed % 3 == 0 else None)
+    network = Network(robots, rng, lost, repeated, delay=rng.uniform(0.0, 0.3))
     while network.now < 600.0 and not network.is_settled:
         network.wait(rng.uniform(0.5, 3.0))
         sleeper = f"r{rng.integers(3)}"
@@ -91,6 +101,130 @@ def test_messages_may_be_lost_late_repeated_and_in_any_order(seed: int) -> None:
     network.run(600.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
+
+
+# CONSENSUS among peers.
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_peers_agree_by_consensus_and_the_answer_is_certified(d: int) -> None:
+    graph = world(d)
+    network = Network(robots_of(graph, 4, pipeline=PEERS), np.random.default_rng(0))
+    network.run(60.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+    assert all(robot.last.stages[1] == "SOC" for robot in network.robots.values())
+    expected = solvers.solve(
+        pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC),
+        PEERS,
+        robots=pgo.partition(graph, 4),
+    )
+    outcome = network.robots["r0"].outcome
+    assert outcome is not None
+    assert outcome.certificate is not None
+    assert outcome.certificate.objective == pytest.approx(expected.objective, rel=1e-9)
+
+
+def test_what_two_robots_tell_each_other_does_not_pass_the_one_that_drives() -> None:
+    graph = world()
+    robots = robots_of(graph, 3, pipeline=PEERS)
+    heard: dict[tuple[str, str], list[object]] = {}
+
+    def listen(sender: str, receiver: str, data: bytes) -> bool:
+        envelope = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES))
+        heard.setdefault((sender, receiver), []).append(envelope.message)
+        return False
+
+    network = Network(robots, np.random.default_rng(0), is_lost=listen)
+    network.run(60.0)
+    assert network.is_settled
+    letters = [message for message in heard["r1", "r2"] if isinstance(message, Letter)]
+    kinds = {kind for letter in letters for kind in kinds_in(letter.content)}
+    assert {Told, RowChange, NeighbourMessage} <= kinds
+    answers = [message.answer for message in heard["r1", "r0"] if isinstance(message, Reply)]
+    tokens = [token for answer in answers for token in to_robot(2, answer)]
+    assert len(tokens) == sum(len(letter.content) for letter in letters) > 0
+    assert all(isinstance(token, Token) for token in tokens)
+    for link in (("r0", "r1"), ("r1", "r0")):  # of the one that drives, as before
+        assert not any(isinstance(message, Letter) for message in heard[link])
+
+
+def test_a_letter_that_is_lost_is_asked_for_and_one_that_is_never_heard_ends_the_solve() -> None:
+    graph = world()
+    for times, is_solved in ((3, True), (10**9, False)):
+        robots = robots_of(graph, 3, pipeline=PEERS)
+        lost: list[object] = []
+
+        def loses(sender: str, receiver: str, data: bytes, lost=lost, times=times) -> bool:
+            message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
+            is_lost = isinstance(message, Letter) and sender == "r1" and len(lost) < times
+            lost.extend([message] * is_lost)
+            return is_lost
+
+        network = Network(robots, np.random.default_rng(0), is_lost=loses)
+        network.run(60.0)
+        assert network.is_settled is is_solved
+        assert len(lost) >= 3
+        if is_solved:
+            assert_is_the_optimum(robots, graph)
+        else:
+            assert all(robot.outcome is None for robot in robots.values())
+
+
+def test_a_robot_that_begins_anew_while_its_letter_is_waited_for_is_solved_with_again() -> None:
+    graph = world()
+    letters: list[str] = []
+
+    def with_letter_lost(number: int) -> Network:
+        """Robots of which r1 loses one letter, counted from 1."""
+        letters.clear()
+
+        def loses(sender: str, receiver: str, data: bytes) -> bool:
+            message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
+            is_letter = isinstance(message, Letter) and sender == "r1"
+            letters.extend([receiver] * is_letter)
+            return is_letter and len(letters) == number
+
+        robots = robots_of(graph, 3, pipeline=PEERS)
+        return Network(robots, np.random.default_rng(0), is_lost=loses)
+
+    with_letter_lost(0).run(60.0)
+    num_letters = len(letters)
+    assert num_letters > 5
+    for number in (1, 2, num_letters // 2, num_letters):
+        network = with_letter_lost(number)
+        while len(letters) < number:
+            network.wait(0.02)
+        saved = network.robots["r1"].save()
+        network.robots["r1"] = solvers.Robot.load(
+            saved, KEY, pipeline=PEERS, patience=5.0, retry=0.3
+        )
+        network.run(200.0)
+        assert network.is_settled
+        assert_is_the_optimum(network.robots, graph)
+
+
+def kinds_in(record: object) -> set[type]:
+    """Classes of all records in a record."""
+    if isinstance(record, Mapping):
+        return {kind for value in record.values() for kind in kinds_in(value)}
+    parts = record if isinstance(record, tuple) else ()
+    if is_dataclass(record):
+        parts = tuple(getattr(record, each.name) for each in fields(record))
+    return {type(record)} | {kind for part in parts for kind in kinds_in(part)}
+
+
+def to_robot(place: int, answer: object) -> list[object]:
+    """What an answer has for a robot."""
+    if isinstance(answer, Mapping):
+        return [message for to, message in answer.items() if to == place]
+    parts = answer if isinstance(answer, tuple) else ()
+    if is_dataclass(answer):
+        parts = tuple(getattr(answer, each.name) for each in fields(answer))
+    return [message for part in parts for message in to_robot(place, part)]
+
+
+# Robots that come and go.
 
 
 def test_a_robot_that_never_comes_is_named_and_the_others_have_an_answer() -> None:

@@ -1,0 +1,101 @@
+"""Letters: what robots of a team tell each other in a solve that a third one drives.
+
+An answer of a robot may have messages for other robots, in mappings by receiver. The robot sends
+them itself, and its answer carries tokens in their place. The page of the solve passes the tokens
+on, in mappings by sender, and the receiver puts what the letters say in their place. A letter that
+is lost is asked for again. What is for the robot that drives, or from it, needs no letter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, NamedTuple
+
+from solvers.network.messages import Token, count_bytes
+
+DRIVER_PLACE = 0
+
+
+class LetterName(NamedTuple):
+    """The robot that a letter is from, or to, by its place in the solve, and the order's number."""
+
+    place: int
+    call: int
+
+
+Content = Mapping[int, Any]  # messages by their number in an answer
+
+
+@dataclass(eq=False)
+class Letters:
+    """Letters of the robot with this place, of one solve."""
+
+    place: int
+    sent: dict[LetterName, Content] = field(default_factory=dict)
+    received: dict[LetterName, Content] = field(default_factory=dict)
+
+    def take_out(self, call: int, answer: object) -> tuple[Any, list[LetterName]]:
+        """The answer to an order with tokens in place of messages, and the letters to be sent."""
+        contents: dict[int, dict[int, Any]] = {}
+
+        def take(messages: Mapping[int, Any], number: int) -> Mapping[int, Any]:
+            kept = {}
+            for receiver, message in messages.items():
+                if receiver in (DRIVER_PLACE, self.place):
+                    kept[receiver] = message
+                    continue
+                contents.setdefault(receiver, {})[number] = message
+                kept[receiver] = Token(self.place, call, number, count_bytes(message))
+            return kept
+
+        with_tokens = _with_mappings(answer, _numbered(take))
+        names = [LetterName(receiver, call) for receiver in contents]
+        for name in names:
+            self.sent[name] = contents[name.place]
+        return with_tokens, names
+
+    def put_in(self, request: object) -> tuple[Any, set[LetterName]]:
+        """The request of an order with messages in place of tokens, and the letters missing."""
+        missing = set()
+
+        def put(messages: Mapping[int, Any], _: int) -> Mapping[int, Any]:
+            found = {}
+            for sender, message in messages.items():
+                found[sender] = message
+                if isinstance(message, Token):
+                    name = LetterName(message.sender, message.call)
+                    if name in self.received:
+                        found[sender] = self.received[name][message.number]
+                    else:
+                        missing.add(name)
+            return found
+
+        return _with_mappings(request, _numbered(put)), missing
+
+
+Change = Callable[[Mapping[int, Any]], Mapping[int, Any]]
+
+
+def _numbered(change: Callable[[Mapping[int, Any], int], Mapping[int, Any]]) -> Change:
+    """Tell a change, too, how many mappings came before."""
+    numbers: Iterator[int] = iter(range(1 << 30))
+    return lambda messages: change(messages, next(numbers))
+
+
+def _with_mappings(record: Any, change: Change) -> Any:  # noqa: ANN401 - a request or an answer
+    """A record with its mappings changed, one after the other."""
+    if isinstance(record, Mapping):
+        return change(record)
+    if isinstance(record, tuple):
+        items = [_with_mappings(item, change) for item in record]
+        return type(record)(*items) if hasattr(record, "_fields") else tuple(items)
+    if not is_dataclass(record) or isinstance(record, type):
+        return record
+    changed = {}
+    for each in fields(record):
+        before = getattr(record, each.name)
+        after = _with_mappings(before, change)
+        if after is not before:
+            changed[each.name] = after
+    return replace(record, **changed) if changed else record
