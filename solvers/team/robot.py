@@ -598,10 +598,11 @@ class Robot:
         self._out.append(Message(to, data, priority))
 
     def _learn_term(self, term: Term) -> None:
-        """Give up a solve that another robot has overtaken."""
+        """Give up a solve that another robot has overtaken, and solve again if this one drives."""
         if term > self._term:
             self._term = term
             self._part = None
+            self._tried = None
             self._give_up()
 
     def _give_up(self) -> None:
@@ -756,6 +757,9 @@ class Robot:
     def _take_outcome(self, sender: str, outcome: TeamOutcome) -> None:
         if outcome.term == self._term and outcome.term.driver == sender:
             if self.last is None or self.last.term != outcome.term:
+                if self._part is None and outcome.certificate is not None:
+                    self._have_all_begin_again(outcome.term)  # its poses are lost
+                    return
                 self._end_with(outcome)
             self._send(sender, Heard(outcome.term), Priority.NORMAL)
 

@@ -25,7 +25,7 @@ from solvers.network.messages import Token
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.agent import OwnAnswer, Sharing
-from solvers.team.messages import MESSAGES, Letter, Reply
+from solvers.team.messages import MESSAGES, Letter, Reply, TeamOutcome
 from solvers.team.robot import Envelope, TeamLedger
 from solvers.team.wire import opened
 
@@ -202,6 +202,26 @@ def test_a_robot_that_begins_anew_while_its_letter_is_waited_for_is_solved_with_
         network.run(200.0)
         assert network.is_settled
         assert_is_the_optimum(network.robots, graph)
+
+
+def test_a_robot_that_begins_anew_before_it_has_heard_the_outcome_gets_its_poses() -> None:
+    graph = world()
+    robots = robots_of(graph, 3)
+    ended: list[object] = []
+
+    def loses(sender: str, receiver: str, data: bytes) -> bool:
+        message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
+        is_outcome = isinstance(message, TeamOutcome) and receiver == "r2"
+        ended.extend([message] * is_outcome)
+        return is_outcome and len(ended) == 1
+
+    network = Network(robots, np.random.default_rng(0), is_lost=loses)
+    while not ended:
+        network.wait(0.02)
+    network.robots["r2"] = solvers.Robot.load(robots["r2"].save(), KEY, patience=5.0, retry=0.3)
+    network.run(100.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
 
 
 def kinds_in(record: object) -> set[type]:
