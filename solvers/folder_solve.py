@@ -39,6 +39,8 @@ from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import Record, Stage, Status
 from solvers.robots import Robots
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
@@ -75,6 +77,9 @@ class FolderSolution(Summarised):
         have matrices, what failed, and what may find more.
     num_absent : int
         Number of poses of robots without a file, which edges of others name.
+    num_rejected : int, optional
+        Edges that the robots left out because they do not agree with others; None where none were
+        judged.
     """
 
     name: str
@@ -88,6 +93,18 @@ class FolderSolution(Summarised):
     seconds: float
     note: str = ""
     num_absent: int = 0
+    num_rejected: int | None = None
+
+    @property
+    def robust_text(self) -> str:
+        """What was left out, and what that is worth; empty where no edges were judged."""
+        if self.num_rejected is None:
+            return ""
+        kept = int(self.sizes[1].sum())
+        return (
+            f"{self.num_rejected} of {kept + self.num_rejected} edges left out, which do not agree "
+            "pairwise with others; the answer is for those kept, and nobody has checked them"
+        )
 
     def __str__(self) -> str:
         num_poses, num_edges = self.sizes
@@ -104,6 +121,7 @@ class FolderSolution(Summarised):
             ("status", f"{self.status.name}: {self.status.value}"),
             *self._facts_of_certificate(),
             *self._other_cost(),
+            ("closures", self.robust_text),
             ("note", self.note),
             ("frame", self.frame),
             ("seconds", f"{self.seconds:.3g}"),
@@ -116,6 +134,8 @@ class FolderSolution(Summarised):
         """Cost, bound, gap and verdict, which says for whom it holds."""
         facts = dict(self.certificate.facts())
         facts["verdict"] += verdict_suffix(self.num_absent)
+        if self.num_rejected is not None:
+            facts["verdict"] += ", for the edges that were kept"
         return list(facts.items())
 
     def _other_cost(self) -> list[tuple[str, str]]:
@@ -132,6 +152,7 @@ def solve_folder(
     pipeline: Pipeline | None = None,
     *,
     weighting: Weighting = Weighting.OWN,
+    robust: GNC | PCM | None = None,
     robots: Robots | None = None,
     out: Path | str | None = None,
     callback: Callable[[Any, Record], bool | None] | None = None,
@@ -144,9 +165,9 @@ def solve_folder(
 
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it. An
     edge between two robots may be in the file of either, or of both. Start, SOC, Newton,
-    certificate and staircase are those of `solve(.., robots=..)`. Robust losses, priors, landmarks,
-    checkpoints and an ascent of handedness terms need `solve`. A robot that is lost
-    reads its file again, and is sent again all that it had received. The frame is that of the first
+    certificate and staircase are those of `solve(.., robots=..)`. GNC, priors, landmarks,
+    checkpoints and an ascent of handedness terms need `solve`. A robot that is lost reads its file
+    again, and is sent again all that it had received. The frame is that of the first
     pose with a FIX line, or else of the first pose of all, where its file has it.
 
     Parameters
@@ -160,6 +181,10 @@ def solve_folder(
         The cost: INFORMATION is chi2 of the files' information matrices, ISOTROPIC F, and OWN chi2
         where it is another cost than F and no robot has an edge whose share of chi2 can be
         negative.
+    robust : PCM, optional
+        Have every two robots judge the closures between them, and each robot its own, by pairwise
+        consistency, with one message each way; odometry is known to be right. What agrees is kept,
+        and the rest left out (`pairwise_consistent` finds the same).
     robots : Robots, optional
         Where the robots run, and the memory of their driver; who owns which poses is in the files.
     out : Path or str, optional
@@ -178,8 +203,8 @@ def solve_folder(
     Raises
     ------
     SettingError
-        When the first stage is no SOC that factors its subproblems, or the weighting is that of
-        rotations alone.
+        When `robust` is no PCM for all odometry, the first stage is no SOC that factors its
+        subproblems, or the weighting is that of rotations alone.
     PGOError
         As of `solve`, and for files that cannot be read as of `read_g2o`.
 
@@ -194,13 +219,16 @@ def solve_folder(
     folder = locate(folder).absolute()
     _check_first_stage(pipeline.soc)
     _check_robots(robots)
+    pcm = check_robust(robust)
     if weighting is Weighting.ROTATIONS:
         raise SettingError(f"robots with files of their own solve for poses; {READ_HERE}")
     files = list(enumerate(g2o_files(folder)))
     if out is not None:
         check_g2o_folder(out, len(files))
     engine = _engine_of_robots(robots.engine, len(files))
-    job = FilesOfRobots(folder.name, files, engine, robots.driver_memory, weighting, trust_folder)
+    job = FilesOfRobots(
+        folder.name, files, engine, robots.driver_memory, weighting, trust_folder, pcm
+    )
     return job.solved(pipeline, monitor, None if out is None else Path(out).absolute())
 
 
@@ -217,13 +245,16 @@ class FilesOfRobots:
     memory: float
     weighting: Weighting
     trust_folder: bool = False
+    pcm: PCM | None = None
 
     def solved(
         self, pipeline: Pipeline, monitor: RunMonitor, out: Path | None = None
     ) -> FolderSolution:
         """The solution, which robots write to the folder `out`, if it is given."""
         stages: list[Stage] = []
-        opened = open_files(self.files, self.engine, self.memory, self.weighting, self.trust_folder)
+        opened = open_files(
+            self.files, self.engine, self.memory, self.weighting, self.trust_folder, self.pcm
+        )
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         driver = opened.driver
         journal = Journal(None, {}, stages)
@@ -247,6 +278,7 @@ class FilesOfRobots:
             F=F,
             note=_note(self.weighting, opened, place.note(best)),
             num_absent=opened.num_absent,
+            num_rejected=None if self.pcm is None else opened.num_rejected,
             seconds=time.perf_counter() - monitor.began,
         )
 
@@ -269,6 +301,18 @@ def _check_first_stage(soc: FirstStage) -> None:
         raise SettingError(
             f"robots are those of the files, and factor their subproblems, got {soc}; {READ_HERE}"
         )
+
+
+def check_robust(robust: GNC | PCM | None) -> PCM | None:
+    """Return how robots with own files find wrong edges; a SettingError for what they cannot."""
+    if robust is None:
+        return None
+    if not isinstance(robust, PCM) or robust.known is not None:
+        raise SettingError(
+            "robots with files of their own find wrong edges by PCM(), beside their odometry; for "
+            f"others {READ_HERE}"
+        )
+    return robust
 
 
 def _check_robots(robots: Robots) -> None:

@@ -30,6 +30,7 @@ FOR_OWN_FILES = {
     "graph",
     "out",
     "method",
+    "robust",
     "engine",
     "address",
     "driver_memory",

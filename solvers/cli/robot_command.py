@@ -80,7 +80,9 @@ def robot_command(
     ] = False,
     robust: Annotated[
         Robust | None,
-        typer.Option(help="Find wrong edges, as pgo solve does; with --share-measurements."),
+        typer.Option(
+            help="Find wrong edges, as pgo solve does; pcm alone without --share-measurements."
+        ),
     ] = None,
     patience: Annotated[
         float,

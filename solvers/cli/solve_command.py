@@ -559,6 +559,7 @@ def _solve_own_files(
         source.graph,
         pipeline,
         weighting=weightings[source.chosen_cost],
+        robust=choices.chosen_robust(stages.robust),
         robots=Robots(engine=engine, driver_memory=memory),
         out=outputs.out[0] if outputs.out else None,
         time_limit=stages.time_limit,
@@ -568,7 +569,8 @@ def _solve_own_files(
     )
     if not display.quiet:
         typer.echo(f"{solution}")
-    is_certified = solution.certificate.is_certified
+    # Nobody has checked the edges that pairwise consistency keeps.
+    is_certified = solution.certificate.is_certified and solution.num_rejected is None
     return _exit_code(solution.status, is_certified, solution.num_absent)
 
 

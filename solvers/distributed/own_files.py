@@ -30,6 +30,7 @@ from solvers.distributed.elimination_choice import (
     may_leave_poses,
     positions_in_cover,
 )
+from solvers.distributed.robots.own_consistency import keep_consistent, tell_trajectories
 from solvers.distributed.robots.own_file import (
     READ_HERE,
     Border,
@@ -48,6 +49,7 @@ from solvers.distributed.robots.own_file import (
 )
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
+from solvers.robust.consistency import PCM
 from solvers.soc.subgraph import RobotSummary, place_poses
 
 SOLVE_PARTS = "solve each part in a folder of its own"
@@ -69,6 +71,8 @@ class OpenedFiles:
         Whether the share of any edge in chi2 can be negative.
     num_absent : int
         Number of poses of robots without a file, as `PoseGraph.absent`.
+    num_rejected : int
+        Edges that robots have left out, as they do not agree with others.
     """
 
     driver: Driver
@@ -76,6 +80,7 @@ class OpenedFiles:
     weighting: Weighting
     has_indefinite: bool
     num_absent: int
+    num_rejected: int = 0
 
 
 def open_files(
@@ -84,8 +89,11 @@ def open_files(
     memory: float,
     weighting: Weighting,
     trust_folder: bool = False,
+    pcm: PCM | None = None,
 ) -> OpenedFiles:
     """Have robots read these files, and agree on the cost that `weighting` stands for.
+
+    With `pcm` they leave out edges that do not agree pairwise.
 
     Raises a FileFormatError for a file that cannot be read or has no pose of its own, and, unless
     the folder is trusted, for files that speak against being of one graph. Raises a GraphError if
@@ -100,6 +108,9 @@ def open_files(
         sent = network.ask(number_poses, numbered.runs, Count.PIGGYBACKED)
         received = [(told, trust_folder) for told in network.exchange(sent)]
         borders = network.ask(join_neighbours, received, Count.PIGGYBACKED)
+        num_rejected = 0
+        if pcm is not None:
+            borders, num_rejected = _consistent_borders(network, pcm)
         sizes = np.array([border.counts for border in borders]).T
         num_without_edge = num_poses - int(sizes[0].sum())
         _check_connected(borders, num_without_edge, files[0][1].parent)
@@ -116,10 +127,20 @@ def open_files(
         if memory != 0:
             summaries = _chosen_elimination(network, summaries)
         driver = Driver(summaries, num_poses, lambda: network, memory)
-        return OpenedFiles(driver, sizes, weighting, has_indefinite, numbered.num_absent)
+        return OpenedFiles(
+            driver, sizes, weighting, has_indefinite, numbered.num_absent, num_rejected
+        )
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()
         raise
+
+
+def _consistent_borders(network: CountedPool, pcm: PCM) -> tuple[list[Border], int]:
+    """Have every two robots judge the edges between them; borders, and how many edges go."""
+    told = network.ask(tell_trajectories, [None] * network.ledger.num_robots, Count.PIGGYBACKED)
+    requests = [(trajectories, pcm.quantile) for trajectories in network.exchange(told)]
+    parts = network.ask(keep_consistent, requests, Count.PIGGYBACKED)
+    return [part.border for part in parts], sum(part.num_rejected for part in parts)
 
 
 def _chosen_elimination(network: CountedPool, summaries: list[RobotSummary]) -> list[RobotSummary]:

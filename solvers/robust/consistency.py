@@ -130,18 +130,18 @@ def pairwise_consistent(
     check_shape(is_known, (graph.num_edges,), "known")
     kept = np.ones(graph.num_edges, dtype=bool)
     kept[is_whole(graph) & ~is_known] = False
-    for edges, agree in _agreements(graph, is_known, ~is_known, quantile):
+    tested = np.flatnonzero(is_whole(graph) & ~is_known)
+    for edges, agree in agreements(Chains.of(graph, is_known), tested, quantile):
         clique, _ = maximum_clique(agree)
         kept[edges[clique]] = True
     return kept
 
 
-def _agreements(
-    graph: PoseGraph, known: BoolArray, candidates: BoolArray, quantile: float
+def agreements(
+    chains: Chains, tested: IntArray, quantile: float
 ) -> Iterator[tuple[IntArray, BoolArray]]:
-    """Candidates, (k,), between every two chains, and which of them are consistent, (k, k)."""
-    tested = np.flatnonzero(is_whole(graph) & candidates & ~known)
-    chains = Chains.of(graph, known)
+    """Tested edges, (k,), between every two chains, and which of them are consistent, (k, k)."""
+    graph = chains.graph
     closures = chains.closures(tested)
     dof = graph.d + tangent_dimension(graph.d)
     threshold = float(scipy.special.chdtri(dof, 1.0 - quantile))

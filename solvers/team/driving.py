@@ -20,7 +20,7 @@ from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.folder_solve import FilesOfRobots, FolderSolution
+from solvers.folder_solve import FilesOfRobots, FolderSolution, check_robust
 from solvers.loop import RunMonitor
 from solvers.network.engine import DEFAULT_MEMORY
 from solvers.network.messages import Idle, Worker, obey, raise_first_error
@@ -106,7 +106,8 @@ class Drive:
     def _solved_by_robots(self) -> FolderSolution:
         """The solution by robots with files of their own."""
         files = [(k, Path("team") / f"{name}.g2o") for k, name in enumerate(self.members)]
-        job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting)
+        pcm = check_robust(self.robust)
+        job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting, pcm=pcm)
         return job.solved(self.pipeline, RunMonitor(progress=False))
 
     def _solved_in_one_place(self) -> Solution:

@@ -154,7 +154,8 @@ class Robot:
         MEASUREMENTS, compressed, which mostly are fewer bytes. Then the robot that drives solves
         alone, with all that `solve` can: priors and GPS, landmarks, robust solves, covariances.
     robust : GNC or PCM, optional
-        How a team that shares its measurements finds wrong edges.
+        How the team finds wrong edges: a team that does not share its measurements by PCM, where
+        every two robots judge the closures between them.
     patience : float
         Seconds after which a robot that was not heard of counts as absent.
     retry : float
@@ -227,8 +228,11 @@ class Robot:
         self._weighting = weighting
         self._sharing = sharing
         self._robust = robust
-        if robust is not None and sharing is not Sharing.MEASUREMENTS:
-            raise SettingError("a robust solve of a team needs sharing=Sharing.MEASUREMENTS")
+        if sharing is not Sharing.MEASUREMENTS and not isinstance(robust, PCM | None):
+            raise SettingError(
+                "a team that does not share its measurements finds wrong edges by PCM(); "
+                f"{type(robust).__name__} needs sharing=Sharing.MEASUREMENTS"
+            )
         self._patience = patience
         self.retry = retry
         self._measurements = Measurements()
@@ -885,6 +889,8 @@ def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, i
             rounds=ended.ledger.rounds,
             stages=tuple(stage.name for stage in ended.stages),
             note=ended.note,
+            robust=ended.robust_text,
+            is_held=ended.num_rejected is None,
         )
     if isinstance(ended, Solution):
         d = ended.poses.d

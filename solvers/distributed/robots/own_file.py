@@ -326,7 +326,7 @@ def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) 
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
     joined = JoinedFile(graph, numbers, owners, _given_pose(lines, ids[holding]))
     agent.record = joined
-    return _border(agent.robot, joined)
+    return border_of(agent.robot, joined)
 
 
 def _joined_edges(files: Sequence[Edges]) -> _JoinedEdges:
@@ -349,7 +349,7 @@ def _given_pose(lines: G2OLines, pose_id: int) -> Array:
     return Poses(*poses_of(lines.d, rows)).stacked()
 
 
-def _border(robot: int, joined: JoinedFile) -> Border:
+def border_of(robot: int, joined: JoinedFile) -> Border:
     """Border of a robot whose graph is known."""
     graph = joined.graph
     numbers = joined.numbers

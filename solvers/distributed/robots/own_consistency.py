@@ -1,0 +1,180 @@
+"""Pairwise consistency by the robots: closures between two of them are judged by these two.
+
+A robot tells each neighbour how its odometry leads from one pose to the next of those that closures
+between the two touch: one message each way. Then both know the cycles of all closures between them,
+and keep the same largest set that agrees (`solvers.robust.consistency`). The closures of a robot
+with itself it judges alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from solvers.distributed.robots.own_file import Border, FileAgent, JoinedFile, border_of
+from solvers.robust.chains import (
+    Chains,
+    carried,
+    inverse,
+    is_whole,
+    measured_covariances,
+    product,
+)
+from solvers.robust.cliques import maximum_clique
+from solvers.robust.consistency import agreements, pairwise_consistent
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of a robot along its chains of odometry, each seen from the first one of its chain.
+
+    Parameters
+    ----------
+    numbers : (k,) array
+        Numbers of the poses in the whole graph, ascending.
+    chain : (k,) array
+        Chain of every pose.
+    R, t : (k, d, d) and (k, d) arrays
+        The motions.
+    covariance : (k, p, p) array
+        Covariances of the motions, as in `Chains`.
+    """
+
+    numbers: IntArray
+    chain: IntArray
+    R: Array
+    t: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ConsistentPart:
+    """What a robot reports of its edges that are left, and how many are not."""
+
+    border: Border
+    num_rejected: int  # where an edge between two robots counts with one of them
+
+
+def tell_trajectories(agent: FileAgent, _: None) -> Mapping[int, Trajectory]:
+    """Order: tell every neighbour of the own poses that edges between the two touch."""
+    return _trajectories(agent.robot, agent.known(JoinedFile))
+
+
+def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
+    graph = joined.graph
+    is_own = joined.owners == robot
+    chains = Chains.of(graph, _own_odometry(graph, is_own))
+    R, t = chains.motion
+    told = {}
+    for other in np.unique(joined.owners[~is_own]).tolist():
+        between = _edges_between(joined, robot, other)
+        ends = np.concatenate([graph.i[between], graph.j[between]])
+        poses = np.unique(ends[is_own[ends]])
+        chain, first = np.unique(chains.chain[poses], return_index=True)
+        begins = poses[first][np.searchsorted(chain, chains.chain[poses])]
+        to_begin = inverse((R[begins], t[begins]))
+        seen_R, seen_t = product(to_begin, (R[poses], t[poses]))
+        grown = chains.covariance[poses] - chains.covariance[begins]
+        told[other] = Trajectory(
+            joined.numbers[poses], chains.chain[poses], seen_R, seen_t, carried(to_begin, grown)
+        )
+    return told
+
+
+def keep_consistent(
+    agent: FileAgent, request: tuple[Mapping[int, Trajectory], float]
+) -> ConsistentPart:
+    """Order: leave out what does not agree, with the neighbours' trajectories and a quantile."""
+    received, quantile = request
+    joined = agent.known(JoinedFile)
+    robot = agent.robot
+    graph = joined.graph
+    kept = np.ones(graph.num_edges, dtype=bool)
+    is_own = joined.owners == robot
+    among_own = _in_order(joined, np.flatnonzero(is_own[graph.i] & is_own[graph.j]))
+    if len(among_own):
+        own_graph = graph.edge_subgraph(among_own)
+        own_odometry = _own_odometry(graph, is_own)[among_own]
+        kept[among_own] = pairwise_consistent(own_graph, own_odometry, quantile)
+    own = _trajectories(robot, joined)
+    for other, theirs in received.items():
+        between = _edges_between(joined, robot, other)
+        known = {robot: own[other], other: theirs}
+        kept[between] = _agree(joined, between, [known[k] for k in sorted(known)], quantile)
+    owner_who_counts = joined.owners[np.stack([graph.i, graph.j])].min(axis=0)
+    num_rejected = int((~kept & (owner_who_counts == robot)).sum())
+    left = _without(joined, robot, kept)
+    agent.record = left
+    return ConsistentPart(border_of(robot, left), num_rejected)
+
+
+def _agree(
+    joined: JoinedFile, between: IntArray, both: list[Trajectory], quantile: float
+) -> BoolArray:
+    """Which of the edges between two robots are kept: both find the same."""
+    graph = joined.graph
+    pair = graph.edge_subgraph(between)  # the poses of both, in the order of their numbers
+    first, second = both
+    order = np.argsort(np.concatenate([first.numbers, second.numbers]))
+    chain = np.concatenate([first.chain, second.chain + first.chain.max() + 1])
+    R = np.concatenate([first.R, second.R])
+    t = np.concatenate([first.t, second.t])
+    covariance = np.concatenate([first.covariance, second.covariance])
+    chains = Chains(
+        graph=pair,
+        chain=chain[order],
+        step_to=np.full(pair.num_poses, -1),
+        motion=(R[order], t[order]),
+        measured=measured_covariances(pair),
+        covariance=covariance[order],
+    )
+    kept = np.ones(len(between), dtype=bool)
+    tested = np.flatnonzero(is_whole(pair))
+    kept[tested] = False
+    for edges, agree in agreements(chains, tested, quantile):
+        clique, _ = maximum_clique(agree)
+        kept[edges[clique]] = True
+    return kept
+
+
+def _own_odometry(graph: PoseGraph, is_own: BoolArray) -> BoolArray:
+    """Whether an edge joins own poses whose ids are neighbours, (m,)."""
+    are_neighbours = np.abs(graph.pose_ids[graph.i] - graph.pose_ids[graph.j]) == 1
+    return np.asarray(are_neighbours & is_own[graph.i] & is_own[graph.j])
+
+
+def _edges_between(joined: JoinedFile, robot: int, other: int) -> IntArray:
+    """Edges between poses of the robot and of another one, in order."""
+    owners = joined.owners[np.stack([joined.graph.i, joined.graph.j])]
+    are_between = (owners == robot).any(axis=0) & (owners == other).any(axis=0)
+    return _in_order(joined, np.flatnonzero(are_between))
+
+
+def _in_order(joined: JoinedFile, edges: IntArray) -> IntArray:
+    """Edges in an order that does not depend on the files: by their ends, then by their numbers.
+
+    To first order the distance between two closures depends a little on which of them comes first.
+    """
+    graph = joined.graph
+    ends = joined.numbers[graph.i[edges]], joined.numbers[graph.j[edges]]
+    turns = graph.R_ij[edges].reshape(len(edges), -1)
+    return edges[np.lexsort([*graph.t_ij[edges].T, *turns.T, *ends])]
+
+
+def _without(joined: JoinedFile, robot: int, kept: BoolArray) -> JoinedFile:
+    """What is joined by the edges that are kept, with all own poses."""
+    graph = joined.graph
+    is_used = joined.owners == robot
+    is_used[graph.i[kept]] = True
+    is_used[graph.j[kept]] = True
+    poses = np.flatnonzero(is_used)
+    return replace(
+        joined,
+        graph=graph.without_edges(~kept).subgraph(poses),
+        numbers=joined.numbers[poses],
+        owners=joined.owners[poses],
+    )
