@@ -316,6 +316,7 @@ soc = solvers.SOC(
     translation_penalty=relative_rho_t,
     acceleration=None,
     local_passes=1,
+    bytes_per_number=8,
     coupling=solvers.Coupling.CONSENSUS,
 )
 library = [state.omega for state in itertools.islice(solvers.iterate(soc, problem), 1, 26)]

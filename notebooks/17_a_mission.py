@@ -386,10 +386,11 @@ draw_links(tables, names)
 # The two ways end with the same bound; here measurements are 40 % of the bytes. Which is less depends
 # on the graph. The matrices tell more than the totals:
 #
-# - Everything goes to and from a driver. Carl and Dora, who never drive, send each other 27 kB in either
-#   way. These are greetings, with which robots notice each other: one every 1.25 seconds, a quarter of
-#   `patience`, and one at once when a robot has new measurements. All twelve links have about as many or
-#   more, so greetings are more than half of the 534 kB in the right matrix.
+# - Nearly everything goes to and from a driver. Carl and Dora, who never drive, send each other 27 kB in
+#   the right matrix. These are greetings, with which robots notice each other: one every 1.25 seconds, a
+#   quarter of `patience`, and one at once when a robot has new measurements. All twelve links have about
+#   as many or more, so greetings are more than half of the 536 kB in that matrix. In the left one they
+#   also tell each other, and nobody else, of the twelve edges between them: 2 to 3 kB.
 # - Ben's row and column are those of a driver, too, thanks to one minute without Anna.
 # - Dora has the most separators, and sends Anna the most in the left matrix. Sharing measurements
 #   depends on the edges of a robot, and sharing its interface on its separators.
@@ -563,7 +564,8 @@ assert np.isclose(by_hand, team_bound, rtol=1e-9)
 assert rounds["measurements"] == 2
 assert 10 <= rounds["interface"] <= 30
 assert tables["measurements"].sum() < 0.5 * tables["interface"].sum()
-assert np.allclose(tables["interface"][2:, 2:], tables["measurements"][2:, 2:], rtol=0.05)
+assert np.allclose(tables["interface"][2:, 2:], tables["measurements"][2:, 2:], rtol=0.15)
+assert 1.0 < tables["interface"][2, 3] - tables["measurements"][2, 3] < 4.0
 assert 12 * tables["measurements"][2, 3] > 0.5 * tables["measurements"].sum()
 assert log[-1]["ben"].outcome.term == log_of_sharing[-1]["ben"].outcome.term
 assert log[-1]["ben"].outcome.term.number == 20
