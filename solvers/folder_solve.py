@@ -184,7 +184,8 @@ def solve_folder(
     robust : PCM, optional
         Have every two robots judge the closures between them, and each robot its own, by pairwise
         consistency, with one message each way; odometry is known to be right. What agrees is kept,
-        and the rest left out (`pairwise_consistent` finds the same).
+        and the rest left out, also of the files in `out`. `pairwise_consistent` finds the same, but
+        that the distance of two closures depends a little on which comes first.
     robots : Robots, optional
         Where the robots run, and the memory of their driver; who owns which poses is in the files.
     out : Path or str, optional

@@ -122,34 +122,36 @@ class CoverSystem:
 
 
 def may_leave_poses(system: CoverSystem) -> bool:
-    """Whether fronts take so long that robots should try to leave poses to the driver.
+    """Whether fronts take so long that robots should try to leave poses to the driver."""
+    return has_cholmod() and system.flops >= ENOUGH_FLOPS
 
-    Only CHOLMOD (extra `fast`) factors what they leave fast enough.
-    """
-    has_cholmod = default_backend() is CholeskyBackend.CHOLMOD
-    return has_cholmod and system.flops >= ENOUGH_FLOPS
+
+def has_cholmod() -> bool:
+    """Whether there is CHOLMOD (extra `fast`), which factors what robots leave fast enough."""
+    return default_backend() is CholeskyBackend.CHOLMOD
 
 
 def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
     """Return the subgraphs of one graph with the cover that suits driver and robots better.
 
-    The larger one is tried where messages are longer than a list of all edges. It is chosen where
-    they then become shorter and the driver takes few operations, or fewer than before.
+    The larger one is tried where messages are longer than a list of all edges, or fronts take long
+    (`may_leave_poses`). It is chosen where messages become shorter and the driver takes few
+    operations, or where fronts take long and it takes fewer.
     """
     system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
     are_short = BYTES_PER_NUMBER * system.num_sent <= bytes_of_edges(subgraphs)
-    has_cholmod = default_backend() is CholeskyBackend.CHOLMOD
-    if not has_cholmod or (are_short and system.flops < ENOUGH_FLOPS):
+    takes_long = may_leave_poses(system)
+    if not has_cholmod() or (are_short and not takes_long):
         return tuple(subgraphs)
     larger = leave_poses(subgraphs, MOST_COUPLED)
     sparse = CoverSystem.of([subgraph.summary for subgraph in larger])
     is_shorter = sparse.num_sent < system.num_sent and sparse.flops < ENOUGH_FLOPS
-    is_quicker = sparse.flops < system.flops and system.flops >= ENOUGH_FLOPS
+    is_quicker = takes_long and sparse.flops < system.flops
     return larger if is_shorter or is_quicker else tuple(subgraphs)
 
 
 def bytes_of_edges(subgraphs: Sequence[Subgraph]) -> int:
-    """Bytes of a list of all edges, each a relative pose and two weights."""
+    """Bytes of a list of all edges, each a relative pose and the two precisions of F."""
     d = subgraphs[0].graph.d
     num_edges = sum(int(subgraph.is_counted.sum()) for subgraph in subgraphs)
     return BYTES_PER_NUMBER * num_edges * (d * (d + 1) // 2 + 2)

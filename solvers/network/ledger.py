@@ -75,8 +75,9 @@ class Ledger(Summarised):
         process. They are not part of an algorithm's communication, and are in none of the other
         figures.
     graph_bytes : int
-        Bytes of a list of all edges, each with a relative pose of d (d + 1) / 2 numbers and two
-        weights: what it would take to gather the graph in one place. 0 where no process knows it.
+        Bytes of a list of all edges, each with a relative pose of d (d + 1) / 2 numbers and the two
+        precisions of F: what it would take to gather the graph, without information matrices. 0
+        where no process knows it.
 
     Examples
     --------

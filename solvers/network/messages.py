@@ -106,7 +106,7 @@ def raise_first_error(answers: list[Any]) -> list[Any]:
 def count_bytes(record: object, ignored_fields: Collection[str] = ()) -> int:
     """Count the bytes that a request or an answer carries between a worker and the driver.
 
-    A number takes eight, and in an array as many as there.
+    A number takes eight bytes, an array its `nbytes`, and a token those of its message.
 
     A mapping holds messages for other workers, which are counted when they are exchanged. Fields in
     `ignored_fields` are counted elsewhere, and fields whose names begin with `measured` are off the

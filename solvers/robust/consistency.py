@@ -147,7 +147,7 @@ def agreements(
     threshold = float(scipy.special.chdtri(dof, 1.0 - quantile))
     first = chains.chain[closures.i]
     second = chains.chain[closures.j]
-    groups = first * np.int64(graph.num_poses) + second
+    groups = first * (chains.chain.max(initial=0) + np.int64(1)) + second
     for group in np.unique(groups):
         members = np.flatnonzero(groups == group)
         is_own_chain = first[members[0]] == second[members[0]]

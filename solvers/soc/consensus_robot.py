@@ -90,8 +90,8 @@ class ConsensusRobot:
             B = stationary_B(unstack_transposes(state.X[n:]), state.Lambda, np.ones(n))
             pull = stack_transposes(B).reshape(n, d * d)
         force = -2.0 * layout.problem.apply_M(state.X)
-        none = np.zeros_like(force)
-        force, sent = self._as_sent(force, none, order.settings.bytes_per_number)
+        no_force = np.zeros_like(force)
+        force, sent = self._as_sent(force, no_force, order.settings.bytes_per_number)
         of_poses = np.concatenate([rho[:, None], state.diagonal, pull], axis=1)
         no_poses = np.zeros(0, dtype=np.int64)
         messages = {}

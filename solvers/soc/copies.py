@@ -272,7 +272,7 @@ class Waiting:
 class ReceivedRows:
     """Rows of a neighbour's s that the robot shares, and what the acceleration remembers of them.
 
-    The neighbour has the same bits.
+    The neighbour has the same numbers.
     """
 
     s: Array

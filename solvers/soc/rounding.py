@@ -3,8 +3,9 @@
 Neighbours have a robot's rows of s, and it sends them the step of the fixed-point map from there,
 in whole multiples of a unit: the largest step divided by 127 (one byte a number) or 32767 (two).
 Sender and receivers add the same multiples to the same rows. So all continue from the same numbers,
-what was rounded off is part of the next step, and the unit shrinks as the recursion converges. The
-poses that it converges to are the same, and bounds are proved in full precision.
+what was rounded off is part of the next step, and the unit shrinks as the recursion converges. Its
+fixed points are the same, and bounds are proved in full precision. (Where rho changes, all begin
+again at omega, which each robot has projected itself: the same numbers up to rounding.)
 
 To compress the difference from what the receiver has is known from gradients (Richtarik, Sokolov &
 Fatkhullin, EF21, 2021).
@@ -65,9 +66,10 @@ def _of_rows(units: Array, rows: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ShortNumbers:
-    """Numbers in two bytes each, m 2^e with a mantissa m of one: two digits, whatever their size.
+    """Numbers in two bytes each, m 2^e with a mantissa m of one byte: two digits.
 
-    Coefficients of the acceleration need no more, as long as all parties have the same.
+    Coefficients of the acceleration need no more, as long as all parties have the same. Sizes
+    beyond 2^-128 and 2^127 are cut off.
     """
 
     mantissas: NDArray[np.int8]
@@ -75,7 +77,7 @@ class ShortNumbers:
 
     @classmethod
     def of(cls, numbers: Array) -> ShortNumbers:
-        """Round numbers, (q,), to 1/128 of themselves at most."""
+        """Round numbers, (q,)."""
         fractions, exponents = np.frexp(numbers)  # 1/2 <= |fraction| < 1
         mantissas = np.clip(np.rint(128.0 * fractions), -127, 127)
         return cls(mantissas.astype(np.int8), np.clip(exponents, -128, 127).astype(np.int8))
@@ -101,6 +103,8 @@ class PartOfSums:
     def of(cls, sums: Array, num_bytes: int) -> PartOfSums:
         """Part of sums, (1 + k,), whose ratios are in full if rows are (`WHOLE`)."""
         first = float(sums[0])
+        if not np.isfinite(first):  # only this is read then
+            return cls(first, np.zeros(len(sums) - 1))
         with np.errstate(over="ignore"):
             ratios = sums[1:] / (first if first > 0 else 1.0)
         if num_bytes == WHOLE:
@@ -111,5 +115,5 @@ class PartOfSums:
     @property
     def sums(self) -> Array:
         """The sums, (1 + k,), as everybody has them."""
-        factor = self.first if self.first > 0 else 1.0
+        factor = self.first if np.isfinite(self.first) and self.first > 0 else 1.0
         return np.append(self.first, factor * self.ratios.astype(float))

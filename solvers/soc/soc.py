@@ -57,8 +57,9 @@ class SOC(SOCSettings):
     bytes_per_number : 1, 2 or 8
         Of CONSENSUS alone: of the rows that robots send each other. With 2, the default, a robot
         sends the change of its rows, a number of it as a whole multiple of a 32767th of the
-        largest, and sums for the acceleration in four bytes (`solvers.soc.rounding`); 8 is full
-        precision. Where each robot accelerates alone, rows are sent in full.
+        largest (with 1 of a 127th), forces at the start in two bytes, and for the acceleration sums
+        in four bytes and coefficients in two (`solvers.soc.rounding`); 8 is full precision. Where
+        each robot accelerates alone, or robots do not wait for each other, rows are sent in full.
     translation_penalty : float or None
         Of CONSENSUS alone: penalty of the translations of separators, the poses that several robots
         hold, as a multiple of their diagonal in M, the matrix of the cost F = tr(X^T M X). The

@@ -95,8 +95,7 @@ class TeamAgent(FileAgent):
             return None
         own = np.flatnonzero(self.record.subgraph.is_own)
         ids = self.record.joined.graph.pose_ids[own]
-        nothing = np.zeros((0, 2), dtype=np.int64)
-        return OwnAnswer(ids, self.record.answer[own], None, nothing)
+        return OwnAnswer(ids, self.record.answer[own], None, self.record.joined.rejected)
 
 
 def give_measurements(agent: TeamAgent, _: None) -> str:

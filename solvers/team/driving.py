@@ -46,7 +46,8 @@ class _AbandonedError(BaseException):
 class Drive:
     """A solve of the term by the robots `members`, the first of which is this one, with its agent.
 
-    `waiting` are the asks without an answer, by robot, `outcome` the solution or error at the end.
+    `waiting` are the asks without an answer, by robot, `num_asked` says how many orders each has
+    had (not all are for everybody), `outcome` is the solution or error at the end.
     """
 
     term: Term
@@ -57,6 +58,7 @@ class Drive:
     robust: GNC | PCM | None = None
     call: int = -1
     waiting: dict[str, Ask] = field(default_factory=dict)
+    num_asked: dict[str, int] = field(default_factory=dict)
     outcome: FolderSolution | Solution | PGOError | None = None
     _answers: list[Any] = field(default_factory=list)
     _page: Any = None
@@ -77,7 +79,8 @@ class Drive:
 
     def take(self, robot: str, reply: Reply) -> None:
         """Take an answer; with the last one the page goes on."""
-        if reply.call != self.call or robot not in self.waiting:
+        ask = self.waiting.get(robot)
+        if ask is None or reply.call != ask.call:
             return
         del self.waiting[robot]
         place = self.members.index(robot)
@@ -146,8 +149,10 @@ class Drive:
         self._answers = [None] * len(requests)
         for place, (name, request) in enumerate(zip(self.members, requests, strict=True)):
             if place > 0 and request is not Idle.IDLE:
-                members = self.members if self.call == 0 else ()
-                self.waiting[name] = Ask(self.term, self.call, place, named, request, members)
+                number = self.num_asked.get(name, 0)
+                self.num_asked[name] = number + 1
+                members = self.members if number == 0 else ()
+                self.waiting[name] = Ask(self.term, number, place, named, request, members)
         self._answers[:1] = obey([self.agent], order, requests[:1])
         if self.waiting:
             self._page.parent.switch()

@@ -18,9 +18,9 @@ DRIVER_PLACE = 0
 
 
 class LetterName(NamedTuple):
-    """The robot that a letter is from, or to, by its place in the solve, and the order's number."""
+    """The other robot of a letter, by its place in the solve, and the number of the order."""
 
-    place: int
+    other: int
     call: int
 
 
@@ -29,7 +29,10 @@ Content = Mapping[int, Any]  # messages by their number in an answer
 
 @dataclass(eq=False)
 class Letters:
-    """Letters of the robot with this place, of one solve."""
+    """Letters of the robot with this place, of one solve.
+
+    All are kept for as long as the solve takes: the page may return to an earlier moment of it.
+    """
 
     place: int
     sent: dict[LetterName, Content] = field(default_factory=dict)
@@ -52,7 +55,7 @@ class Letters:
         with_tokens = _with_mappings(answer, _numbered(take))
         names = [LetterName(receiver, call) for receiver in contents]
         for name in names:
-            self.sent[name] = contents[name.place]
+            self.sent[name] = contents[name.other]
         return with_tokens, names
 
     def put_in(self, request: object) -> tuple[Any, set[LetterName]]:
@@ -60,16 +63,16 @@ class Letters:
         missing = set()
 
         def put(messages: Mapping[int, Any], _: int) -> Mapping[int, Any]:
-            found = {}
+            whole = {}
             for sender, message in messages.items():
-                found[sender] = message
+                whole[sender] = message
                 if isinstance(message, Token):
                     name = LetterName(message.sender, message.call)
                     if name in self.received:
-                        found[sender] = self.received[name][message.number]
+                        whole[sender] = self.received[name][message.number]
                     else:
                         missing.add(name)
-            return found
+            return whole
 
         return _with_mappings(request, _numbered(put)), missing
 

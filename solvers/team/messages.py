@@ -43,7 +43,7 @@ class Hello:
 
 @dataclass(frozen=True, eq=False)
 class Ask:
-    """Order number `call` of a solve, with its request; `place` is the robot's number in it.
+    """Order number `call` to a robot in a solve, with its request; `place` is the robot's number.
 
     `members` are the robots of the solve by their places, in order number 0.
     """

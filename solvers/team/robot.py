@@ -174,7 +174,7 @@ class Robot:
     ------
     SettingError
         For a name that is not in the team, a name twice, a short key, times that are not positive,
-        or a robust solve of robots that do not share their measurements.
+        or a robust solve, but by PCM, of robots that do not share their measurements.
     MissingExtraError
         Without the package greenlet, which the extra `team` brings.
 
@@ -228,10 +228,11 @@ class Robot:
         self._weighting = weighting
         self._sharing = sharing
         self._robust = robust
-        if sharing is not Sharing.MEASUREMENTS and not isinstance(robust, PCM | None):
+        is_plain_pcm = isinstance(robust, PCM) and robust.known is None
+        if robust is not None and sharing is not Sharing.MEASUREMENTS and not is_plain_pcm:
             raise SettingError(
                 "a team that does not share its measurements finds wrong edges by PCM(); "
-                f"{type(robust).__name__} needs sharing=Sharing.MEASUREMENTS"
+                f"{robust!r:.40} needs sharing=Sharing.MEASUREMENTS"
             )
         self._patience = patience
         self.retry = retry
@@ -607,6 +608,7 @@ class Robot:
             self._term = term
             self._part = None
             self._tried = None
+            self._unheard.clear()
             self._give_up()
 
     def _give_up(self) -> None:
@@ -634,6 +636,7 @@ class Robot:
 
     def _begin_drive(self, awake: tuple[str, ...], now: float) -> None:
         self._tried = self._current_revisions(awake)
+        self._unheard.clear()  # of the last outcome: there will be another one
         self._term = Term(self._term.number + 1, self.name)
         agent = self._new_agent(0)
         members = (self.name, *(name for name in awake if name != self.name))
@@ -692,7 +695,7 @@ class Robot:
             return
         if ask.term > self._term:
             self._learn_term(ask.term)
-        if self._part is None and ask.call > 0:
+        if ask.call > (0 if self._part is None else self._part.call + 1):
             self._have_all_begin_again(ask.term)
             return
         if self._part is None:
@@ -706,7 +709,7 @@ class Robot:
             if part.waiting is not None:  # asked again: the letters should be here by now
                 for name in lost:
                     message = LetterLost(ask.term, name.call, part.letters.place)
-                    self._send(part.members[name.place], message, Priority.URGENT)
+                    self._send(part.members[name.other], message, Priority.URGENT)
             part.waiting = ask if lost else None
         elif ask.call == part.call and part.reply is not None:
             self._send(sender, part.reply, Priority.URGENT)
@@ -736,7 +739,7 @@ class Robot:
 
     def _send_letter(self, part: _Part, term: Term, name: LetterName) -> None:
         letter = Letter(term, name.call, part.letters.place, part.letters.sent[name])
-        self._send(part.members[name.place], letter, Priority.URGENT)
+        self._send(part.members[name.other], letter, Priority.URGENT)
 
     def _take_letter(self, letter: Letter) -> None:
         """Keep a letter, and obey the order that has waited for it."""
@@ -751,12 +754,11 @@ class Robot:
         """Send a letter again."""
         if lost.term != self._term:
             return
-        if self._part is None:
+        name = LetterName(lost.place, lost.call)
+        if self._part is None or name not in self._part.letters.sent:
             self._have_all_begin_again(lost.term)
             return
-        name = LetterName(lost.place, lost.call)
-        if name in self._part.letters.sent:
-            self._send_letter(self._part, lost.term, name)
+        self._send_letter(self._part, lost.term, name)
 
     def _take_outcome(self, sender: str, outcome: TeamOutcome) -> None:
         if outcome.term == self._term and outcome.term.driver == sender:
@@ -854,6 +856,7 @@ class Robot:
         robot._measurements = Measurements(list(saved_measurements.lines), saved_measurements.d)
         robot._term = saved.term
         robot.outcome = saved.outcome
+        robot.last = saved.outcome
         robot._known = saved.known
         return robot
 

@@ -89,6 +89,23 @@ def test_a_folder_with_wrong_closures_is_solved_for_those_that_agree(tmp_path: P
     assert "closures" not in str(solvers.solve_folder("robots"))
 
 
+def test_closures_between_several_pieces_of_trajectories_are_judged_apart(tmp_path: Path) -> None:
+    # Robot 0 has two pieces of odometry, robot 1 six; no measurement is wrong.
+    pieces = np.array([0] * 3 + [1] * 3 + [k for k in range(2, 8) for _ in range(2)])
+    ids = np.arange(len(pieces)) + 10 * pieces
+    truth = pgo.grid_world(1, len(pieces), np.random.default_rng(0), d=2).truth
+    assert truth is not None
+    pairs = [(k, k + 1) for k in range(len(pieces) - 1) if pieces[k] == pieces[k + 1]]
+    pairs += [(0, 6 + 2 * 5), (3, 6 + 2 * 1), (1, 4), *((6, 6 + 2 * k) for k in range(1, 6))]
+    i, j = np.array(pairs).T
+    R = np.swapaxes(truth.R[i], 1, 2) @ truth.R[j]
+    t = np.einsum("eba,eb->ea", truth.R[i], truth.t[j] - truth.t[i])
+    ones = np.ones(len(i))
+    graph = PoseGraph(len(pieces), i, j, R, t, 100.0 * ones, 100.0 * ones, ids=ids)
+    write_g2o_folder(graph.with_robots((pieces > 1).astype(int)), tmp_path / "in", truth)
+    assert solvers.solve_folder(tmp_path / "in", robust=solvers.PCM()).num_rejected == 0
+
+
 def test_what_robots_with_files_cannot_judge_is_refused() -> None:
     known = np.ones(212, dtype=bool)
     for robust in (solvers.GNC(), solvers.PCM(known=known)):
@@ -106,12 +123,16 @@ def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_pa
         robots[name].read(tmp_path / f"{k}.g2o")
     network = Network(robots, np.random.default_rng(0), lost=0.2)
     network.run(100.0)
-    num_wrong = int((~consistent(graph)).sum())
+    kept = consistent(graph)
+    num_wrong = int((~kept).sum())
+    wrong = np.stack([graph.pose_ids[graph.i], graph.pose_ids[graph.j]], axis=1)[~kept]
+    told = {pair for robot in robots.values() for pair in robot.rejected}
+    assert told == {(int(i), int(j)) for i, j in wrong}
     for robot in robots.values():
         assert robot.outcome is not None
         assert robot.outcome.certificate is not None
         assert robot.outcome.certificate.is_certified
         assert not robot.is_certified  # nobody has checked the edges that are kept
         assert robot.outcome.robust.startswith(f"{num_wrong} of {graph.num_edges} edges left out")
-    with pytest.raises(SettingError, match=r"GNC needs sharing=Sharing\.MEASUREMENTS"):
+    with pytest.raises(SettingError, match=r"GNC.* needs sharing=Sharing\.MEASUREMENTS"):
         solvers.Robot("a", names, KEY, robust=solvers.GNC())

@@ -12,6 +12,7 @@ import pytest
 from budget import examples
 from graphs import informed
 from networks import KEY, Network, give_edge, robots_of
+from robots import share
 from wrong_edges import spoiled
 
 import pgo_models as pgo
@@ -25,9 +26,9 @@ from solvers.network.messages import Token
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.agent import OwnAnswer, Sharing
-from solvers.team.messages import MESSAGES, Letter, Reply, TeamOutcome
+from solvers.team.messages import MESSAGES, Ask, Heard, Letter, Reply, TeamOutcome
 from solvers.team.robot import Envelope, TeamLedger
-from solvers.team.wire import opened
+from solvers.team.wire import opened, sealed
 
 pytest.importorskip("greenlet")
 
@@ -222,6 +223,69 @@ def test_a_robot_that_begins_anew_before_it_has_heard_the_outcome_gets_its_poses
     network.run(100.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
+
+
+def test_robots_that_hold_fronts_for_the_one_that_drives_are_not_all_asked_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    share(monkeypatch)
+    graph = world(n=60)
+    network = Network(robots_of(graph, 6), np.random.default_rng(0))
+    network.run(60.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+
+
+def test_a_late_copy_of_the_first_order_finds_a_robot_that_has_begun_anew() -> None:
+    graph = world()
+    robots = robots_of(graph, 3)
+    first: list[bytes] = []
+    num_asked: list[int] = []
+
+    def listen(sender: str, receiver: str, data: bytes) -> bool:
+        message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
+        if isinstance(message, Ask) and receiver == "r1":
+            first.extend([data] * (message.call == 0))
+            num_asked.append(message.call)
+        return False
+
+    network = Network(robots, np.random.default_rng(0), is_lost=listen)
+    while not num_asked or num_asked[-1] < 6:
+        network.wait(0.02)
+    network.robots["r1"] = solvers.Robot.load(robots["r1"].save(), KEY, patience=5.0, retry=0.3)
+    network.robots["r1"].receive(first[0], network.now)
+    network.run(100.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+
+
+def test_nobody_repeats_an_outcome_that_another_one_has_followed() -> None:
+    graph = world()
+
+    def loses(sender: str, receiver: str, data: bytes) -> bool:
+        message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
+        return isinstance(message, Heard) and receiver == "r1"
+
+    network = Network(robots_of(graph, 3), np.random.default_rng(0), asleep={"r0"}, is_lost=loses)
+    network.wait(20.0)  # r1 drives
+    network.asleep = set()
+    network.run(100.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+
+
+def test_a_robot_that_was_saved_with_the_outcome_does_not_ask_for_another() -> None:
+    graph = world()
+    network = Network(robots_of(graph, 3), np.random.default_rng(0))
+    network.run(60.0)
+    before = network.robots["r0"].outcome
+    assert before is not None
+    loaded = solvers.Robot.load(network.robots["r2"].save(), KEY, patience=5.0, retry=0.3)
+    network.robots["r2"] = loaded
+    loaded.receive(sealed(KEY, Envelope("r0", "r2", before)), network.now)  # its Heard was lost
+    network.wait(20.0)
+    assert network.robots["r0"].outcome is before
+    assert loaded.poses
 
 
 def kinds_in(record: object) -> set[type]:

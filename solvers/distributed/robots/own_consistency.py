@@ -172,8 +172,10 @@ def _without(joined: JoinedFile, robot: int, kept: BoolArray) -> JoinedFile:
     is_used[graph.i[kept]] = True
     is_used[graph.j[kept]] = True
     poses = np.flatnonzero(is_used)
+    ids = graph.pose_ids
     return replace(
         joined,
+        rejected=np.stack([ids[graph.i[~kept]], ids[graph.j[~kept]]], axis=1),
         graph=graph.without_edges(~kept).subgraph(poses),
         numbers=joined.numbers[poses],
         owners=joined.owners[poses],

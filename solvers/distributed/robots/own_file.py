@@ -1,15 +1,16 @@
 """A robot that loads its own file: what it knows, order by order, until it is one like any other.
 
 The orders stand below in the sequence in which they are given: `read_file`, `number_poses`,
-`join_neighbours`, `take_cost`, `place_cover`; where areas of robots interleave `propose_poses`,
-`place_larger_cover` and `take_larger_cover`; then, after the solve, `keep_answer`,
-`return_to_answer`, `move_answer` and `write_answer`. `solvers.distributed.own_files` gives them.
+`join_neighbours`, those of `own_consistency` where edges are judged, `take_cost`, `place_cover`;
+where areas of robots interleave `propose_poses`, `place_larger_cover` and `take_larger_cover`;
+then, after the solve, `keep_answer`, `return_to_answer`, `move_answer` and `write_answer`.
+`solvers.distributed.own_files` gives them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -173,13 +174,15 @@ class NumberedFile:
 class JoinedFile:
     """After `join_neighbours`: its graph, of its own poses and those at the far end of its edges.
 
-    Numbers in the whole graph, (n_a,), ascend.
+    Numbers in the whole graph, (n_a,), ascend. Of edges that were left out since it has the ids of
+    the ends, (k, 2).
     """
 
     graph: PoseGraph
     numbers: IntArray
     owners: IntArray
     given: Array  # as in `Answer`
+    rejected: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,18 +14,30 @@ from scipy.sparse import block_array, csr_array, kron
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from solvers.soc.subdomains import Subdomains, lower_triangle
+from solvers.soc.subdomains import Subdomains
 
 Widths = tuple[int, ...]  # numbers a separator in every field
 
 
 def coupled_unknowns(coupled: csr_array, widths: Widths) -> csr_array:
     """Lower triangle of the unknowns that are coupled, of that of the poses, (g, g)."""
-    if not coupled.shape[0]:
+    g = coupled.shape[0]
+    side = g * sum(widths)
+    if not g:
         return csr_array((0, 0))
-    both = csr_array(coupled + coupled.T)
-    rows = [[kron(both, np.ones((w, v), dtype=bool)) for v in widths] for w in widths]
-    return lower_triangle(csr_array(block_array(rows)))
+    of_pose = []
+    begin = 0
+    for width in widths:
+        of_pose.append(begin + width * np.arange(g)[:, None] + np.arange(width))
+        begin += width * g
+    unknowns = np.concatenate(of_pose, axis=1)  # (g, sum(widths)): of every pose
+    rows, columns = coupled.tocoo().coords
+    one = unknowns[rows][:, :, None]
+    other = unknowns[columns][:, None, :]
+    ends = np.maximum(one, other).ravel(), np.minimum(one, other).ravel()
+    lower = csr_array((np.ones(len(ends[0])), ends), shape=(side, side))
+    lower.sum_duplicates()  # two unknowns of one pose come twice; sorted, too
+    return lower.astype(bool)
 
 
 @dataclass(frozen=True, eq=False)
