@@ -43,9 +43,11 @@ class RowChange:
         largest = np.array([np.abs(part).max(initial=0.0) for part in (change[:q], change[q:])])
         if not np.isfinite(largest).all():
             return None
-        units = largest / _LARGEST[num_bytes]
+        most = _LARGEST[num_bytes]
+        units = largest / most
         units = np.where(units > 0, units, 1.0)
-        multiples = np.rint(change / _of_rows(units, change))
+        # A unit that is subnormal is itself rounded, and the largest multiple may be more.
+        multiples = np.clip(np.rint(change / _of_rows(units, change)), -most, most)
         return cls(multiples.astype(np.int8 if num_bytes == 1 else np.int16), units)
 
     def some(self, rows: IntArray) -> RowChange:

@@ -42,6 +42,14 @@ def test_a_change_arrives_to_half_a_unit_of_its_kind(seed, q, d, num_bytes, size
     np.testing.assert_array_equal(of_some, change.added_to(known)[rows])
 
 
+def test_subnormal_changes_do_not_wrap_around():
+    for largest in (5e-324, 4e-322, 4e-319, 3e-310):
+        change = RowChange.of(np.full((4, 3), largest), 2)
+        assert change is not None
+        arrived = change.added_to(np.zeros((4, 3)))
+        assert ((arrived >= 0.0) & (arrived <= 2.0 * largest)).all()
+
+
 def test_no_change_and_what_is_not_finite():
     change = RowChange.of(np.zeros((8, 3)), 2)
     assert change is not None
