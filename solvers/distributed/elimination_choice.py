@@ -34,6 +34,9 @@ ENOUGH_FLOPS = 5e9
 # robots sends 15.8, 16.6, 21.4 and 32.4 MB on sphere2500 (81.3 where all is eliminated), and with
 # 4, 8 and 16 it sends 4.2, 3.9 and 4.1 MB on M3500.
 MOST_COUPLED = 8
+# Numbers sent for one factor from which robots try to make their messages shorter: 80 kB. Less is
+# not worth the search.
+ENOUGH_NUMBERS = 10_000
 # How often driver and robots exchange vectors on the boundaries with one factor: a solve makes five
 # factors in 11 to 22 rounds.
 _EXCHANGES = 3
@@ -134,18 +137,20 @@ def has_cholmod() -> bool:
 def choose_elimination(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
     """Return the subgraphs of one graph with the cover that suits driver and robots better.
 
-    The larger one is tried where messages are longer than a list of all edges, or fronts take long
-    (`may_leave_poses`). It is chosen where messages become shorter and the driver takes few
-    operations, or where fronts take long and it takes fewer.
+    The larger one is tried where messages are long, and longer than a list of all edges, or fronts
+    take long (`may_leave_poses`). It is chosen where messages become shorter and the driver takes
+    few operations, or where fronts take long and it takes fewer.
     """
     system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
-    are_short = BYTES_PER_NUMBER * system.num_sent <= bytes_of_edges(subgraphs)
+    num_sent = system.num_sent
+    num_bytes = BYTES_PER_NUMBER * num_sent
+    are_short = num_sent < ENOUGH_NUMBERS or num_bytes <= bytes_of_edges(subgraphs)
     takes_long = may_leave_poses(system)
     if not has_cholmod() or (are_short and not takes_long):
         return tuple(subgraphs)
     larger = leave_poses(subgraphs, MOST_COUPLED)
     sparse = CoverSystem.of([subgraph.summary for subgraph in larger])
-    is_shorter = sparse.num_sent < system.num_sent and sparse.flops < ENOUGH_FLOPS
+    is_shorter = sparse.num_sent < num_sent and sparse.flops < ENOUGH_FLOPS
     is_quicker = takes_long and sparse.flops < system.flops
     return larger if is_shorter or is_quicker else tuple(subgraphs)
 
