@@ -14,7 +14,7 @@ from graphs import (
     varied_graph,
     varied_problem,
 )
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 from robots import (
     BACKENDS,
     PARTITIONERS,
@@ -22,6 +22,7 @@ from robots import (
     Recording,
     arrays_in,
     bytes_of,
+    contiguous,
     corner_cases,
     driver_at,
     eliminate_all,
@@ -326,6 +327,7 @@ def test_what_crosses_has_the_size_of_the_separators(
 
 
 @settings(max_examples=examples(15))
+@example(seed=234, n=20, d=3, noise=LOUD_NOISE, partitioner=contiguous)  # terms go back to the best
 @given(seed=SEEDS, n=st.integers(6, 24), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
 def test_no_interior_pose_and_no_private_measurement_crosses(
     seed: int, n: int, d: int, noise: NoiseModel, partitioner: Partitioner
@@ -352,7 +354,8 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
     # sent: of a pose with one edge they are its precision.
     sent = [
         value
-        for name, value in engine.crossed(current_poses.result)
+        # Robots are given poses where a solve goes back to those of an earlier attempt.
+        for name, value in engine.crossed(current_poses.result, current_poses.set_poses)
         if name not in ("norms", "scale")
     ]
     assert not np.isin(secrets, np.concatenate(sent)).any()
