@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
@@ -132,8 +132,7 @@ def test_what_two_robots_tell_each_other_does_not_pass_the_one_that_drives() -> 
     heard: dict[tuple[str, str], list[object]] = {}
 
     def listen(sender: str, receiver: str, data: bytes) -> bool:
-        envelope = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES))
-        heard.setdefault((sender, receiver), []).append(envelope.message)
+        heard.setdefault((sender, receiver), []).append(message_in(data))
         return False
 
     network = Network(robots, np.random.default_rng(0), is_lost=listen)
@@ -154,18 +153,11 @@ def test_a_letter_that_is_lost_is_asked_for_and_one_that_is_never_heard_ends_the
     graph = world()
     for times, is_solved in ((3, True), (10**9, False)):
         robots = robots_of(graph, 3, pipeline=PEERS)
-        lost: list[object] = []
-
-        def loses(sender: str, receiver: str, data: bytes, lost=lost, times=times) -> bool:
-            message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
-            is_lost = isinstance(message, Letter) and sender == "r1" and len(lost) < times
-            lost.extend([message] * is_lost)
-            return is_lost
-
+        loses, letters = losing(Letter, range(times), sender="r1")
         network = Network(robots, np.random.default_rng(0), is_lost=loses)
         network.run(60.0)
         assert network.is_settled is is_solved
-        assert len(lost) >= 3
+        assert len(letters) >= 3
         if is_solved:
             assert_is_the_optimum(robots, graph)
         else:
@@ -174,27 +166,20 @@ def test_a_letter_that_is_lost_is_asked_for_and_one_that_is_never_heard_ends_the
 
 def test_a_robot_that_begins_anew_while_its_letter_is_waited_for_is_solved_with_again() -> None:
     graph = world()
-    letters: list[str] = []
 
-    def with_letter_lost(number: int) -> Network:
-        """Robots of which r1 loses one letter, counted from 1."""
-        letters.clear()
-
-        def loses(sender: str, receiver: str, data: bytes) -> bool:
-            message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
-            is_letter = isinstance(message, Letter) and sender == "r1"
-            letters.extend([receiver] * is_letter)
-            return is_letter and len(letters) == number
-
+    def with_letters_lost(numbers: Collection[int]) -> tuple[Network, list[object]]:
+        """Robots of which r1 loses some letters, and the letters of r1."""
+        loses, letters = losing(Letter, numbers, sender="r1")
         robots = robots_of(graph, 3, pipeline=PEERS)
-        return Network(robots, np.random.default_rng(0), is_lost=loses)
+        return Network(robots, np.random.default_rng(0), is_lost=loses), letters
 
-    with_letter_lost(0).run(60.0)
+    undisturbed, letters = with_letters_lost(())
+    undisturbed.run(60.0)
     num_letters = len(letters)
     assert num_letters > 5
-    for number in (1, 2, num_letters // 2, num_letters):
-        network = with_letter_lost(number)
-        while len(letters) < number:
+    for number in (0, 1, num_letters // 2 - 1, num_letters - 1):
+        network, letters = with_letters_lost((number,))
+        while len(letters) <= number:
             network.wait(0.02)
         saved = network.robots["r1"].save()
         network.robots["r1"] = solvers.Robot.load(
@@ -208,14 +193,7 @@ def test_a_robot_that_begins_anew_while_its_letter_is_waited_for_is_solved_with_
 def test_a_robot_that_begins_anew_before_it_has_heard_the_outcome_gets_its_poses() -> None:
     graph = world()
     robots = robots_of(graph, 3)
-    ended: list[object] = []
-
-    def loses(sender: str, receiver: str, data: bytes) -> bool:
-        message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
-        is_outcome = isinstance(message, TeamOutcome) and receiver == "r2"
-        ended.extend([message] * is_outcome)
-        return is_outcome and len(ended) == 1
-
+    loses, ended = losing(TeamOutcome, (0,), receiver="r2")
     network = Network(robots, np.random.default_rng(0), is_lost=loses)
     while not ended:
         network.wait(0.02)
@@ -243,7 +221,7 @@ def test_a_late_copy_of_the_first_order_finds_a_robot_that_has_begun_anew() -> N
     num_asked: list[int] = []
 
     def listen(sender: str, receiver: str, data: bytes) -> bool:
-        message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
+        message = message_in(data)
         if isinstance(message, Ask) and receiver == "r1":
             first.extend([data] * (message.call == 0))
             num_asked.append(message.call)
@@ -261,11 +239,7 @@ def test_a_late_copy_of_the_first_order_finds_a_robot_that_has_begun_anew() -> N
 
 def test_nobody_repeats_an_outcome_that_another_one_has_followed() -> None:
     graph = world()
-
-    def loses(sender: str, receiver: str, data: bytes) -> bool:
-        message = opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
-        return isinstance(message, Heard) and receiver == "r1"
-
+    loses, _ = losing(Heard, range(10**9), receiver="r1")
     network = Network(robots_of(graph, 3), np.random.default_rng(0), asleep={"r0"}, is_lost=loses)
     network.wait(20.0)  # r1 drives
     network.asleep = set()
@@ -286,6 +260,30 @@ def test_a_robot_that_was_saved_with_the_outcome_does_not_ask_for_another() -> N
     network.wait(20.0)
     assert network.robots["r0"].outcome is before
     assert loaded.poses
+
+
+def message_in(data: bytes) -> object:
+    """What sealed bytes say."""
+    return opened(KEY, data, (Envelope, OwnAnswer, *MESSAGES)).message
+
+
+def losing(
+    kind: type, numbers: Collection[int], sender: str | None = None, receiver: str | None = None
+) -> tuple[Callable[[str, str, bytes], bool], list[object]]:
+    """What loses messages of a kind by their numbers, from 0, and the list of those that came.
+
+    They are those from and to these robots, where they are named.
+    """
+    came: list[object] = []
+
+    def is_lost(by: str, to: str, data: bytes) -> bool:
+        message = message_in(data)
+        if not isinstance(message, kind) or sender not in (None, by) or receiver not in (None, to):
+            return False
+        came.append(message)
+        return len(came) - 1 in numbers
+
+    return is_lost, came
 
 
 def kinds_in(record: object) -> set[type]:
