@@ -167,8 +167,8 @@ def solve_folder(
     edge between two robots may be in the file of either, or of both. Start, SOC, Newton,
     certificate and staircase are those of `solve(.., robots=..)`. GNC, priors, landmarks,
     checkpoints and an ascent of handedness terms need `solve`. A robot that is lost reads its file
-    again, and is sent again all that it had received. The frame is that of the first
-    pose with a FIX line, or else of the first pose of all, where its file has it.
+    again, and is sent again all that it had received. The frame is that of the first pose with a
+    FIX line, or else of the first pose of all, where its file has it.
 
     Parameters
     ----------

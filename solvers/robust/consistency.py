@@ -128,16 +128,19 @@ def pairwise_consistent(
     check_quantile(quantile)
     is_known = odometry(graph) if known is None else np.asarray(known, dtype=bool)
     check_shape(is_known, (graph.num_edges,), "known")
-    kept = np.ones(graph.num_edges, dtype=bool)
-    kept[is_whole(graph) & ~is_known] = False
-    tested = np.flatnonzero(is_whole(graph) & ~is_known)
-    for edges, agree in agreements(Chains.of(graph, is_known), tested, quantile):
+    return largest_sets(Chains.of(graph, is_known), is_whole(graph) & ~is_known, quantile)
+
+
+def largest_sets(chains: Chains, is_tested: BoolArray, quantile: float) -> BoolArray:
+    """Edges, (m,), in the largest consistent sets of those tested, and all that are not tested."""
+    kept = ~is_tested
+    for edges, agree in _agreements(chains, np.flatnonzero(is_tested), quantile):
         clique, _ = maximum_clique(agree)
         kept[edges[clique]] = True
     return kept
 
 
-def agreements(
+def _agreements(
     chains: Chains, tested: IntArray, quantile: float
 ) -> Iterator[tuple[IntArray, BoolArray]]:
     """Tested edges, (k,), between every two chains, and which of them are consistent, (k, k)."""

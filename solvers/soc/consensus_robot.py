@@ -180,7 +180,7 @@ class ConsensusRobot:
         X, omega, _B, drift = self._solved_after_local_passes()
         x = np.where(self.layout.held, X, 0.0)
         before = self.block
-        step = over_relax(x, omega, before.settings.alpha) - omega + drift
+        step = before.step_of_map(x, omega, drift)
         # Neighbours have s, or the first time with these penalties omega.
         known = before.omega if before.anderson.image is None else before.s
         image, sent = self._as_sent(before.s + step, known, before.settings.bytes_per_number)

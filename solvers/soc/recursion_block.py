@@ -110,17 +110,18 @@ class RecursionBlock:
         """Whether all entries of s are finite."""
         return bool(np.isfinite(self.s).all())
 
-    def after_solve(
-        self, x: Array, omega: Array | None = None, drift: Array | float = 0.0
-    ) -> tuple[RecursionBlock, Array]:
-        """Block with the x of step (a), (rows, d), and this party's sums for the acceleration.
+    def after_solve(self, x: Array) -> tuple[RecursionBlock, Array]:
+        """Block with the x of step (a), (rows, d), and this party's sums for the acceleration."""
+        step = self.step_of_map(x, self.omega)
+        return self.after_map(x, step, self.s + step)
+
+    def step_of_map(self, x: Array, omega: Array, drift: Array | float = 0.0) -> Array:
+        """Step from s of the fixed-point map, (rows, d), where step (a) gives x.
 
         After local passes, `omega` is the one that they led to and `drift` their change of omega +
         B, both (rows, d).
         """
-        omega = self.omega if omega is None else omega
-        step = over_relax(x, omega, self.settings.alpha) - omega + drift
-        return self.after_map(x, step, self.s + step)
+        return over_relax(x, omega, self.settings.alpha) - omega + drift
 
     def after_map(self, x: Array, step: Array, image: Array) -> tuple[RecursionBlock, Array]:
         """Block with x, and the sums, where the fixed-point map takes s to `image` = s + step."""

@@ -8,8 +8,9 @@ is lost is asked for again. What is for the robot that drives, or from it, needs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from itertools import count
 from typing import Any, NamedTuple
 
 from solvers.network.messages import Token, count_bytes
@@ -82,7 +83,7 @@ Change = Callable[[Mapping[int, Any]], Mapping[int, Any]]
 
 def _numbered(change: Callable[[Mapping[int, Any], int], Mapping[int, Any]]) -> Change:
     """Tell a change, too, how many mappings came before."""
-    numbers: Iterator[int] = iter(range(1 << 30))
+    numbers = count()
     return lambda messages: change(messages, next(numbers))
 
 

@@ -24,8 +24,7 @@ from solvers.robust.chains import (
     measured_covariances,
     product,
 )
-from solvers.robust.cliques import maximum_clique
-from solvers.robust.consistency import agreements, pairwise_consistent
+from solvers.robust.consistency import largest_sets, pairwise_consistent
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,13 +131,7 @@ def _agree(
         measured=measured_covariances(pair),
         covariance=covariance[order],
     )
-    kept = np.ones(len(between), dtype=bool)
-    tested = np.flatnonzero(is_whole(pair))
-    kept[tested] = False
-    for edges, agree in agreements(chains, tested, quantile):
-        clique, _ = maximum_clique(agree)
-        kept[edges[clique]] = True
-    return kept
+    return largest_sets(chains, is_whole(pair), quantile)
 
 
 def _own_odometry(graph: PoseGraph, is_own: BoolArray) -> BoolArray:
