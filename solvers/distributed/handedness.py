@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from pgo_models.certificates.lower_bound import UNGROUNDED_MARGIN
 from pgo_models.errors import NotPositiveDefiniteError
@@ -30,6 +29,7 @@ _SETTLED = 1e-3
 _FAR = 1.0  # of the smallest eigenvalue: a shift farther below it is moved closer
 _MOST_STEPS = 10  # with one shift
 _MOST_SHIFTS = 8
+_DEPENDENT = 1e-13  # of the largest square of a direction in the span: less is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +37,8 @@ class LowestVectors:
     """The lowest eigenvectors X C, by driver and robots, and their eigenvalues."""
 
     values: Array  # (q,), ascending
-    X: Array  # ((d+1) g, q): rows of the rotations of the cover
-    C: Array  # (q, q)
+    X: Array  # ((d+1) g, k): rows of the rotations of the cover
+    C: Array  # (k, q); q is below k where some columns of X depend on the others
     is_settled: bool  # whether the last step hardly changed the smallest eigenvalue
 
 
@@ -173,6 +173,19 @@ def _factor_below(
     raise NotPositiveDefiniteError("no shift makes the certificate matrix positive definite")
 
 
+def _ritz_values(energies: Array, products: Array) -> tuple[Array, Array]:
+    """Ritz values theta, (q,), and C, (k, q), of (Y^T X C) c = theta (Y^T Y) c.
+
+    A shift close to one eigenvalue leaves columns of Y that depend on the others up to rounding;
+    C then spans what is left.
+    """
+    squares, axes = np.linalg.eigh(products)
+    kept = squares > _DEPENDENT * squares[-1]
+    basis = axes[:, kept] / np.sqrt(squares[kept])
+    theta, c = np.linalg.eigh(0.5 * basis.T @ (energies + energies.T) @ basis)
+    return theta, basis @ c
+
+
 def _iterated(driver: Driver, proof: InterfaceProof, shift: float, X: Array) -> LowestVectors:
     """Take steps of inverse iteration with a factor, until the smallest eigenvalue settles.
 
@@ -194,7 +207,7 @@ def _iterated(driver: Driver, proof: InterfaceProof, shift: float, X: Array) -> 
         energies = X.T @ b + sum(answer.energies for answer in answers)
         products = X.T @ X + sum(answer.products for answer in answers)
         last = theta[0]
-        theta, C = scipy.linalg.eigh(0.5 * (energies + energies.T), products)
+        theta, C = _ritz_values(energies, products)
         is_settled = bool(abs(theta[0] - last) <= _SETTLED * theta[0])
         if is_settled:
             break

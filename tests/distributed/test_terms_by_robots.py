@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import LOUD_NOISE, SEEDS, varied_graph
-from hypothesis import given, settings, strategies as st
-from robots import PARTITIONERS, Partitioner, driver_at, graph_of, metis
+from hypothesis import example, given, settings, strategies as st
+from robots import PARTITIONERS, Partitioner, contiguous, driver_at, graph_of, metis
 
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
@@ -177,6 +177,7 @@ def ascents(
 
 @settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, partitioner=PARTITIONERS)
+@example(seed=908, n=3, partitioner=contiguous)  # a shift at an eigenvalue
 def test_an_ascent_begins_at_the_same_eigenvalues(
     seed: int, n: int, partitioner: Partitioner
 ) -> None:
