@@ -27,6 +27,7 @@ from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.own_files import OpenedFiles, open_files
+from solvers.distributed.paper import check_paper
 from solvers.distributed.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.distributed.robots_with_files import RobotsWithFiles
 from solvers.loop import RunMonitor
@@ -41,6 +42,7 @@ from solvers.result import Record, Stage, Status
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
@@ -296,9 +298,13 @@ def _check_first_stage(soc: FirstStage) -> None:
     """Raise a SettingError for a first stage that robots with own files cannot run."""
     if soc is None or soc is AUTO:
         return
-    if type(soc) is not SOC:
-        raise SettingError(f"robots with files of their own run SOC(..), got {soc}; {READ_HERE}")
-    if soc.robots is not None or soc.r_step is not RStep.FACTORIZED:
+    if type(soc) not in (SOC, PaperSOC):
+        raise SettingError(
+            f"robots with files of their own run SOC(..) or PaperSOC(..), got {soc}; {READ_HERE}"
+        )
+    if isinstance(soc, PaperSOC) and soc.robots is None:
+        check_paper(soc)
+    elif soc.robots is not None or soc.r_step is not RStep.FACTORIZED:
         raise SettingError(
             f"robots are those of the files, and factor their subproblems, got {soc}; {READ_HERE}"
         )

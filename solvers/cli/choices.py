@@ -24,7 +24,12 @@ if TYPE_CHECKING:
     from solvers.robust.gnc import GNC
 
 # Methods that driver and robots run.
-ON_ROBOTS = (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS, FirstStage.NEWTON)
+ON_ROBOTS = (
+    FirstStage.SUBSTRUCTURED,
+    FirstStage.CONSENSUS,
+    FirstStage.PAPER,
+    FirstStage.NEWTON,
+)
 # Arguments of `pgo solve` that go with robots which load their own files.
 FOR_OWN_FILES = {
     "graph",

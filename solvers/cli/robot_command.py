@@ -38,6 +38,7 @@ class MethodOfTeam(enum.Enum):
 
     SUBSTRUCTURED = "substructured"
     CONSENSUS = "consensus"
+    PAPER = "paper"
     NEWTON = "newton"
 
 

@@ -425,9 +425,9 @@ class RobotOptions:
         partition = None
         if self.is_given or method in (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS):
             partition = chosen_partition(graph, self.robots, self.split)
-        # Robots factor; the other back ends of CONSENSUS have all robots in one place.
-        is_factorized = stages.r_step in (None, BackEndName.FACTORIZED)
-        if partition is not None and engine is not None and is_factorized:
+        # Robots of SOC factor; the other back ends of CONSENSUS have all robots in one place.
+        has_back_end = method is FirstStage.PAPER or stages.r_step in (None, BackEndName.FACTORIZED)
+        if partition is not None and engine is not None and has_back_end:
             return ChosenPlace(method, partition, engine)
         if stages.r_step is not None and self.is_about_network:
             raise SettingError(

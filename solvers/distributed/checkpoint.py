@@ -31,6 +31,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import CoverPoses, Driver, DriverState
 from solvers.distributed.newton import SubstructuredNewtonState
+from solvers.distributed.paper import PaperRobotsState
 from solvers.distributed.robots.records import RightHandSide
 from solvers.distributed.substructured import SubstructuredState
 from solvers.loop import Method, RunMonitor
@@ -43,7 +44,9 @@ from solvers.robots import Checkpoint
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.copies import SeparatorPenalty
-from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
+from solvers.soc.paper import PaperSOC, PaperStop
+from solvers.soc.paper_block import CommonPenalty
+from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
 from solvers.soc.rounding import RowChange
@@ -101,6 +104,8 @@ _CLASSES = (
     # States of methods.
     SubstructuredState,
     ConsensusState,
+    PaperRobotsState,
+    CommonPenalty,
     SubstructuredNewtonState,
     RecursionBlock,
     RightHandSide,
@@ -112,6 +117,8 @@ _CLASSES = (
     Rotations,
     # Settings of methods.
     SOC,
+    PaperSOC,
+    PaperStop,
     Newton,
     GrowingStart,
     Anderson,
@@ -120,6 +127,7 @@ _CLASSES = (
     MultiplierPenalty,
     FixedPenalty,
     BalancedPenalty,
+    BoydPenalty,
     Partition,
     PartitionMethod,
 )

@@ -6,6 +6,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.pose_graph import PoseGraph
+from solvers.distributed.paper import check_paper
 from solvers.place import Automatic, FirstStage
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
@@ -32,10 +33,8 @@ def robots_of_solve(soc: FirstStage, robots: Partition | int | None, graph: Pose
             f"solve() has {robots}, SOC has {of_soc}; give both the same robots, or SOC none"
         )
     if isinstance(soc, PaperSOC):
-        raise SettingError(
-            "PaperSOC is run in one place; leave out the robots of solve(), or use SOC(robots=..)"
-        )
-    if soc is not None and soc.r_step is not RStep.FACTORIZED:
+        check_paper(soc)
+    elif soc is not None and soc.r_step is not RStep.FACTORIZED:
         raise SettingError(
             f"robots factor their subproblems, got r_step {soc.r_step}; use RStep.FACTORIZED"
         )

@@ -10,21 +10,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
-from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
+from solvers.distributed.asynchronous import AsynchronousSOC
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
 from solvers.distributed.newton import SubstructuredNewton
+from solvers.distributed.paper import PaperByRobots
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
-from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
+from solvers.distributed.substructured import SubstructuredSOC
 from solvers.network.faults import Faults
 from solvers.network.ledger import Ledger
-from solvers.place import AUTO, Attempt, FirstStage, Place
+from solvers.place import AUTO, AnySOC, Attempt, FirstStage, Place
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import Staircase
-from solvers.soc.consensus import ConsensusState
+from solvers.soc.paper import PaperSOC
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, WARM_START
 
@@ -77,7 +79,7 @@ class DriverPlace(PlaceOfRobots):
         """Dimension of the space, 2 or 3."""
         return self.driver.d
 
-    def chordal_start(self, soc: FirstStage) -> tuple[Attempt, SOC | None]:
+    def chordal_start(self, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
         """Have the robots relax the rotations; with the start goes the SOC to run from there.
 
         AUTO is in the plane the averaged start and no SOC, as in one place: from there Newton's
@@ -106,7 +108,7 @@ class DriverPlace(PlaceOfRobots):
         self.stages.append(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
         return Attempt()
 
-    def run_soc(self, attempt: Attempt, soc: SOC) -> Attempt:
+    def run_soc(self, attempt: Attempt, soc: AnySOC) -> Attempt:
         """Run SOC from the current poses, which stay where it finds none that cost less."""
         journal = self.journal
         if journal.goes_on_with(SubstructuredNewton):
@@ -120,7 +122,9 @@ class DriverPlace(PlaceOfRobots):
             driver.restore_poses()
         objective = self._final_objective()
         seconds = time.perf_counter() - began
-        name = "SOC, convex" if driver.is_final else "SOC"
+        name = type(soc).__name__
+        if driver.is_final:
+            name = f"{name}, convex"
         stage = Stage(
             name,
             finished.status,
@@ -141,11 +145,14 @@ class DriverPlace(PlaceOfRobots):
         heard.check_heard(self.faults, rounds)
         return heard
 
-    def _run_coupling(
-        self, soc: SOC
-    ) -> Outcome[AsynchronousState] | Outcome[ConsensusState] | Outcome[SubstructuredState]:
-        """Run the coupling that the settings name; its factors go with it."""
+    def _run_coupling(self, soc: AnySOC) -> Outcome[Any]:
+        """Run the coupling that the settings name, or the paper's; its factors go with it."""
         driver = self.driver
+        if isinstance(soc, PaperSOC):
+            by_paper = PaperByRobots(soc)
+            ended = self.journal.run(by_paper, driver, self.monitor)
+            by_paper.finish(driver, ended.state)
+            return ended
         if soc.effective_coupling is not Coupling.CONSENSUS:
             substructured = SubstructuredSOC(soc)
             finished = self.journal.run(substructured, driver, self.monitor)
@@ -208,9 +215,9 @@ class DriverPlace(PlaceOfRobots):
         return self.driver.current.objective
 
 
-def chosen_soc(soc: FirstStage) -> SOC | None:
+def chosen_soc(soc: FirstStage) -> AnySOC | None:
     """SOC of robots that is asked for; AUTO stands for one with a coarse tolerance."""
     if soc is AUTO:
         return WARM_START
-    assert soc is None or isinstance(soc, SOC)  # as the places have checked
+    assert soc is None or isinstance(soc, SOC | PaperSOC)  # as the places have checked
     return soc

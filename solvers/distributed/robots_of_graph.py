@@ -14,7 +14,7 @@ from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.driver_place import AttemptWithFaults, DriverPlace, chosen_soc
@@ -37,13 +37,13 @@ from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.here import Here
 from solvers.network.counted_pool import Count
 from solvers.network.engine import DEFAULT_MEMORY, Engine
-from solvers.place import Attempt, Ending, FirstStage, after_search
+from solvers.place import AnySOC, Attempt, Ending, FirstStage, after_search
 from solvers.result import Outcome, Stage
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
 from solvers.robust.gnc import GNC, Inliers
 from solvers.robust.weighted_edges import first_poses, known_inliers
-from solvers.soc.soc import SOC
+from solvers.soc.paper import PaperSOC
 from solvers.soc.subgraph import middle_separator, split_graph
 
 
@@ -86,8 +86,11 @@ class RobotsOfGraph(DriverPlace):
         """Whether the graph has landmarks."""
         return self.here.has_landmarks
 
-    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, SOC | None]:
-        """Start at given poses, the chordal relaxation, or the outcome that a checkpoint has."""
+    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
+        """Start at given poses, the chordal relaxation, or the outcome that a checkpoint has.
+
+        PaperSOC starts at a spanning tree, as in one place.
+        """
         known = self._known_outcome()
         if known is not None:
             return known, None
@@ -100,6 +103,10 @@ class RobotsOfGraph(DriverPlace):
             poses = chordal_start(problem.convex_part)
             set_poses = partial(self.driver.set_poses, poses)
             return self.begin("chordal start, in one place", set_poses), chosen_soc(soc)
+        if isinstance(soc, PaperSOC):
+            poses = spanning_tree_start(problem.convex_part.graph)
+            set_poses = partial(self.driver.set_poses, poses)
+            return self.begin("spanning tree, in one place", set_poses), soc
         return self.chordal_start(soc)
 
     def _known_outcome(self) -> Attempt | None:

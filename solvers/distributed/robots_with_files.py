@@ -33,10 +33,9 @@ from solvers.distributed.robots.own_file import (
     return_to_answer,
 )
 from solvers.network.counted_pool import Count
-from solvers.place import BROKEN_OFF, Attempt, Ending, FirstStage, Step
+from solvers.place import BROKEN_OFF, AnySOC, Attempt, Ending, FirstStage, Step
 from solvers.result import Status
 from solvers.riemannian.staircase import Staircase
-from solvers.soc.soc import SOC
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,7 @@ class RobotsWithFiles(DriverPlace):
         """How to have the missing steps taken."""
         return READ_HERE
 
-    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, SOC | None]:
+    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
         """Start at the chordal relaxation: nobody could give the poses of all robots."""
         return self.chordal_start(soc)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
+from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -54,7 +54,7 @@ class ConsensusRobot:
     def begin(self, poses: Poses) -> tuple[ConsensusRobot, copies.Rows]:
         """Start at own poses, (n_a), and send them to the neighbours that hold copies."""
         X = poses.stacked()
-        return self._with(X=X), self._rows_of_own_poses(X)
+        return self._with(X=X), self.layout.rows_of_own_poses(X)
 
     def begin_here(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Start at omega with the robot's translations."""
@@ -63,16 +63,9 @@ class ConsensusRobot:
     def multiplier_ratios(self, rows: copies.Rows) -> tuple[ConsensusRobot, Array]:
         """Take the owners' poses; return ||Lambda_i||_2 / m_i of the robot's own."""
         layout = self.layout
-        X = self._with_rows_of_others(self.state.X.copy(), rows)
-        n = layout.problem.num_poses
-        d = layout.problem.d
-        whole = layout.whole
-        Lambda = multipliers(whole, Poses(unstack_transposes(X[n:]), X[:n]))
-        diagonal_of_M = whole.M.data[whole.diagonal_positions]
-        of_translations = diagonal_of_M[:n, None]
-        of_rotations = diagonal_of_M[n:].reshape(n, d)
-        diagonal = np.concatenate([of_translations, of_rotations], axis=1)
-        following = self._with(X=X, Lambda=Lambda, diagonal=diagonal)
+        X = layout.with_rows_of_others(self.state.X.copy(), rows)
+        Lambda = layout.multipliers(X)
+        following = self._with(X=X, Lambda=Lambda, diagonal=layout.diagonal)
         norms = multiplier_norms(Lambda[layout.own])
         return following, norms / following._scale[layout.own]
 
@@ -363,11 +356,11 @@ class ConsensusRobot:
 
     def held_rows(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Rows of the own poses, for every neighbour that holds copies of them."""
-        return self, self._rows_of_own_poses(self.poses.stacked())
+        return self, self.layout.rows_of_own_poses(self.poses.stacked())
 
     def stationarity_beside(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.Stationarity]:
         """As `stationarity`, with the owners' rows in place of the robot's copies."""
-        X = self._with_rows_of_others(self.poses.stacked(), rows)
+        X = self.layout.with_rows_of_others(self.poses.stacked(), rows)
         n = self.layout.problem.num_poses
         return self, self._stationarity_at(Poses(unstack_transposes(X[n:]), X[:n]))
 
@@ -391,16 +384,6 @@ class ConsensusRobot:
         cost = float(problem.edge_costs(poses)[self.layout.subgraph.is_counted].sum())
         gradient = float(gradient_squares(problem, poses)[self.layout.own].sum())
         return copies.Stationarity(gradient, cost)
-
-    def _rows_of_own_poses(self, X: Array) -> copies.Rows:
-        layout = self.layout
-        return {robot: X[layout.rows(mine)] for robot, mine in layout.sent.items()}
-
-    def _with_rows_of_others(self, X: Array, rows: copies.Rows) -> Array:
-        """X, (rows, d), which is changed, with the rows that the owners of other poses sent."""
-        for robot, theirs in self.layout.received.items():
-            X[self.layout.rows(theirs)] = rows[robot]
-        return X
 
     def _sending(self, block: RecursionBlock) -> tuple[ConsensusRobot, copies.Rows]:
         return self._with(block=block), self._common_rows(block.s)

@@ -7,7 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
@@ -230,6 +232,29 @@ class CopyLayout:
     def rows(self, poses: IntArray) -> IntArray:
         """Rows of X of some poses."""
         return columns_of(poses, self.problem.num_poses, (1, self.problem.d))
+
+    @cached_property
+    def diagonal(self) -> Array:
+        """Diagonal of M, (n_a, d + 1), of every pose its translation first; right for own poses."""
+        n = self.problem.num_poses
+        diagonal = self.whole.M.data[self.whole.diagonal_positions]
+        of_rotations = diagonal[n:].reshape(n, self.problem.d)
+        return np.concatenate([diagonal[:n, None], of_rotations], axis=1)
+
+    def multipliers(self, X: Array) -> Array:
+        """Lambda, (n_a, d, d), at X, (rows, d); right for own poses."""
+        n = self.problem.num_poses
+        return multipliers(self.whole, Poses(unstack_transposes(X[n:]), X[:n]))
+
+    def rows_of_own_poses(self, X: Array) -> Rows:
+        """Rows of X, (rows, d), of own poses, for every neighbour that holds copies of them."""
+        return {robot: X[self.rows(mine)] for robot, mine in self.sent.items()}
+
+    def with_rows_of_others(self, X: Array, rows: Rows) -> Array:
+        """X, (rows, d), which is changed, with the rows that the owners of other poses sent."""
+        for robot, theirs in self.received.items():
+            X[self.rows(theirs)] = rows[robot]
+        return X
 
     def subproblem(self, penalty: Array) -> RSubproblem:
         """Step (a) of the robot."""

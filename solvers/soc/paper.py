@@ -16,28 +16,22 @@ frozen neighbours counts.
 """
 
 import enum
+import math
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, csr_array, vstack
 
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import (
-    Array,
-    BoolArray,
-    project_to_rotations,
-    stack_transposes,
-    unstack_transposes,
-)
+from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.matrices import assemble, block_entries, norm, rotation_columns
+from pgo_models.problem.matrices import norm
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
+from solvers.soc.paper_block import Blocks, CommonPenalty, PaperIterate
 from solvers.soc.penalty import (
     BalancedPenalty,
     BoydPenalty,
@@ -45,50 +39,21 @@ from solvers.soc.penalty import (
     PenaltyRule,
     first_penalties,
 )
-from solvers.soc.r_step import BackEnd, RotationStep, RStep, RSubproblem, prepare
-
-_PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
-
-
-@dataclass(frozen=True, eq=False)
-class Blocks:
-    """L split by robots: L = own + between.
-
-    Parameters
-    ----------
-    A : (rows, dn) sparse array
-        Residuals of `own`: the edges within a robot, and one end at a time of the edges between
-        robots.
-    w : (rows,) array
-        Weights of these residuals.
-    own : (dn, dn) sparse array
-        A^T diag(w) A, a block for every robot: its edges, and kappa I for its ends of the edges
-        between robots.
-    between : (dn, dn) sparse array
-        L - own, which ties rotations to the frozen neighbours.
-    analysis : SymbolicCholesky
-        Ordering and pattern of the factor of `own`.
-    """
-
-    A: csr_array
-    w: Array
-    own: csc_array
-    between: csr_array
-    analysis: SymbolicCholesky
+from solvers.soc.r_step import BackEnd, RotationStep, RStep
 
 
 @dataclass(frozen=True, eq=False)
 class PaperState(Summarised):
-    """Iterate k of the paper's recursion; names as in Algorithm 1.
+    """Iterate k of the paper's recursion.
 
     Parameters
     ----------
     k : int
         Number of the iterate.
-    R, omega, B : (n, d, d) arrays
+    iterate : PaperIterate
         R_i, omega_i and B_i of all poses.
-    rho : float
-        One penalty for all poses, as in the paper.
+    penalty : CommonPenalty
+        One rho for all poses, as in the paper.
     blocks : Blocks
         The split matrix.
     r_step : RotationStep
@@ -98,27 +63,35 @@ class PaperState(Summarised):
     dual_residual : float
         Stationarity, ||2 L R + rho B||_F / scale over the root of n d, with the rows of R and B
         stacked as those of L.
-    smallest_merit : float
-        For the safeguard of the adaptive rho: the smallest norm of (R - omega, omega - omega_last)
-        since rho changed.
-    steps_since_smallest : int
-        How many steps ago that was.
-    may_fall : bool
-        Whether rho may still be lowered.
     """
 
     k: int
-    R: Array
-    omega: Array
-    B: Array
-    rho: float
+    iterate: PaperIterate
+    penalty: CommonPenalty
     blocks: Blocks
     r_step: RotationStep
     scale: float
     dual_residual: float = np.inf
-    smallest_merit: float = np.inf
-    steps_since_smallest: int = 0
-    may_fall: bool = True
+
+    @property
+    def R(self) -> Array:
+        """Solution of step (a), (n, d, d)."""
+        return self.iterate.R
+
+    @property
+    def omega(self) -> Array:
+        """Its projections to rotations, (n, d, d)."""
+        return self.iterate.omega
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of R = omega, (n, d, d)."""
+        return self.iterate.B
+
+    @property
+    def rho(self) -> float:
+        """The penalty."""
+        return self.penalty.rho
 
 
 class PaperStop(enum.Enum):
@@ -232,50 +205,40 @@ class PaperSOC:
         start = start if start is not None else spanning_tree_start(problem.graph)
         problem.stacked(start)  # raises unless the poses fit
         robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
-        blocks = _split(problem, robots)
+        all_poses = np.arange(problem.num_poses)
+        blocks = Blocks.of(problem, robots.cut_edges(problem.graph), all_poses)
         rho = float(first_penalties(self.penalty, problem, start).mean())
-        scale = float(problem.L.diagonal().mean())
-        r_step = _prepare(problem, blocks, rho, self.r_step)
         return PaperState(
             k=0,
-            R=start.R,
-            omega=start.R,
-            B=np.zeros_like(start.R),
-            rho=rho,
+            iterate=PaperIterate.first(start.R),
+            penalty=CommonPenalty(rho),
             blocks=blocks,
-            r_step=r_step,
-            scale=scale,
+            r_step=blocks.prepared(rho, self.r_step),
+            scale=float(problem.L.diagonal().mean()),
         )
 
     def step(self, problem: PGOProblem, state: PaperState) -> PaperState:
         """Make one iteration, (a), (b), (c); then adapt rho, and B with it."""
-        frozen = state.blocks.between @ stack_transposes(state.R)
-        shift = stack_transposes(state.omega - state.B) - (2.0 / state.rho) * frozen
-        R = unstack_transposes(state.r_step.solve(shift))  # (a) R-step
-        if not np.isfinite(R).all():
-            return replace(state, k=state.k + 1, R=R, dual_residual=np.nan)
-        omega = project_to_rotations(R + state.B)  # (b) projection
-        B = state.B + R - omega  # (c) Bregman update
-        following = replace(state, k=state.k + 1, R=R, omega=omega, B=B)
-        return self._with_residuals(problem, state, following)
-
-    def _with_residuals(
-        self, problem: PGOProblem, before: PaperState, state: PaperState
-    ) -> PaperState:
-        """The state with its dual residual and merit, and with the rho for the next step."""
-        gradient = 2.0 * (problem.L @ stack_transposes(state.R))
-        gradient += state.rho * stack_transposes(state.B)
-        root = np.sqrt(state.R.shape[0] * state.R.shape[1])
-        dual_residual = norm(gradient) / (root * state.scale)
-        primal = norm(state.omega - state.R) / root
-        change = norm(state.omega - before.omega) / root
-        merit = float(np.hypot(primal, change))
-        state = replace(state, dual_residual=dual_residual)
-        if merit < state.smallest_merit:
-            state = replace(state, smallest_merit=merit, steps_since_smallest=0)
-        else:
-            state = replace(state, steps_since_smallest=state.steps_since_smallest + 1)
-        return _with_adapted_rho(problem, state, self.penalty, primal, change, self.r_step)
+        last = state.iterate
+        rho = state.rho
+        blocks = state.blocks
+        iterate = blocks.iteration(state.r_step, rho, last, last.R)
+        state = replace(state, k=state.k + 1, iterate=iterate, dual_residual=np.nan)
+        if not np.isfinite(iterate.R).all():
+            return state
+        root = np.sqrt(last.R.shape[0] * last.R.shape[1])
+        gradient = 2.0 * blocks.pull(iterate.R, iterate.R) + rho * stack_transposes(iterate.B)
+        primal = norm(iterate.omega - iterate.R) / root
+        change = norm(iterate.omega - last.omega) / root
+        penalty = state.penalty.after(self.penalty, primal, change)
+        state = replace(state, penalty=penalty, dual_residual=norm(gradient) / (root * state.scale))
+        if penalty.rho == rho:
+            return state
+        return replace(
+            state,
+            iterate=iterate.with_scaled_penalty(penalty.rho / rho),
+            r_step=blocks.prepared(penalty.rho, self.r_step),
+        )
 
     def measure(self, problem: PGOProblem, state: PaperState) -> Measurement:
         """F at omega with the best translations, and the paper's KKT residual p_res per pose.
@@ -286,10 +249,7 @@ class PaperSOC:
         if np.isnan(state.dual_residual):
             return Measurement(np.nan, np.nan, np.nan)
         omega = state.omega
-        d = state.omega.shape[1]
-        orthogonality = norm(np.swapaxes(omega, 1, 2) @ omega - np.eye(d))
-        disagreement = norm(omega - state.R)
-        p_res = float(np.hypot(orthogonality, disagreement)) / np.sqrt(len(omega))
+        p_res = math.sqrt(state.iterate.p_res_square / len(omega))
         X = np.concatenate([problem.recover_translations(omega), stack_transposes(omega)])
         return Measurement(problem.objective_stacked(X), p_res, state.dual_residual)
 
@@ -312,86 +272,13 @@ class PaperSOC:
 
     def converged(self, state: PaperState, measurement: Measurement) -> Status | None:
         """CONVERGED when the residuals that `stop` names are within tolerance."""
-        if state.k == 0:  # omega^0 is R^0, which says nothing
+        return self.status_at(state.k, measurement)
+
+    def status_at(self, k: int, measurement: Measurement) -> Status | None:
+        """CONVERGED when the residuals of iterate k that `stop` names are within tolerance."""
+        if k == 0:  # omega^0 is R^0, which says nothing
             return None
         worst = measurement.primal_residual
         if self.stop is PaperStop.BOTH_RESIDUALS:
             worst = max(worst, measurement.dual_residual)
         return Status.CONVERGED if worst <= self.tolerance else None
-
-
-def _with_adapted_rho(
-    problem: PGOProblem,
-    state: PaperState,
-    rule: PenaltyRule,
-    primal: float,
-    change: float,
-    back_end: BackEnd,
-) -> PaperState:
-    """State with the rho for the next step, and B rescaled with it.
-
-    Under a BalancedPenalty rho goes up, and may not fall any more, when the merit has stayed up for
-    long.
-    """
-    may_fall = state.may_fall
-    if isinstance(rule, BoydPenalty):
-        factor = rule.rescaling(primal, state.rho * change)
-    elif isinstance(rule, BalancedPenalty) and state.steps_since_smallest >= _PATIENCE:
-        factor = rule.refactor_ratio
-        may_fall = False
-    else:
-        factor = rule.rescaling(primal, change)
-    if factor == 1.0 or (factor < 1.0 and not may_fall):
-        return state
-    rho = factor * state.rho
-    return replace(
-        state,
-        rho=rho,
-        B=state.B / factor,
-        r_step=_prepare(problem, state.blocks, rho, back_end),
-        smallest_merit=np.inf,
-        steps_since_smallest=0,
-        may_fall=may_fall,
-    )
-
-
-def _prepare(problem: PGOProblem, blocks: Blocks, rho: float, back_end: BackEnd) -> RotationStep:
-    penalty = np.full(blocks.own.shape[0], rho)
-    d = problem.d
-    subproblem = RSubproblem(
-        blocks.A, blocks.w, blocks.own, d, 0, penalty, blocks.analysis, problem.backend
-    )
-    return prepare(subproblem, back_end)
-
-
-def _split(problem: PGOProblem, robots: Partition) -> Blocks:
-    """Split L: a residual between two robots becomes two, each with only one of its ends."""
-    graph = problem.graph
-    n = problem.num_poses
-    d = problem.d
-    is_cut = robots.cut_edges(graph)
-    A, w = problem.residual_matrix
-    # Rows of the rotation residuals come after one translation residual for every edge.
-    rows = graph.num_edges + d * np.arange(graph.num_edges)[:, None] + np.arange(d)
-    rows_inside = rows[~is_cut].ravel()
-    rows_between = rows[is_cut].ravel()
-    A_R = A[:, n:].tocsr()
-    A_between = A_R[rows_between].tocoo()
-    is_of_i = A_between.col // d == np.repeat(graph.i[is_cut], d)[A_between.row]
-    A_own = vstack(
-        [A_R[rows_inside], _entries(A_between, is_of_i), _entries(A_between, ~is_of_i)],
-        format="csr",
-    )
-    w_own = np.concatenate([w[rows_inside], w[rows_between], w[rows_between]])
-    product = (A_own.T @ (A_own * w_own[:, None])).tocoo()
-    # Zeros keep the full block of every pose in the pattern.
-    full_blocks = rotation_columns(np.arange(n), 0, d)
-    zeros = *block_entries(full_blocks, full_blocks), np.zeros((n, d, d))
-    own = assemble([(product.row, product.col, product.data), zeros], n * d)
-    return Blocks(A_own, w_own, own, (problem.L - own).tocsr(), analyze(own, problem.backend))
-
-
-def _entries(matrix: coo_array, chosen: BoolArray) -> csr_array:
-    """The matrix with some of its entries only."""
-    positions = matrix.row[chosen], matrix.col[chosen]
-    return csr_array((matrix.data[chosen], positions), shape=matrix.shape)

@@ -34,7 +34,6 @@ def test_consensus_goes_without_a_driver_and_says_so(pgo_command):
     assert "raise driver_memory (--driver-memory), or set it to 0" in err
     for options in (
         ("--method", "joint"),
-        ("--method", "paper"),
         ("--method", "consensus", "--r-step", "fista"),
     ):
         code, out, err = pgo_command("solve", "robots", "--driver-memory", "4", *options)
@@ -381,7 +380,7 @@ def test_info_names_the_components(pgo_command, tmp_path):
         ("solve", "sphere", "--method", "joint", "--robots", "2"),
         ("solve", "sphere", "--method", "joint", "--engine", "process"),
         ("solve", "sphere", "--method", "joint", "--split", "contiguous"),
-        ("solve", "sphere", "--method", "paper", "--resume", "run.ckpt"),
+        ("solve", "sphere", "--method", "joint", "--resume", "run.ckpt"),
         ("solve", "sphere", "--method", "substructured", "--r-step", "fista"),
         ("solve", "sphere", "--robots", "2", "--engine", "process", "--address", "localhost:6379"),
         ("solve", "sphere", "--robots", "2", "--address", "localhost"),

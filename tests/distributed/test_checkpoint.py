@@ -43,7 +43,11 @@ def killed_after(steps):
 
 
 def pipeline(coupling, robots, gap=1e-6):
-    soc = replace(WARM_START, coupling=coupling, robots=robots, tolerance=1e-6)
+    """Settings of SOC with a coupling, or of PaperSOC."""
+    if coupling is None:
+        soc = solvers.PaperSOC(robots=robots, tolerance=1e-6, max_iterations=60)
+    else:
+        soc = replace(WARM_START, coupling=coupling, robots=robots, tolerance=1e-6)
     return solvers.Pipeline(soc=soc, gap=gap, growing=None, staircase=None)
 
 
@@ -65,7 +69,9 @@ def assert_same(found, expected):
         assert (np.diff(one.history.seconds) >= 0).all()
 
 
-@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
+@pytest.mark.parametrize(
+    "coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS, None]
+)
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.7, 1.0])
 def test_a_run_that_was_broken_off_goes_on_to_the_same_numbers(coupling, part, tmp_path):
     graph = varied_graph(int(10 * part), 50, 3)

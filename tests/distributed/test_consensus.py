@@ -44,7 +44,6 @@ from solvers.soc import safeguard, separator_stiffness as stiffness
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus import ConsensusState, LocalConsensus
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.soc.r_step import RStep
 from solvers.soc.recursion_block import RecursionBlock
@@ -313,7 +312,5 @@ def test_solve_and_soc_have_the_same_robots() -> None:
 def test_what_robots_cannot_run_is_refused() -> None:
     graph = grid(np.random.default_rng(0))
     parts = partition(graph, 3)
-    with pytest.raises(SettingError, match="PaperSOC is run in one place"):
-        solve(graph, Pipeline(soc=PaperSOC()), robots=parts)
     with pytest.raises(SettingError, match=r"robots factor their subproblems, got r_step .*FISTA"):
         solve(graph, Pipeline(soc=SOC(robots=parts, r_step=RStep.FISTA)), robots=parts)

@@ -438,10 +438,14 @@ def test_consensus_needs_somebody_who_owns_the_poses() -> None:
 # Errors and their messages.
 
 
+class OwnSOC(solvers.SOC):
+    pass
+
+
 def test_what_takes_the_whole_graph_is_refused(tmp_path: Path) -> None:
     robots = pgo.partition(read_g2o(ROBOTS), 4)
-    with pytest.raises(SettingError, match=r"own run SOC\(\.\.\), got PaperSOC"):
-        solve_folder(ROBOTS, solvers.Pipeline(soc=solvers.PaperSOC()))
+    with pytest.raises(SettingError, match=r"own run SOC\(\.\.\) or PaperSOC\(\.\.\), got Own"):
+        solve_folder(ROBOTS, solvers.Pipeline(soc=OwnSOC()))
     for soc in (
         solvers.SOC(robots=robots),
         solvers.SOC(robots=robots, coupling=Coupling.SUBSTRUCTURED),

@@ -374,7 +374,9 @@ def test_an_iterate_that_is_not_finite_is_said_to_be() -> None:
     problem = varied_problem(0, 8, 3)
     soc = paper()
     state = soc.init(problem, None)
-    broken = soc.step(problem, replace(state, B=np.full_like(state.B, np.inf)))
+    broken = soc.step(
+        problem, replace(state, iterate=replace(state.iterate, B=np.full_like(state.B, np.inf)))
+    )
     measurement = soc.measure(problem, broken)
     assert np.isnan(
         [measurement.objective, measurement.primal_residual, measurement.dual_residual]

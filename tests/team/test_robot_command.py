@@ -226,7 +226,7 @@ def test_ctrl_c_keeps_what_is_known(fleet: Fleet) -> None:
         (["--listen", "here"], "'here' is no address; give HOST:PORT"),
         (["--name", "z"], "'z' is not in the team"),
         (["--cost", "unit"], "give --cost chi2 or isotropic"),
-        (["--method", "paper"], "'paper' is not one of 'substructured', 'consensus', 'newton'"),
+        (["--method", "joint"], "'joint' is not one of 'substructured', 'consensus', 'paper'"),
     ],
 )
 def test_wrong_words_are_answered_in_a_sentence(

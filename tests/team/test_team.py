@@ -34,6 +34,8 @@ pytest.importorskip("greenlet")
 
 PEERS = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.CONSENSUS, tolerance=5e-3))
 
+PAPER = solvers.Pipeline(soc=solvers.PaperSOC(max_iterations=100))
+
 
 def world(d: int = 2, n: int = 40) -> PoseGraph:
     return replace(pgo.grid_world(1, n, 3, d=d), information=None)
@@ -107,17 +109,19 @@ def test_messages_may_be_lost_late_repeated_and_in_any_order(seed: int) -> None:
 # CONSENSUS among peers.
 
 
+@pytest.mark.parametrize("pipeline", [PEERS, PAPER], ids=["CONSENSUS", "PaperSOC"])
 @pytest.mark.parametrize("d", [2, 3])
-def test_peers_agree_by_consensus_and_the_answer_is_certified(d: int) -> None:
+def test_peers_agree_and_the_answer_is_certified(d: int, pipeline: solvers.Pipeline) -> None:
     graph = world(d)
-    network = Network(robots_of(graph, 4, pipeline=PEERS), np.random.default_rng(0))
+    network = Network(robots_of(graph, 4, pipeline=pipeline), np.random.default_rng(0))
     network.run(60.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
-    assert all(robot.last.stages[1] == "SOC" for robot in network.robots.values())
+    name = type(pipeline.soc).__name__
+    assert all(robot.last.stages[1] == name for robot in network.robots.values())
     expected = solvers.solve(
         pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC),
-        PEERS,
+        pipeline,
         robots=pgo.partition(graph, 4),
     )
     outcome = network.robots["r0"].outcome

@@ -31,11 +31,16 @@ from solvers.network.serialization import deserialize, serialize
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, ReceivedRows, Rows, TurnSettings, Waiting
+from solvers.soc.paper_block import PaperIterate
+from solvers.soc.paper_robot import PaperCopies, PaperPenalty, PaperRobot
+from solvers.soc.r_step import RStep
 from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
 from solvers.soc.subgraph import Subgraph
 
 Q = TypeVar("Q")
 A = TypeVar("A")
+# A robot that holds what its neighbours send: of CONSENSUS, or of Algorithm 1 of the paper.
+Copies = ConsensusRobot | PaperRobot
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +48,7 @@ class Held:
     """What a robot holds at a moment: interior and copies, as values."""
 
     interior: Interior | None  # None if it counts no edge
-    copies: ConsensusRobot | None  # None before CONSENSUS begins
+    copies: Copies | None  # None before SOC with copies of neighbours' poses begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,7 @@ class HeldStates:
     """The states of what a robot holds, without what follows from its subgraph."""
 
     interior: InteriorState | None
-    copies: CopiesState | None
+    copies: CopiesState | PaperCopies | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +93,10 @@ CLASSES = (
     AndersonShare,
     AndersonSums,
     ReceivedRows,
+    PaperCopies,
+    PaperIterate,
+    PaperPenalty,
+    RStep,
     RobotProof,
     HandednessTerms,
     RobotAscent,
@@ -109,7 +118,7 @@ class BaseAgent(ABC):
         self.backend = backend
         # As in `Held`.
         self.interior: Interior | None = interior
-        self.copies: ConsensusRobot | None = None
+        self.copies: Copies | None = None
         self.front: HeldFront | None = None  # None if it holds no front of the separator tree
         self.moments: dict[int, Held] = {}
 
@@ -149,15 +158,19 @@ class BaseAgent(ABC):
         interior = self.interior
         if interior is not None and states.interior is not None:
             interior = interior.in_state_of(states.interior)
-        copies = None
-        if states.copies is not None:
-            copies = self._new_copies.restored(states.copies)
+        copies: Copies | None = None
+        if isinstance(states.copies, CopiesState):
+            copies = ConsensusRobot(self._layout, states.copies).restored(states.copies)
+        elif states.copies is not None:
+            copies = PaperRobot(self._layout, states.copies).restored(states.copies)
         return Held(interior, copies)
 
     @property
-    def _new_copies(self) -> ConsensusRobot:
-        """Copies without a state."""
-        return ConsensusRobot(CopyLayout(self.subgraph, self.backend), CopiesState())
+    def _layout(self) -> CopyLayout:
+        """What follows from its part of the graph, for robots that hold copies."""
+        if self.copies is not None:
+            return self.copies.layout
+        return CopyLayout(self.subgraph, self.backend)
 
 
 class Agent(BaseAgent):
@@ -195,8 +208,17 @@ def order_interior(
 def order_copies(
     order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]], agent: BaseAgent, request: Q
 ) -> A:
-    """Give the copies an order."""
-    assert agent.copies is not None
+    """Give the copies of CONSENSUS an order."""
+    assert isinstance(agent.copies, ConsensusRobot)
+    agent.copies, answer = order(agent.copies, request)
+    return answer
+
+
+def order_paper(
+    order: Callable[[PaperRobot, Q], tuple[PaperRobot, A]], agent: BaseAgent, request: Q
+) -> A:
+    """Give the robot of Algorithm 1 an order."""
+    assert isinstance(agent.copies, PaperRobot)
     agent.copies, answer = order(agent.copies, request)
     return answer
 
@@ -217,9 +239,15 @@ def order_front(
 
 def begin_copies(agent: BaseAgent, cover: Poses) -> Rows:
     """Start the copies at the current poses, of which the driver sends those of the cover."""
-    if agent.copies is None:
-        agent.copies = agent._new_copies
+    if not isinstance(agent.copies, ConsensusRobot):
+        agent.copies = ConsensusRobot(agent._layout, CopiesState())
     return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
+
+
+def begin_paper(agent: BaseAgent, cover: Poses) -> Rows:
+    """Start Algorithm 1 at the current poses, of which the driver sends those of the cover."""
+    agent.copies = PaperRobot(agent._layout, PaperCopies())
+    return order_paper(PaperRobot.begin, agent, held_poses(agent, cover))
 
 
 def held_poses(agent: BaseAgent, cover: Poses) -> Poses:
