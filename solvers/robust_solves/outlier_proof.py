@@ -33,6 +33,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 
@@ -47,19 +48,44 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting
 from solvers.here import Here
-from solvers.loop import RunMonitor
+from solvers.loop import RunMonitor, iterate
 from solvers.plan import solve_at
 from solvers.request import Pipeline
+from solvers.riemannian.staircase import Staircase
 from solvers.robust.chains import Chains, cycle_distances, is_whole, squared_distances
 from solvers.robust.outlier_record import OutlierProof
+from solvers.robust_solves.coarse_chains import CoarseChains
 from solvers.solution import Solution
 
-# What first-order distances have to be, in units of s, for a proof to be tried.
-_MARGIN = 1.2
+
+@dataclass(frozen=True)
+class _Effort:
+    """How hard proofs are tried, and what first-order distances have to be for it, in units of s.
+
+    `num_steps` are those that chains are made of (`CoarseChains`); None for chains as they are.
+    """
+
+    of_single: float
+    of_pair: float
+    num_steps: int | None
+
+
+# Proofs that are easy and likely to succeed come first, as s falls with each success.
+_EFFORTS = (
+    _Effort(2.0, 4.0, 24),
+    _Effort(1.2, 2.0, 24),
+    _Effort(1.2, 1.5, 96),
+    _Effort(1.2, 1.2, None),
+)
 # Relative gap of the first certificate: of most wrong closures the cost is many times s.
 _WIDE_GAP = 0.5
 # Closures of which all pairs are compared within seconds.
 _MOST_PAIRED = 2000
+# Poses are not improved: what counts is the bound.
+_FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, second_try=False)
+# A wide gap can be proven far from a stationary point.
+_COARSE_STAIRCASE = Staircase(tolerance=1e-2, gap=_WIDE_GAP)
+_MOST_STEPS = 100
 _OUTWARD = 1.0 + 1e-12  # for sums of up to a million positive terms
 _ROUNDING = 2.0**-40  # of an eigenvalue, over the trace
 
@@ -126,7 +152,8 @@ class _Search:
 
     `cost` is U, an upper bound. `classes` has the closures that are not proven wrong; any two of a
     class are proven inconsistent. `single` are first-order distances of all edges, (m,), and
-    `proven` the lower bound of each closure or pair that was solved for. `pairs` are closures and
+    `proven` the lower bound of each closure or pair that was `tried`, with so many steps of
+    `coarse` chains. `level` is the place of the current effort. `pairs` are closures and
     the first-order distances of all pairs of these, once they are computed.
     """
 
@@ -134,12 +161,15 @@ class _Search:
     known: BoolArray
     thresholds: Array
     chains: Chains
+    coarse: CoarseChains
     kept: BoolArray
     cost: float
     classes: list[list[int]]
     single: Array
     deadline: float
+    level: int = 0
     proven: dict[tuple[int, ...], float] = field(default_factory=dict)
+    tried: set[tuple[tuple[int, ...], int | None]] = field(default_factory=set)
     pairs: tuple[IntArray, Array] | None = None
 
     @classmethod
@@ -154,8 +184,10 @@ class _Search:
         chains = Chains.of(graph, known)
         single = _single_distances(chains, np.flatnonzero(~known))
         classes = [[e] for e in np.flatnonzero(~known).tolist()]
+        coarse = CoarseChains(chains, *precisions_below(problem))
+        bound = _OUTWARD * cost
         return cls(
-            problem, known, thresholds, chains, kept, _OUTWARD * cost, classes, single, deadline
+            problem, known, thresholds, chains, coarse, kept, bound, classes, single, deadline
         )
 
     @property
@@ -173,12 +205,12 @@ class _Search:
 
     def run(self) -> None:
         """Prove single closures wrong, then pairs inconsistent, until nothing changes."""
-        while True:
-            before = self.most_cost
-            self.exclude_single_closures()
-            self.join_classes()
-            if self.is_out_of_time() or not self.most_cost < before:
-                return
+        for self.level in range(len(_EFFORTS)):
+            before = math.inf
+            while self.most_cost < before and not self.is_out_of_time():
+                before = self.most_cost
+                self.exclude_single_closures()
+                self.join_classes()
 
     def is_out_of_time(self) -> bool:
         """Whether no further proof is to be tried."""
@@ -189,7 +221,7 @@ class _Search:
         while not self.is_out_of_time():
             s = self.most_cost
             doubted = [e for members in self.classes for e in members]
-            far = [e for e in doubted if self.single[e] > _MARGIN * s]
+            far = [e for e in doubted if self.single[e] > _EFFORTS[self.level].of_single * s]
             far.sort(key=lambda e: -self.single[e])
             wrong = set()
             for e in far:
@@ -210,22 +242,22 @@ class _Search:
             return
         distance = self.distances_between(doubted)
         s = self.most_cost
-        if not (distance > _MARGIN * s).any():
-            return
-        place = {int(e): k for k, e in enumerate(doubted)}
+        is_near = distance <= _EFFORTS[self.level].of_pair * s
         ordered = sorted(self.classes, key=lambda members: not self.kept[members].any())
         joined: list[list[int]] = []
+        class_of = np.full(len(doubted), -1)
         for members in ordered:
-            rows = [place[e] for e in members]
-            for other in joined:
-                columns = [place[e] for e in other]
-                if (distance[np.ix_(rows, columns)] <= _MARGIN * s).any():
-                    continue
-                if all(self.is_proven((e, f), s) for e in members for f in other):
-                    other += members
+            rows = np.searchsorted(doubted, members)
+            near_classes = class_of[is_near[rows].any(axis=0)]
+            number = len(joined)
+            for other in np.setdiff1d(np.arange(len(joined)), near_classes):
+                if all(self.is_proven((e, f), s) for e in members for f in joined[other]):
+                    number = int(other)
                     break
-            else:
-                joined.append(members)
+            if number == len(joined):
+                joined.append([])
+            joined[number] += members
+            class_of[rows] = number
         self.classes = joined
 
     def distances_between(self, edges: IntArray) -> Array:
@@ -242,19 +274,30 @@ class _Search:
     def is_proven(self, edges: tuple[int, ...], s: float) -> bool:
         """Whether known inliers and these closures are proven to cost more than s."""
         edges = tuple(sorted(edges))
-        if edges not in self.proven and self.is_out_of_time():
-            return False
-        if edges not in self.proven:
-            self.proven[edges] = self._lower_bound(edges, s)
-        return self.proven[edges] > s
+        for effort in _EFFORTS[: self.level + 1]:
+            if self.proven.get(edges, 0.0) > s:
+                return True
+            if (edges, effort.num_steps) not in self.tried and not self.is_out_of_time():
+                self.tried.add((edges, effort.num_steps))
+                bound = self._lower_bound(edges, s, effort.num_steps)
+                self.proven[edges] = max(self.proven.get(edges, 0.0), bound)
+        return self.proven.get(edges, 0.0) > s
 
-    def _lower_bound(self, edges: tuple[int, ...], s: float) -> float:
+    def _lower_bound(self, edges: tuple[int, ...], s: float, num_steps: int | None) -> float:
         """Proven lower bound on the cost of known inliers and closures, as far as it is above s.
 
         It is that of the subgraph between the ends of the closures: what is left out costs nothing
-        at least. Where chi2 is not quadratic its tangent proves little of a cost as large as that
-        of a wrong closure, and the bound is that of an F below it.
+        at least. Chains with few steps cost less than the chains. Where chi2 is not quadratic its
+        tangent proves little of a cost as large as that of a wrong closure, and the bound is that
+        of an F below it.
         """
+        if num_steps is not None:
+            found = self.coarse.with_closures(edges, num_steps)
+            if found is None:
+                return 0.0
+            coarse, rounding = found
+            problem = PGOProblem(coarse, self.problem.backend, Weighting.ISOTROPIC)
+            return _relaxed_bound(problem, s + rounding) - rounding
         subgraph = self._between_ends(edges)
         if subgraph is None:
             return 0.0
@@ -322,11 +365,35 @@ def isotropic_below(problem: PGOProblem) -> PGOProblem:
     return PGOProblem(weighted, problem.backend, Weighting.ISOTROPIC)
 
 
+def precisions_below(problem: PGOProblem) -> tuple[Array, Array]:
+    """Return kappa and tau, (m,), of an F below the cost at all poses; zeros if none is known."""
+    graph = problem.graph
+    if problem.weighting is not Weighting.ISOTROPIC:
+        graph = isotropic_below(problem).graph
+    if graph.num_edges != problem.graph.num_edges:  # edges with a singular matrix were left out
+        return np.zeros(problem.graph.num_edges), np.zeros(problem.graph.num_edges)
+    return graph.kappa, graph.tau
+
+
 def _least_eigenvalues(blocks: Array) -> Array:
     """Smallest eigenvalues, (m,), rounded down, and zero where rounding hides them."""
     traces = np.einsum("mkk->m", blocks)
     least = np.linalg.eigvalsh(blocks)[:, 0]
     return np.asarray(np.maximum(least - _ROUNDING * traces, 0.0))
+
+
+def _relaxed_bound(problem: PGOProblem, s: float) -> float:
+    """Proven lower bound on a cost from its relaxation; the search ends where it is above s."""
+    bound = 0.0
+    try:
+        for state in islice(iterate(_COARSE_STAIRCASE, problem), _MOST_STEPS):
+            if state.bound is not None:
+                bound = max(bound, state.bound.lower_bound)
+            if bound > s or state.is_solved or state.stalled:
+                break
+    except FAILURES:
+        pass
+    return bound
 
 
 def _bound_above(problem: PGOProblem, s: float) -> float:
@@ -336,7 +403,7 @@ def _bound_above(problem: PGOProblem, s: float) -> float:
     for _ in range(2):
         place = Here(RunMonitor(progress=False), [], problem, gap)
         try:
-            found = solve_at(place, Pipeline(soc=None, gap=gap, handedness=None), None)
+            found = solve_at(place, replace(_FOR_BOUNDS, gap=gap), None)
         except FAILURES:
             break
         bound = max(bound, found.proof.lower_bound)

@@ -1,0 +1,148 @@
+"""Chains with few poses cost less than the chains, whatever the poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from graphs import DIMENSIONS, SEEDS, informed
+from hypothesis import given, strategies as st
+
+import pgo_models as pgo
+from pgo_models.graphs.scenes import NoiseModel
+from solvers.riemannian.polish import polish
+from solvers.robust.chains import Chains
+from solvers.robust_solves.coarse_chains import CoarseChains
+from solvers.robust_solves.outlier_proof import precisions_below
+
+
+def chain_with_closures(seed: int, n: int, d: int, num_closures: int) -> pgo.PoseGraph:
+    """A chain whose edges point either way, with weights of all sizes, and closures at random."""
+    rng = np.random.default_rng(seed)
+    i = np.arange(n - 1)
+    j = i + 1
+    is_turned = rng.random(n - 1) < 0.5
+    i, j = np.where(is_turned, j, i), np.where(is_turned, i, j)
+    ends = np.array([rng.choice(n, 2, replace=False) for _ in range(num_closures)], dtype=int)
+    ends = ends.reshape(-1, 2)
+    i = np.concatenate([i, ends[:, 0]])
+    j = np.concatenate([j, ends[:, 1]])
+    m = len(i)
+    spread = rng.choice([0.1, 1.0, 3.0])
+    R = pgo.exp_map(spread * rng.standard_normal((m, 2 * d - 3)))
+    t = rng.choice([0.1, 1.0, 10.0]) * rng.standard_normal((m, d))
+    kappa, tau = np.exp(rng.uniform(-3.0, 6.0, (2, m)))
+    return pgo.PoseGraph(n, i, j, R, t, kappa, tau)
+
+
+def costs_of(problem: pgo.PGOProblem, coarse: CoarseChains, edges: list[int], num_steps: int):
+    """For poses of the problem: F of the coarse graph less its rounding, and of the edges."""
+    graph = problem.graph
+    found = coarse.with_closures(edges, num_steps)
+    assert found is not None
+    small, rounding = found
+    ends = np.unique(np.concatenate([graph.i[edges], graph.j[edges]]))
+    lines = [np.arange(low, high + 1) for low, high in pairwise(ends)]
+    cuts = [
+        low + (high - low) * np.arange(k + 1) // k
+        for low, high in pairwise(ends)
+        for k in [min(num_steps, high - low)]
+    ]
+    nodes = np.unique(np.concatenate(cuts))
+    chosen = np.zeros(graph.num_edges, dtype=bool)
+    chosen[edges] = True
+    inside = np.unique(np.concatenate(lines))
+    step = np.abs(graph.i - graph.j) == 1
+    is_closure = np.arange(graph.num_edges) >= graph.num_poses - 1
+    chosen |= step & ~is_closure & np.isin(graph.i, inside) & np.isin(graph.j, inside)
+    small_problem = pgo.PGOProblem(small)
+
+    def costs(poses: pgo.Poses) -> tuple[float, float]:
+        below = small_problem.objective(pgo.Poses(poses.R[nodes], poses.t[nodes])) - rounding
+        return below, float(problem.edge_costs(poses)[chosen].sum())
+
+    return costs
+
+
+@given(
+    seed=SEEDS,
+    n=st.integers(3, 40),
+    d=DIMENSIONS,
+    num_closures=st.integers(1, 2),
+    num_steps=st.integers(1, 12),
+)
+def test_they_cost_less_at_all_poses(
+    seed: int, n: int, d: int, num_closures: int, num_steps: int
+) -> None:
+    graph = chain_with_closures(seed, n, d, num_closures)
+    problem = pgo.PGOProblem(graph)
+    known = np.arange(graph.num_edges) < n - 1
+    coarse = CoarseChains(Chains.of(graph, known), graph.kappa, graph.tau)
+    edges = np.flatnonzero(~known).tolist()
+    costs = costs_of(problem, coarse, edges, num_steps)
+    rng = np.random.default_rng(seed)
+    along = coarse.chains.motion
+    start = pgo.Poses(*along)
+    tried = [start, polish(problem, start)]
+    for size in (1e-3, 0.1, 1.0, 10.0):
+        R = tried[1].R @ pgo.exp_map(size * rng.standard_normal((n, 2 * d - 3)))
+        tried.append(pgo.Poses(R, tried[1].t + size * rng.standard_normal((n, d))))
+    for poses in tried:
+        below, cost = costs(poses)
+        assert below <= cost * (1 + 1e-9) + 1e-9
+
+
+def test_many_steps_lose_little() -> None:
+    """Of a closure that is wrong: the more steps, the closer are the least costs."""
+    graph = chain_with_closures(7, 60, 2, 0)
+    graph = replace(graph, R_ij=np.tile(np.eye(2), (59, 1, 1)), kappa=np.full(59, 1e3))
+    along = Chains.of(graph, np.ones(59, dtype=bool)).motion
+    R = along[0][[5]].swapaxes(1, 2) @ along[0][[50]]
+    t = (along[1][[50]] - along[1][[5]]) @ along[0][5] + 0.5
+    graph = graph.with_edges(np.array([5]), np.array([50]), pgo.Poses(R, t), 1e3, 1e3)
+    known = np.arange(60) < 59
+    coarse = CoarseChains(Chains.of(graph, known), graph.kappa, graph.tau)
+
+    def least(problem: pgo.PGOProblem, start: pgo.Poses | None = None) -> float:
+        return problem.objective(polish(problem, start or pgo.chordal_start(problem)))
+
+    whole = least(pgo.PGOProblem(graph), pgo.Poses(*along))
+    costs = []
+    for num_steps in (1, 3, 10, 45):
+        found = coarse.with_closures([59], num_steps)
+        assert found is not None
+        costs.append(least(pgo.PGOProblem(found[0])))
+    assert np.all(np.diff(costs) > 0)
+    assert costs[0] > 0.3 * whole
+    assert costs[-1] == pytest.approx(whole, rel=0.02)  # edges j -> i turn at their first pose
+
+
+def test_the_precisions_are_those_of_an_f_below_chi2() -> None:
+    graph = informed(3, 12, 3, coupled=False, spread=2.0, noise=NoiseModel(0.5, 0.5))
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+    kappa, tau = precisions_below(problem)
+    assert kappa.shape == tau.shape == (graph.num_edges,)
+    rng = np.random.default_rng(0)
+    below = pgo.PGOProblem(replace(graph.with_weights(kappa, tau), information=None))
+    for spread in (1e-3, 1.0):
+        R = graph.truth.R @ pgo.exp_map(spread * rng.standard_normal((12, 3)))
+        poses = replace(graph.truth, R=R, t=graph.truth.t + spread * rng.standard_normal((12, 3)))
+        assert (below.edge_costs(poses) <= problem.edge_costs(poses) * (1 + 1e-12)).all()
+
+
+def test_nothing_is_said_where_a_step_has_no_precision_or_the_ends_are_apart() -> None:
+    graph = chain_with_closures(0, 20, 2, 1)
+    known = np.arange(20) < 19
+    tau = graph.tau.copy()
+    tau[min(graph.i[19], graph.j[19])] = 0.0
+    chains = Chains.of(graph, known)
+    assert CoarseChains(chains, graph.kappa, tau).with_closures([19], 4) is None
+    broken = Chains.of(graph, known & (np.arange(20) != min(graph.i[19], graph.j[19])))
+    found = CoarseChains(broken, graph.kappa, graph.tau).with_closures([19], 4)
+    assert found is not None
+    assert found[0].num_edges == 1  # the closure, which costs nothing by itself
+    two = graph.with_edges(np.array([0]), np.array([1]), pgo.Poses.identity(1, 2), 1.0, 1.0)
+    apart = CoarseChains(Chains.of(two, np.zeros(21, dtype=bool)), two.kappa, two.tau)
+    assert apart.with_closures([19, 20], 4) is None
