@@ -27,7 +27,6 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM
 from solvers.robust.candidates import Candidates
-from solvers.robust.clusters import closure_clusters
 from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
 from solvers.robust.linear_search import LinearSearch
 from solvers.robust.revision import Fit, inlier_problem, is_held
@@ -73,7 +72,7 @@ class ClusterSearch:
         """Clusters of the edges that are not known."""
         if self.is_single:
             return list(np.flatnonzero(~self.sets.known)[:, None])
-        return closure_clusters(self.sets.chains, self.sets.known, self.sets.scale)
+        return self.sets.pairs.clusters(self.sets.scale)
 
     @cached_property
     def linear(self) -> LinearSearch:
@@ -95,6 +94,8 @@ class ClusterSearch:
         fit = self.sets.settled(kept, poses)
         while True:
             fit = self._at_rest(fit)
+            if not self.sets.has_time():
+                return fit
             if self.new is None and any(len(cluster) > 1 for cluster in self.clusters):
                 fit = min(fit, self.singly._at_rest(fit), key=self.sets.cost)
             exchanged = self.linear.exchanged(fit)
@@ -168,9 +169,11 @@ class ClusterSearch:
         trials: dict[int, int] = {}
         while self.sets.has_time():
             fit = self._with_fitting(fit)
+            if not self.sets.has_time():
+                break
             larger = self._with_next_clusters(fit, self._candidates(fit), trials)
             if larger is None:
-                return fit
+                break
             fit = larger
         return fit
 
@@ -294,6 +297,8 @@ class ClusterSearch:
 
     def _exchanged(self, fit: Fit) -> Fit | None:
         """A fit of less truncated cost, by a rejected cluster that excludes some of those kept."""
+        if not self.sets.has_time():
+            return None
         candidates = self._candidates(fit)
         for k in candidates.order[: self._most_failures].tolist():
             if not self.sets.has_time():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
@@ -13,6 +12,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.right_costs import RightCosts
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
+from solvers.robust.clusters import ClosurePairs
 from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
 # Probability with which a right cluster, or edge, passes a test.
@@ -25,22 +25,28 @@ _LEAST_DECREASE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class EdgeSets:
-    """Sets of edges of `problem`, all of which have those that are `known`, (m,).
+    """Sets of edges of `problem`, all of which have those that are known.
 
-    `allowed` (m,) are the thresholds of the truncated cost, times the scale s of the errors, which
-    is `scale`. A search among sets ends early once `has_time` is false.
+    `pairs` has its closures. `allowed` (m,) are the thresholds of the truncated cost, times the
+    scale s of the errors, which is `scale`. A search among sets ends early once `has_time` is
+    false.
     """
 
     problem: PGOProblem
-    known: BoolArray
+    pairs: ClosurePairs
     allowed: Array
     scale: float
     has_time: Callable[[], bool]
 
-    @cached_property
+    @property
+    def known(self) -> BoolArray:
+        """Edges that are known to be right, (m,)."""
+        return self.pairs.known
+
+    @property
     def chains(self) -> Chains:
         """Chains of the known edges."""
-        return Chains.of(self.problem.graph, self.known)
+        return self.pairs.chains
 
     @property
     def motion_dimension(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
 from solvers.riemannian.polish import polish
 from solvers.robust.cluster_search import ClusterSearch
+from solvers.robust.clusters import ClosurePairs
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.gnc import GNC
@@ -148,6 +149,11 @@ class _RobustSolve:
     def choice(self) -> Choice:
         """The attempts made so far, compared."""
         return Choice(self.doubted, tuple(self.estimates))
+
+    @cached_property
+    def closure_pairs(self) -> ClosurePairs:
+        """The closures of the graph, and how far they agree."""
+        return ClosurePairs.of(self.doubted.problem.graph, self.doubted.known)
 
     # Step 1: least squares; and pairwise consistency alone
 
@@ -329,7 +335,7 @@ class _RobustSolve:
         doubted = self.doubted
         scale = choice.threshold_scale
         allowed = scale * doubted.thresholds
-        sets = EdgeSets(doubted.problem, doubted.known, allowed, scale, self._has_time)
+        sets = EdgeSets(doubted.problem, self.closure_pairs, allowed, scale, self._has_time)
         return ClusterSearch(sets, self.new)
 
     def _by_chance(self, solution: Solution, kept: BoolArray) -> float:

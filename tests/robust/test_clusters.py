@@ -13,7 +13,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust.cluster_search import ClusterSearch
-from solvers.robust.clusters import closure_clusters
+from solvers.robust.clusters import ClosurePairs
 from solvers.robust.consistency import odometry
 from solvers.robust.distances import FirstOrder
 from solvers.robust.edge_sets import EdgeSets
@@ -23,7 +23,8 @@ from solvers.robust.revision import inlier_problem, truncated_cost
 def search_of(problem: pgo.PGOProblem, has_time: bool = True) -> ClusterSearch:
     known = odometry(problem.graph)
     thresholds = pgo.chi2_thresholds(problem)
-    return ClusterSearch(EdgeSets(problem, known, thresholds, 1.0, lambda: has_time))
+    pairs = ClosurePairs.of(problem.graph, known)
+    return ClusterSearch(EdgeSets(problem, pairs, thresholds, 1.0, lambda: has_time))
 
 
 def street(seed: int, share: float = 0.5, kind: str = "random") -> tuple[pgo.PoseGraph, BoolArray]:
@@ -34,7 +35,7 @@ def street(seed: int, share: float = 0.5, kind: str = "random") -> tuple[pgo.Pos
 def test_a_cluster_is_right_or_wrong_as_a_whole(kind: str) -> None:
     graph, is_wrong = street(0, 0.8, kind)
     known = odometry(graph)
-    clusters = closure_clusters(Chains.of(graph, known), known)
+    clusters = ClosurePairs.of(graph, known).clusters()
     np.testing.assert_array_equal(np.sort(np.concatenate(clusters)), np.flatnonzero(~known))
     right = [cluster for cluster in clusters if not is_wrong[cluster].any()]
     assert all(is_wrong[cluster].all() for cluster in clusters if is_wrong[cluster].any())
@@ -50,7 +51,7 @@ def test_where_closures_agree_by_chance_clusters_are_small(kind: str) -> None:
     )
     graph, is_wrong = spoiled(right, 0.9, kind, 0)
     known = odometry(graph)
-    clusters = closure_clusters(Chains.of(graph, known), known)
+    clusters = ClosurePairs.of(graph, known).clusters()
     right_with_wrong = [
         (~is_wrong[cluster]).sum() for cluster in clusters if is_wrong[cluster].any()
     ]
@@ -69,7 +70,7 @@ def test_closures_of_a_road_driven_back_are_one_cluster_whichever_way_they_are_w
     i[turned], j[turned] = j[turned], i[turned].copy()
     reversed_graph = pgo.PoseGraph(graph.num_poses, i, j, R, t, graph.kappa, graph.tau)
     of_both = [
-        sorted(map(tuple, closure_clusters(Chains.of(each, odometry(each)), odometry(each))))
+        sorted(map(tuple, ClosurePairs.of(each, odometry(each)).clusters()))
         for each in (graph, reversed_graph)
     ]
     assert of_both[0] == of_both[1]

@@ -15,6 +15,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.hessian import TangentLayout
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import measured_covariances
+from solvers.robust.clusters import ClosurePairs
 from solvers.robust.consistency import odometry
 from solvers.robust.edge_sets import EdgeSets, with_edges
 from solvers.robust.linear_choice import LinearChoice, _linearised
@@ -37,6 +38,12 @@ def sparse_world(d: int, size: float = 1e-3) -> pgo.PGOProblem:
     return pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
 
 
+def sets_of(problem: pgo.PGOProblem, *, has_time: bool = True) -> EdgeSets:
+    """Sets of closures beside odometry."""
+    pairs = ClosurePairs.of(problem.graph, odometry(problem.graph))
+    return EdgeSets(problem, pairs, pgo.chi2_thresholds(problem), 1.0, lambda: has_time)
+
+
 def model_at(
     problem: pgo.PGOProblem, num_kept: int
 ) -> tuple[LinearChoice, EdgeSets, np.ndarray, np.ndarray, pgo.Poses]:
@@ -45,7 +52,7 @@ def model_at(
     known = odometry(graph)
     closures = np.flatnonzero(~known)[:10]
     kept = np.arange(num_kept)
-    sets = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: True)
+    sets = sets_of(problem)
     fit = sets.settled(with_edges(known, closures[kept]), pgo.odometry_start(graph))
     measured = measured_covariances(graph)[closures]
     staying = inlier_problem(problem, known)
@@ -135,7 +142,7 @@ def test_a_map_that_was_bent_to_a_wrong_closure_comes_back() -> None:
         graph, is_wrong = spoiled(right, 0.5, "random", seed)
         problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
         known = odometry(graph)
-        sets = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: True)
+        sets = sets_of(problem)
         planted = sets.settled(~is_wrong, graph.truth)
         wrong = np.flatnonzero(is_wrong)[:1]
         fit = sets.settled(with_edges(known, wrong), pgo.odometry_start(graph))
@@ -158,11 +165,11 @@ def test_without_one_leaves_a_wrong_closure_out() -> None:
     graph, is_wrong = spoiled(right, 0.3, "random", 1)
     problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
     known = odometry(graph)
-    ran_out = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: False)
+    ran_out = sets_of(problem, has_time=False)
     wrong = np.flatnonzero(is_wrong)[:1]
     fit = ran_out.settled(with_edges(known, wrong), pgo.odometry_start(graph))
     assert LinearSearch.of(ran_out).without_one(fit) is None
-    sets = EdgeSets(problem, known, pgo.chi2_thresholds(problem), 1.0, lambda: True)
+    sets = sets_of(problem)
     other = LinearSearch.of(sets).without_one(fit)
     assert other is not None
     assert sets.is_better(other, fit)

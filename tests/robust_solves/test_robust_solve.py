@@ -14,6 +14,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
 from solvers.robust.cluster_search import ClusterSearch
+from solvers.robust.clusters import ClosurePairs
 from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.revision import drop_contradicted, inlier_problem
 from solvers.robust.weighted_edges import known_inliers
@@ -408,7 +409,8 @@ def test_closures_that_the_map_can_follow_come_back(seed, claim):
     far = problem.edge_costs(poses) > 5.0 * pgo.chi2_thresholds(problem) * claim
     assert (far & ~kept & ~wrong).any()
     allowed = claim * pgo.chi2_thresholds(problem)
-    search = ClusterSearch(EdgeSets(problem, known, allowed, claim, lambda: True))
+    pairs = ClosurePairs.of(graph, known)
+    search = ClusterSearch(EdgeSets(problem, pairs, allowed, claim, lambda: True))
     np.testing.assert_array_equal(search.improved(kept, poses).kept, ~wrong)
 
 
