@@ -37,6 +37,9 @@ from solvers.robust.weighted_edges import (
     negligible_weight,
 )
 
+# Share of the least weight that stays with an edge that a run in one place leaves out, where known
+# inliers alone leave poses apart.
+_LEFT_OUT_SHARE = 1e-4
 # The median of ratios between 10^-24 and 1 by bisection of the exponent, to 1e-6 of itself.
 _LEAST_EXPONENT = -24.0
 _NUM_HALVINGS = 26
@@ -46,12 +49,13 @@ _NUM_HALVINGS = 26
 class SharedEdges:
     """The edges that robots hold at their poses.
 
-    `newton` has the figures of the last weighted cost, and the moment when driver and robots hold
-    these edges and poses.
+    Weights up to `least_weight` become `left_out`. `newton` has the figures of the last weighted
+    cost, and the moment when driver and robots hold these edges and poses.
     """
 
     driver: Driver
     least_weight: float
+    left_out: float
     newton: SubstructuredNewtonState
 
     @property
@@ -89,7 +93,8 @@ class SharedEdges:
         return replace(self, newton=SubstructuredNewton().step(self.driver, self.newton))
 
     def _order(self, loss: RobustLoss, mu: float, scale: float) -> Reweigh:
-        return Reweigh(loss is RobustLoss.TRUNCATED, mu, scale, self.least_weight)
+        is_truncated = loss is RobustLoss.TRUNCATED
+        return Reweigh(is_truncated, mu, scale, self.least_weight, self.left_out)
 
 
 SharedGNCState = ScheduleState[SharedEdges]
@@ -97,15 +102,26 @@ SharedGNCState = ScheduleState[SharedEdges]
 
 @dataclass(frozen=True)
 class SharedGNC:
-    """`GNC` by a driver and its robots, from the poses that they hold."""
+    """`GNC` by a driver and its robots, from the poses that they hold.
+
+    Weights up to `least_weight` become `left_out`.
+    """
 
     gnc: GNC
     least_weight: float
+    left_out: float
 
     @classmethod
     def of(cls, gnc: GNC, graph: PoseGraph) -> SharedGNC:
-        """The method for a graph, which says which weights are negligible."""
-        return cls(gnc, negligible_weight(graph, known_inliers(graph, gnc.known)))
+        """The method for a graph, which says which weights are negligible.
+
+        A wrong edge can cost so much that even a small share of its weight bends the map. So it
+        has none where known inliers hold the poses together.
+        """
+        known = known_inliers(graph, gnc.known)
+        least_weight = negligible_weight(graph, known)
+        is_held = np.array_equal(held_together(graph, known, np.zeros(graph.num_edges)), known)
+        return cls(gnc, least_weight, 0.0 if is_held else _LEFT_OUT_SHARE * least_weight)
 
     @property
     def max_iterations(self) -> int:
@@ -115,7 +131,7 @@ class SharedGNC:
     def init(self, driver: Driver, start: SharedGNCState | None) -> SharedGNCState:
         """State 0, at the poses that driver and robots hold."""
         newton = SubstructuredNewton().init(driver, None)
-        edges = SharedEdges(driver, self.least_weight, newton)
+        edges = SharedEdges(driver, self.least_weight, self.left_out, newton)
         schedule, sums = first_schedule(self.gnc, edges)
         return ScheduleState(0, schedule, sums, edges)
 

@@ -88,7 +88,7 @@ def test_sums_and_costs_are_those_of_the_whole_graph(wrong, loss: RobustLoss) ->
         open_driver(problem, partition(problem.graph, 3), InProcess(), thresholds=allowed(problem))
     ) as driver:
         driver.set_poses(poses)
-        method = SharedGNC(gnc, 1e-9)
+        method = SharedGNC(gnc, 1e-9, 1e-13)
         state = method.init(driver, None)
         assert state.objective == pytest.approx(gnc.init(problem, poses).objective, rel=1e-12)
         assert state.sums.count == np.sum(~known)
@@ -100,7 +100,7 @@ def test_sums_and_costs_are_those_of_the_whole_graph(wrong, loss: RobustLoss) ->
             median = state.edges.median_ratio(1.0, state.sums.kept)
             assert median == pytest.approx(np.median(kept), rel=1e-5)
         mu = state.schedule.mu
-        driver.reweigh(Reweigh(loss is RobustLoss.TRUNCATED, mu, 1.0, 1e-9))
+        driver.reweigh(Reweigh(loss is RobustLoss.TRUNCATED, mu, 1.0, 1e-9, 1e-13))
         weights = np.where(known, 1.0, np.maximum(loss.weights(ratio, mu), 1e-13))
         assert driver.current.objective == pytest.approx(
             float(weights @ problem.edge_costs(poses)), rel=1e-9
@@ -114,13 +114,13 @@ def test_what_is_asked_and_told_does_not_grow_with_the_edges() -> None:
         problem = pgo.PGOProblem(graph)
         subgraph = split_graph(problem, partition(graph, 2), allowed(problem))[0]
         agent = Agent(subgraph, None)
-        order = Reweigh(True, 0.5, 1.0, 1e-9)
+        order = Reweigh(True, 0.5, 1.0, 1e-9, 1e-13)
         sums = order_interior(sum_ratios, agent, order)
         reply = order_interior(reweigh, agent, order)
         boundary = (graph.d + 1) * len(subgraph.part.boundary)
         assert count_bytes(reply) == 8 * (boundary + 2 + graph.d * boundary)
         sizes.append((count_bytes(order), count_bytes(sums)))
-    assert sizes == [(32, 56), (32, 56)]
+    assert sizes == [(40, 56), (40, 56)]
 
 
 def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
@@ -133,7 +133,7 @@ def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
         agent,
         first_poses(problem.graph, subgraph_known(problem))[subgraph.part.poses],
     )
-    order_interior(reweigh, agent, Reweigh(True, 0.01, 1.0, 1e-9))
+    order_interior(reweigh, agent, Reweigh(True, 0.01, 1.0, 1e-9, 1e-13))
     before = order_interior(current_poses.evaluate, agent, None)
     again.restore(agent.snapshot())
     after = order_interior(current_poses.evaluate, again, None)
@@ -201,8 +201,8 @@ def test_the_driver_counts_the_orders(wrong) -> None:
     ) as driver:
         driver.set_poses(first_poses(problem.graph, subgraph_known(problem)))
         rounds = driver.network.ledger.rounds
-        driver.ask(sum_ratios, Reweigh(True, 0.1, 1.0, 1e-9), Count.ROUND)
-        driver.reweigh(Reweigh(True, 0.1, 1.0, 1e-9))
+        driver.ask(sum_ratios, Reweigh(True, 0.1, 1.0, 1e-9, 1e-13), Count.ROUND)
+        driver.reweigh(Reweigh(True, 0.1, 1.0, 1e-9, 1e-13))
         assert driver.network.ledger.rounds == rounds + 2
 
 

@@ -57,6 +57,7 @@ class Reweigh:
     mu: float  # control of the robust loss's surrogate
     scale: float  # of the thresholds
     least: float  # weight under which an edge hardly counts
+    left_out: float  # weight of such an edge, which keeps its place in the matrices
 
 
 @dataclass(frozen=True, eq=False)

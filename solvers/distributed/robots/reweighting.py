@@ -14,17 +14,12 @@ from solvers.distributed.robots.records import Reweigh, Reweighed
 from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import RatioSums
 
-# Share of the least weight that stays with an edge which a run in one place leaves out: the pattern
-# of the matrices stays the same, and the graph connected.
-_LEFT_OUT_SHARE = 1e-4
-
 
 def reweigh(interior: Interior, order: Reweigh) -> tuple[Interior, Reweighed]:
     """Weights for the residuals at the current poses, and the cost with them."""
     ratio = interior.whole.ratios(interior.poses, order.scale)
     weights = _loss(order).weights(ratio, order.mu)
-    least = _LEFT_OUT_SHARE * order.least
-    weights = np.where(weights > order.least, weights, least)
+    weights = np.where(weights > order.least, weights, order.left_out)
     weights = np.where(_is_known(interior), 1.0, weights)
     state = replace(interior.state, weights=weights, session=None, has_sent_laplacian=False)
     following = interior.in_state_of(state)
