@@ -251,7 +251,11 @@ class _Search:
             near_classes = class_of[is_near[rows].any(axis=0)]
             number = len(joined)
             for other in np.setdiff1d(np.arange(len(joined)), near_classes):
-                if all(self.is_proven((e, f), s) for e in members for f in joined[other]):
+                pairs = [(e, f) for e in members for f in joined[other]]
+                e, f = np.searchsorted(doubted, np.array(pairs).T)
+                # The hardest come first, so that little is proven in vain.
+                in_order = np.argsort(distance[e, f], kind="stable")
+                if all(self.is_proven(pairs[k], s) for k in in_order):
                     number = int(other)
                     break
             if number == len(joined):
