@@ -110,7 +110,8 @@ class PaperSOC:
     Parameters
     ----------
     robots : Partition or None
-        Who owns which poses; one pose a robot unless given, as in the paper.
+        Who owns which poses. Unless given, one pose a robot, as in the paper; where robots run the
+        solve (`solvers.distributed.paper`), those.
     penalty : PenaltyRule
         Rule of rho, one for all poses: BalancedPenalty, BoydPenalty, FixedPenalty, or an own one,
         whose first penalties are averaged. The paper's own is `BoydPenalty`.
