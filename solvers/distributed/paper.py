@@ -4,6 +4,10 @@ The iterates are those of `solvers.soc.paper` with a block for every robot. All 
 the residuals need go along with that exchange: a robot does the steps (a) to (c) of an iterate
 before it is known how good the last one is, so that R of the one and the residuals of the other
 travel together. The last steps of a run are in vain.
+
+A run that does not converge ends with its best iterate. Here that is the one of the least cost of
+rotations, in one place the one of least F: best translations would take two more rounds an
+iteration.
 """
 
 import math

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import PoseGraph, bridges
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.distributed.driver import Driver, collect
@@ -20,6 +20,7 @@ from solvers.distributed.robots.records import Reweigh
 from solvers.distributed.robots.reweighting import count_below, edges_within, sum_ratios
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Outcome, Stage, Status
+from solvers.robust.chains import is_whole
 from solvers.robust.gnc import (
     GNC,
     Inliers,
@@ -38,7 +39,7 @@ from solvers.robust.weighted_edges import (
 )
 
 # Share of the least weight that stays with an edge that a run in one place leaves out, where known
-# inliers alone leave poses apart.
+# inliers alone may leave poses apart.
 _LEFT_OUT_SHARE = 1e-4
 # The median of ratios between 10^-24 and 1 by bisection of the exponent, to 1e-6 of itself.
 _LEAST_EXPONENT = -24.0
@@ -116,11 +117,12 @@ class SharedGNC:
         """The method for a graph, which says which weights are negligible.
 
         A wrong edge can cost so much that even a small share of its weight bends the map. So it
-        has none where known inliers hold the poses together.
+        has none where whole motions among the known inliers connect all poses.
         """
         known = known_inliers(graph, gnc.known)
         least_weight = negligible_weight(graph, known)
-        is_held = np.array_equal(held_together(graph, known, np.zeros(graph.num_edges)), known)
+        apart = bridges(graph, known & is_whole(graph), np.zeros(graph.num_edges))
+        is_held = len(apart) == 0 and not graph.is_world_loose
         return cls(gnc, least_weight, 0.0 if is_held else _LEFT_OUT_SHARE * least_weight)
 
     @property

@@ -7,8 +7,9 @@ With u_k = 2 sin(theta_k / 2) they cost
 
 The motion from the first pose to the last then differs from the measured one by a turn, u, and by
 an offset of length e. Chordal distances of rotations add up at most. If the errors are put in one
-after the other, from the first edge to the last, a turn at a pose moves the last one by u_k D_k,
-with D_k the distance between the two as measured. So
+after the other, from the first edge to the last, the turn of an edge i -> j, also where the chain
+goes from j to i, moves the last pose by u_k D_k at most, with D_k its distance from j as measured.
+So
 
     u <= sum_k u_k,      e <= sum_k e_k + D_k u_k.
 
@@ -17,8 +18,9 @@ The least cost for given u and e is a quadratic program with two constraints. Wi
     a = sum_k 1 / 2 kappa_k,  b = sum_k D_k^2 / 2 kappa_k + 1 / tau_k,
     c = sum_k D_k / 2 kappa_k,  r = c / sqrt(a b)
 
-its dual at lambda = 2 u / (1 + r) a and mu = 2 e / (1 + r) b shows that all these edges cost at
-least as much as one edge with the measured motion and
+its dual at lambda = 2 u / (1 + r) a and mu = 2 e / (1 + r) b, where 2 u e / sqrt(a b) is at most
+u^2 / a + e^2 / b, shows that all these edges cost at least as much as one edge with the measured
+motion and
 
     kappa = 1 / 2 (1 + r) a,      tau = 1 / (1 + r) b.
 """
@@ -36,10 +38,12 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from solvers.robust.chains import Chains, inverse, product
 
-# Of every composition of motions: of a turn, and of an offset over the length of the chains.
-_ROUNDING = 2.0**-48
+# Of every composition of motions whose rotations are right to 64 eps: of a turn, and of an offset
+# over the length of the chains.
+_ROUNDING = 2.0**-45
 # Share of the precisions that is given up, so that measured motions may be rounded: for all
-# eta in (0, 1) and lengths, (e - delta)^2 >= (1 - eta) e^2 - delta^2 / eta.
+# eta in (0, 1) and lengths, (e - delta)^2 >= (1 - eta) e^2 - delta^2 / eta. It is given up twice,
+# for the rounding of the sums a, b and c.
 _ETA = 1e-6
 
 
@@ -117,7 +121,7 @@ class CoarseChains:
         a = np.add.reduceat(softness, begins)
         b = np.add.reduceat(D * D * softness + 1.0 / self.tau[edges], begins)
         c = np.add.reduceat(D * softness, begins)
-        share = (1.0 - 2.0 * _ETA) / (1.0 + c / np.sqrt(a * b))
+        share = (1.0 - 2.0 * _ETA) / (1.0 + c / (np.sqrt(a) * np.sqrt(b)))
         return motion_R, motion_t, 0.5 * share / a, share / b
 
     @cached_property

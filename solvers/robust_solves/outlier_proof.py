@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -276,8 +277,13 @@ class _Search:
         return distances[np.ix_(places, places)]
 
     def is_proven(self, edges: tuple[int, ...], s: float) -> bool:
-        """Whether known inliers and these closures are proven to cost more than s."""
+        """Whether known inliers and these closures are proven to cost more than s.
+
+        Those that the answer keeps do not, as its poses show.
+        """
         edges = tuple(sorted(edges))
+        if self.kept[list(edges)].all():
+            return False
         for effort in _EFFORTS[: self.level + 1]:
             if self.proven.get(edges, 0.0) > s:
                 return True
@@ -291,9 +297,9 @@ class _Search:
         """Proven lower bound on the cost of known inliers and closures, as far as it is above s.
 
         It is that of the subgraph between the ends of the closures: what is left out costs nothing
-        at least. Chains with few steps cost less than the chains. Where chi2 is not quadratic its
-        tangent proves little of a cost as large as that of a wrong closure, and the bound is that
-        of an F below it.
+        at least. With `num_steps` it is that of an F below it on chains with few steps. Where chi2
+        is not quadratic its tangent proves little of a cost as large as that of a wrong closure,
+        and the bound is that of an F below it.
         """
         if num_steps is not None:
             found = self.coarse.with_closures(edges, num_steps)
@@ -349,7 +355,8 @@ class _Search:
 def _easier_problems(problem: PGOProblem) -> Iterator[PGOProblem]:
     """Problems whose cost is at most that of a problem, the easiest to bound first."""
     if not problem.is_quadratic:
-        yield isotropic_below(problem)
+        with suppress(*FAILURES):  # of matrices that rounding hides
+            yield isotropic_below(problem)
     yield problem
 
 
@@ -370,13 +377,21 @@ def isotropic_below(problem: PGOProblem) -> PGOProblem:
 
 
 def precisions_below(problem: PGOProblem) -> tuple[Array, Array]:
-    """Return kappa and tau, (m,), of an F below the cost at all poses; zeros if none is known."""
+    """Return kappa and tau, (m,), of an F below the cost at all poses.
+
+    They are zero for all edges where the cost is neither F nor chi2, and where no such F is known:
+    of matrices that are singular, or that rounding hides.
+    """
     graph = problem.graph
-    if problem.weighting is not Weighting.ISOTROPIC:
-        graph = isotropic_below(problem).graph
-    if graph.num_edges != problem.graph.num_edges:  # edges with a singular matrix were left out
-        return np.zeros(problem.graph.num_edges), np.zeros(problem.graph.num_edges)
-    return graph.kappa, graph.tau
+    below = None
+    if problem.weighting is Weighting.ISOTROPIC:
+        below = graph
+    elif problem.weighting is Weighting.INFORMATION:
+        with suppress(*FAILURES):
+            below = isotropic_below(problem).graph
+    if below is None or below.num_edges != graph.num_edges:
+        return np.zeros(graph.num_edges), np.zeros(graph.num_edges)
+    return below.kappa, below.tau
 
 
 def _least_eigenvalues(blocks: Array) -> Array:

@@ -220,3 +220,14 @@ def test_edges_that_alone_connect_poses_are_kept_as_in_one_place() -> None:
         solution = solvers.solve(wrong, robust=solvers.GNC(), robots=robots)
         assert solution.robust is not None
         assert len(wrong.components(solution.robust.kept)) == 1
+
+
+def test_left_out_edges_have_no_weight_only_where_whole_motions_connect_all_poses() -> None:
+    graph = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
+    assert SharedGNC.of(GNC(), graph).left_out == 0.0
+    for name in ("kappa", "tau"):
+        weights = {"kappa": graph.kappa.copy(), "tau": graph.tau.copy()}
+        weights[name][9] = 0.0  # odometry 9 -> 10
+        partial = replace(graph.with_weights(**weights), information=None)
+        method = SharedGNC.of(GNC(), partial)
+        assert 0.0 < method.left_out < method.least_weight

@@ -132,6 +132,19 @@ def test_the_precisions_are_those_of_an_f_below_chi2() -> None:
         assert (below.edge_costs(poses) <= problem.edge_costs(poses) * (1 + 1e-12)).all()
 
 
+@pytest.mark.parametrize("size", [1e-150, 1e-4, 1.0, 1e200])
+def test_the_unit_of_the_weights_does_not_matter(size: float) -> None:
+    graph = chain_with_closures(5, 20, 2, 1)
+    known = np.arange(20) < 19
+    chains = Chains.of(graph, known)
+    found = CoarseChains(chains, size * graph.kappa, size * graph.tau).with_closures([19], 3)
+    expected = CoarseChains(chains, graph.kappa, graph.tau).with_closures([19], 3)
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_allclose(found[0].kappa / size, expected[0].kappa, rtol=1e-9)
+    np.testing.assert_allclose(found[0].tau / size, expected[0].tau, rtol=1e-9)
+
+
 def test_nothing_is_said_where_a_step_has_no_precision_or_the_ends_are_apart() -> None:
     graph = chain_with_closures(0, 20, 2, 1)
     known = np.arange(20) < 19

@@ -16,7 +16,7 @@ from pgo_models.errors import SettingError
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.riemannian.polish import polish
 from solvers.robust.revision import truncated_cost
-from solvers.robust_solves.outlier_proof import isotropic_below
+from solvers.robust_solves.outlier_proof import isotropic_below, precisions_below
 
 
 def walk_with_closures(
@@ -104,6 +104,35 @@ def test_a_proof_that_is_out_of_time_says_so() -> None:
     assert proof.most_closures == 8
     with pytest.raises(SettingError, match=r"give solve\(.., robust=GNC\(\)\)"):
         solvers.prove_outliers(solvers.solve(graph))
+
+
+def test_of_rotations_alone_no_offset_proves_anything() -> None:
+    """The closure turns as it should; how far it says that its ends lie apart costs nothing."""
+    chain = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
+    chain = chain.without_edges(np.abs(chain.i - chain.j) != 1)
+    turn = chain.truth.R[2].T @ chain.truth.R[25]
+    far = pgo.Poses(turn[None], np.array([[300.0, 400.0]]))
+    graph = chain.with_edges(np.array([2]), np.array([25]), far, 1e4, 1e4)
+    for given_graph in (graph, replace(graph, information=None)):
+        problem = pgo.PGOProblem(given_graph, weighting=pgo.Weighting.ROTATIONS)
+        assert not precisions_below(problem)[0].any()
+        solution = solvers.prove_outliers(solvers.solve(problem, robust=solvers.GNC()))
+        assert not solution.robust.rejected.any()
+        assert not solution.robust.proof.proven_wrong.any()
+
+
+def test_a_matrix_that_rounding_hides_elsewhere_takes_no_proof_away() -> None:
+    chain = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
+    chain = chain.without_edges(np.abs(chain.i - chain.j) != 1)
+    far = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
+    graph = chain.with_edges(np.array([2]), np.array([25]), far, 1e4, 1e4)
+    information = np.tile(np.diag([1e4, 1e4, 2e4]), (graph.num_edges, 1, 1))
+    information[28, [0, 2], [2, 0]] = (1.0 - 1e-9) * np.sqrt(2e8)
+    problem = pgo.PGOProblem(
+        replace(graph, information=information), weighting=pgo.Weighting.INFORMATION
+    )
+    solution = solvers.prove_outliers(solvers.solve(problem, robust=solvers.GNC()))
+    assert np.flatnonzero(solution.robust.proof.proven_wrong).tolist() == [graph.num_edges - 1]
 
 
 @pytest.mark.parametrize("coupled", [False, True])
