@@ -468,7 +468,7 @@ METHODS_OF_ROBOTS: dict[str, Begin] = {
     ),
     "newton": lambda driver: (SubstructuredNewton(), driver),
     "staircase": lambda driver: (SubstructuredStaircase(), driver),
-    "gnc": lambda driver: (SharedGNC(GNC(spread=None), 1e-9), driver),
+    "gnc": lambda driver: (SharedGNC(GNC(spread=None), 1e-9, 1e-13), driver),
     "ascent": ascent,
 }
 BY_ROBOTS = pytest.mark.parametrize("begin", METHODS_OF_ROBOTS.values(), ids=METHODS_OF_ROBOTS)
