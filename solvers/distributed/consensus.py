@@ -1,7 +1,7 @@
 """CONSENSUS by robots on a network: `solvers.soc.consensus`, from the poses that they hold."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -9,11 +9,11 @@ from typing import TypeVar
 import numpy as np
 
 from solvers.distributed.driver import Driver
-from solvers.distributed.robots.agent import begin_copies, finish_copies, order_copies
+from solvers.distributed.robots.agent import C, begin_copies, finish_copies, order_copies
 from solvers.network.counted_pool import Count
 from solvers.network.faults import LossyChannel
 from solvers.result import Measurement, Status
-from solvers.soc.consensus import Consensus, ConsensusState, Order, ask_all
+from solvers.soc.consensus import Consensus, ConsensusState, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import Rows
 from solvers.soc.recursion_block import Rotations
@@ -54,7 +54,9 @@ class RobotsOfDriver:
         count = Count.PIGGYBACKED if self.has_driver else Count.OFF
         return self.driver.network.ask(begin_copies, self.driver.poses_of_cover(), count)
 
-    def ask(self, order: Order[Q, A], requests: Sequence[Q], count: Count) -> list[A]:
+    def ask(
+        self, order: Callable[[C, Q], tuple[C, A]], requests: Sequence[Q], count: Count
+    ) -> list[A]:
         """Answers of all robots to an order, each with its request."""
         return self.driver.network.ask(partial(order_copies, order), requests, count)
 

@@ -13,7 +13,6 @@ iteration.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.driver import Driver
-from solvers.distributed.robots.agent import begin_paper, order_paper
+from solvers.distributed.robots.agent import begin_paper
 from solvers.network.counted_pool import Count
 from solvers.network.moments import Moment
 from solvers.network.serialization import COMPUTED_AGAIN
@@ -88,18 +87,17 @@ class PaperByRobots:
         """State 0: R = omega = the current rotations, B = 0; two rounds."""
         if start is not None:
             return replace(start, moment=driver.moment())
-        network = driver.network
-        sent_poses = network.ask(begin_paper, driver.poses_of_cover(), Count.PIGGYBACKED)
-        poses = network.exchange(sent_poses)
-        ratios = network.ask(partial(order_paper, PaperRobot.ratios), poses, Count.GATHER)
+        robots = RobotsOfDriver(driver)
+        poses_of_cover = driver.poses_of_cover()
+        poses = robots.exchange(driver.network.ask(begin_paper, poses_of_cover, Count.PIGGYBACKED))
+        ratios = robots.ask(PaperRobot.ratios, poses, Count.GATHER)
         order = PenaltyOrder(*self.soc.penalty.bounds(np.concatenate(ratios)))
-        orders = [order] * len(poses)
-        parts = network.ask(partial(order_paper, PaperRobot.units), orders, Count.ALL_REDUCE)
+        parts = robots.ask(PaperRobot.units, [order] * len(poses), Count.ALL_REDUCE)
         num_poses = sum(part.num_poses for part in parts)
         num_rows = num_poses * driver.d
         penalty = CommonPenalty(math.fsum(part.rho for part in parts) / num_poses)
         told = [self._told(penalty)] * len(poses)
-        replies = network.ask(partial(order_paper, PaperRobot.start), told, Count.ALL_REDUCE)
+        replies = robots.ask(PaperRobot.start, told, Count.ALL_REDUCE)
         state = PaperRobotsState(
             k=0,
             penalty=penalty,
@@ -122,8 +120,7 @@ class PaperByRobots:
         penalty = state.penalty.after(self.soc.penalty, float(primal), float(change))
         told = self._told(penalty)
         orders = [(told, rows) for rows in state.rows]
-        step = partial(order_paper, PaperRobot.step)
-        answers = driver.network.ask(step, orders, Count.ALL_REDUCE)
+        answers = RobotsOfDriver(driver).ask(PaperRobot.step, orders, Count.ALL_REDUCE)
         gradient = math.sqrt(math.fsum(last.gradient for last, _ in answers))
         following = replace(
             following,

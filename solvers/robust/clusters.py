@@ -66,9 +66,8 @@ class ClosurePairs:
         what the matrices claim. An edge that measures no whole motion is a cluster of its own, too.
         """
         graph = self.chains.graph
-        doubted = np.flatnonzero(~self.known)
-        whole = is_whole(graph)[doubted]
-        alone: list[IntArray] = [doubted[[k]] for k in np.flatnonzero(~whole)]
+        partial = np.flatnonzero(~self.known & ~is_whole(graph))
+        alone: list[IntArray] = list(partial[:, None])
         tested = self._tested
         if len(tested) == 0:
             return alone

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,7 @@ Q = TypeVar("Q")
 A = TypeVar("A")
 # A robot that holds what its neighbours send: of CONSENSUS, or of Algorithm 1 of the paper.
 Copies = ConsensusRobot | PaperRobot
+C = TypeVar("C", ConsensusRobot, PaperRobot)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +161,9 @@ class BaseAgent(ABC):
             interior = interior.in_state_of(states.interior)
         copies: Copies | None = None
         if isinstance(states.copies, CopiesState):
-            copies = ConsensusRobot(self._layout, states.copies).restored(states.copies)
+            copies = ConsensusRobot(self._layout, CopiesState()).restored(states.copies)
         elif states.copies is not None:
-            copies = PaperRobot(self._layout, states.copies).restored(states.copies)
+            copies = PaperRobot(self._layout, PaperCopies()).restored(states.copies)
         return Held(interior, copies)
 
     @property
@@ -205,21 +206,11 @@ def order_interior(
     return answer
 
 
-def order_copies(
-    order: Callable[[ConsensusRobot, Q], tuple[ConsensusRobot, A]], agent: BaseAgent, request: Q
-) -> A:
-    """Give the copies of CONSENSUS an order."""
-    assert isinstance(agent.copies, ConsensusRobot)
-    agent.copies, answer = order(agent.copies, request)
-    return answer
-
-
-def order_paper(
-    order: Callable[[PaperRobot, Q], tuple[PaperRobot, A]], agent: BaseAgent, request: Q
-) -> A:
-    """Give the robot of Algorithm 1 an order."""
-    assert isinstance(agent.copies, PaperRobot)
-    agent.copies, answer = order(agent.copies, request)
+def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: BaseAgent, request: Q) -> A:
+    """Give the copies an order, which is of their kind: a method began with these."""
+    copies: Any = agent.copies
+    assert copies is not None
+    agent.copies, answer = order(copies, request)
     return answer
 
 
@@ -247,7 +238,7 @@ def begin_copies(agent: BaseAgent, cover: Poses) -> Rows:
 def begin_paper(agent: BaseAgent, cover: Poses) -> Rows:
     """Start Algorithm 1 at the current poses, of which the driver sends those of the cover."""
     agent.copies = PaperRobot(agent._layout, PaperCopies())
-    return order_paper(PaperRobot.begin, agent, held_poses(agent, cover))
+    return order_copies(PaperRobot.begin, agent, held_poses(agent, cover))
 
 
 def held_poses(agent: BaseAgent, cover: Poses) -> Poses:
