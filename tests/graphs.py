@@ -226,3 +226,22 @@ def polar_factor(A: Array, *, rotation: bool = False) -> Array:
     if rotation and np.linalg.det(U @ Vt) < 0:
         U[:, -1] *= -1.0
     return np.asarray(U @ Vt)
+
+
+def chain_with_closures(seed: int, n: int, d: int, num_closures: int) -> PoseGraph:
+    """A chain whose edges point either way, with weights of all sizes, and closures at random."""
+    rng = np.random.default_rng(seed)
+    i = np.arange(n - 1)
+    j = i + 1
+    is_turned = rng.random(n - 1) < 0.5
+    i, j = np.where(is_turned, j, i), np.where(is_turned, i, j)
+    ends = np.array([rng.choice(n, 2, replace=False) for _ in range(num_closures)], dtype=int)
+    ends = ends.reshape(-1, 2)
+    i = np.concatenate([i, ends[:, 0]])
+    j = np.concatenate([j, ends[:, 1]])
+    m = len(i)
+    spread = rng.choice([0.1, 1.0, 3.0])
+    R = exp_map(spread * rng.standard_normal((m, 2 * d - 3)))
+    t = rng.choice([0.1, 1.0, 10.0]) * rng.standard_normal((m, d))
+    kappa, tau = np.exp(rng.uniform(-3.0, 6.0, (2, m)))
+    return PoseGraph(n, i, j, R, t, kappa, tau)

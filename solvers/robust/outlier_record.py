@@ -51,19 +51,19 @@ class OutlierProof(Summarised):
 
     def __str__(self) -> str:
         num_wrong = int(self.proven_wrong.sum())
+        in_time = "" if self.is_complete else "; the time did not suffice to try all"
         if not num_wrong and self.most_closures == self.num_closures:
             return (
-                "no closure can be proven wrong: the known inliers can follow every one of the "
-                f"{self.num_closures}"
+                f"none of {self.num_closures} closures is proven wrong: the known inliers may be "
+                f"able to follow every one{in_time}"
             )
         percent = math.ceil(1000.0 * self.gap) / 10.0
-        text = (
+        return (
             f"{num_wrong} of {self.num_closures} closures are proven wrong, if all known inliers "
             f"are right. No map at least as good keeps more than {self.most_closures} closures; "
             f"this one keeps {self.num_kept}. The truncated cost is within {percent:g} % of the "
-            "least possible"
+            f"least possible{in_time}"
         )
-        return text if self.is_complete else f"{text}; the time did not suffice to try all"
 
     def as_json(self) -> dict[str, object]:
         """Return what is written as JSON.

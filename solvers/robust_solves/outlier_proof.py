@@ -12,83 +12,74 @@ most U keeps a set K of closures, those with r_e^2 <= c_e^2. The cost of known i
 So each closure of K, and each pair, fits the known inliers at a cost of at most s:
 d_e = min F_e <= s and d_ef = min F_ef <= s.
 
-1. A closure whose proven lower bound of d_e is above s is wrong in every map that is as good as the
-   answer. Without it the sum over K is smaller, and so is s: the others are tried again.
-2. Closures are divided into classes of which any two are proven inconsistent, d_ef > s. K has at
-   most one of a class, so that the sum over K is at most that of the largest c_e^2 of each class;
-   with this s more closures may be wrong, and more pairs inconsistent.
+1. A closure whose proven lower bound of d_e is above s is wrong in every map that is as good as
+   the answer. Two closures with d_ef > s are inconsistent: no such map keeps both.
+2. Closures are divided into classes of which any two are inconsistent. K has at most one of a
+   class, so that the sum over K is at most that of the largest c_e^2 of each class.
+3. Of the maps that keep a closure e more is known: they keep none that is inconsistent with e.
+   Their s_e takes of each class the largest c_e^2 of those that are left. It takes the place of s
+   for e, and for e with any other closure.
 
-In the end K has at most as many closures as there are classes, and TLS(X) is at least C less the
-sum of the largest c_e^2 of each class, for all X: for those worse than the answer it is above U.
+Each closure that is left out, and each pair, lowers s or s_e, so that more can be. In the end K has
+at most as many closures as there are classes, and TLS(X) is at least C less the sum of the largest
+c_e^2 of each class, for all X: for those worse than the answer it is above U.
 
-Which closures and pairs are tried is decided by first-order distances on the known inliers
-(`solvers.robust.chains`); what is claimed rests on certificates alone. Guaranteed outlier removal
-does this for registration (Parra Bustos & Chin, "Guaranteed outlier removal for point cloud
-registration with correspondences", IEEE TPAMI 2018).
+Most bounds come in closed form, for all closures and pairs at once (`cycle_bounds`). Where they do
+not suffice certificates prove more (`closure_costs`), if first-order distances on the known inliers
+(`solvers.robust.chains`) say that it is worth it. Guaranteed outlier removal does step 1 for
+registration (Parra Bustos & Chin, "Guaranteed outlier removal for point cloud registration with
+correspondences", IEEE TPAMI 2018).
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice
 
 import numpy as np
 
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.certificates.shrunk_information import shrink_information
-from pgo_models.errors import FAILURES, SettingError, door
+from pgo_models.errors import SettingError, door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
-from pgo_models.problem.weighting import Weighting
-from solvers.here import Here
-from solvers.loop import RunMonitor, iterate
-from solvers.plan import solve_at
-from solvers.request import Pipeline
-from solvers.riemannian.staircase import Staircase
 from solvers.robust.chains import Chains, cycle_distances, is_whole, squared_distances
 from solvers.robust.outlier_record import OutlierProof
-from solvers.robust_solves.coarse_chains import CoarseChains
+from solvers.robust_solves.chain_sums import ChainSums
+from solvers.robust_solves.closure_costs import ClosureCosts, precisions_below
+from solvers.robust_solves.cycle_bounds import CycleBounds
 from solvers.solution import Solution
 
 
 @dataclass(frozen=True)
 class _Effort:
-    """How hard proofs are tried, and what first-order distances have to be for it, in units of s.
+    """How hard proofs are tried, and for which closures and pairs.
 
-    `num_steps` are those that chains are made of (`CoarseChains`); None for chains as they are.
+    First-order distances and the bounds that are known have to be so many times s. `num_steps` are
+    those that chains are made of (`CoarseChains`); None for chains as they are.
     """
 
-    of_single: float
-    of_pair: float
+    distance: float
+    bound: float
     num_steps: int | None
 
 
 # Proofs that are easy and likely to succeed come first, as s falls with each success.
 _EFFORTS = (
-    _Effort(2.0, 4.0, 24),
-    _Effort(1.2, 2.0, 24),
-    _Effort(1.2, 1.5, 96),
-    _Effort(1.2, 1.2, None),
+    _Effort(1.5, 0.4, 24),
+    _Effort(1.5, 0.25, 24),
+    _Effort(1.2, 0.2, 96),
+    _Effort(1.0, 0.1, None),
+    _Effort(1.2, 0.0, None),
 )
-# Relative gap of the first certificate: of most wrong closures the cost is many times s.
-_WIDE_GAP = 0.5
+# Proofs after which s is computed again.
+_MOST_PROOFS = 64
 # Closures of which all pairs are compared within seconds.
 _MOST_PAIRED = 2000
-# Poses are not improved: what counts is the bound.
-_FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, second_try=False)
-# A wide gap can be proven far from a stationary point.
-_COARSE_STAIRCASE = Staircase(tolerance=1e-2, gap=_WIDE_GAP)
-_MOST_STEPS = 100
 _OUTWARD = 1.0 + 1e-12  # for sums of up to a million positive terms
-_ROUNDING = 2.0**-40  # of an eigenvalue, over the trace
 
 
 @door
@@ -148,30 +139,49 @@ def prove_outliers(solution: Solution, time_limit: float = math.inf) -> Solution
 
 
 @dataclass(eq=False)
-class _Search:
-    """A search under way.
+class _Pairs:
+    """Proven lower bounds of d_ef, (k, k), and first-order distances, (k, k)."""
 
-    `cost` is U, an upper bound. `classes` has the closures that are not proven wrong; any two of a
-    class are proven inconsistent. `single` are first-order distances of all edges, (m,), and
-    `proven` the lower bound of each closure or pair that was `tried`, with so many steps of
-    `coarse` chains. `level` is the place of the current effort. `pairs` are closures and
-    the first-order distances of all pairs of these, once they are computed.
+    bound: Array
+    distance: Array
+
+    @classmethod
+    def of(cls, cycles: CycleBounds, edges: IntArray) -> _Pairs:
+        return cls(cycles.of_pairs(edges), _pair_distances(cycles.sums.chains, edges))
+
+    def __getitem__(self, chosen: BoolArray) -> _Pairs:
+        both = np.ix_(chosen, chosen)
+        return _Pairs(self.bound[both], self.distance[both])
+
+
+@dataclass(eq=False)
+class _Search:
+    """A search under way, among the closures `edges` (k,) that are not proven wrong.
+
+    `cost` is U, an upper bound, and `total` C; `most_cost` (k,) is s_e of each closure, and
+    `class_of` (k,) its class. `bound` (k,) are proven lower bounds of d_e, `distance` (k,)
+    first-order distances. There are no `pairs` as long as closures are too many. `tried` are edges
+    with the number of steps that chains were made of; the search is complete unless the time did
+    not suffice for a proof.
     """
 
     problem: PGOProblem
     known: BoolArray
-    thresholds: Array
-    chains: Chains
-    coarse: CoarseChains
-    kept: BoolArray
-    cost: float
-    classes: list[list[int]]
-    single: Array
+    cycles: CycleBounds
+    costs: ClosureCosts
     deadline: float
-    level: int = 0
-    proven: dict[tuple[int, ...], float] = field(default_factory=dict)
+    cost: float
+    total: float
+    edges: IntArray
+    thresholds: Array
+    is_kept: BoolArray
+    class_of: IntArray
+    most_cost: Array
+    bound: Array
+    distance: Array
+    pairs: _Pairs | None = None
     tried: set[tuple[tuple[int, ...], int | None]] = field(default_factory=set)
-    pairs: tuple[IntArray, Array] | None = None
+    is_complete: bool = True
 
     @classmethod
     def of(
@@ -182,263 +192,192 @@ class _Search:
         inliers = PGOProblem(graph.without_edges(~kept), problem.backend, problem.weighting)
         error = objective_rounding(inliers, poses).error
         cost = inliers.objective(poses) + error + float(thresholds[~kept].sum())
+        edges = np.flatnonzero(~known)
         chains = Chains.of(graph, known)
-        single = _single_distances(chains, np.flatnonzero(~known))
-        classes = [[e] for e in np.flatnonzero(~known).tolist()]
-        coarse = CoarseChains(chains, *precisions_below(problem))
-        bound = _OUTWARD * cost
+        cycles = CycleBounds(ChainSums(chains, *precisions_below(problem)))
         return cls(
-            problem, known, thresholds, chains, coarse, kept, bound, classes, single, deadline
+            problem,
+            known,
+            cycles,
+            ClosureCosts(problem, known, cycles.sums),
+            deadline,
+            cost=_OUTWARD * cost,
+            total=math.fsum(thresholds[edges]),
+            edges=edges,
+            thresholds=thresholds[edges],
+            is_kept=kept[edges],
+            class_of=np.arange(len(edges)),
+            most_cost=np.full(len(edges), math.inf),
+            bound=cycles.of_singles(edges),
+            distance=_single_distances(chains, edges),
         )
 
-    @property
-    def most_cost(self) -> float:
-        """s: what known inliers and closures of a map as good as this one cost at most.
-
-        It is U less the thresholds of the closures that no such map keeps: of each class all but
-        the largest, and of those proven wrong all.
-        """
-        is_left_out = ~self.known
-        for members in self.classes:
-            largest = max(members, key=lambda e: self.thresholds[e])
-            is_left_out[largest] = False
-        return max(0.0, self.cost - math.fsum(self.thresholds[is_left_out]) / _OUTWARD)
-
     def run(self) -> None:
-        """Prove single closures wrong, then pairs inconsistent, until nothing changes."""
-        for self.level in range(len(_EFFORTS)):
-            before = math.inf
-            while self.most_cost < before and not self.is_out_of_time():
-                before = self.most_cost
-                self.exclude_single_closures()
-                self.join_classes()
+        """Prove closures wrong and pairs inconsistent, until nothing changes."""
+        self.use_bounds()
+        level = 0
+        while level < len(_EFFORTS):
+            before = self.most_cost.sum()
+            self.try_singles(_EFFORTS[level])
+            self.join_classes(_EFFORTS[level])
+            self.use_bounds()
+            level = 0 if self.most_cost.sum() < before else level + 1
 
-    def is_out_of_time(self) -> bool:
-        """Whether no further proof is to be tried."""
-        return time.perf_counter() > self.deadline
+    def has_time(self) -> bool:
+        """Whether there is time for a further proof."""
+        if time.perf_counter() > self.deadline:
+            self.is_complete = False
+        return self.is_complete
 
-    def exclude_single_closures(self) -> None:
-        """Step 1: closures that cost more than s beside the known inliers, the farthest first."""
-        while not self.is_out_of_time():
-            s = self.most_cost
-            doubted = [e for members in self.classes for e in members]
-            far = [e for e in doubted if self.single[e] > _EFFORTS[self.level].of_single * s]
-            far.sort(key=lambda e: -self.single[e])
-            wrong = set()
-            for e in far:
-                if self.is_proven((e,), s):
-                    wrong.add(e)
-            if not wrong:
+    def use_bounds(self) -> None:
+        """Lower s by the bounds that are known, until nothing changes."""
+        before = math.inf
+        while True:
+            self.leave_out_wrong()
+            if self.pairs is None and len(self.edges) <= _MOST_PAIRED and self.has_time():
+                self.pairs = _Pairs.of(self.cycles, self.edges)
+            if self.most_cost.sum() >= before:
                 return
-            members = [[e for e in of_class if e not in wrong] for of_class in self.classes]
-            self.classes = [of_class for of_class in members if of_class]
+            before = self.most_cost.sum()
+            self.join_classes()
 
-    def join_classes(self) -> None:
-        """Step 2: join classes whose closures are inconsistent, pair by pair.
+    def leave_out_wrong(self) -> None:
+        """Steps 1 and 3: leave out closures that cost more than s_e, until nothing changes."""
+        while len(self.edges):
+            before = self.most_cost
+            self.most_cost = np.minimum(before, self._costs_beside())
+            right = self.bound <= self.most_cost
+            if right.all() and not (self.most_cost < before).any():
+                return
+            self.edges = self.edges[right]
+            self.thresholds = self.thresholds[right]
+            self.is_kept = self.is_kept[right]
+            self.class_of = np.unique(self.class_of[right], return_inverse=True)[1]
+            self.most_cost = self.most_cost[right]
+            self.bound = self.bound[right]
+            self.distance = self.distance[right]
+            self.pairs = None if self.pairs is None else self.pairs[right]
 
-        Closures that the answer keeps stand in different classes; others join one of them.
-        """
-        doubted = np.array(sorted(e for members in self.classes for e in members), dtype=np.int64)
-        if not 1 < len(doubted) <= _MOST_PAIRED:
-            return
-        distance = self.distances_between(doubted)
+    def _costs_beside(self) -> Array:
+        """s_e, (k,): U - C and the largest c_e^2 that each class has beside a closure."""
+        in_order = np.argsort(self.class_of, kind="stable")
+        begins = np.flatnonzero(np.diff(self.class_of[in_order], prepend=-1))
+        beside = np.where(self.is_inconsistent(), 0.0, self.thresholds)[:, in_order]
+        sums = np.maximum.reduceat(beside, begins, axis=1).sum(axis=1)
+        rounding = (_OUTWARD - 1.0) * (self.cost + self.total)
+        return np.asarray(np.maximum(0.0, self.cost - self.total + sums + rounding))
+
+    def is_inconsistent(self) -> BoolArray:
+        """Pairs, (k, k), of which no map as good as the answer keeps both."""
+        if self.pairs is None:
+            # Nothing is known of pairs: one row serves all closures.
+            return np.zeros((1, len(self.edges)), dtype=bool)
+        return np.asarray(self.pairs.bound > self._most_costs_of_pairs())
+
+    def _most_costs_of_pairs(self) -> Array:
+        return np.minimum.outer(self.most_cost, self.most_cost)
+
+    def try_singles(self, effort: _Effort) -> None:
+        """Step 1: try to prove closures wrong, those with the largest bounds first."""
         s = self.most_cost
-        is_near = distance <= _EFFORTS[self.level].of_pair * s
-        ordered = sorted(self.classes, key=lambda members: not self.kept[members].any())
-        joined: list[list[int]] = []
-        class_of = np.full(len(doubted), -1)
-        for members in ordered:
-            rows = np.searchsorted(doubted, members)
-            near_classes = class_of[is_near[rows].any(axis=0)]
-            number = len(joined)
-            for other in np.setdiff1d(np.arange(len(joined)), near_classes):
-                pairs = [(e, f) for e in members for f in joined[other]]
-                e, f = np.searchsorted(doubted, np.array(pairs).T)
-                # The hardest come first, so that little is proven in vain.
-                in_order = np.argsort(distance[e, f], kind="stable")
-                if all(self.is_proven(pairs[k], s) for k in in_order):
-                    number = int(other)
-                    break
-            if number == len(joined):
-                joined.append([])
-            joined[number] += members
-            class_of[rows] = number
-        self.classes = joined
+        hopeful = (self.bound >= effort.bound * s) & (self.distance > effort.distance * s)
+        tried = np.flatnonzero(hopeful & ~self.is_kept)
+        for e in tried[np.argsort(-(self.bound / s)[tried], kind="stable")].tolist():
+            self.bound[e] = max(self.bound[e], self._prove((e,), s[e], effort))
+        self.leave_out_wrong()
 
-    def distances_between(self, edges: IntArray) -> Array:
-        """First-order distances, (k, k), of pairs of edges, ascending; computed the first time.
+    def join_classes(self, effort: _Effort | None = None) -> None:
+        """Step 2: classes of inconsistent closures, if they are better than those there are.
 
-        Later calls ask for some of the edges of the first one.
+        Closures go to the first class that they are inconsistent with: those that the answer keeps
+        first, then those that are consistent with the most others. With an effort pairs that are
+        hopeful are tried, up to a number.
         """
         if self.pairs is None:
-            self.pairs = edges, _pair_distances(self.chains, edges)
-        paired, distances = self.pairs
-        places = np.searchsorted(paired, edges)
-        return distances[np.ix_(places, places)]
+            return
+        inconsistent = self.is_inconsistent()
+        may_join = inconsistent if effort is None else inconsistent | self._is_hopeful(effort)
+        k = len(self.edges)
+        takes = np.ones((k, k), dtype=bool)  # of every class and closure
+        classes: list[list[int]] = []
+        class_of = np.zeros(k, dtype=np.int64)
+        most_tried = len(self.tried) + _MOST_PROOFS
+        for e in np.lexsort([inconsistent.sum(axis=1), ~self.is_kept]).tolist():
+            for q in np.flatnonzero(takes[: len(classes), e]).tolist():
+                if self._excludes(classes[q], e, effort, most_tried):
+                    break
+            else:
+                q = len(classes)
+                classes.append([])
+            classes[q].append(e)
+            takes[q] &= may_join[e]
+            class_of[e] = q
+        if self._sum_of_largest(class_of) < self._sum_of_largest(self.class_of):
+            self.class_of = class_of
 
-    def is_proven(self, edges: tuple[int, ...], s: float) -> bool:
-        """Whether known inliers and these closures are proven to cost more than s.
+    def _is_hopeful(self, effort: _Effort) -> BoolArray:
+        """Pairs, (k, k), that are worth an effort; not those that the answer keeps."""
+        assert self.pairs is not None
+        s = self._most_costs_of_pairs()
+        bound = np.maximum(self.pairs.bound, np.maximum.outer(self.bound, self.bound))
+        hopeful = (bound >= effort.bound * s) & (self.pairs.distance > effort.distance * s)
+        return np.asarray(hopeful & ~np.logical_and.outer(self.is_kept, self.is_kept))
 
-        Those that the answer keeps do not, as its poses show.
-        """
-        edges = tuple(sorted(edges))
-        if self.kept[list(edges)].all():
-            return False
-        for effort in _EFFORTS[: self.level + 1]:
-            if self.proven.get(edges, 0.0) > s:
+    def _excludes(
+        self, members: list[int], e: int, effort: _Effort | None, most_tried: int
+    ) -> bool:
+        """Whether closures are inconsistent with another; the hardest are tried first."""
+        assert self.pairs is not None
+        s = np.minimum(self.most_cost[e], self.most_cost[members])
+        ratio = self.pairs.bound[e, members] / s
+        for place in np.argsort(ratio, kind="stable").tolist():
+            if self.pairs.bound[e, members[place]] > s[place]:
                 return True
-            if (edges, effort.num_steps) not in self.tried and not self.is_out_of_time():
-                self.tried.add((edges, effort.num_steps))
-                bound = self._lower_bound(edges, s, effort.num_steps)
-                self.proven[edges] = max(self.proven.get(edges, 0.0), bound)
-        return self.proven.get(edges, 0.0) > s
+            if effort is None or len(self.tried) >= most_tried:
+                return False
+            f = members[place]
+            bound = max(self.pairs.bound[e, f], self._prove((e, f), s[place], effort))
+            self.pairs.bound[e, f] = self.pairs.bound[f, e] = bound
+            if bound <= s[place]:
+                return False
+        return True
 
-    def _lower_bound(self, edges: tuple[int, ...], s: float, num_steps: int | None) -> float:
-        """Proven lower bound on the cost of known inliers and closures, as far as it is above s.
-
-        It is that of the subgraph between the ends of the closures: what is left out costs nothing
-        at least. With `num_steps` it is that of an F below it on chains with few steps. Where chi2
-        is not quadratic its tangent proves little of a cost as large as that of a wrong closure,
-        and the bound is that of an F below it.
-        """
-        if num_steps is not None:
-            found = self.coarse.with_closures(edges, num_steps)
-            if found is None:
-                return 0.0
-            coarse, rounding = found
-            problem = PGOProblem(coarse, self.problem.backend, Weighting.ISOTROPIC)
-            return _relaxed_bound(problem, s + rounding) - rounding
-        subgraph = self._between_ends(edges)
-        if subgraph is None:
+    def _prove(self, closures: tuple[int, ...], s: float, effort: _Effort) -> float:
+        """Lower bound that an effort proves; zero if it was made before."""
+        edges = tuple(sorted(self.edges[list(closures)].tolist()))
+        if (edges, effort.num_steps) in self.tried or not self.has_time():
             return 0.0
-        bound = 0.0
-        for problem in _easier_problems(subgraph):
-            bound = max(bound, _bound_above(problem, s))
-            if bound > s:
-                break
-        return bound
+        self.tried.add((edges, effort.num_steps))
+        return self.costs.lower_bound(edges, s, effort.num_steps)
 
-    def _between_ends(self, edges: Sequence[int]) -> PGOProblem | None:
-        """The problem of known inliers and closures between the ends of these; None if apart."""
-        graph = self.problem.graph
-        ends = np.concatenate([graph.i[list(edges)], graph.j[list(edges)]])
-        chain = self.chains.chain
-        poses = [
-            np.arange(ends[chain[ends] == c].min(), ends[chain[ends] == c].max() + 1)
-            for c in np.unique(chain[ends])
-        ]
-        chosen = self.known.copy()
-        chosen[list(edges)] = True
-        subgraph = graph.without_edges(~chosen).subgraph(np.concatenate(poses))
-        if len(subgraph.components()) > 1:
-            return None
-        return PGOProblem(subgraph, self.problem.backend, self.problem.weighting)
+    def _sum_of_largest(self, class_of: IntArray) -> float:
+        """Sum of the largest c_e^2 of each class."""
+        largest = np.zeros(len(class_of))
+        np.maximum.at(largest, class_of, self.thresholds)
+        return math.fsum(largest)
 
     def proof(self) -> OutlierProof:
         """What has been proven so far."""
-        doubted = [e for members in self.classes for e in members]
         proven_wrong = ~self.known
-        proven_wrong[doubted] = False
-        largest = math.fsum(max(self.thresholds[members]) for members in self.classes)
-        bound = math.fsum(self.thresholds[~self.known]) / _OUTWARD - _OUTWARD * largest
+        proven_wrong[self.edges] = False
+        bound = self.total / _OUTWARD - _OUTWARD * self._sum_of_largest(self.class_of)
         return OutlierProof(
             proven_wrong,
-            num_kept=int((self.kept & ~self.known).sum()),
+            num_kept=int(self.is_kept.sum()),
             num_closures=int((~self.known).sum()),
-            most_closures=len(self.classes),
+            most_closures=len(np.unique(self.class_of)),
             truncated_cost=self.cost,
             truncated_cost_bound=min(max(0.0, bound), self.cost),
-            is_complete=not self.is_out_of_time(),
+            is_complete=self.is_complete,
         )
 
 
-def _easier_problems(problem: PGOProblem) -> Iterator[PGOProblem]:
-    """Problems whose cost is at most that of a problem, the easiest to bound first."""
-    if not problem.is_quadratic:
-        with suppress(*FAILURES):  # of matrices that rounding hides
-            yield isotropic_below(problem)
-    yield problem
-
-
-def isotropic_below(problem: PGOProblem) -> PGOProblem:
-    """F with precisions so small that it is below chi2 at all poses.
-
-    Of matrices without coupling, below those of the graph (`shrink_information`), the smallest
-    eigenvalues are taken. With the turn theta of an edge, chi2 has at least 2 (1 - cos theta) times
-    that of I_rr, and F 4 (1 - cos theta) kappa.
-    """
-    d = problem.d
-    graph = shrink_information(problem.graph, cap=1.0)
-    information = proper_information(graph)
-    tau = _least_eigenvalues(information[:, :d, :d])
-    kappa = 0.5 * _least_eigenvalues(information[:, d:, d:])
-    weighted = replace(graph.with_weights(kappa, tau), information=None)
-    return PGOProblem(weighted, problem.backend, Weighting.ISOTROPIC)
-
-
-def precisions_below(problem: PGOProblem) -> tuple[Array, Array]:
-    """Return kappa and tau, (m,), of an F below the cost at all poses.
-
-    They are zero for all edges where the cost is neither F nor chi2, and where no such F is known:
-    of matrices that are singular, or that rounding hides.
-    """
-    graph = problem.graph
-    below = None
-    if problem.weighting is Weighting.ISOTROPIC:
-        below = graph
-    elif problem.weighting is Weighting.INFORMATION:
-        with suppress(*FAILURES):
-            below = isotropic_below(problem).graph
-    if below is None or below.num_edges != graph.num_edges:
-        return np.zeros(graph.num_edges), np.zeros(graph.num_edges)
-    return below.kappa, below.tau
-
-
-def _least_eigenvalues(blocks: Array) -> Array:
-    """Smallest eigenvalues, (m,), rounded down, and zero where rounding hides them."""
-    traces = np.einsum("mkk->m", blocks)
-    least = np.linalg.eigvalsh(blocks)[:, 0]
-    return np.asarray(np.maximum(least - _ROUNDING * traces, 0.0))
-
-
-def _relaxed_bound(problem: PGOProblem, s: float) -> float:
-    """Proven lower bound on a cost from its relaxation; the search ends where it is above s."""
-    bound = 0.0
-    try:
-        for state in islice(iterate(_COARSE_STAIRCASE, problem), _MOST_STEPS):
-            if state.bound is not None:
-                bound = max(bound, state.bound.lower_bound)
-            if bound > s or state.is_solved or state.stalled:
-                break
-    except FAILURES:
-        pass
-    return bound
-
-
-def _bound_above(problem: PGOProblem, s: float) -> float:
-    """Proven lower bound on a cost, with a gap that suffices where its minimum is above s."""
-    bound = 0.0
-    gap = _WIDE_GAP
-    for _ in range(2):
-        place = Here(RunMonitor(progress=False), [], problem, gap)
-        try:
-            found = solve_at(place, replace(_FOR_BOUNDS, gap=gap), None)
-        except FAILURES:
-            break
-        bound = max(bound, found.proof.lower_bound)
-        least = found.proof.objective
-        if bound > s or least <= s:
-            break
-        gap = 0.5 * (least - s) / least
-    return bound
-
-
 def _single_distances(chains: Chains, edges: IntArray) -> Array:
-    """First-order distances, (m,), of edges from the chain between their ends; zero elsewhere."""
+    """First-order distances, (k,), of edges from the chain between their ends; zero elsewhere."""
     graph = chains.graph
-    distances = np.zeros(graph.num_edges)
-    whole = edges[is_whole(graph)[edges]]
-    closures = chains.closures(whole)
+    distances = np.zeros(len(edges))
+    whole = np.flatnonzero(is_whole(graph)[edges])
+    closures = chains.closures(edges[whole])
     own = chains.chain[closures.i] == chains.chain[closures.j]
     along = chains.covariance[closures.j[own]] - chains.covariance[closures.i[own]]
     covariance = closures.covariance[own] + along

@@ -1,0 +1,172 @@
+"""What closures cost beside the known inliers, at least: proofs by certificates.
+
+The known inliers between the ends of closures, and the closures, are a problem of their own; what
+is left out costs nothing at least. A certificate bounds its least cost from below, whatever poses
+were found, and so does one of a problem whose cost is below: of chains with few steps, or of an F
+below chi2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+
+from pgo_models.certificates.shrunk_information import shrink_information
+from pgo_models.errors import FAILURES
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.precisions import proper_information
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from solvers.here import Here
+from solvers.loop import RunMonitor, iterate
+from solvers.plan import solve_at
+from solvers.request import Pipeline
+from solvers.riemannian.staircase import Staircase
+from solvers.robust.chains import is_whole
+from solvers.robust_solves.chain_sums import ChainSums
+from solvers.robust_solves.coarse_chains import CoarseChains
+
+# Relative gap of the first certificate: of most wrong closures the cost is many times s.
+_WIDE_GAP = 0.5
+# Poses are not improved: what counts is the bound.
+_FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, second_try=False)
+# A wide gap can be proven far from a stationary point.
+_COARSE_STAIRCASE = Staircase(tolerance=1e-2, gap=_WIDE_GAP)
+_MOST_STEPS = 100
+_ROUNDING = 2.0**-40  # of an eigenvalue, over the trace
+
+
+@dataclass(frozen=True, eq=False)
+class ClosureCosts:
+    """Lower bounds on the least cost of known inliers and a few closures."""
+
+    problem: PGOProblem
+    known: BoolArray
+    sums: ChainSums
+
+    def lower_bound(self, edges: tuple[int, ...], s: float, num_steps: int | None) -> float:
+        """Proven lower bound, as far as it is above s.
+
+        With `num_steps` chains are made of so many steps. Where chi2 is not quadratic its tangent
+        proves little of a cost as large as that of a wrong closure, and the bound is that of an F
+        below it.
+        """
+        if num_steps is not None:
+            found = CoarseChains(self.sums).with_closures(edges, num_steps)
+            if found is None:
+                return 0.0
+            coarse, rounding = found
+            problem = PGOProblem(coarse, self.problem.backend, Weighting.ISOTROPIC)
+            return _relaxed_bound(problem, s + rounding) - rounding
+        subgraph = self._between_ends(edges)
+        if subgraph is None:
+            return 0.0
+        bound = 0.0
+        for problem in _easier_problems(subgraph):
+            bound = max(bound, _bound_above(problem, s))
+            if bound > s:
+                break
+        return bound
+
+    def _between_ends(self, edges: Sequence[int]) -> PGOProblem | None:
+        """The problem of known inliers and closures between the ends of these; None if apart."""
+        graph = self.problem.graph
+        ends = np.concatenate([graph.i[list(edges)], graph.j[list(edges)]])
+        chain = self.sums.chains.chain
+        poses = [
+            np.arange(ends[chain[ends] == c].min(), ends[chain[ends] == c].max() + 1)
+            for c in np.unique(chain[ends])
+        ]
+        chosen = self.known.copy()
+        chosen[list(edges)] = True
+        subgraph = graph.without_edges(~chosen).subgraph(np.concatenate(poses))
+        if len(subgraph.components()) > 1:
+            return None
+        return PGOProblem(subgraph, self.problem.backend, self.problem.weighting)
+
+
+def _easier_problems(problem: PGOProblem) -> Iterator[PGOProblem]:
+    """Problems whose cost is at most that of a problem, the easiest to bound first."""
+    if not problem.is_quadratic:
+        with suppress(*FAILURES):  # of matrices that rounding hides
+            yield isotropic_below(problem)
+    yield problem
+
+
+def isotropic_below(problem: PGOProblem) -> PGOProblem:
+    """F with precisions so small that it is below chi2 at all poses.
+
+    Of matrices without coupling, below those of the graph (`shrink_information`), the smallest
+    eigenvalues are taken. With the turn theta of an edge, chi2 has at least 2 (1 - cos theta) times
+    that of I_rr, and F 4 (1 - cos theta) kappa.
+    """
+    d = problem.d
+    graph = shrink_information(problem.graph, cap=1.0)
+    information = proper_information(graph)
+    tau = _least_eigenvalues(information[:, :d, :d])
+    kappa = 0.5 * _least_eigenvalues(information[:, d:, d:])
+    weighted = replace(graph.with_weights(kappa, tau), information=None)
+    return PGOProblem(weighted, problem.backend, Weighting.ISOTROPIC)
+
+
+def precisions_below(problem: PGOProblem) -> tuple[Array, Array]:
+    """Return kappa and tau, (m,), of an F below the cost at all poses.
+
+    They are zero for all edges where the cost is neither F nor chi2, and where no such F is known:
+    of matrices that are singular, or that rounding hides. They are zero for edges that measure no
+    whole motion, too.
+    """
+    graph = problem.graph
+    below = None
+    if problem.weighting is Weighting.ISOTROPIC:
+        below = graph
+    elif problem.weighting is Weighting.INFORMATION:
+        with suppress(*FAILURES):
+            below = isotropic_below(problem).graph
+    if below is None or below.num_edges != graph.num_edges:
+        return np.zeros(graph.num_edges), np.zeros(graph.num_edges)
+    whole = is_whole(graph)
+    return np.where(whole, below.kappa, 0.0), np.where(whole, below.tau, 0.0)
+
+
+def _least_eigenvalues(blocks: Array) -> Array:
+    """Smallest eigenvalues, (m,), rounded down, and zero where rounding hides them."""
+    traces = np.einsum("mkk->m", blocks)
+    least = np.linalg.eigvalsh(blocks)[:, 0]
+    return np.asarray(np.maximum(least - _ROUNDING * traces, 0.0))
+
+
+def _relaxed_bound(problem: PGOProblem, s: float) -> float:
+    """Proven lower bound on a cost from its relaxation; the search ends where it is above s."""
+    bound = 0.0
+    try:
+        for state in islice(iterate(_COARSE_STAIRCASE, problem), _MOST_STEPS):
+            if state.bound is not None:
+                bound = max(bound, state.bound.lower_bound)
+            if bound > s or state.is_solved or state.stalled:
+                break
+    except FAILURES:
+        pass
+    return bound
+
+
+def _bound_above(problem: PGOProblem, s: float) -> float:
+    """Proven lower bound on a cost, with a gap that suffices where its minimum is above s."""
+    bound = 0.0
+    gap = _WIDE_GAP
+    for _ in range(2):
+        place = Here(RunMonitor(progress=False), [], problem, gap)
+        try:
+            found = solve_at(place, replace(_FOR_BOUNDS, gap=gap), None)
+        except FAILURES:
+            break
+        bound = max(bound, found.proof.lower_bound)
+        least = found.proof.objective
+        if bound > s or least <= s:
+            break
+        gap = 0.5 * (least - s) / least
+    return bound
