@@ -21,7 +21,12 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds, edge_residuals
+from pgo_models.problem.thresholds import (
+    FALSE_ALARM,
+    EdgeResiduals,
+    chi2_thresholds,
+    edge_residuals,
+)
 
 # Moves poses to the stationary point nearby.
 Settle = Callable[[PGOProblem, Poses], Poses]
@@ -36,11 +41,13 @@ _NUM_FOR_CLEAR = 15
 
 
 def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
-    """The problem with the kept edges, (m,), alone.
+    """The problem with the kept edges, (m,), alone: the problem itself if these are all.
 
     A GraphError when these do not connect the poses.
     """
     graph = problem.graph
+    if kept.all() and len(graph.components()) == 1:
+        return problem
     parts = graph.components(kept)
     if len(parts) > 1:
         apart = f"{len(parts)} parts (one with pose {graph.pose_name(int(parts[1][0]))})"
@@ -63,13 +70,12 @@ def truncated_cost(problem: PGOProblem, known: BoolArray, thresholds: Array, pos
     return float(np.sum(np.where(known, costs, np.minimum(costs, thresholds))))
 
 
-def error_scale(problem: PGOProblem, poses: Poses) -> float:
+def error_scale(residuals: EdgeResiduals) -> float:
     """Factor on the thresholds, at most 1, where errors are smaller than the matrices claim.
 
     It is the cost of all edges over the expected one, times the largest such ratio that chance
     explains.
     """
-    residuals = edge_residuals(problem, poses)
     return min(1.0, residuals.overall * residuals.overall_allowed)
 
 
@@ -88,7 +94,7 @@ class Fit:
 
     def error_scale(self, problem: PGOProblem) -> float:
         """Scale of the errors of the edges kept."""
-        return error_scale(inlier_problem(problem, self.kept), self.poses)
+        return error_scale(edge_residuals(inlier_problem(problem, self.kept), self.poses))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,12 +137,12 @@ def drop_contradicted(
     fit = Fit.of(problem, kept, poses)
     suspect = _remove_worst(problem, known, allowed, fit, settle)
     while suspect is not None:
-        if suspect.loss <= suspect.fit.error_scale(problem):
-            break
         # The loss of the next edge is at least its residual: where that is too large already, its
         # removal need not be tried.
         least_loss = float(_ratios(problem, known, allowed, suspect.fit).max())
         if not is_contradicted(suspect, least_loss):
+            break
+        if suspect.loss <= suspect.fit.error_scale(problem):
             break
         following = _remove_worst(problem, known, allowed, suspect.fit, settle)
         if following is None or not is_contradicted(suspect, following.loss):

@@ -22,6 +22,7 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import edge_residuals
 from solvers.network.ledger import Ledger
 from solvers.place import Place
 from solvers.places import open_place
@@ -231,7 +232,7 @@ class Estimate:
         num_cycles = int(kept.sum()) - (doubted.problem.num_poses - 1)
         errors = 1.0
         if num_cycles >= _MIN_CYCLES:
-            errors = error_scale(doubted.with_edges(kept), poses)
+            errors = error_scale(edge_residuals(doubted.with_edges(kept), poses))
         certificate = solution.certificate
         attempt = Attempt(
             name=stage.name.removeprefix(_OF_GNC),

@@ -196,7 +196,7 @@ class _RobustSolve:
             return False
         problem = self.doubted.problem
         quantile = max(self.doubted.quantile, 1.0 - FALSE_ALARM / problem.graph.num_edges)
-        scale = threshold_scale(error_scale(problem, solution.poses))
+        scale = threshold_scale(error_scale(residuals))
         if not (known | (residuals.cost <= scale * chi2_thresholds(problem, quantile))).all():
             return False
         every_edge = self.doubted.every_edge
