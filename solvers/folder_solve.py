@@ -27,6 +27,7 @@ from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.own_files import OpenedFiles, open_files
+from solvers.distributed.own_revision import revised
 from solvers.distributed.paper import check_paper
 from solvers.distributed.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.distributed.robots_with_files import RobotsWithFiles
@@ -46,6 +47,9 @@ from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
+
+# Passes of GNC, each from the map of the one before, while the truncated cost falls.
+_MOST_PASSES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,8 @@ class FolderSolution(Summarised):
     num_rejected : int, optional
         Edges that the robots left out because they do not agree with others; None where none were
         judged.
+    rejected_by : str
+        What they do not agree with.
     """
 
     name: str
@@ -96,6 +102,7 @@ class FolderSolution(Summarised):
     note: str = ""
     num_absent: int = 0
     num_rejected: int | None = None
+    rejected_by: str = "do not agree pairwise with others"
 
     @property
     def robust_text(self) -> str:
@@ -104,8 +111,8 @@ class FolderSolution(Summarised):
             return ""
         kept = int(self.sizes[1].sum())
         return (
-            f"{self.num_rejected} of {kept + self.num_rejected} edges left out, which do not agree "
-            "pairwise with others; the answer is for those kept, and nobody has checked them"
+            f"{self.num_rejected} of {kept + self.num_rejected} edges left out, which "
+            f"{self.rejected_by}; the answer is for those kept, and nobody has checked them"
         )
 
     def __str__(self) -> str:
@@ -167,7 +174,7 @@ def solve_folder(
 
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it. An
     edge between two robots may be in the file of either, or of both. Start, SOC, Newton,
-    certificate and staircase are those of `solve(.., robots=..)`. GNC, priors, landmarks,
+    certificate and staircase are those of `solve(.., robots=..)`. Priors, landmarks,
     checkpoints and an ascent of handedness terms need `solve`. A robot that is lost reads its file
     again, and is sent again all that it had received. The frame is that of the first pose with a
     FIX line, or else of the first pose of all, where its file has it.
@@ -183,11 +190,14 @@ def solve_folder(
         The cost: INFORMATION is chi2 of the files' information matrices, ISOTROPIC F, and OWN chi2
         where it is another cost than F and no robot has an edge whose share of chi2 can be
         negative.
-    robust : PCM, optional
-        Have every two robots judge the closures between them, and each robot its own, by pairwise
-        consistency, with one message each way; odometry is known to be right. What agrees is kept,
-        and the rest left out, also of the files in `out`. `pairwise_consistent` finds the same, but
-        that the distance of two closures depends a little on which comes first.
+    robust : PCM or GNC, optional
+        With PCM have every two robots judge the closures between them, and each robot its own, by
+        pairwise consistency, with one message each way; odometry is known to be right. What agrees
+        is kept, and the rest left out, also of the files in `out`. `pairwise_consistent` finds the
+        same, but that the distance of two closures depends a little on which comes first. With GNC
+        the robots go on from there by graduated non-convexity on all edges, and take what it keeps
+        where the truncated cost falls. The attempts, clusters and doubts of `solve` take one
+        process that has the graph.
     robots : Robots, optional
         Where the robots run, and the memory of their driver; who owns which poses is in the files.
     out : Path or str, optional
@@ -206,7 +216,7 @@ def solve_folder(
     Raises
     ------
     SettingError
-        When `robust` is no PCM for all odometry, the first stage is no SOC that factors its
+        When `robust` is given known inliers, the first stage is no SOC that factors its
         subproblems, or the weighting is that of rotations alone.
     PGOError
         As of `solve`, and for files that cannot be read as of `read_g2o`.
@@ -222,7 +232,7 @@ def solve_folder(
     folder = locate(folder).absolute()
     _check_first_stage(pipeline.soc)
     _check_robots(robots)
-    pcm = check_robust(robust)
+    check_robust(robust)
     if weighting is Weighting.ROTATIONS:
         raise SettingError(f"robots with files of their own solve for poses; {READ_HERE}")
     files = list(enumerate(g2o_files(folder)))
@@ -230,7 +240,7 @@ def solve_folder(
         check_g2o_folder(out, len(files))
     engine = _engine_of_robots(robots.engine, len(files))
     job = FilesOfRobots(
-        folder.name, files, engine, robots.driver_memory, weighting, trust_folder, pcm
+        folder.name, files, engine, robots.driver_memory, weighting, trust_folder, robust
     )
     return job.solved(pipeline, monitor, None if out is None else Path(out).absolute())
 
@@ -248,16 +258,18 @@ class FilesOfRobots:
     memory: float
     weighting: Weighting
     trust_folder: bool = False
-    pcm: PCM | None = None
+    robust: GNC | PCM | None = None
 
     def solved(
         self, pipeline: Pipeline, monitor: RunMonitor, out: Path | None = None
     ) -> FolderSolution:
         """The solution, which robots write to the folder `out`, if it is given."""
         stages: list[Stage] = []
+        pcm = PCM(quantile=self.robust.quantile) if isinstance(self.robust, GNC) else self.robust
         opened = open_files(
-            self.files, self.engine, self.memory, self.weighting, self.trust_folder, self.pcm
+            self.files, self.engine, self.memory, self.weighting, self.trust_folder, pcm
         )
+        rejected_by = FolderSolution.rejected_by
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         driver = opened.driver
         journal = Journal(None, {}, stages)
@@ -266,6 +278,23 @@ class FilesOfRobots:
                 monitor, stages, driver, journal, None, name, pipeline.gap, opened.weighting
             )
             best = solve_at(place, pipeline, None)
+            passes = _MOST_PASSES if isinstance(self.robust, GNC) else 0
+            for _ in range(passes):
+                if best.is_out_of_time:
+                    break
+                assert isinstance(self.robust, GNC)
+                revision = revised(
+                    opened, self.robust, best.proof.is_certified, monitor, self.files[0][1].parent
+                )
+                stages.append(revision.stage)
+                opened = revision.opened
+                driver = opened.driver
+                start = "poses of GNC" if revision.is_better else "poses found before GNC"
+                place = replace(place, driver=driver, kept=[], begins_at=start)
+                best = solve_at(place, replace(pipeline, soc=None), None)
+                if not revision.is_better:
+                    break
+                rejected_by = "the map of the others contradicts"
             best, frame, F = place.move_to_frame(best)
             if out is not None:
                 nothing = [None] * len(self.files)
@@ -281,7 +310,8 @@ class FilesOfRobots:
             F=F,
             note=_note(self.weighting, opened, place.note(best)),
             num_absent=opened.num_absent,
-            num_rejected=None if self.pcm is None else opened.num_rejected,
+            num_rejected=None if self.robust is None else opened.num_rejected,
+            rejected_by=rejected_by,
             seconds=time.perf_counter() - monitor.began,
         )
 
@@ -310,16 +340,13 @@ def _check_first_stage(soc: FirstStage) -> None:
         )
 
 
-def check_robust(robust: GNC | PCM | None) -> PCM | None:
-    """Return how robots with own files find wrong edges; a SettingError for what they cannot."""
-    if robust is None:
-        return None
-    if not isinstance(robust, PCM) or robust.known is not None:
+def check_robust(robust: GNC | PCM | None) -> None:
+    """Raise a SettingError for wrong edges that robots with own files cannot find."""
+    if robust is not None and robust.known is not None:
         raise SettingError(
-            "robots with files of their own find wrong edges by PCM(), beside their odometry; for "
-            f"others {READ_HERE}"
+            "robots with files of their own take their odometry to be right, and no other known "
+            f"edges; for these {READ_HERE}"
         )
-    return robust
 
 
 def _check_robots(robots: Robots) -> None:

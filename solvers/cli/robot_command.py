@@ -81,9 +81,7 @@ def robot_command(
     ] = False,
     robust: Annotated[
         Robust | None,
-        typer.Option(
-            help="Find wrong edges, as pgo solve does; pcm alone without --share-measurements."
-        ),
+        typer.Option(help="Find wrong edges; with --share-measurements as pgo solve does."),
     ] = None,
     patience: Annotated[
         float,

@@ -11,7 +11,7 @@ counts once, as in `read_g2o`. What robots do is in `solvers.distributed.robots.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,6 +82,17 @@ class OpenedFiles:
     num_absent: int
     num_rejected: int = 0
 
+    def with_edges(self, borders: Sequence[Border], num_rejected: int, folder: Path) -> OpenedFiles:
+        """The same robots with other edges, of which they have told the borders.
+
+        A GraphError if these do not connect the poses.
+        """
+        old = self.driver
+        driver, sizes = _placed(
+            old.network, borders, old.num_poses, old.memory, self.weighting, folder
+        )
+        return replace(self, driver=driver, sizes=sizes, num_rejected=num_rejected)
+
 
 def open_files(
     files: Sequence[RobotFile],
@@ -108,31 +119,43 @@ def open_files(
         sent = network.ask(number_poses, numbered.runs, Count.PIGGYBACKED)
         received = [(told, trust_folder) for told in network.exchange(sent)]
         borders = network.ask(join_neighbours, received, Count.PIGGYBACKED)
-        num_rejected = 0
-        if pcm is not None:
-            borders, num_rejected = _consistent_borders(network, pcm)
-        sizes = np.array([border.counts for border in borders]).T
-        num_without_edge = num_poses - int(sizes[0].sum())
-        _check_connected(borders, num_without_edge, files[0][1].parent)
-        pairs = np.concatenate([border.pairs for border in borders])
-        owners = np.concatenate([border.owners for border in borders])
-        placements = place_poses(pairs, owners, len(files), borders[0].middle)
         has_indefinite = any(border.has_indefinite for border in borders)
         if weighting is Weighting.OWN:
             weighting = _own_weighting(borders)
-        can_run_soc = network.ask(take_cost, [weighting] * len(files), Count.ROUND)
-        has_two_costs = not all(can_run_soc)
-        places = [(placement, has_two_costs) for placement in placements]
-        summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
-        if memory != 0:
-            summaries = _chosen_elimination(network, summaries)
-        driver = Driver(summaries, num_poses, lambda: network, memory)
+        num_rejected = 0
+        if pcm is not None:
+            borders, num_rejected = _consistent_borders(network, pcm)
+        folder = files[0][1].parent
+        driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
         return OpenedFiles(
             driver, sizes, weighting, has_indefinite, numbered.num_absent, num_rejected
         )
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()
         raise
+
+
+def _placed(
+    network: CountedPool,
+    borders: Sequence[Border],
+    num_poses: int,
+    memory: float,
+    weighting: Weighting,
+    folder: Path,
+) -> tuple[Driver, IntArray]:
+    """Have robots with these borders take their places around a driver; and their sizes."""
+    sizes = np.array([border.counts for border in borders]).T
+    _check_connected(borders, num_poses - int(sizes[0].sum()), folder)
+    pairs = np.concatenate([border.pairs for border in borders])
+    owners = np.concatenate([border.owners for border in borders])
+    placements = place_poses(pairs, owners, len(borders), borders[0].middle)
+    can_run_soc = network.ask(take_cost, [weighting] * len(borders), Count.ROUND)
+    has_two_costs = not all(can_run_soc)
+    places = [(placement, has_two_costs) for placement in placements]
+    summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
+    if memory != 0:
+        summaries = _chosen_elimination(network, summaries)
+    return Driver(summaries, num_poses, lambda: network, memory), sizes
 
 
 def _consistent_borders(network: CountedPool, pcm: PCM) -> tuple[list[Border], int]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import CoverPoses
 from solvers.distributed.driver_place import DriverPlace
 from solvers.distributed.lower_bound import best_bound_distributed
+from solvers.distributed.own_revision import go_to_poses_found
 from solvers.distributed.robots.own_file import (
     READ_HERE,
     Answer,
@@ -57,13 +59,15 @@ class KeptAnswer:
 class RobotsWithFiles(DriverPlace):
     """A solve by robots with own files: of the folder `name`, to a relative `gap`.
 
-    `kept` are the answers that the robots have kept, the last of which is theirs.
+    `kept` are the answers that the robots have kept, the last of which is theirs. With
+    `begins_at`, the name of a start, it begins at poses that the robots have found before.
     """
 
     name: str
     gap: float
     weighting: Weighting
     kept: list[KeptAnswer] = field(default_factory=list)
+    begins_at: str | None = None
 
     @property
     def has_landmarks(self) -> bool:
@@ -84,8 +88,13 @@ class RobotsWithFiles(DriverPlace):
         return READ_HERE
 
     def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
-        """Start at the chordal relaxation: nobody could give the poses of all robots."""
-        return self.chordal_start(soc)
+        """Start at the chordal relaxation, or at poses that the robots have found.
+
+        Nobody could give the poses of all robots.
+        """
+        if self.begins_at is None:
+            return self.chordal_start(soc)
+        return self.begin(self.begins_at, partial(go_to_poses_found, self.driver)), None
 
     def certify(self, attempt: Attempt) -> Attempt:
         """Find a bound, and have the robots keep the current poses if these are the cheapest."""

@@ -17,7 +17,12 @@ from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.newton import SubstructuredNewton, SubstructuredNewtonState
 from solvers.distributed.robots.records import Reweigh
-from solvers.distributed.robots.reweighting import count_below, edges_within, sum_ratios
+from solvers.distributed.robots.reweighting import (
+    count_below,
+    count_doubted,
+    edges_within,
+    sum_ratios,
+)
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Outcome, Stage, Status
 from solvers.robust.chains import is_whole
@@ -41,9 +46,11 @@ from solvers.robust.weighted_edges import (
 # Share of the least weight that stays with an edge that a run in one place leaves out, where known
 # inliers alone may leave poses apart.
 _LEFT_OUT_SHARE = 1e-4
-# The median of ratios between 10^-24 and 1 by bisection of the exponent, to 1e-6 of itself.
+# The median of ratios between 10^-24 and 1 by division of the exponent, to 1e-6 of itself: each of
+# the rounds counts the ratios below so many bounds.
 _LEAST_EXPONENT = -24.0
-_NUM_HALVINGS = 26
+_NUM_BOUNDS = 127
+_NUM_DIVISIONS = 4
 
 
 @dataclass(frozen=True)
@@ -74,13 +81,11 @@ class SharedEdges:
         self.driver.return_to(self.newton.moment)
         low = _LEAST_EXPONENT
         high = 0.0
-        for _ in range(_NUM_HALVINGS):
-            middle = 0.5 * (low + high)
-            num_below = math.fsum(self.driver.ask(count_below, (scale, 10.0**middle)))
-            if num_below >= 0.5 * num_kept:
-                high = middle
-            else:
-                low = middle
+        for _ in range(_NUM_DIVISIONS):
+            bounds = np.linspace(low, high, _NUM_BOUNDS + 2)
+            counts = self.driver.ask(count_below, (scale, 10.0 ** bounds[1:-1]))
+            place = int(np.searchsorted(np.sum(counts, axis=0), 0.5 * num_kept))
+            low, high = bounds[place], bounds[place + 1]
         return float(10.0**high)
 
     def reweighted(self, loss: RobustLoss, mu: float, scale: float) -> SharedEdges:
@@ -105,12 +110,13 @@ SharedGNCState = ScheduleState[SharedEdges]
 class SharedGNC:
     """`GNC` by a driver and its robots, from the poses that they hold.
 
-    Weights up to `least_weight` become `left_out`.
+    Weights up to `least_weight` become `left_out`. `has_map` says that the poses are of a map.
     """
 
     gnc: GNC
     least_weight: float
     left_out: float
+    has_map: bool = False
 
     @classmethod
     def of(cls, gnc: GNC, graph: PoseGraph) -> SharedGNC:
@@ -120,10 +126,17 @@ class SharedGNC:
         has none where whole motions among the known inliers connect all poses.
         """
         known = known_inliers(graph, gnc.known)
-        least_weight = negligible_weight(graph, known)
+        least_weight = negligible_weight(float((~known).sum()), graph.num_poses)
         apart = bridges(graph, known & is_whole(graph), np.zeros(graph.num_edges))
         is_held = len(apart) == 0 and not graph.is_world_loose
         return cls(gnc, least_weight, 0.0 if is_held else _LEFT_OUT_SHARE * least_weight)
+
+    @classmethod
+    def of_files(cls, gnc: GNC, driver: Driver, has_map: bool) -> SharedGNC:
+        """The method for robots with own files, where known inliers leave robots apart."""
+        num_doubted = math.fsum(driver.ask(count_doubted, None, Count.PIGGYBACKED))
+        least_weight = negligible_weight(num_doubted, driver.num_poses)
+        return cls(gnc, least_weight, _LEFT_OUT_SHARE * least_weight, has_map)
 
     @property
     def max_iterations(self) -> int:
@@ -134,7 +147,7 @@ class SharedGNC:
         """State 0, at the poses that driver and robots hold."""
         newton = SubstructuredNewton().init(driver, None)
         edges = SharedEdges(driver, self.least_weight, self.left_out, newton)
-        schedule, sums = first_schedule(self.gnc, edges)
+        schedule, sums = first_schedule(self.gnc, edges, self.has_map)
         return ScheduleState(0, schedule, sums, edges)
 
     def step(self, driver: Driver, state: SharedGNCState) -> SharedGNCState:
@@ -164,7 +177,12 @@ def inliers_of(
     poses = collect(driver)[0]
     ratio = problem.edge_costs(poses) / chi2_thresholds(problem, gnc.quantile)
     kept = held_together(problem.graph, kept, ratio)
-    stage = Stage(
+    return Inliers(poses, kept, scale, stage_of(gnc, finished))
+
+
+def stage_of(gnc: GNC, finished: Outcome[SharedGNCState]) -> Stage:
+    """What a run did."""
+    return Stage(
         "GNC",
         finished.status,
         finished.iterations,
@@ -173,4 +191,3 @@ def inliers_of(
         finished.history,
         gnc,
     )
-    return Inliers(poses, kept, scale, stage)

@@ -356,21 +356,30 @@ def next_state(settings: GNC, state: S) -> S:
     return replace(state, k=state.k + 1, schedule=updated, sums=sums, edges=edges)
 
 
-def first_schedule(settings: GNC, edges: ReweightedEdges) -> tuple[GNCSchedule, RatioSums]:
+def first_schedule(
+    settings: GNC, edges: ReweightedEdges, has_map: bool = False
+) -> tuple[GNCSchedule, RatioSums]:
     """Schedule of state 0, and the sums over its edges.
 
-    Its control is `first_control` of the largest ratio r_e^2 / c_e^2. If that is so small that even
-    the best-fitting edge would hardly count, the control of truncated least squares is raised until
-    this edge has `least_weight`, about.
+    With a map that has been found before it is the last one, which starts as a schedule that
+    starts again: what the thresholds are scaled to is known. Else its control is `first_control` of
+    the largest ratio r_e^2 / c_e^2. If that is so small that even the best-fitting edge would
+    hardly count, the control of truncated least squares is raised until this edge has
+    `least_weight`, about.
     """
     # The control only decides which edges are undecided, a sum that is not used here.
     sums = edges.sums(settings.loss, mu=1.0, scale=settings.scale)
+    num_rescalings = 0 if settings.spread is None else _MOST_RESCALINGS
+    if has_map:
+        mu = _restarted_control(settings.loss, sums.largest_kept)
+        schedule = GNCSchedule(mu, settings.scale, num_rescalings)
+        schedule = rescaled_schedule(settings, ScheduleState(0, schedule, sums, edges))
+        return replace(schedule, rescalings_left=0), sums
     # For small mu the weight of equation 14 is sqrt(mu (mu + 1) / ratio) - mu, or sqrt(mu / ratio)
     # to first order, which is `least_weight` at mu = least_weight^2 ratio. The ratio is capped at 1
     # because an edge beyond its threshold need not count; without any edge it is infinite.
     least_control = edges.least_weight**2 * min(1.0, sums.least)
     mu = first_control(settings.loss, sums.largest, least_control)
-    num_rescalings = 0 if settings.spread is None else _MOST_RESCALINGS
     return GNCSchedule(mu, settings.scale, num_rescalings), sums
 
 
@@ -423,18 +432,21 @@ def rescaled_schedule(settings: GNC, state: ScheduleState[E]) -> GNCSchedule:
             return settled
         factor = 1.0
         rescalings_left = 0
-    mu = first_control(settings.loss, sums.largest_kept / factor, 0.0)
-    if settings.loss is RobustLoss.TRUNCATED:
-        mu = min(mu, _RESTARTED_CONTROL)
-    else:
-        mu = max(mu, 1.0 / _RESTARTED_CONTROL)
     return replace(
         schedule,
-        mu=mu,
+        mu=_restarted_control(settings.loss, sums.largest_kept / factor),
         scale=factor * schedule.scale,
         rescalings_left=rescalings_left,
         undecided=1.0,
     )
+
+
+def _restarted_control(loss: RobustLoss, largest_kept: float) -> float:
+    """Control of a schedule that starts again, where edges kept have this largest ratio."""
+    mu = first_control(loss, largest_kept, 0.0)
+    if loss is RobustLoss.TRUNCATED:
+        return min(mu, _RESTARTED_CONTROL)
+    return max(mu, 1.0 / _RESTARTED_CONTROL)
 
 
 def expected_median_ratio(d: int, quantile: float) -> float:

@@ -120,7 +120,7 @@ class WeightedEdges:
     @property
     def least_weight(self) -> float:
         """Weight up to which an edge is left out."""
-        return negligible_weight(self.problem.graph, self.known)
+        return negligible_weight(float((~self.known).sum()), self.problem.num_poses)
 
     def ratio(self, scale: float) -> Array:
         """Squared residuals over scaled thresholds, (m,)."""
@@ -189,14 +189,14 @@ def held_together(graph: PoseGraph, kept: BoolArray, ratio: Array) -> BoolArray:
     return held
 
 
-def negligible_weight(graph: PoseGraph, known: BoolArray) -> float:
+def negligible_weight(num_closures: float, num_poses: int) -> float:
     """Weight up to which an edge is left out of a weighted problem.
 
     With c closures in a chain of n poses, a closure constrains about n / c of them, whose
     compliance grows with the cube of that number: the weight at which an edge stops to matter is
     smaller by the same factor. kitti_00, with one closure to 30 poses, needs 1e-7.
     """
-    closures_per_pose = (~known).sum() / graph.num_poses
+    closures_per_pose = num_closures / num_poses
     return float(_NEGLIGIBLE_WEIGHT * min(1.0, closures_per_pose) ** 3)
 
 

@@ -109,8 +109,8 @@ class Drive:
     def _solved_by_robots(self) -> FolderSolution:
         """The solution by robots with files of their own."""
         files = [(k, Path("team") / f"{name}.g2o") for k, name in enumerate(self.members)]
-        pcm = check_robust(self.robust)
-        job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting, pcm=pcm)
+        check_robust(self.robust)
+        job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting, robust=self.robust)
         return job.solved(self.pipeline, RunMonitor(progress=False))
 
     def _solved_in_one_place(self) -> Solution:

@@ -154,8 +154,8 @@ class Robot:
         MEASUREMENTS, compressed, which mostly are fewer bytes. Then the robot that drives solves
         alone, with all that `solve` can: priors and GPS, landmarks, robust solves, covariances.
     robust : GNC or PCM, optional
-        How the team finds wrong edges: a team that does not share its measurements by PCM, where
-        every two robots judge the closures between them.
+        How the team finds wrong edges. A team that does not share its measurements does it as
+        robots with own files do (`solve_folder`).
     patience : float
         Seconds after which a robot that was not heard of counts as absent.
     retry : float
@@ -174,7 +174,7 @@ class Robot:
     ------
     SettingError
         For a name that is not in the team, a name twice, a short key, times that are not positive,
-        or a robust solve, but by PCM, of robots that do not share their measurements.
+        or known inliers of robots that do not share their measurements.
     MissingExtraError
         Without the package greenlet, which the extra `team` brings.
 
@@ -228,11 +228,11 @@ class Robot:
         self._weighting = weighting
         self._sharing = sharing
         self._robust = robust
-        is_plain_pcm = isinstance(robust, PCM) and robust.known is None
-        if robust is not None and sharing is not Sharing.MEASUREMENTS and not is_plain_pcm:
+        has_known = robust is not None and robust.known is not None
+        if has_known and sharing is not Sharing.MEASUREMENTS:
             raise SettingError(
-                "a team that does not share its measurements finds wrong edges by PCM(); "
-                f"{robust!r:.40} needs sharing=Sharing.MEASUREMENTS"
+                "a team that does not share its measurements takes its odometry to be right; "
+                "other known edges need sharing=Sharing.MEASUREMENTS"
             )
         self._patience = patience
         self.retry = retry

@@ -33,7 +33,7 @@ _LENGTH_BYTES = 4
 _LEVEL = 1  # of the compression: numbers hardly shrink, trees do
 # A message may not unpack to more: whoever has the key could else fill the memory of the others.
 MOST_BYTES = 1 << 30
-# Rooms whose records are sent, and modules whose functions robots are ordered to call.
+# Rooms and modules whose records are sent, and modules whose functions robots are ordered to call.
 _ROOMS = (
     "pgo_models.certificates",
     "pgo_models.geometry",
@@ -43,6 +43,7 @@ _ROOMS = (
     "solvers.distributed.robots",
     "solvers.network",
     "solvers.riemannian",
+    "solvers.robust.weighted_edges",
     "solvers.soc",
 )
 _MODULES_OF_ORDERS = (
@@ -97,9 +98,10 @@ def records_of_rooms() -> tuple[type, ...]:
     found: dict[str, type] = {}
     for room in _ROOMS:
         package = importlib.import_module(room)
-        for module in pkgutil.iter_modules(package.__path__, f"{room}."):
-            for name, value in vars(importlib.import_module(module.name)).items():
-                if inspect.isclass(value) and value.__module__ == module.name and _is_record(value):
+        within = pkgutil.iter_modules(getattr(package, "__path__", []), f"{room}.")
+        for module in [room, *(inside.name for inside in within)]:
+            for name, value in vars(importlib.import_module(module)).items():
+                if inspect.isclass(value) and value.__module__ == module and _is_record(value):
                     assert name not in found, f"two records are called {name}"
                     found[name] = value
     return tuple(found.values())

@@ -476,8 +476,8 @@ def test_a_robot_that_shares_its_interface_alone_gives_away_nothing_else() -> No
     for robot in robots.values():
         assert robot.outcome is None
         assert "b shares its interface alone" in robot.failure
-    with pytest.raises(SettingError, match=r"needs sharing=Sharing\.MEASUREMENTS"):
-        solvers.Robot("a", names, KEY, robust=solvers.GNC())
+    with pytest.raises(SettingError, match=r"other known edges need sharing=Sharing\.MEASUREMENTS"):
+        solvers.Robot("a", names, KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))
 
 
 def test_bytes_are_counted_where_they_are_handed_out_and_received() -> None:

@@ -66,11 +66,11 @@ def tell_trajectories(agent: FileAgent, _: None) -> Mapping[int, Trajectory]:
 def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
     graph = joined.graph
     is_own = joined.owners == robot
-    chains = Chains.of(graph, _own_odometry(graph, is_own))
+    chains = Chains.of(graph, own_odometry(graph, is_own))
     R, t = chains.motion
     told = {}
     for other in np.unique(joined.owners[~is_own]).tolist():
-        between = _edges_between(joined, robot, other)
+        between = edges_between(joined, robot, other)
         ends = np.concatenate([graph.i[between], graph.j[between]])
         poses = np.unique(ends[is_own[ends]])
         chain, first = np.unique(chains.chain[poses], return_index=True)
@@ -97,13 +97,20 @@ def keep_consistent(
     among_own = _in_order(joined, np.flatnonzero(is_own[graph.i] & is_own[graph.j]))
     if len(among_own):
         own_graph = graph.edge_subgraph(among_own)
-        own_odometry = _own_odometry(graph, is_own)[among_own]
-        kept[among_own] = pairwise_consistent(own_graph, own_odometry, quantile)
+        odometry = own_odometry(graph, is_own)[among_own]
+        kept[among_own] = pairwise_consistent(own_graph, odometry, quantile)
     own = _trajectories(robot, joined)
     for other, theirs in received.items():
-        between = _edges_between(joined, robot, other)
+        between = edges_between(joined, robot, other)
         known = {robot: own[other], other: theirs}
         kept[between] = _agree(joined, between, [known[k] for k in sorted(known)], quantile)
+    return leave_out(agent, joined, kept)
+
+
+def leave_out(agent: FileAgent, joined: JoinedFile, kept: BoolArray) -> ConsistentPart:
+    """Go on with the edges that are kept, (m_a,)."""
+    robot = agent.robot
+    graph = joined.graph
     owner_who_counts = joined.owners[np.stack([graph.i, graph.j])].min(axis=0)
     num_rejected = int((~kept & (owner_who_counts == robot)).sum())
     left = _without(joined, robot, kept)
@@ -134,13 +141,13 @@ def _agree(
     return largest_sets(chains, is_whole(pair), quantile)
 
 
-def _own_odometry(graph: PoseGraph, is_own: BoolArray) -> BoolArray:
+def own_odometry(graph: PoseGraph, is_own: BoolArray) -> BoolArray:
     """Whether an edge joins own poses whose ids are neighbours, (m,)."""
     are_neighbours = np.abs(graph.pose_ids[graph.i] - graph.pose_ids[graph.j]) == 1
     return np.asarray(are_neighbours & is_own[graph.i] & is_own[graph.j])
 
 
-def _edges_between(joined: JoinedFile, robot: int, other: int) -> IntArray:
+def edges_between(joined: JoinedFile, robot: int, other: int) -> IntArray:
     """Edges between poses of the robot and of another one, in order."""
     owners = joined.owners[np.stack([joined.graph.i, joined.graph.j])]
     are_between = (owners == robot).any(axis=0) & (owners == other).any(axis=0)
@@ -172,4 +179,6 @@ def _without(joined: JoinedFile, robot: int, kept: BoolArray) -> JoinedFile:
         graph=graph.without_edges(~kept).subgraph(poses),
         numbers=joined.numbers[poses],
         owners=joined.owners[poses],
+        everything=joined,
+        thresholds=None,
     )

@@ -3,7 +3,8 @@
 The orders stand below in the sequence in which they are given: `read_file`, `number_poses`,
 `join_neighbours`, those of `own_consistency` where edges are judged, `take_cost`, `place_cover`;
 where areas of robots interleave `propose_poses`, `place_larger_cover` and `take_larger_cover`;
-then, after the solve, `keep_answer`, `return_to_answer`, `move_answer` and `write_answer`.
+then, after the solve, `keep_answer`, `return_to_answer`, `move_answer` and `write_answer`. Where
+edges are judged again those of `own_revision` follow `keep_answer`, and go on with `take_cost`.
 `solvers.distributed.own_files` gives them.
 """
 
@@ -175,7 +176,9 @@ class JoinedFile:
     """After `join_neighbours`: its graph, of its own poses and those at the far end of its edges.
 
     Numbers in the whole graph, (n_a,), ascend. Of edges that were left out since it has the ids of
-    the ends, (k, 2).
+    the ends, (k, 2), and `everything` is what was joined before. In a robust solve `consistent` is
+    what agrees pairwise, `thresholds`, (m_a,), are those of the edges, and `solved` poses of its
+    own that were found.
     """
 
     graph: PoseGraph
@@ -183,6 +186,10 @@ class JoinedFile:
     owners: IntArray
     given: Array  # as in `Answer`
     rejected: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    everything: JoinedFile | None = None
+    consistent: JoinedFile | None = None
+    thresholds: Array | None = None
+    solved: Poses | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +212,8 @@ class PlacedFile:
     left: IntArray | None = None
     larger: Subgraph | None = None
     answer: Poses | None = None  # the poses that were kept
+    # Of a robust solve: edges within their thresholds, (m_a,), as far as this robot counts them.
+    within: BoolArray | None = None
 
     @property
     def kept(self) -> Poses:
@@ -415,7 +424,9 @@ def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary
     if has_two_costs:
         final = weights
         weights = convex_cost(problem.information, graph.d)
-    subgraph = Subgraph(*known, *placement.of(*known), edges, weights, final)
+    subgraph = Subgraph(
+        *known, *placement.of(*known), edges, weights, final, thresholds=joined.thresholds
+    )
     agent.place(PlacedFile(joined, subgraph))
     return replace(subgraph.summary, part=None)
 

@@ -36,15 +36,26 @@ def sum_ratios(interior: Interior, order: Reweigh) -> tuple[Interior, RatioSums]
     return interior, sums
 
 
-def count_below(interior: Interior, bounds: tuple[float, float]) -> tuple[Interior, float]:
-    """Number of edges, without the known ones, whose r^2 / c^2 is at most a bound.
+def count_doubted(interior: Interior, _: None) -> tuple[Interior, float]:
+    """Number of edges that are not known to be right."""
+    return interior, float(np.sum(~_is_known(interior)))
 
-    `bounds` are the scale of the thresholds c^2, and that bound.
+
+def sum_truncated(interior: Interior, scale: float) -> tuple[Interior, float]:
+    """Sum of the costs, of which each counts its scaled threshold at most."""
+    costs = interior.whole.costs(interior.poses)
+    return interior, float(np.minimum(costs, scale * _thresholds(interior)).sum())
+
+
+def count_below(interior: Interior, request: tuple[float, Array]) -> tuple[Interior, IntArray]:
+    """Numbers of edges, without the known ones, whose r^2 / c^2 is at most each of some bounds.
+
+    The request has the scale of the thresholds c^2, and the bounds, ascending.
     """
-    scale, largest_ratio = bounds
+    scale, bounds = request
     ratio = interior.whole.ratios(interior.poses, scale)
-    is_below = (ratio <= largest_ratio) & ~_is_known(interior)
-    return interior, float(np.sum(is_below))
+    ratios = np.sort(ratio[~_is_known(interior)])
+    return interior, np.searchsorted(ratios, bounds, side="right")
 
 
 def edges_within(interior: Interior, scale: float) -> tuple[Interior, IntArray]:

@@ -1,0 +1,123 @@
+"""Graduated non-convexity by robots with own files, from what pairwise consistency has found.
+
+The robots hold all edges again, each with the threshold of its cost, at the poses that were found
+with the edges that agree pairwise. From there they run the algorithm of `solvers.robust.gnc`. The
+edges within their thresholds at the end are kept if the truncated cost of all edges has fallen, and
+those that robots need to hold together; else those that agree pairwise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import GraphError
+from pgo_models.geometry.rotations import BoolArray
+from solvers.distributed.driver import Driver
+from solvers.distributed.own_files import OpenedFiles
+from solvers.distributed.robots import current_poses
+from solvers.distributed.robots.own_revision import (
+    Links,
+    go_to_solved,
+    keep,
+    return_to_consistent,
+    take_back,
+    tell_cover,
+    tell_kept,
+    tell_links,
+)
+from solvers.distributed.robots.reweighting import sum_truncated
+from solvers.distributed.robust import SharedGNC, stage_of
+from solvers.loop import RunMonitor
+from solvers.network.counted_pool import Count
+from solvers.place import BROKEN_OFF
+from solvers.result import Stage
+from solvers.robust.gnc import GNC
+
+
+@dataclass(frozen=True, eq=False)
+class Revision:
+    """What a run has made of the edges: robots that hold those kept, at poses found for them."""
+
+    opened: OpenedFiles
+    stage: Stage
+    is_better: bool
+
+
+def revised(
+    opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor, folder: Path
+) -> Revision:
+    """Judge all edges by a run from the poses that the robots keep.
+
+    With `has_map` these are of a map, which most edges fit, and one short schedule will do.
+    """
+    network = opened.driver.network
+    num_robots = network.ledger.num_robots
+    nothing = [None] * num_robots
+    request = opened.weighting, gnc.quantile, not gnc.consistent
+    borders = network.ask(take_back, [request] * num_robots, Count.PIGGYBACKED)
+    driver = opened.with_edges(borders, 0, folder).driver
+    go_to_poses_found(driver)
+    before = _truncated_cost(driver)
+    finished = monitor.run(SharedGNC.of_files(gnc, driver, has_map), driver)
+    driver.return_to(finished.state.edges.newton.moment)
+    scale = finished.state.schedule.scale
+    stage = stage_of(gnc, finished)
+    if finished.status not in BROKEN_OFF and _truncated_cost(driver) < before:
+        requests = [(scale, cover) for cover in driver.poses_of_cover()]
+        links = network.ask(tell_links, requests, Count.ROUND)
+        told = network.ask(tell_kept, holding(links), Count.PIGGYBACKED)
+        parts = network.ask(keep, network.exchange(told), Count.PIGGYBACKED)
+        num_rejected = sum(part.num_rejected for part in parts)
+        try:
+            kept = opened.with_edges([part.border for part in parts], num_rejected, folder)
+        except GraphError:
+            pass  # they leave poses apart
+        else:
+            return Revision(kept, stage, is_better=True)
+    borders = network.ask(return_to_consistent, nothing, Count.PIGGYBACKED)
+    return Revision(opened.with_edges(borders, opened.num_rejected, folder), stage, is_better=False)
+
+
+def holding(links: Sequence[Links]) -> list[BoolArray]:
+    """Which links robots need, so that those within their thresholds leave none apart.
+
+    They are those of a tree with the smallest ratios.
+    """
+    owners = np.concatenate([part.owners for part in links])
+    ratio = np.concatenate([part.ratio for part in links])
+    order = np.argsort(ratio, kind="stable")
+    parts = np.arange(len(links))
+    is_held = np.zeros(len(ratio), dtype=bool)
+    for link in order.tolist():
+        first, second = parts[owners[link]]
+        if first != second:
+            parts[parts == second] = first
+            is_held[link] = True
+    ends = np.cumsum([len(part.ratio) for part in links])[:-1]
+    return [np.asarray(part) for part in np.split(is_held, ends)]
+
+
+def go_to_poses_found(driver: Driver) -> None:
+    """Go to the poses that the robots have found of their own."""
+    network = driver.network
+    nothing = [None] * network.ledger.num_robots
+    R = driver.current.R.copy()
+    t = driver.current.t.copy()
+    for own in network.ask(tell_cover, nothing, Count.ROUND):
+        R[own.in_cover] = own.poses.R
+        t[own.in_cover] = own.poses.t
+    driver.current = replace(driver.current, R=R, t=t)
+    network.ask(go_to_solved, driver.poses_of_cover(), Count.PIGGYBACKED)
+    answers = driver.ask(current_poses.evaluate, None, Count.PIGGYBACKED)
+    driver.current = driver.with_cost(driver.current, answers)
+    driver.choose_cost(final=True)
+
+
+def _truncated_cost(driver: Driver) -> float:
+    """Truncated cost of all edges at the current poses."""
+    return math.fsum(driver.ask(sum_truncated, 1.0))
