@@ -13,7 +13,9 @@ from pgo_models.summaries import Summarised
 
 @dataclass(frozen=True, eq=False)
 class OutlierProof(Summarised):
-    """What is proven of the closures of a graph whose known inliers are right.
+    """What is proven of the closures of a graph: of all maps at least as good as this one.
+
+    "As good" is meant by the truncated cost, in which known inliers count in full.
 
     Parameters
     ----------
@@ -30,7 +32,8 @@ class OutlierProof(Summarised):
     truncated_cost_bound : float
         Lower bound on the truncated cost of every map.
     is_complete : bool
-        Whether everything that was worth trying was tried in the time given.
+        Whether the time limit has stopped nothing. Of more than 2,000 closures no pairs are
+        compared, whatever the time.
     """
 
     proven_wrong: BoolArray
@@ -43,7 +46,7 @@ class OutlierProof(Summarised):
 
     @property
     def gap(self) -> float:
-        """How far the truncated cost may be above the least possible, relative."""
+        """How far below the truncated cost of this map the least one may be, over the former."""
         if self.truncated_cost <= 0.0:
             return 0.0
         distance = self.truncated_cost - self.truncated_cost_bound
@@ -59,10 +62,10 @@ class OutlierProof(Summarised):
             )
         percent = math.ceil(1000.0 * self.gap) / 10.0
         return (
-            f"{num_wrong} of {self.num_closures} closures are proven wrong, if all known inliers "
-            f"are right. No map at least as good keeps more than {self.most_closures} closures; "
-            f"this one keeps {self.num_kept}. The truncated cost is within {percent:g} % of the "
-            f"least possible{in_time}"
+            f"{num_wrong} of {self.num_closures} closures are proven wrong, if the right map is at "
+            f"least as good as this one. No map at least as good keeps more than "
+            f"{self.most_closures} closures; this one keeps {self.num_kept}. The least possible "
+            f"truncated cost is at most {percent:g} % lower{in_time}"
         )
 
     def as_json(self) -> dict[str, object]:

@@ -5,11 +5,12 @@ Where edge k turns at p_k as measured, it costs
 
     kappa_k ||W_k||_F^2 + tau_k ||e_k||^2,      W_k = Q_k - Q_(k-1),
 
-with an offset e_k, and the errors add up to that of the whole. At a point c it is
+with an offset e_k: a body that moves with the poses is turned by W_k and shifted by e_k at p_k. The
+errors add up to that of the whole. Where c is turned and shifted to, it is
 
-    W = sum_k W_k,      e = sum_k e_k + W_k (c - p_k),
+    W = sum_k W_k,      e = sum_k e_k + W_k (c - p_k).
 
-up to signs. If the matrices W_k may be any, and not only differences of rotations, the least cost
+If the matrices W_k may be any, and not only differences of rotations, the least cost
 for given W and e is that of a linear least-squares problem. With c the mean of the points p_k with
 weights 1 / kappa_k it is kappa ||W||_F^2 + tau ||e||^2, where
 
@@ -30,7 +31,8 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.robust.chains import Chains, Closures, Motions
 
-# Of compositions along a chain, per pose: of turns, and of offsets over the lengths.
+# Of compositions along a chain, per pose: of turns, and of offsets over the lengths. It has to
+# cover the 64 eps that graphs allow measured rotations to be off by, which takes nearly all of it.
 _ROUNDING = 2.0**-45
 # Of sums along a chain, per pose.
 _ROUNDING_OF_SUMS = 2.0**-48
@@ -109,7 +111,8 @@ class ChainSums:
     def single_edges(self, sums: EdgeSums, reach: Array | float) -> SingleEdges:
         """Edges below those of the sums, whose points are at most `reach` (k,) from the origin.
 
-        What rounding can have taken from the sums is added to them.
+        What rounding can have taken from the sums is added to them. It can also put the centre of
+        light edges beside heavy ones far away, which their precisions then pay for.
         """
         n = self.chains.graph.num_poses
         total, of_offsets = self._summed[-1, 0], self._summed[-1, -2]
@@ -118,6 +121,7 @@ class ChainSums:
             center = sums.values[:, 1:-3] / softness[:, None]
             spread = sums.values[:, -3] - softness * np.sum(center**2, axis=1)
             rounding = _ROUNDING_OF_SUMS * n * (total + softness)
+            reach = np.maximum(reach, np.linalg.norm(center, axis=1))
             kappa = _INWARD / (softness + rounding)
             spread = spread + sums.values[:, -2] + rounding * np.square(reach)
             tau = _INWARD / (spread + _ROUNDING_OF_SUMS * n * of_offsets)

@@ -83,7 +83,10 @@ class ClosureCosts:
         ]
         chosen = self.known.copy()
         chosen[list(edges)] = True
-        subgraph = graph.without_edges(~chosen).subgraph(np.concatenate(poses))
+        inside = np.zeros(graph.num_poses, dtype=bool)
+        inside[np.concatenate(poses)] = True
+        chosen &= inside[graph.i] & inside[graph.j]
+        subgraph = graph.edge_subgraph(np.flatnonzero(chosen))
         if len(subgraph.components()) > 1:
             return None
         return PGOProblem(subgraph, self.problem.backend, self.problem.weighting)

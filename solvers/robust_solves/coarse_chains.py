@@ -37,8 +37,9 @@ class CoarseChains:
     def with_closures(self, edges: Sequence[int], num_steps: int) -> tuple[PoseGraph, float] | None:
         """A graph of closures and the chains between their ends, `num_steps` from end to end.
 
-        Its F less the second number is at most what the closures and all edges of these chains
-        cost, at all poses. None where an edge has no precisions, or the graph is not connected.
+        For all poses of these chains it has poses, with the same ends, whose F less the second
+        number is at most what the closures and all edges of the chains cost. None where an edge has
+        no precisions, or the graph is not connected.
         """
         sums = self.sums
         graph = sums.chains.graph
@@ -78,7 +79,8 @@ class CoarseChains:
         if len(coarse.components()) > 1:
             return None
         of_turns = 2.0 * sums.rounding**2 * float(kappa.sum())
-        of_offsets = (sums.rounding * sums.length) ** 2 * float(tau.sum())
+        length = max(sums.length, float(np.linalg.norm(origin, axis=1).max()))
+        of_offsets = (sums.rounding * length) ** 2 * float(tau.sum())
         return coarse, (of_turns + of_offsets) / _ETA
 
     def _pieces(self, ends: IntArray, num_steps: int) -> tuple[IntArray, IntArray]:

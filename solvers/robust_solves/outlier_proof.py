@@ -1,6 +1,6 @@
 """Wrong closures proven wrong, one by one, and how far a robust answer is from the best one.
 
-The known inliers are taken to be right, which is the only assumption. For poses X let
+Known inliers are edges that every map has to fit. For poses X let
 
     TLS(X) = sum over known inliers of r_e^2 + sum over closures of min(r_e^2, c_e^2)
 
@@ -9,8 +9,8 @@ most U keeps a set K of closures, those with r_e^2 <= c_e^2. The cost of known i
 
     F_K(X) = TLS(X) - C + sum over K of c_e^2  <=  s,   s = U - C + largest possible sum over K.
 
-So each closure of K, and each pair, fits the known inliers at a cost of at most s:
-d_e = min F_e <= s and d_ef = min F_ef <= s.
+Let F_e be the cost of known inliers and closure e, F_ef that with closures e and f. Each closure of
+K, and each pair, costs at most s at least: d_e = min F_e <= s and d_ef = min F_ef <= s.
 
 1. A closure whose proven lower bound of d_e is above s is wrong in every map that is as good as
    the answer. Two closures with d_ef > s are inconsistent: no such map keeps both.
@@ -20,9 +20,11 @@ d_e = min F_e <= s and d_ef = min F_ef <= s.
    Their s_e takes of each class the largest c_e^2 of those that are left. It takes the place of s
    for e, and for e with any other closure.
 
-Each closure that is left out, and each pair, lowers s or s_e, so that more can be. In the end K has
-at most as many closures as there are classes, and TLS(X) is at least C less the sum of the largest
-c_e^2 of each class, for all X: for those worse than the answer it is above U.
+Each closure that is left out, and each pair, lowers s or s_e, so that more can be. What is proven
+is about maps with TLS(X) <= U; a closure that none of them keeps is wrong if the right map is one
+of them. In the end K has at most as many closures as there are classes, and TLS(X) is at least C
+less the sum of the largest c_e^2 of each class, for all X: for those worse than the answer it is
+above U.
 
 Most bounds come in closed form, for all closures and pairs at once (`cycle_bounds`). Where they do
 not suffice certificates prove more (`closure_costs`), if first-order distances on the known inliers
@@ -48,6 +50,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.robust.chains import Chains, cycle_distances, is_whole, squared_distances
 from solvers.robust.outlier_record import OutlierProof
+from solvers.robust.weighted_edges import held_together
 from solvers.robust_solves.chain_sums import ChainSums
 from solvers.robust_solves.closure_costs import ClosureCosts, precisions_below
 from solvers.robust_solves.cycle_bounds import CycleBounds
@@ -80,15 +83,17 @@ _MOST_PROOFS = 64
 # Closures of which all pairs are compared within seconds.
 _MOST_PAIRED = 2000
 _OUTWARD = 1.0 + 1e-12  # for sums of up to a million positive terms
+_LEAST = float(np.finfo(float).tiny)
 
 
 @door
 def prove_outliers(solution: Solution, time_limit: float = math.inf) -> Solution:
     """Prove closures wrong, for all maps that are as good as that of a robust solve.
 
-    Known inliers, odometry unless others were given, are taken to be right. What is proven is exact
-    for the thresholds of the truncated cost: closures that no map at least as good keeps, how many
-    closures such a map keeps at most, and a lower bound on the truncated cost of every map.
+    Known inliers, odometry unless others were given, count in full. What is proven is exact for the
+    thresholds of the truncated cost: closures that no map at least as good keeps, which are wrong
+    if the right map is at least as good, how many closures such a map keeps at most, and a lower
+    bound on the truncated cost of every map.
 
     Parameters
     ----------
@@ -105,8 +110,8 @@ def prove_outliers(solution: Solution, time_limit: float = math.inf) -> Solution
     Raises
     ------
     SettingError
-        When the solution is not of a robust solve, or an edge has a negative cost, as chi2 of an
-        indefinite information matrix can.
+        When the solution is not of a robust solve, or an edge has a negative cost, as it can where
+        terms of one's own were added.
 
     References
     ----------
@@ -188,10 +193,13 @@ class _Search:
         cls, problem: PGOProblem, known: BoolArray, thresholds: Array, poses: Poses, deadline: float
     ) -> _Search:
         graph = problem.graph
-        kept = known | (problem.edge_costs(poses) <= thresholds)
-        inliers = PGOProblem(graph.without_edges(~kept), problem.backend, problem.weighting)
+        costs = problem.edge_costs(poses)
+        kept = known | (costs <= thresholds)
+        # Edges that the poses need beside these count in full: U is an upper bound.
+        counted = held_together(graph, kept, costs / thresholds)
+        inliers = PGOProblem(graph.without_edges(~counted), problem.backend, problem.weighting)
         error = objective_rounding(inliers, poses).error
-        cost = inliers.objective(poses) + error + float(thresholds[~kept].sum())
+        cost = inliers.objective(poses) + error + float(thresholds[~counted].sum())
         edges = np.flatnonzero(~known)
         chains = Chains.of(graph, known)
         cycles = CycleBounds(ChainSums(chains, *precisions_below(problem)))
@@ -242,7 +250,10 @@ class _Search:
             self.join_classes()
 
     def leave_out_wrong(self) -> None:
-        """Steps 1 and 3: leave out closures that cost more than s_e, until nothing changes."""
+        """Steps 1 and 3: leave out closures that cost more than s_e, until nothing changes.
+
+        No cost is below zero, so that s_e is not, either, for those that are left.
+        """
         while len(self.edges):
             before = self.most_cost
             self.most_cost = np.minimum(before, self._costs_beside())
@@ -265,7 +276,7 @@ class _Search:
         beside = np.where(self.is_inconsistent(), 0.0, self.thresholds)[:, in_order]
         sums = np.maximum.reduceat(beside, begins, axis=1).sum(axis=1)
         rounding = (_OUTWARD - 1.0) * (self.cost + self.total)
-        return np.asarray(np.maximum(0.0, self.cost - self.total + sums + rounding))
+        return np.asarray(self.cost - self.total + sums + rounding)
 
     def is_inconsistent(self) -> BoolArray:
         """Pairs, (k, k), of which no map as good as the answer keeps both."""
@@ -282,7 +293,8 @@ class _Search:
         s = self.most_cost
         hopeful = (self.bound >= effort.bound * s) & (self.distance > effort.distance * s)
         tried = np.flatnonzero(hopeful & ~self.is_kept)
-        for e in tried[np.argsort(-(self.bound / s)[tried], kind="stable")].tolist():
+        ratio = self.bound[tried] / np.maximum(s[tried], _LEAST)
+        for e in tried[np.argsort(-ratio, kind="stable")].tolist():
             self.bound[e] = max(self.bound[e], self._prove((e,), s[e], effort))
         self.leave_out_wrong()
 
@@ -329,7 +341,7 @@ class _Search:
         """Whether closures are inconsistent with another; the hardest are tried first."""
         assert self.pairs is not None
         s = np.minimum(self.most_cost[e], self.most_cost[members])
-        ratio = self.pairs.bound[e, members] / s
+        ratio = self.pairs.bound[e, members] / np.maximum(s, _LEAST)
         for place in np.argsort(ratio, kind="stable").tolist():
             if self.pairs.bound[e, members[place]] > s[place]:
                 return True

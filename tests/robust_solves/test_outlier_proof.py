@@ -110,6 +110,51 @@ def test_a_proof_that_is_out_of_time_says_so() -> None:
         solvers.prove_outliers(solvers.solve(graph))
 
 
+def test_between_two_robots_one_closure_against_many_is_proven_wrong() -> None:
+    """It costs nothing by itself; what it excludes is more than any map as good can give up."""
+    rng = np.random.default_rng(0)
+    t = np.zeros((20, 2))
+    t[:, 0] = np.tile(np.arange(10), 2)
+    t[10:, 1] = 3.0
+    steps = [(a, a + 1) for a in range(19) if a != 9]
+    i, j = np.array([*steps, *((k, 10 + k) for k in (0, 2, 4, 6, 8)), (3, 13)]).T
+    measured = t[j] - t[i] + 0.005 * rng.standard_normal((len(i), 2))
+    measured[-1] += (40.0, 30.0)
+    R = pgo.exp_map(0.005 * rng.standard_normal((len(i), 1)))
+    ones = np.ones(len(i))
+    graph = pgo.PoseGraph(20, i, j, R, measured, 2e4 * ones, 4e4 * ones)
+    graph = graph.with_robots(np.repeat([0, 1], 10))
+    proof = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC())).robust.proof
+    assert np.flatnonzero(proof.proven_wrong).tolist() == [len(i) - 1]
+    assert (proof.most_closures, proof.num_kept) == (5, 5)
+
+
+@pytest.mark.parametrize("world", [30, 0])
+def test_priors_are_closures_wherever_the_pose_of_the_world_stands(world: int) -> None:
+    rng = np.random.default_rng(0)
+    body = np.delete(np.arange(31), world)
+    t = np.zeros((31, 2))
+    t[body, 0] = np.arange(30)
+    pairs = [(body[k], body[k + 1]) for k in range(29)] + [(world, body[3]), (world, body[20])]
+    i, j = np.array([*pairs, (body[2], body[25]), (body[4], body[29])]).T
+    measured = t[j] - t[i] + 0.01 * rng.standard_normal((len(i), 2))
+    measured[-2:] += (4.0, 0.0)
+    R = pgo.exp_map(0.01 * rng.standard_normal((len(i), 1)))
+    ones = np.ones(len(i))
+    graph = pgo.PoseGraph(31, i, j, R, measured, 2e3 * ones, 4e3 * ones, world=world)
+    proof = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC())).robust.proof
+    assert np.flatnonzero(proof.proven_wrong).tolist() == [31, 32]
+
+
+def test_priors_that_all_contradict_odometry_are_counted_as_far_as_they_hold_the_map() -> None:
+    graph = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
+    graph = graph.without_edges(np.abs(graph.i - graph.j) != 1)
+    far = graph.truth.t[[0, 20]] + np.array([[0.0, 0.0], [80.0, 0.0]])
+    graph = graph.with_position_prior(np.array([0, 20]), far, 1e4)
+    proof = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC())).robust.proof
+    assert proof.truncated_cost_bound <= proof.truncated_cost
+
+
 def test_of_rotations_alone_no_offset_proves_anything() -> None:
     """The closure turns as it should; how far it says that its ends lie apart costs nothing."""
     chain = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
