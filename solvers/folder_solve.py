@@ -36,7 +36,7 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import Ledger
 from solvers.network.ray_engine import RayEngine
-from solvers.place import AUTO, FirstStage
+from solvers.place import AUTO, Attempt, FirstStage
 from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import Record, Stage, Status
@@ -48,8 +48,8 @@ from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 
-# Passes of GNC, each from the map of the one before, while the truncated cost falls.
-_MOST_PASSES = 4
+# Passes of GNC; two were enough on all graphs tried.
+_MOST_PASSES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,33 +269,20 @@ class FilesOfRobots:
         opened = open_files(
             self.files, self.engine, self.memory, self.weighting, self.trust_folder, pcm
         )
-        rejected_by = FolderSolution.rejected_by
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
-        driver = opened.driver
         journal = Journal(None, {}, stages)
-        with closing(driver):
+        with closing(opened.driver):
             place = RobotsWithFiles(
-                monitor, stages, driver, journal, None, name, pipeline.gap, opened.weighting
+                monitor, stages, opened.driver, journal, None, name, pipeline.gap, opened.weighting
             )
-            best = solve_at(place, pipeline, None)
-            passes = _MOST_PASSES if isinstance(self.robust, GNC) else 0
-            for _ in range(passes):
-                if best.is_out_of_time:
-                    break
-                assert isinstance(self.robust, GNC)
-                revision = revised(
-                    opened, self.robust, best.proof.is_certified, monitor, self.files[0][1].parent
-                )
-                stages.append(revision.stage)
-                opened = revision.opened
-                driver = opened.driver
-                start = "poses of GNC" if revision.is_better else "poses found before GNC"
-                place = replace(place, driver=driver, kept=[], begins_at=start)
-                best = solve_at(place, replace(pipeline, soc=None), None)
-                if not revision.is_better:
-                    break
-                rejected_by = "the map of the others contradicts"
-            best, frame, F = place.move_to_frame(best)
+            answer = _Answer(opened, place, solve_at(place, pipeline, None))
+            if isinstance(self.robust, GNC):
+                folder = self.files[0][1].parent
+                answer = _after_passes(answer, self.robust, pipeline, folder)
+            opened = answer.opened
+            place = answer.place
+            driver = opened.driver
+            best, frame, F = place.move_to_frame(answer.best)
             if out is not None:
                 nothing = [None] * len(self.files)
                 driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)
@@ -311,9 +298,47 @@ class FilesOfRobots:
             note=_note(self.weighting, opened, place.note(best)),
             num_absent=opened.num_absent,
             num_rejected=None if self.robust is None else opened.num_rejected,
-            rejected_by=rejected_by,
+            rejected_by=answer.rejected_by,
             seconds=time.perf_counter() - monitor.began,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """What was found so far: robots with the edges kept, their place, and the attempt there."""
+
+    opened: OpenedFiles
+    place: RobotsWithFiles
+    best: Attempt
+    rejected_by: str = FolderSolution.rejected_by
+
+
+def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline, folder: Path) -> _Answer:
+    """The answer after passes of GNC, each from the map of the one before.
+
+    They end with one that began at a certified map, or has not lowered the truncated cost.
+    """
+    for _ in range(_MOST_PASSES):
+        has_map = answer.best.proof.is_certified
+        if answer.best.is_out_of_time:
+            break
+        place = answer.place
+        revision = revised(answer.opened, gnc, has_map, place.monitor, folder)
+        place.stages.append(revision.stage)
+        start = "poses of GNC" if revision.is_better else "poses found before GNC"
+        place = replace(place, driver=revision.opened.driver, kept=[], begins_at=start)
+        answer = replace(
+            answer,
+            opened=revision.opened,
+            place=place,
+            best=solve_at(place, replace(pipeline, soc=None), None),
+        )
+        if not revision.is_better:
+            break
+        answer = replace(answer, rejected_by="the map of the others contradicts")
+        if has_map:
+            break
+    return answer
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:

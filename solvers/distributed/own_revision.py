@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import GraphError
+from pgo_models.errors import FAILURES, GraphError
 from pgo_models.geometry.rotations import BoolArray
 from solvers.distributed.driver import Driver
 from solvers.distributed.own_files import OpenedFiles
@@ -56,31 +56,43 @@ def revised(
     With `has_map` these are of a map, which most edges fit, and one short schedule will do.
     """
     network = opened.driver.network
-    num_robots = network.ledger.num_robots
-    nothing = [None] * num_robots
-    request = opened.weighting, gnc.quantile, not gnc.consistent
-    borders = network.ask(take_back, [request] * num_robots, Count.PIGGYBACKED)
+    objective = opened.driver.current.objective
+    try:
+        stage, kept = _judged(opened, gnc, has_map, monitor, folder)
+    except FAILURES:
+        stage, kept = Stage.failure("GNC", objective), None
+    if kept is not None:
+        return Revision(kept, stage, is_better=True)
+    nothing = [None] * network.ledger.num_robots
+    borders = network.ask(return_to_consistent, nothing, Count.PIGGYBACKED)
+    return Revision(opened.with_edges(borders, opened.num_rejected, folder), stage, is_better=False)
+
+
+def _judged(
+    opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor, folder: Path
+) -> tuple[Stage, OpenedFiles | None]:
+    """What a run did, and the robots with the edges that it keeps, if it has found a better map."""
+    network = opened.driver.network
+    requests = [(opened.weighting, gnc.quantile, not gnc.consistent)] * network.ledger.num_robots
+    borders = network.ask(take_back, requests, Count.PIGGYBACKED)
     driver = opened.with_edges(borders, 0, folder).driver
     go_to_poses_found(driver)
     before = _truncated_cost(driver)
     finished = monitor.run(SharedGNC.of_files(gnc, driver, has_map), driver)
     driver.return_to(finished.state.edges.newton.moment)
-    scale = finished.state.schedule.scale
     stage = stage_of(gnc, finished)
-    if finished.status not in BROKEN_OFF and _truncated_cost(driver) < before:
-        requests = [(scale, cover) for cover in driver.poses_of_cover()]
-        links = network.ask(tell_links, requests, Count.ROUND)
-        told = network.ask(tell_kept, holding(links), Count.PIGGYBACKED)
-        parts = network.ask(keep, network.exchange(told), Count.PIGGYBACKED)
-        num_rejected = sum(part.num_rejected for part in parts)
-        try:
-            kept = opened.with_edges([part.border for part in parts], num_rejected, folder)
-        except GraphError:
-            pass  # they leave poses apart
-        else:
-            return Revision(kept, stage, is_better=True)
-    borders = network.ask(return_to_consistent, nothing, Count.PIGGYBACKED)
-    return Revision(opened.with_edges(borders, opened.num_rejected, folder), stage, is_better=False)
+    if finished.status in BROKEN_OFF or not _truncated_cost(driver) < before:
+        return stage, None
+    scale = finished.state.schedule.scale
+    covers = [(scale, cover) for cover in driver.poses_of_cover()]
+    links = network.ask(tell_links, covers, Count.ROUND)
+    told = network.ask(tell_kept, holding(links), Count.PIGGYBACKED)
+    parts = network.ask(keep, network.exchange(told), Count.PIGGYBACKED)
+    num_rejected = sum(part.num_rejected for part in parts)
+    try:
+        return stage, opened.with_edges([part.border for part in parts], num_rejected, folder)
+    except GraphError:  # they leave poses of a robot apart
+        return stage, None
 
 
 def holding(links: Sequence[Links]) -> list[BoolArray]:
