@@ -6,7 +6,7 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
-from hypothesis import given, strategies as st
+from hypothesis import assume, given, strategies as st
 from robots import Recording
 
 import pgo_models as pgo
@@ -52,8 +52,12 @@ def test_iterates_are_those_of_one_place(
     method = PaperByRobots(soc)
     driver = open_driver(problem, robots, InProcess())
     driver.set_poses(start)
-    at_robots = list(islice(iterate(method, driver), 7))
-    in_one_place = list(islice(iterate(soc, problem, start), 7))
+    try:
+        at_robots = list(islice(iterate(method, driver), 7))
+        in_one_place = list(islice(iterate(soc, problem, start), 7))
+    except RuntimeWarning as warning:
+        assume("RStep.FACTORIZED" not in str(warning))  # FISTA has not converged
+        raise
     for expected, found in zip(in_one_place[1:], at_robots[1:], strict=True):
         measured = method.measure(driver, found)
         known = soc.measure(problem, expected)
