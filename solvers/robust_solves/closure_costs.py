@@ -18,6 +18,7 @@ import numpy as np
 from pgo_models.certificates.shrunk_information import shrink_information
 from pgo_models.errors import FAILURES
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -101,39 +102,57 @@ def _easier_problems(problem: PGOProblem) -> Iterator[PGOProblem]:
 
 
 def isotropic_below(problem: PGOProblem) -> PGOProblem:
-    """F with precisions so small that it is below chi2 at all poses.
+    """F with precisions so small that it is below chi2 at all poses."""
+    weighted = _isotropic_graph_below(problem.graph)
+    return PGOProblem(weighted, problem.backend, Weighting.ISOTROPIC)
+
+
+def _isotropic_graph_below(graph: PoseGraph) -> PoseGraph:
+    """The graph with precisions whose F is below chi2 at all poses.
 
     Of matrices without coupling, below those of the graph (`shrink_information`), the smallest
     eigenvalues are taken. With the turn theta of an edge, chi2 has at least 2 (1 - cos theta) times
     that of I_rr, and F 4 (1 - cos theta) kappa.
     """
-    d = problem.d
-    graph = shrink_information(problem.graph, cap=1.0)
+    d = graph.d
+    graph = shrink_information(graph, cap=1.0)
     information = proper_information(graph)
     tau = _least_eigenvalues(information[:, :d, :d])
     kappa = 0.5 * _least_eigenvalues(information[:, d:, d:])
-    weighted = replace(graph.with_weights(kappa, tau), information=None)
-    return PGOProblem(weighted, problem.backend, Weighting.ISOTROPIC)
+    return replace(graph.with_weights(kappa, tau), information=None)
 
 
 def precisions_below(problem: PGOProblem) -> tuple[Array, Array]:
     """Return kappa and tau, (m,), of an F below the cost at all poses.
 
-    They are zero for all edges where the cost is neither F nor chi2, and where no such F is known:
-    of matrices that are singular, or that rounding hides. They are zero for edges that measure no
-    whole motion, too.
+    They are zero where the cost is neither F nor chi2, and for edges of which no such F is known:
+    with matrices that are singular, or that rounding hides, or that measure no whole motion.
     """
     graph = problem.graph
-    below = None
+    kappa = np.zeros(graph.num_edges)
+    tau = np.zeros(graph.num_edges)
+    whole = np.flatnonzero(is_whole(graph))
     if problem.weighting is Weighting.ISOTROPIC:
-        below = graph
+        kappa[whole] = graph.kappa[whole]
+        tau[whole] = graph.tau[whole]
     elif problem.weighting is Weighting.INFORMATION:
-        with suppress(*FAILURES):
-            below = isotropic_below(problem).graph
-    if below is None or below.num_edges != graph.num_edges:
-        return np.zeros(graph.num_edges), np.zeros(graph.num_edges)
-    whole = is_whole(graph)
-    return np.where(whole, below.kappa, 0.0), np.where(whole, below.tau, 0.0)
+        _set_precisions_below(graph, whole, kappa, tau)
+    return kappa, tau
+
+
+def _set_precisions_below(graph: PoseGraph, edges: IntArray, kappa: Array, tau: Array) -> None:
+    """Set the precisions of edges, (k,); where that fails, of each half of them."""
+    if not len(edges):
+        return
+    below = None
+    with suppress(*FAILURES):
+        below = _isotropic_graph_below(graph.edge_subgraph(edges))
+    if below is not None and below.num_edges == len(edges):
+        kappa[edges] = below.kappa
+        tau[edges] = below.tau
+    elif len(edges) > 1:
+        for half in np.array_split(edges, 2):
+            _set_precisions_below(graph, half, kappa, tau)
 
 
 def _least_eigenvalues(blocks: Array) -> Array:

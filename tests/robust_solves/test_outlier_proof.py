@@ -184,6 +184,23 @@ def test_a_matrix_that_rounding_hides_elsewhere_takes_no_proof_away() -> None:
     assert np.flatnonzero(solution.robust.proof.proven_wrong).tolist() == [graph.num_edges - 1]
 
 
+def test_of_matrices_that_are_singular_or_hidden_other_edges_keep_their_precisions() -> None:
+    graph = informed(3, 12, 2, coupled=True, spread=2.0, noise=NoiseModel(0.1, 0.1))
+    expected = precisions_below(pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION))
+    information = graph.information.copy()
+    information[[2, 7]] = np.diag([1e4, 1e4, 2e4])
+    information[2, [0, 2], [2, 0]] = np.sqrt(2e8)  # singular
+    information[7, [0, 2], [2, 0]] = (1.0 - 1e-9) * np.sqrt(2e8)  # hidden
+    spoiled = pgo.PGOProblem(
+        replace(graph, information=information), weighting=pgo.Weighting.INFORMATION
+    )
+    others = np.delete(np.arange(graph.num_edges), [2, 7])
+    for found, known in zip(precisions_below(spoiled), expected, strict=True):
+        assert (known > 0.0).all()
+        np.testing.assert_allclose(found[others], known[others], rtol=1e-9)
+        assert found[2] == 0.0
+
+
 @pytest.mark.parametrize("coupled", [False, True])
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_isotropic_cost_is_below_chi2_at_all_poses(d: int, coupled: bool) -> None:
