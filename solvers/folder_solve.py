@@ -275,7 +275,12 @@ class FilesOfRobots:
             place = RobotsWithFiles(
                 monitor, stages, opened.driver, journal, None, name, pipeline.gap, opened.weighting
             )
-            answer = _Answer(opened, place, solve_at(place, pipeline, None))
+            first = pipeline
+            if isinstance(
+                self.robust, GNC
+            ):  # which goes on from it, whether it is certified or not
+                first = replace(pipeline.with_newton_alone(pipeline.newton), soc=pipeline.soc)
+            answer = _Answer(opened, place, solve_at(place, first, None))
             if isinstance(self.robust, GNC):
                 folder = self.files[0][1].parent
                 answer = _after_passes(answer, self.robust, pipeline, folder)
