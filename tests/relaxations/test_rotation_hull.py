@@ -70,13 +70,13 @@ def test_primal_and_dual_agree_and_are_between_the_plain_relaxation_and_F(
     F = solvers.solve(problem).objective
     plain = solve_relaxation(problem, RelaxationForm.DUAL, "CLARABEL")
     solutions = [solve_relaxation(problem, form) for form in HULLS]
-    allowed = 1e-5 * max(1.0, F)
+    allowed = 5e-5 * max(1.0, F)  # a conic solver stops there on hostile draws
     assert solutions[0].value == pytest.approx(solutions[1].value, abs=allowed)
     for solution in solutions:
         assert plain.value <= solution.value + allowed
         assert solution.value <= F + allowed
         assert solution.lower_bound <= F
-        assert solution.lower_bound >= solution.value - 10.0 * allowed - 1e-3 * F
+        assert solution.lower_bound >= solution.value - 2.0 * allowed - 1e-3 * F
 
 
 def test_both_models_as_posed_have_one_value() -> None:
