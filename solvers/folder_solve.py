@@ -282,8 +282,7 @@ class FilesOfRobots:
                 first = replace(pipeline.with_newton_alone(pipeline.newton), soc=pipeline.soc)
             answer = _Answer(opened, place, solve_at(place, first, None))
             if isinstance(self.robust, GNC):
-                folder = self.files[0][1].parent
-                answer = _after_passes(answer, self.robust, pipeline, folder)
+                answer = _after_passes(answer, self.robust, pipeline)
             opened = answer.opened
             place = answer.place
             driver = opened.driver
@@ -318,7 +317,7 @@ class _Answer:
     rejected_by: str = FolderSolution.rejected_by
 
 
-def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline, folder: Path) -> _Answer:
+def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
     """The answer after passes of GNC, each from the map of the one before.
 
     They end with one that began at a certified map, or has not lowered the truncated cost.
@@ -328,7 +327,7 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline, folder: Path) -
         if answer.best.is_out_of_time:
             break
         place = answer.place
-        revision = revised(answer.opened, gnc, has_map, place.monitor, folder)
+        revision = revised(answer.opened, gnc, has_map, place.monitor)
         place.stages.append(revision.stage)
         start = "poses of GNC" if revision.is_better else "poses found before GNC"
         place = replace(place, driver=revision.opened.driver, kept=[], begins_at=start)

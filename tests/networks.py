@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -119,3 +120,14 @@ def give_edge(robot: solvers.Robot, graph: PoseGraph, e: int) -> None:
         robot.add_edge(i, j, R, t, information=graph.information[e])
     else:
         robot.add_edge(i, j, R, t, kappa=float(graph.kappa[e]), tau=float(graph.tau[e]))
+
+
+def robots_with_files(
+    folder: Path, num_robots: int, **settings: object
+) -> dict[str, solvers.Robot]:
+    """Robots a, b, .. of one team, each of which has read its file 0.g2o, 1.g2o, .."""
+    names = [chr(ord("a") + k) for k in range(num_robots)]
+    robots = {name: solvers.Robot(name, names, KEY, **settings) for name in names}
+    for k, robot in enumerate(robots.values()):
+        robot.read(folder / f"{k}.g2o")
+    return robots

@@ -1183,10 +1183,16 @@ def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
     """
     kept_edges = edge_counts(graph.i[kept], graph.j[kept], graph.num_poses)
     count, part = connected_components(kept_edges, directed=False)
+    return least_tree(part[graph.i], part[graph.j], count, ratio)
+
+
+def least_tree(i: IntArray, j: IntArray, count: int, ratio: Array) -> IntArray:
+    """Links, of those from i to j (m,), of a minimum spanning tree of `count` nodes (Kruskal).
+
+    Nodes that no link joins to others have trees of their own.
+    """
     order = np.argsort(ratio, kind="stable")
-    part_i = part[graph.i[order]]
-    part_j = part[graph.j[order]]
-    parts = np.stack([part_i, part_j]).astype(np.int64)
+    parts = np.stack([i[order], j[order]]).astype(np.int64)
     ends = np.sort(parts, axis=0)
     is_between = ends[0] != ends[1]
     order = order[is_between]

@@ -65,6 +65,8 @@ class OpenedFiles:
         The driver of the robots.
     sizes : (2, num_robots) array
         How many poses, and edges, every robot has.
+    folder : Path
+        Where the files are.
     weighting : Weighting
         The cost that is solved: ISOTROPIC or INFORMATION.
     has_indefinite : bool
@@ -77,19 +79,20 @@ class OpenedFiles:
 
     driver: Driver
     sizes: IntArray
+    folder: Path
     weighting: Weighting
     has_indefinite: bool
     num_absent: int
     num_rejected: int = 0
 
-    def with_edges(self, borders: Sequence[Border], num_rejected: int, folder: Path) -> OpenedFiles:
+    def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
         """The same robots with other edges, of which they have told the borders.
 
         A GraphError if these do not connect the poses.
         """
         old = self.driver
         driver, sizes = _placed(
-            old.network, borders, old.num_poses, old.memory, self.weighting, folder
+            old.network, borders, old.num_poses, old.memory, self.weighting, self.folder
         )
         return replace(self, driver=driver, sizes=sizes, num_rejected=num_rejected)
 
@@ -128,7 +131,7 @@ def open_files(
         folder = files[0][1].parent
         driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
         return OpenedFiles(
-            driver, sizes, weighting, has_indefinite, numbered.num_absent, num_rejected
+            driver, sizes, folder, weighting, has_indefinite, numbered.num_absent, num_rejected
         )
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()

@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from pgo_models.errors import FAILURES, GraphError
 from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.pose_graph import least_tree
 from solvers.distributed.driver import Driver
 from solvers.distributed.own_files import OpenedFiles
 from solvers.distributed.robots import current_poses
@@ -48,9 +48,7 @@ class Revision:
     is_better: bool
 
 
-def revised(
-    opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor, folder: Path
-) -> Revision:
+def revised(opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor) -> Revision:
     """Judge all edges by a run from the poses that the robots keep.
 
     With `has_map` these are of a map, which most edges fit, and one short schedule will do.
@@ -58,24 +56,24 @@ def revised(
     network = opened.driver.network
     objective = opened.driver.current.objective
     try:
-        stage, kept = _judged(opened, gnc, has_map, monitor, folder)
+        stage, kept = _judged(opened, gnc, has_map, monitor)
     except FAILURES:
         stage, kept = Stage.failure("GNC", objective), None
     if kept is not None:
         return Revision(kept, stage, is_better=True)
     nothing = [None] * network.ledger.num_robots
     borders = network.ask(return_to_consistent, nothing, Count.PIGGYBACKED)
-    return Revision(opened.with_edges(borders, opened.num_rejected, folder), stage, is_better=False)
+    return Revision(opened.with_edges(borders, opened.num_rejected), stage, is_better=False)
 
 
 def _judged(
-    opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor, folder: Path
+    opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor
 ) -> tuple[Stage, OpenedFiles | None]:
     """What a run did, and the robots with the edges that it keeps, if it has found a better map."""
     network = opened.driver.network
     requests = [(opened.weighting, gnc.quantile, not gnc.consistent)] * network.ledger.num_robots
     borders = network.ask(take_back, requests, Count.PIGGYBACKED)
-    driver = opened.with_edges(borders, 0, folder).driver
+    driver = opened.with_edges(borders, 0).driver
     go_to_poses_found(driver)
     before = _truncated_cost(driver)
     finished = monitor.run(SharedGNC.of_files(gnc, driver, has_map), driver)
@@ -90,7 +88,7 @@ def _judged(
     parts = network.ask(keep, network.exchange(told), Count.PIGGYBACKED)
     num_rejected = sum(part.num_rejected for part in parts)
     try:
-        return stage, opened.with_edges([part.border for part in parts], num_rejected, folder)
+        return stage, opened.with_edges([part.border for part in parts], num_rejected)
     except GraphError:  # they leave poses of a robot apart
         return stage, None
 
@@ -102,14 +100,8 @@ def holding(links: Sequence[Links]) -> list[BoolArray]:
     """
     owners = np.concatenate([part.owners for part in links])
     ratio = np.concatenate([part.ratio for part in links])
-    order = np.argsort(ratio, kind="stable")
-    parts = np.arange(len(links))
     is_held = np.zeros(len(ratio), dtype=bool)
-    for link in order.tolist():
-        first, second = parts[owners[link]]
-        if first != second:
-            parts[parts == second] = first
-            is_held[link] = True
+    is_held[least_tree(owners[:, 0], owners[:, 1], len(links), ratio)] = True
     ends = np.cumsum([len(part.ratio) for part in links])[:-1]
     return [np.asarray(part) for part in np.split(is_held, ends)]
 

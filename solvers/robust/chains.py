@@ -69,6 +69,14 @@ class Chains:
         second = np.where(is_backward, i, j)
         return Closures(first, second, (cycle_R, cycle_t), covariance)
 
+    def pairs(self, closures: Closures) -> tuple[IntArray, IntArray]:
+        """All pairs a < b of closures between the same two chains, or in the same one."""
+        a, b = np.triu_indices(len(closures), 1)
+        first = self.chain[closures.i]
+        second = self.chain[closures.j]
+        are_alike = (first[a] == first[b]) & (second[a] == second[b])
+        return a[are_alike], b[are_alike]
+
 
 @dataclass(frozen=True, eq=False)
 class Closures:

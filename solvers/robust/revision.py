@@ -46,8 +46,6 @@ def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
     A GraphError when these do not connect the poses.
     """
     graph = problem.graph
-    if kept.all() and len(graph.components()) == 1:
-        return problem
     parts = graph.components(kept)
     if len(parts) > 1:
         apart = f"{len(parts)} parts (one with pose {graph.pose_name(int(parts[1][0]))})"
@@ -55,6 +53,8 @@ def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
             f"known inliers and the edges kept leave {graph.name} in {apart}; "
             "name more known inliers, or raise the quantile"
         )
+    if kept.all():
+        return problem
     return PGOProblem(graph.without_edges(~kept), problem.backend, problem.weighting)
 
 

@@ -1,14 +1,15 @@
 """Chains with few poses, whose cost is below that of the chains themselves.
 
-A piece of a chain costs at least as much as one edge (`chain_sums`), from the pose before the piece
-to its last pose, in a frame whose origin is the point c where that edge turns. Poses at which
-closures end keep their frames, so that the last step before them is a piece of its own: it turns
-there if it was measured in this direction. If not it is seen from a distance D of c. As
+A piece of a chain costs at least as much as one edge (`chain_sums`, which has the notation), from
+the pose before the piece to its last pose, in a frame whose origin is the point c where that edge
+turns. Poses at which closures end keep their frames. So the last step before them is a piece of its
+own, if there are two pieces or more: it turns there if it was measured in this direction. Any other
+piece that ends there is seen from elsewhere, with the vector D from c. As
 
-    ||e + W D||^2 <= (1 / tau + D^2 / kappa) (tau ||e||^2 + kappa ||W||_F^2),
+    ||e + W D||^2 <= (1 / tau + ||D||^2 / kappa) (tau ||e||^2 + kappa ||W||_F^2),
 
 it costs at least as much as an edge that turns there, with half of kappa and half of
-1 / (1 / tau + D^2 / kappa).
+1 / (1 / tau + ||D||^2 / kappa).
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ class CoarseChains:
     def with_closures(self, edges: Sequence[int], num_steps: int) -> tuple[PoseGraph, float] | None:
         """A graph of closures and the chains between their ends, `num_steps` from end to end.
 
-        For all poses of these chains it has poses, with the same ends, whose F less the second
-        number is at most what the closures and all edges of the chains cost. None where an edge has
-        no precisions, or the graph is not connected.
+        Its least F, for given poses at the ends, is at most what the closures and all edges of the
+        chains cost with these ends, and the second number, which is for rounding. None where an
+        edge has no precisions, or the graph is not connected.
         """
         sums = self.sums
         graph = sums.chains.graph

@@ -48,12 +48,7 @@ class CycleBounds:
         closures = self.sums.chains.closures(edges)
         of_closures = self.sums.of_closures(edges, closures)
         bounds = np.zeros((len(edges), len(edges)))
-        chain = self.sums.chains.chain
-        a, b = np.triu_indices(len(edges), 1)
-        is_cycle = chain[closures.i[a]] == chain[closures.i[b]]
-        is_cycle &= chain[closures.j[a]] == chain[closures.j[b]]
-        a = a[is_cycle]
-        b = b[is_cycle]
+        a, b = self.sums.chains.pairs(closures)
         for begin in range(0, len(a), _CHUNK):
             first = a[begin : begin + _CHUNK]
             second = b[begin : begin + _CHUNK]

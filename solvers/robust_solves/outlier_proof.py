@@ -17,8 +17,8 @@ K, and each pair, costs at most s at least: d_e = min F_e <= s and d_ef = min F_
 2. Closures are divided into classes of which any two are inconsistent. K has at most one of a
    class, so that the sum over K is at most that of the largest c_e^2 of each class.
 3. Of the maps that keep a closure e more is known: they keep none that is inconsistent with e.
-   Their s_e takes of each class the largest c_e^2 of those that are left. It takes the place of s
-   for e, and for e with any other closure.
+   Their s_e = U - C + c_e^2 + the largest c_f^2 that is left in each other class takes the place
+   of s for e, and the smaller of s_e and s_f for e with a closure f.
 
 Each closure that is left out, and each pair, lowers s or s_e, so that more can be. What is proven
 is about maps with TLS(X) <= U; a closure that none of them keeps is wrong if the right map is one
@@ -170,7 +170,6 @@ class _Search:
     not suffice for a proof.
     """
 
-    problem: PGOProblem
     known: BoolArray
     cycles: CycleBounds
     costs: ClosureCosts
@@ -204,7 +203,6 @@ class _Search:
         chains = Chains.of(graph, known)
         cycles = CycleBounds(ChainSums(chains, *precisions_below(problem)))
         return cls(
-            problem,
             known,
             cycles,
             ClosureCosts(problem, known, cycles.sums),
@@ -270,7 +268,7 @@ class _Search:
             self.pairs = None if self.pairs is None else self.pairs[right]
 
     def _costs_beside(self) -> Array:
-        """s_e, (k,): U - C and the largest c_e^2 that each class has beside a closure."""
+        """s_e, (k,): U - C, c_e^2, and the largest c_f^2 of each other class that may go with e."""
         in_order = np.argsort(self.class_of, kind="stable")
         begins = np.flatnonzero(np.diff(self.class_of[in_order], prepend=-1))
         beside = np.where(self.is_inconsistent(), 0.0, self.thresholds)[:, in_order]
@@ -301,16 +299,16 @@ class _Search:
     def join_classes(self, effort: _Effort | None = None) -> None:
         """Step 2: classes of inconsistent closures, if they are better than those there are.
 
-        Closures go to the first class that they are inconsistent with: those that the answer keeps
-        first, then those that are consistent with the most others. With an effort pairs that are
-        hopeful are tried, up to a number.
+        A closure goes to the first class with every member of which it is inconsistent: those that
+        the answer keeps first, then those that are consistent with the most others. With an effort
+        pairs that are hopeful are tried, up to a number.
         """
         if self.pairs is None:
             return
         inconsistent = self.is_inconsistent()
         may_join = inconsistent if effort is None else inconsistent | self._is_hopeful(effort)
         k = len(self.edges)
-        takes = np.ones((k, k), dtype=bool)  # of every class and closure
+        takes = np.ones((k, k), dtype=bool)  # whether a class may take a closure
         classes: list[list[int]] = []
         class_of = np.zeros(k, dtype=np.int64)
         most_tried = len(self.tried) + _MOST_PROOFS
@@ -318,7 +316,7 @@ class _Search:
             for q in np.flatnonzero(takes[: len(classes), e]).tolist():
                 if self._excludes(classes[q], e, effort, most_tried):
                     break
-            else:
+            else:  # no class takes it
                 q = len(classes)
                 classes.append([])
             classes[q].append(e)
@@ -340,14 +338,16 @@ class _Search:
     ) -> bool:
         """Whether closures are inconsistent with another; the hardest are tried first."""
         assert self.pairs is not None
-        s = np.minimum(self.most_cost[e], self.most_cost[members])
-        ratio = self.pairs.bound[e, members] / np.maximum(s, _LEAST)
+        others = np.array(members)
+        s = np.minimum(self.most_cost[e], self.most_cost[others])
+        is_open = self.pairs.bound[e, others] <= s
+        others = others[is_open]
+        s = s[is_open]
+        ratio = self.pairs.bound[e, others] / np.maximum(s, _LEAST)
         for place in np.argsort(ratio, kind="stable").tolist():
-            if self.pairs.bound[e, members[place]] > s[place]:
-                return True
             if effort is None or len(self.tried) >= most_tried:
                 return False
-            f = members[place]
+            f = int(others[place])
             bound = max(self.pairs.bound[e, f], self._prove((e, f), s[place], effort))
             self.pairs.bound[e, f] = self.pairs.bound[f, e] = bound
             if bound <= s[place]:
@@ -408,10 +408,6 @@ def _pair_distances(chains: Chains, edges: IntArray) -> Array:
     distances = np.zeros((k, k))
     whole = np.flatnonzero(is_whole(chains.graph)[edges])
     closures = chains.closures(edges[whole])
-    a, b = np.triu_indices(len(whole), 1)
-    in_first = chains.chain[closures.i[a]] == chains.chain[closures.i[b]]
-    in_second = chains.chain[closures.j[a]] == chains.chain[closures.j[b]]
-    a = a[in_first & in_second]
-    b = b[in_first & in_second]
+    a, b = chains.pairs(closures)
     distances[whole[a], whole[b]] = cycle_distances(closures, chains.covariance, a, b)
     return distances + distances.T

@@ -7,7 +7,7 @@ import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS
 from hypothesis import given, settings, strategies as st
-from networks import KEY, Network
+from networks import KEY, Network, robots_with_files
 from robots import Recording
 from wrong_edges import spoiled
 
@@ -116,11 +116,7 @@ def test_what_robots_with_files_cannot_judge_is_refused() -> None:
 def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_path: Path) -> None:
     pytest.importorskip("greenlet")
     graph = world(2, 2, "random", tmp_path)
-    names = ["a", "b", "c"]
-    robots = {}
-    for k, name in enumerate(names):
-        robots[name] = solvers.Robot(name, names, KEY, robust=solvers.PCM(), retry=0.3)
-        robots[name].read(tmp_path / f"{k}.g2o")
+    robots = robots_with_files(tmp_path, 3, robust=solvers.PCM(), retry=0.3)
     network = Network(robots, np.random.default_rng(0), lost=0.2)
     network.run(100.0)
     kept = consistent(graph)
@@ -135,4 +131,4 @@ def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_pa
         assert not robot.is_certified  # nobody has checked the edges that are kept
         assert robot.outcome.robust.startswith(f"{num_wrong} of {graph.num_edges} edges left out")
     with pytest.raises(SettingError, match=r"other known edges need sharing=Sharing\.MEASUREMENTS"):
-        solvers.Robot("a", names, KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))
+        solvers.Robot("a", list(robots), KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))

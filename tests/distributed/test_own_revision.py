@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from networks import KEY, Network
+from networks import Network, robots_with_files
 from wrong_edges import spoiled
 
 import pgo_models as pgo
@@ -77,10 +77,10 @@ def test_edges_that_leave_poses_apart_are_not_taken(
     agreeing = solvers.solve_folder(tmp_path / "in", robust=solvers.PCM(), trust_folder=True)
     with_edges = own_revision.OpenedFiles.with_edges
 
-    def apart(opened, borders, num_rejected, folder):
+    def apart(opened, borders, num_rejected):
         if num_rejected != agreeing.num_rejected and num_rejected > 0:
             raise GraphError("apart")
-        return with_edges(opened, borders, num_rejected, folder)
+        return with_edges(opened, borders, num_rejected)
 
     monkeypatch.setattr(own_revision.OpenedFiles, "with_edges", apart)
     solution = solvers.solve_folder(tmp_path / "in", robust=solvers.GNC(), trust_folder=True)
@@ -120,11 +120,7 @@ def test_a_team_that_keeps_its_measurements_does_the_same(tmp_path: Path) -> Non
     pytest.importorskip("greenlet")
     world_in_files(tmp_path, 0, 2, "random", 0.3)
     folder = solvers.solve_folder(tmp_path, robust=solvers.GNC(), trust_folder=True)
-    names = ["a", "b", "c", "d"]
-    robots = {}
-    for k, name in enumerate(names):
-        robots[name] = solvers.Robot(name, names, KEY, robust=solvers.GNC(), retry=0.3)
-        robots[name].read(tmp_path / f"{k}.g2o")
+    robots = robots_with_files(tmp_path, 4, robust=solvers.GNC(), retry=0.3)
     network = Network(robots, np.random.default_rng(0), lost=0.1)
     network.run(300.0)
     for robot in robots.values():
