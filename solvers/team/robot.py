@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pgo_models.errors import PGOError, SettingError, door, extra_module
+from pgo_models.errors import EngineError, PGOError, SettingError, door, extra_module
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -52,6 +52,8 @@ from solvers.team.wire import WireError, opened, packed, records_of_rooms, seale
 
 PATIENCE = 10.0  # seconds
 RETRY = 1.0
+# Patiences after which a robot that is there, and has not answered, is waited for no more.
+_MOST_PATIENCES = 10.0
 # Share of its patience after which a robot says again that it is there.
 _SHARE_OF_PATIENCE = 0.25
 _FEWEST_KEY_BYTES = 16
@@ -245,6 +247,7 @@ class Robot:
         self._sought_at = -np.inf
         self._said_revision = -1
         self._sent_at: dict[str, float] = {}  # when the last ask or outcome was sent to each
+        self._waits_since: float | None = None  # for answers to the orders under way
         self._term = Term(0, "")
         self._part: _Part | None = None
         self._drive: Drive | None = None
@@ -648,15 +651,39 @@ class Robot:
         self._after_step(now)
 
     def _go_on_driving(self, now: float, awake: tuple[str, ...]) -> None:
-        """Ask again where no answer came, and give up where a robot has gone."""
+        """Ask again where no answer came, and give up where a robot has gone.
+
+        A robot that is there and does not answer, as one that cannot read the order, ends the
+        solve with an error.
+        """
         assert self._drive is not None
         if not set(self._drive.needed) <= set(awake):
             self._give_up()
+            return
+        if self._waits_since is None:  # a step may have taken longer than any patience
+            self._waits_since = now
+        if now - self._waits_since > _MOST_PATIENCES * self._patience:
+            self._end_without_answers(now)
             return
         for name, ask in self._drive.waiting.items():
             if now - self._sent_at.get(name, -np.inf) >= self.retry:
                 self._sent_at[name] = now
                 self._send(name, ask, Priority.URGENT)
+
+    def _end_without_answers(self, now: float) -> None:
+        """End the solve with an error in place of the answers that are missing."""
+        assert self._drive is not None
+        assert self._waits_since is not None
+        seconds = now - self._waits_since
+        error = error_as_message(
+            EngineError(
+                f"it is there, and has not answered for {seconds:.0f} seconds; "
+                "see whether all robots have the same version, and what their ledgers have dropped"
+            )
+        )
+        for name, ask in list(self._drive.waiting.items()):
+            self._drive.take(name, Reply(ask.term, ask.call, self._revisions[name], None, error))
+        self._after_step(now)
 
     def _take_reply(self, sender: str, reply: Reply, now: float) -> None:
         if self._drive is not None and reply.term == self._drive.term:
@@ -671,6 +698,7 @@ class Robot:
         """Send what the page of the solve asks for, or its outcome if it has ended."""
         drive = self._drive
         assert drive is not None
+        self._waits_since = None
         for name, ask in drive.waiting.items():
             self._sent_at[name] = now
             self._send(name, ask, Priority.URGENT)
