@@ -95,21 +95,64 @@ class Marginals(ReadOnly):
         block = columns[chosen].reshape(k * p, k * p)
         return 0.5 * (block + block.T)
 
+    def joint_of_pairs(self, i: IntArray, j: IntArray) -> Array:
+        """Return the joint covariances of many pairs of poses, by selected inversion.
+
+        The factor has the fill of an edge between the poses of each pair.
+
+        Parameters
+        ----------
+        i, j : (k,) arrays
+            The first and the second pose of every pair.
+
+        Returns
+        -------
+        (k, 2 p, 2 p) array
+            As `joint` of i and j.
+        """
+        self._check(*np.concatenate([i, j]).tolist())
+        p = self.layout.side // self.layout.num_poses
+        joint = np.zeros((len(i), 2 * p, 2 * p))
+        across = (i != self.anchor) & (j != self.anchor)
+        # The poses but the anchor have the numbers of their unknowns.
+        first, second = (ends[across] - (ends[across] > self.anchor) for ends in (i, j))
+        diagonal, blocks = self._blocks(first, second)
+        joint[:, :p, :p] = diagonal[i]
+        joint[:, p:, p:] = diagonal[j]
+        joint[across, :p, p:] = blocks
+        joint[across, p:, :p] = np.swapaxes(blocks, 1, 2)
+        return joint
+
     @cached_property
     def diagonal(self) -> Array:
         """Covariance of every pose, (n, p, p), by selected inversion."""
-        # A factor of its own, whose memory is freed at the end.
-        L, order = self._factorize().take_apart()
+        none = np.zeros(0, dtype=int)
+        return self._blocks(none, none)[0]
+
+    def _blocks(self, i: IntArray, j: IntArray) -> tuple[Array, Array]:
+        """Covariance of every pose, (n, p, p), and blocks (i, j), (k, p, p), between free poses."""
         num_free = self.layout.num_poses - 1
-        # Rows of L that belong to every pose.
-        pose_rows = np.argsort(order).reshape(num_free, -1)
-        rows, columns = block_entries(pose_rows, pose_rows)
+        pose_rows = np.arange(self.layout.side).reshape(num_free + 1, -1)[:num_free]
+        # Zeros make room for the blocks (i, j) in the factor; sums keep them.
+        rows, columns = (part.ravel() for part in block_entries(pose_rows[i], pose_rows[j]))
+        matrix = self._information.tocoo()
+        data = np.concatenate([matrix.data, np.zeros(2 * len(rows))])
+        places = (
+            np.concatenate([matrix.row, rows, columns]),
+            np.concatenate([matrix.col, columns, rows]),
+        )
+        # A factor of its own, whose memory is freed at the end.
+        L, order = self._factorize(csc_array((data, places), shape=matrix.shape)).take_apart()
+        rows_of_L = np.argsort(order)[pose_rows]
+        every = np.arange(num_free)
+        first, second = rows_of_L[np.append(every, i)], rows_of_L[np.append(every, j)]
+        rows, columns = block_entries(first, second)
         # Entries of the lower triangle; those above the diagonal are equal by symmetry.
-        lower_rows = np.maximum(rows, columns)
-        lower_columns = np.minimum(rows, columns)
-        positions = entry_positions(L, lower_rows, lower_columns)
-        covariances = selected_inverse(L)[positions]
-        return np.insert(covariances, self.anchor, 0.0, axis=0)
+        positions = entry_positions(L, np.maximum(rows, columns), np.minimum(rows, columns))
+        p = pose_rows.shape[1]
+        covariances = selected_inverse(L)[positions].reshape(-1, p, p)
+        diagonal = np.insert(covariances[:num_free], self.anchor, 0.0, axis=0)
+        return diagonal, covariances[num_free:]
 
     @cached_property
     def _information(self) -> csc_array:
@@ -130,11 +173,11 @@ class Marginals(ReadOnly):
     @cached_property
     def _factor(self) -> CholeskyFactor:
         """Factor that `joint` solves with, kept between calls."""
-        return self._factorize()
+        return self._factorize(self._information)
 
-    def _factorize(self) -> CholeskyFactor:
+    def _factorize(self, information: csc_array) -> CholeskyFactor:
         try:
-            return factorize(self._information, self.backend)
+            return factorize(information, self.backend)
         except NotPositiveDefiniteError as error:
             raise NotPositiveDefiniteError(
                 "no covariances, the poses are at no strict minimum; "

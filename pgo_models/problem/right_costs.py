@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy  # and scipy.special when it is used
 
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.edge_groups import EdgeGroups
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import LEAST_SCALED, gaussian_information, scaled_blocks
 from pgo_models.problem.edge_cost import EdgeCost
 
@@ -45,15 +45,14 @@ class RightCosts:
         """Quantiles of the costs of single edges, (m,)."""
         return _quantiles_of_sums(self.sums, quantile)
 
-    def thresholds(self, groups: Sequence[IntArray], quantile: float) -> Array:
+    def thresholds(self, groups: EdgeGroups, quantile: float) -> Array:
         """Quantiles of the costs that groups of right edges have together, (k,).
 
         For k edges with matrices of full rank it is that of chi^2 with k d (d + 1) / 2 degrees of
         freedom. Adding the edges of a group to the right map raises the least cost by no more with
         this probability, however far the map moves.
         """
-        sums = np.array([self.sums[group].sum(axis=0) for group in groups]).reshape(-1, 3)
-        return _quantiles_of_sums(sums, quantile)
+        return _quantiles_of_sums(groups.sums(self.sums), quantile)
 
 
 def _power_sums(w: Array) -> Array:

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import scipy  # and scipy.special when it is used
 
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.robust.distances import FirstOrder
 from solvers.robust.edge_sets import QUANTILE, EdgeSets
 from solvers.robust.revision import Fit, inlier_problem
 
+# Distances that are found together. With more, the fill of wrong closures makes each one slower.
+_TOGETHER = 100
+
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Clusters without the edges kept: their names, edges, and thresholds (k,) of T.
+    """Clusters without the edges kept, and thresholds (k,) of T.
 
     `farthest` (k,) is the edge of every cluster that is farthest from the map to first order,
     `first_order` what knows its distance, `largest` (k,) the quantile of this in chi^2. `order` are
     those that may fit, the one of most promise first.
     """
 
-    names: list[int]
-    groups: list[IntArray]
+    groups: EdgeGroups
     thresholds: Array
     first_order: FirstOrder
     farthest: IntArray
@@ -33,34 +36,30 @@ class Candidates:
     order: IntArray
 
     @classmethod
-    def of(cls, sets: EdgeSets, clusters: Sequence[IntArray], fit: Fit, most: float) -> Candidates:
+    def of(cls, sets: EdgeSets, clusters: EdgeGroups, fit: Fit, most: float) -> Candidates:
         """Rejected parts of clusters, those of `order` within `most` times their thresholds.
 
         That is to first order, and at least. A cluster promises its thresholds in the truncated
         cost, less its T.
         """
-        rejected = [cluster[~fit.kept[cluster]] for cluster in clusters]
-        names = [name for name, cluster in enumerate(rejected) if len(cluster)]
-        groups = [rejected[name] for name in names]
+        groups = clusters.of_edges(~fit.kept)
         thresholds = sets.scale * sets.right_costs.thresholds(groups, QUANTILE)
         first_order = FirstOrder(sets.chains, inlier_problem(sets.problem, fit.kept), fit.poses)
-        sizes = np.array([len(group) for group in groups], dtype=int)
-        quantiles = scipy.special.chdtri(sizes * sets.motion_dimension, 1.0 - QUANTILE)
+        quantiles = scipy.special.chdtri(groups.sizes * sets.motion_dimension, 1.0 - QUANTILE)
         largest = np.asarray(sets.scale * quantiles, dtype=float)
-        farthest, ratio = np.zeros(0, dtype=int), np.zeros(0)
-        if groups:
-            edges = np.concatenate(groups)
-            distances = first_order.least_distances(edges)
-            beginnings = np.cumsum(sizes) - sizes
-            ratio = np.maximum.reduceat(distances, beginnings) / largest
-            by_cluster = np.repeat(np.arange(len(groups)), sizes)
-            last = np.lexsort([distances, by_cluster])[beginnings + sizes - 1]
-            farthest = edges[last]
-        allowed = np.array([sets.allowed[group].sum() for group in groups])
-        order = np.argsort(ratio * thresholds - allowed, kind="stable")
+        distances = first_order.least_distances(groups.edges)
+        last = np.lexsort([distances, groups.group_of])[groups.beginnings + groups.sizes - 1]
+        ratio = distances[last] / largest
+        order = np.argsort(ratio * thresholds - groups.sums(sets.allowed), kind="stable")
         order = order[ratio[order] <= most]
-        return cls(names, groups, thresholds, first_order, farthest, largest, order)
+        return cls(groups, thresholds, first_order, groups.edges[last], largest, order)
 
-    def ratio(self, k: int) -> float:
-        """First-order distance of a cluster's farthest edge, over its quantile."""
-        return self.first_order.distance(int(self.farthest[k])) / float(self.largest[k])
+    def ratios(self, chosen: IntArray) -> Array:
+        """First-order distances of the farthest edges of some, over their quantiles."""
+        return self.first_order.distances(self.farthest[chosen]) / self.largest[chosen]
+
+    def near(self, chosen: IntArray, most: float) -> Iterator[int]:
+        """Those of some that are within `most` times their thresholds to first order."""
+        for first in range(0, len(chosen), _TOGETHER):
+            looked_at = chosen[first : first + _TOGETHER]
+            yield from looked_at[self.ratios(looked_at) <= most].tolist()

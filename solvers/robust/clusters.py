@@ -14,6 +14,7 @@ import numpy as np
 import scipy  # and scipy.special and scipy.spatial when they are used
 
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
+from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from solvers.robust.chains import (
     Chains,
@@ -54,7 +55,7 @@ class ClosurePairs:
         """Closures of a graph, with the chains of known edges."""
         return cls(Chains.of(graph, known), known)
 
-    def clusters(self, scale: float = 1.0) -> list[IntArray]:
+    def clusters(self, scale: float = 1.0) -> EdgeGroups:
         """Edges of every cluster of closures, as the chains are.
 
         Two closures are neighbours if their first ends are at most 12 poses apart, and their second
@@ -67,18 +68,17 @@ class ClosurePairs:
         """
         graph = self.chains.graph
         partial = np.flatnonzero(~self.known & ~is_whole(graph))
-        alone: list[IntArray] = list(partial[:, None])
         tested = self._tested
         if len(tested) == 0:
-            return alone
+            return EdgeGroups.singles(partial)
         dof = graph.d + tangent_dimension(graph.d)
         links = self._links(scale * float(scipy.special.chdtri(dof, 1.0 - _QUANTILE)))
         size = len(tested)
         adjacency = scipy.sparse.csr_array((np.ones(len(links[0])), links), shape=(size, size))
         _, label = scipy.sparse.csgraph.connected_components(adjacency, directed=False)
-        order = np.argsort(label, kind="stable")
-        beginnings = np.flatnonzero(np.diff(label[order])) + 1
-        return [*alone, *np.split(tested[order], beginnings)]
+        edges = np.concatenate([partial, tested[np.argsort(label, kind="stable")]])
+        sizes = np.concatenate([np.ones(len(partial), dtype=int), np.bincount(label)])
+        return EdgeGroups(edges, sizes, np.arange(len(sizes)))
 
     def _links(self, threshold: float) -> tuple[IntArray, IntArray]:
         """Pairs of neighbours that agree, as two arrays of places in `_tested`.

@@ -36,7 +36,7 @@ class FirstOrder:
     poses: Poses
 
     def least_distances(self, edges: IntArray) -> Array:
-        """Lower bounds of the distances, (k,), without a solve for each edge.
+        """Lower bounds of the distances, (k,), without the fill of the edges.
 
         Two upper bounds of the compliance J H^-1 J^T are known: that of the chain between the ends
         alone, and 2 (S_i + S_j), with the marginal covariances S of the ends.
@@ -47,20 +47,21 @@ class FirstOrder:
         distances[whole] = np.maximum(self._along_chain(closures), self._of_map(closures))
         return distances
 
-    def distance(self, edge: int) -> float:
-        """Distance of an edge, by a solve."""
-        if not is_whole(self.chains.graph)[edge] or not self.inliers.has_translations:
-            return 0.0
-        closures = self._closures(np.array([edge]))
-        ends = np.array([closures.i[0], closures.j[0]])
+    def distances(self, edges: IntArray) -> Array:
+        """Distances of edges, (k,), by a factor with the fill of all of them."""
+        distances = np.zeros(len(edges))
+        whole = is_whole(self.chains.graph)[edges]
+        if not (whole.any() and self.inliers.has_translations):
+            return distances
+        closures = self._closures(edges[whole])
         try:
-            joint = self._marginals.joint(*ends.tolist())
+            joint = self._marginals.joint_of_pairs(closures.i, closures.j)
         except NotPositiveDefiniteError:
-            return 0.0
-        first, second = self._in_frame(ends)
-        J = np.concatenate([first, -second], axis=1)
-        compliance = (J @ joint @ J.T)[None]
-        return float(squared_distances(closures.cycle, closures.covariance + compliance)[0])
+            return distances
+        J = np.concatenate([self._in_frame(closures.i), -self._in_frame(closures.j)], axis=2)
+        compliance = J @ joint @ np.swapaxes(J, 1, 2)
+        distances[whole] = squared_distances(closures.cycle, closures.covariance + compliance)
+        return distances
 
     @cached_property
     def _marginals(self) -> Marginals:

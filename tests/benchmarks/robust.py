@@ -357,7 +357,8 @@ def verdict_of(case: Case, limit: float) -> dict[str, Any] | None:
         if found is None:
             return None
         planted = planted_cost(source, problem, found["threshold_scale"])
-    run = judged(found, problem, wrong, pgo.odometry_start(problem.graph))
+    start = first_poses(problem.graph, odometry(problem.graph))
+    run = judged(found, problem, wrong, start)
     return {**run, "ratio": run["cost"] / planted, "quality": min(run["precision"], run["recall"])}
 
 

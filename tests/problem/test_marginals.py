@@ -74,8 +74,11 @@ def test_blocks_and_joints_are_those_of_the_dense_inverse(
     every = np.arange(n)
     picked = rng.integers(0, n, int(rng.integers(1, 5))).tolist()
     joint = dense[picked][:, :, picked].reshape(p * len(picked), -1)
+    i, j = rng.integers(0, n, (2, 5))
+    pairs = [dense[[a, b]][:, :, [a, b]].reshape(2 * p, -1) for a, b in zip(i, j, strict=True)]
     for _ in range(2):  # before and after the factor is used up
         np.testing.assert_allclose(marginals.joint(*picked), joint, rtol=0, atol=allowed)
+        np.testing.assert_allclose(marginals.joint_of_pairs(i, j), pairs, rtol=0, atol=allowed)
         np.testing.assert_allclose(marginals.diagonal, dense[every, :, every], rtol=0, atol=allowed)
     assert not marginals.diagonal[anchor].any()
     assert not marginals.joint(anchor).any()
