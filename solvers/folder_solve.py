@@ -27,9 +27,10 @@ from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
 from solvers.distributed.checkpoint import Journal
 from solvers.distributed.own_files import OpenedFiles, open_files
-from solvers.distributed.own_revision import revised
+from solvers.distributed.own_revision import Pass, revised
 from solvers.distributed.paper import check_paper
 from solvers.distributed.robots.own_file import READ_HERE, RobotFile, write_answer
+from solvers.distributed.robots.own_revision import ComesBack
 from solvers.distributed.robots_with_files import RobotsWithFiles
 from solvers.loop import RunMonitor
 from solvers.network.counted_pool import Count
@@ -195,9 +196,10 @@ def solve_folder(
         pairwise consistency, with one message each way; odometry is known to be right. What agrees
         is kept, and the rest left out, also of the files in `out`. `pairwise_consistent` finds the
         same, but that the distance of two closures depends a little on which comes first. With GNC
-        the robots go on from there by graduated non-convexity on all edges, and take what it keeps
-        where the truncated cost falls. The attempts, clusters and doubts of `solve` take one
-        process that has the graph.
+        the robots begin with the pairs of robots between which most closures agree, go on by
+        graduated non-convexity on the edges near that map, or on all edges where it is not
+        certified, and take what it keeps where the truncated cost falls. The attempts, clusters and
+        doubts of `solve` take one process that has the graph.
     robots : Robots, optional
         Where the robots run, and the memory of their driver; who owns which poses is in the files.
     out : Path or str, optional
@@ -265,9 +267,8 @@ class FilesOfRobots:
     ) -> FolderSolution:
         """The solution, which robots write to the folder `out`, if it is given."""
         stages: list[Stage] = []
-        pcm = PCM(quantile=self.robust.quantile) if isinstance(self.robust, GNC) else self.robust
         opened = open_files(
-            self.files, self.engine, self.memory, self.weighting, self.trust_folder, pcm
+            self.files, self.engine, self.memory, self.weighting, self.trust_folder, self.robust
         )
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         journal = Journal(None, {}, stages)
@@ -320,14 +321,23 @@ class _Answer:
 def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
     """The answer after passes of GNC, each from the map of the one before.
 
-    They end with one that began at a certified map, or has not lowered the truncated cost.
+    From a certified map the edges near it come back, and the passes end. Else the first pass has
+    those that agree pairwise, later ones have all. A later pass that has not lowered the truncated
+    cost is the last.
     """
-    for _ in range(_MOST_PASSES):
-        has_map = answer.best.proof.is_certified
+    for number in range(_MOST_PASSES):
         if answer.best.is_out_of_time:
             break
         place = answer.place
-        revision = revised(answer.opened, gnc, has_map, place.monitor)
+        has_map = answer.best.proof.is_certified
+        is_first = number == 0
+        comes_back = ComesBack.EVERYTHING
+        if gnc.consistent or (is_first and not has_map):
+            comes_back = ComesBack.AGREEING
+        elif has_map:
+            comes_back = ComesBack.NEAR
+        job = Pass(comes_back, has_map, is_first)
+        revision = revised(answer.opened, gnc, job, place.monitor)
         place.stages.append(revision.stage)
         start = "poses of GNC" if revision.is_better else "poses found before GNC"
         place = replace(place, driver=revision.opened.driver, kept=[], begins_at=start)
@@ -337,10 +347,9 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
             place=place,
             best=solve_at(place, replace(pipeline, soc=None), None),
         )
-        if not revision.is_better:
-            break
-        answer = replace(answer, rejected_by="the map of the others contradicts")
-        if has_map:
+        if revision.is_better:
+            answer = replace(answer, rejected_by="the map of the others contradicts")
+        if has_map or not (revision.is_better or is_first):
             break
     return answer
 

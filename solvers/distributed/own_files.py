@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.pose_graph import IntArray, edge_counts
+from pgo_models.graphs.pose_graph import IntArray, edge_counts, least_tree
 from pgo_models.graphs.written_digits import most_digits
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import Driver
@@ -30,7 +30,13 @@ from solvers.distributed.elimination_choice import (
     may_leave_poses,
     positions_in_cover,
 )
-from solvers.distributed.robots.own_consistency import keep_consistent, tell_trajectories
+from solvers.distributed.robots.own_consistency import (
+    AgreeingCounts,
+    ConsistentPart,
+    judge_closures,
+    keep_agreeing,
+    tell_trajectories,
+)
 from solvers.distributed.robots.own_file import (
     READ_HERE,
     Border,
@@ -50,6 +56,7 @@ from solvers.distributed.robots.own_file import (
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
 from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC
 from solvers.soc.subgraph import RobotSummary, place_poses
 
 SOLVE_PARTS = "solve each part in a folder of its own"
@@ -96,6 +103,10 @@ class OpenedFiles:
         )
         return replace(self, driver=driver, sizes=sizes, num_rejected=num_rejected)
 
+    def with_parts(self, parts: Sequence[ConsistentPart]) -> OpenedFiles:
+        """The same robots with what they report to be left."""
+        return self.with_edges(*borders_of(parts))
+
 
 def open_files(
     files: Sequence[RobotFile],
@@ -103,11 +114,12 @@ def open_files(
     memory: float,
     weighting: Weighting,
     trust_folder: bool = False,
-    pcm: PCM | None = None,
+    robust: GNC | PCM | None = None,
 ) -> OpenedFiles:
     """Have robots read these files, and agree on the cost that `weighting` stands for.
 
-    With `pcm` they leave out edges that do not agree pairwise.
+    In a robust solve they leave out edges that do not agree pairwise. GNC, which takes all edges
+    back, begins with those of the `strongest_neighbours`, where they join all poses.
 
     Raises a FileFormatError for a file that cannot be read or has no pose of its own, and, unless
     the folder is trusted, for files that speak against being of one graph. Raises a GraphError if
@@ -125,14 +137,23 @@ def open_files(
         has_indefinite = any(border.has_indefinite for border in borders)
         if weighting is Weighting.OWN:
             weighting = _own_weighting(borders)
-        num_rejected = 0
-        if pcm is not None:
-            borders, num_rejected = _consistent_borders(network, pcm)
         folder = files[0][1].parent
-        driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
-        return OpenedFiles(
-            driver, sizes, folder, weighting, has_indefinite, numbered.num_absent, num_rejected
-        )
+
+        def opened(borders: Sequence[Border], num_rejected: int = 0) -> OpenedFiles:
+            driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
+            return OpenedFiles(
+                driver, sizes, folder, weighting, has_indefinite, numbered.num_absent, num_rejected
+            )
+
+        if robust is None:
+            return opened(borders)
+        agreements = _agreements(network, robust.quantile)
+        if isinstance(robust, GNC) and not robust.consistent:
+            try:
+                return opened(*_agreeing(network, strongest_neighbours(agreements)))
+            except GraphError:  # poses of a robot need what is left out
+                pass
+        return opened(*_agreeing(network, [each.neighbours for each in agreements]))
     except BaseException:  # also Ctrl-C: no robot stays behind
         network.workers.close()
         raise
@@ -161,11 +182,36 @@ def _placed(
     return Driver(summaries, num_poses, lambda: network, memory), sizes
 
 
-def _consistent_borders(network: CountedPool, pcm: PCM) -> tuple[list[Border], int]:
-    """Have every two robots judge the edges between them; borders, and how many edges go."""
+def _agreements(network: CountedPool, quantile: float) -> list[AgreeingCounts]:
+    """Have every two robots judge the edges between them."""
     told = network.ask(tell_trajectories, [None] * network.ledger.num_robots, Count.PIGGYBACKED)
-    requests = [(trajectories, pcm.quantile) for trajectories in network.exchange(told)]
-    parts = network.ask(keep_consistent, requests, Count.PIGGYBACKED)
+    requests = [(trajectories, quantile) for trajectories in network.exchange(told)]
+    return network.ask(judge_closures, requests, Count.PIGGYBACKED)
+
+
+def strongest_neighbours(agreements: Sequence[AgreeingCounts]) -> list[IntArray]:
+    """Neighbours of every robot with whom most edges agree.
+
+    A wrong edge agrees with itself, and so two robots that have no right ones keep some. The pairs
+    of robots here are those of a spanning tree with the largest numbers of edges that agree, and
+    those with as many as the weakest of the tree.
+    """
+    num_robots = len(agreements)
+    a = np.repeat(np.arange(num_robots), [len(each.neighbours) for each in agreements])
+    b = np.concatenate([each.neighbours for each in agreements])
+    num = np.concatenate([each.num_agreeing for each in agreements])
+    tree = least_tree(a, b, num_robots, -num)
+    weakest = num[tree].min(initial=num.max(initial=0))
+    return [b[(a == robot) & (num >= weakest)] for robot in range(num_robots)]
+
+
+def _agreeing(network: CountedPool, neighbours: list[IntArray]) -> tuple[list[Border], int]:
+    """Have robots keep the edges to these neighbours that agree; borders, and how many go."""
+    return borders_of(network.ask(keep_agreeing, neighbours, Count.ROUND))
+
+
+def borders_of(parts: Sequence[ConsistentPart]) -> tuple[list[Border], int]:
+    """Borders of what is left, and how many edges are not."""
     return [part.border for part in parts], sum(part.num_rejected for part in parts)
 
 

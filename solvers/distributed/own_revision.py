@@ -1,15 +1,17 @@
 """Graduated non-convexity by robots with own files, from what pairwise consistency has found.
 
-The robots hold all edges again, each with the threshold of its cost, at the poses that were found
-with the edges that agree pairwise. From there they run the algorithm of `solvers.robust.gnc`. The
-edges within their thresholds at the end are kept if the truncated cost of all edges has fallen, and
-those that robots need to hold together; else those that agree pairwise.
+The robots hold more edges again, each with the threshold of its cost, at the poses that were found
+without them. From there they run the algorithm of `solvers.robust.gnc`. The edges within their
+thresholds at the end are kept if the truncated cost has fallen, and those that robots need to hold
+together; else those that were kept before, or agree pairwise. Where the poses are of a certified
+map, the edges that come back are those near it: the others begin a short schedule without weight,
+and would join all robots to each other.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,14 +23,18 @@ from solvers.distributed.driver import Driver
 from solvers.distributed.own_files import OpenedFiles
 from solvers.distributed.robots import current_poses
 from solvers.distributed.robots.own_revision import (
+    ComesBack,
     Links,
+    TakenBack,
+    go_back,
     go_to_solved,
+    judge_near,
     keep,
-    return_to_consistent,
     take_back,
     tell_cover,
     tell_kept,
     tell_links,
+    tell_solved,
 )
 from solvers.distributed.robots.reweighting import sum_truncated
 from solvers.distributed.robust import SharedGNC, stage_of
@@ -48,35 +54,43 @@ class Revision:
     is_better: bool
 
 
-def revised(opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor) -> Revision:
-    """Judge all edges by a run from the poses that the robots keep.
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """A run that judges the edges that come back.
 
-    With `has_map` these are of a map, which most edges fit, and one short schedule will do.
+    From poses of a map, which most edges fit, one short schedule will do.
     """
+
+    comes_back: ComesBack
+    has_map: bool
+    is_first: bool
+
+
+def revised(opened: OpenedFiles, gnc: GNC, job: Pass, monitor: RunMonitor) -> Revision:
+    """Judge edges by a run from the poses that the robots keep."""
     network = opened.driver.network
     objective = opened.driver.current.objective
     try:
-        stage, kept = _judged(opened, gnc, has_map, monitor)
+        stage, kept = _judged(opened, gnc, job, monitor)
     except FAILURES:
         stage, kept = Stage.failure("GNC", objective), None
     if kept is not None:
         return Revision(kept, stage, is_better=True)
     nothing = [None] * network.ledger.num_robots
-    borders = network.ask(return_to_consistent, nothing, Count.PIGGYBACKED)
-    return Revision(opened.with_edges(borders, opened.num_rejected), stage, is_better=False)
+    parts = network.ask(go_back, nothing, Count.PIGGYBACKED)
+    return Revision(opened.with_parts(parts), stage, is_better=False)
 
 
 def _judged(
-    opened: OpenedFiles, gnc: GNC, has_map: bool, monitor: RunMonitor
+    opened: OpenedFiles, gnc: GNC, job: Pass, monitor: RunMonitor
 ) -> tuple[Stage, OpenedFiles | None]:
     """What a run did, and the robots with the edges that it keeps, if it has found a better map."""
     network = opened.driver.network
-    requests = [(opened.weighting, gnc.quantile, not gnc.consistent)] * network.ledger.num_robots
-    borders = network.ask(take_back, requests, Count.PIGGYBACKED)
+    borders = network.ask(take_back, _taken_back(opened, gnc, job), Count.PIGGYBACKED)
     driver = opened.with_edges(borders, 0).driver
     go_to_poses_found(driver)
     before = _truncated_cost(driver)
-    finished = monitor.run(SharedGNC.of_files(gnc, driver, has_map), driver)
+    finished = monitor.run(SharedGNC.of_files(gnc, driver, job.has_map), driver)
     driver.return_to(finished.state.edges.newton.moment)
     stage = stage_of(gnc, finished)
     if finished.status in BROKEN_OFF or not _truncated_cost(driver) < before:
@@ -86,11 +100,27 @@ def _judged(
     links = network.ask(tell_links, covers, Count.ROUND)
     told = network.ask(tell_kept, holding(links), Count.PIGGYBACKED)
     parts = network.ask(keep, network.exchange(told), Count.PIGGYBACKED)
-    num_rejected = sum(part.num_rejected for part in parts)
     try:
-        return stage, opened.with_edges([part.border for part in parts], num_rejected)
+        return stage, opened.with_parts(parts)
     except GraphError:  # they leave poses of a robot apart
         return stage, None
+
+
+def _taken_back(opened: OpenedFiles, gnc: GNC, job: Pass) -> list[TakenBack]:
+    """What every robot takes back; neighbours agree on what is near the map."""
+    network = opened.driver.network
+    num_robots = network.ledger.num_robots
+    near: Sequence[Mapping[int, BoolArray]] = [{}] * num_robots
+    if job.comes_back is ComesBack.NEAR:
+        told = network.ask(tell_solved, [None] * num_robots, Count.PIGGYBACKED)
+        requests = [
+            (received, opened.weighting, gnc.quantile) for received in network.exchange(told)
+        ]
+        near = network.exchange(network.ask(judge_near, requests, Count.PIGGYBACKED))
+    return [
+        TakenBack(job.comes_back, opened.weighting, gnc.quantile, job.is_first, received)
+        for received in near
+    ]
 
 
 def holding(links: Sequence[Links]) -> list[BoolArray]:

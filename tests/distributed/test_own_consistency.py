@@ -56,7 +56,9 @@ def test_the_robots_keep_what_pairwise_consistency_of_the_whole_graph_keeps(
     expected = consistent(graph)
     files = [(k, folder / f"{k}.g2o") for k in range(graph.num_robots)]
     engine = Recording()
-    opened = open_files(files, engine, 4e9, pgo.Weighting.OWN, trust_folder=True, pcm=solvers.PCM())
+    opened = open_files(
+        files, engine, 4e9, pgo.Weighting.OWN, trust_folder=True, robust=solvers.PCM()
+    )
     parts = [agent.known(PlacedFile).joined.graph for agent in engine.agents]
     kept = set().union(*(edges_of(part) for part in parts))
     assert kept == edges_of(graph.without_edges(~expected))

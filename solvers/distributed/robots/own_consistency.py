@@ -2,8 +2,9 @@
 
 A robot tells each neighbour how its odometry leads from one pose to the next of those that closures
 between the two touch: one message each way. Then both know the cycles of all closures between them,
-and keep the same largest set that agrees (`solvers.robust.consistency`). The closures of a robot
-with itself it judges alone.
+and find the same largest set that agrees (`solvers.robust.consistency`). The closures of a robot
+with itself it judges alone. Each tells the driver how many agree with those of every neighbour, and
+is told of which neighbours they stay.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ import numpy as np
 
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from solvers.distributed.robots.own_file import Border, FileAgent, JoinedFile, border_of
+from solvers.distributed.robots.own_file import (
+    Border,
+    CostedFile,
+    FileAgent,
+    JoinedFile,
+    PlacedFile,
+    border_of,
+)
 from solvers.robust.chains import (
     Chains,
     carried,
@@ -51,6 +59,14 @@ class Trajectory:
 
 
 @dataclass(frozen=True, eq=False)
+class AgreeingCounts:
+    """Neighbours of a robot, (k,), and how many edges between it and each agree, (k,)."""
+
+    neighbours: IntArray
+    num_agreeing: IntArray
+
+
+@dataclass(frozen=True, eq=False)
 class ConsistentPart:
     """What a robot reports of its edges that are left, and how many are not."""
 
@@ -69,7 +85,7 @@ def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
     chains = Chains.of(graph, own_odometry(graph, is_own))
     R, t = chains.motion
     told = {}
-    for other in np.unique(joined.owners[~is_own]).tolist():
+    for other in neighbours_of(joined, robot):
         between = edges_between(joined, robot, other)
         ends = np.concatenate([graph.i[between], graph.j[between]])
         poses = np.unique(ends[is_own[ends]])
@@ -84,10 +100,10 @@ def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
     return told
 
 
-def keep_consistent(
+def judge_closures(
     agent: FileAgent, request: tuple[Mapping[int, Trajectory], float]
-) -> ConsistentPart:
-    """Order: leave out what does not agree, with the neighbours' trajectories and a quantile."""
+) -> AgreeingCounts:
+    """Order: find what agrees, with the neighbours' trajectories and a quantile."""
     received, quantile = request
     joined = agent.known(JoinedFile)
     robot = agent.robot
@@ -100,22 +116,68 @@ def keep_consistent(
         odometry = own_odometry(graph, is_own)[among_own]
         kept[among_own] = pairwise_consistent(own_graph, odometry, quantile)
     own = _trajectories(robot, joined)
+    num_agreeing = []
     for other, theirs in received.items():
         between = edges_between(joined, robot, other)
         known = {robot: own[other], other: theirs}
         kept[between] = _agree(joined, between, [known[k] for k in sorted(known)], quantile)
-    return leave_out(agent, joined, kept)
+        num_agreeing.append(int(kept[between].sum()))
+    agent.record = replace(joined, agrees=kept)
+    return AgreeingCounts(np.array(list(received), dtype=int), np.array(num_agreeing, dtype=int))
 
 
-def leave_out(agent: FileAgent, joined: JoinedFile, kept: BoolArray) -> ConsistentPart:
-    """Go on with the edges that are kept, (m_a,)."""
-    robot = agent.robot
-    graph = joined.graph
-    owner_who_counts = joined.owners[np.stack([graph.i, graph.j])].min(axis=0)
-    num_rejected = int((~kept & (owner_who_counts == robot)).sum())
-    left = _without(joined, robot, kept)
+def keep_agreeing(agent: FileAgent, neighbours: IntArray) -> ConsistentPart:
+    """Order: leave out what does not agree, and all edges to other robots than these neighbours.
+
+    It may be given again.
+    """
+    everything = everything_of(joined_of(agent))
+    assert everything.agrees is not None
+    stays = np.isin(everything.owners, [agent.robot, *neighbours.tolist()])
+    graph = everything.graph
+    kept = everything.agrees & stays[graph.i] & stays[graph.j]
+    return go_on_with(agent, with_edges(everything, agent.robot, kept))
+
+
+def joined_of(agent: FileAgent) -> JoinedFile:
+    """What is joined of the robot, whether it has a cost and a place yet or not."""
+    record = agent.record
+    assert isinstance(record, JoinedFile | CostedFile | PlacedFile)
+    return record if isinstance(record, JoinedFile) else record.joined
+
+
+def everything_of(joined: JoinedFile) -> JoinedFile:
+    """What was joined at first."""
+    return joined if joined.everything is None else joined.everything
+
+
+def with_edges(everything: JoinedFile, robot: int, kept: BoolArray) -> JoinedFile:
+    """What is joined by the edges kept, (m_a,), with all own poses."""
+    graph = everything.graph
+    is_used = everything.owners == robot
+    is_used[graph.i[kept]] = True
+    is_used[graph.j[kept]] = True
+    poses = np.flatnonzero(is_used)
+    ids = graph.pose_ids
+    return replace(
+        everything,
+        rejected=np.stack([ids[graph.i[~kept]], ids[graph.j[~kept]]], axis=1),
+        graph=graph.without_edges(~kept).subgraph(poses),
+        numbers=everything.numbers[poses],
+        owners=everything.owners[poses],
+        everything=everything,
+        edges=np.flatnonzero(kept),
+    )
+
+
+def go_on_with(agent: FileAgent, left: JoinedFile) -> ConsistentPart:
+    """Go on with what is left, and report it."""
+    everything = everything_of(left)
+    graph = everything.graph
+    is_counted = everything.owners[np.stack([graph.i, graph.j])].min(axis=0) == agent.robot
+    is_counted[left.edges] = False
     agent.record = left
-    return ConsistentPart(border_of(robot, left), num_rejected)
+    return ConsistentPart(border_of(agent.robot, left), int(is_counted.sum()))
 
 
 def _agree(
@@ -147,6 +209,11 @@ def own_odometry(graph: PoseGraph, is_own: BoolArray) -> BoolArray:
     return np.asarray(are_neighbours & is_own[graph.i] & is_own[graph.j])
 
 
+def neighbours_of(joined: JoinedFile, robot: int) -> list[int]:
+    """Other robots at the far ends of a robot's edges."""
+    return [int(other) for other in np.unique(joined.owners) if other != robot]
+
+
 def edges_between(joined: JoinedFile, robot: int, other: int) -> IntArray:
     """Edges between poses of the robot and of another one, in order."""
     owners = joined.owners[np.stack([joined.graph.i, joined.graph.j])]
@@ -163,22 +230,3 @@ def _in_order(joined: JoinedFile, edges: IntArray) -> IntArray:
     ends = joined.numbers[graph.i[edges]], joined.numbers[graph.j[edges]]
     turns = graph.R_ij[edges].reshape(len(edges), -1)
     return edges[np.lexsort([*graph.t_ij[edges].T, *turns.T, *ends])]
-
-
-def _without(joined: JoinedFile, robot: int, kept: BoolArray) -> JoinedFile:
-    """What is joined by the edges that are kept, with all own poses."""
-    graph = joined.graph
-    is_used = joined.owners == robot
-    is_used[graph.i[kept]] = True
-    is_used[graph.j[kept]] = True
-    poses = np.flatnonzero(is_used)
-    ids = graph.pose_ids
-    return replace(
-        joined,
-        rejected=np.stack([ids[graph.i[~kept]], ids[graph.j[~kept]]], axis=1),
-        graph=graph.without_edges(~kept).subgraph(poses),
-        numbers=joined.numbers[poses],
-        owners=joined.owners[poses],
-        everything=joined,
-        thresholds=None,
-    )

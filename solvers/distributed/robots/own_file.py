@@ -176,9 +176,10 @@ class JoinedFile:
     """After `join_neighbours`: its graph, of its own poses and those at the far end of its edges.
 
     Numbers in the whole graph, (n_a,), ascend. Of edges that were left out since it has the ids of
-    the ends, (k, 2), and `everything` is what was joined before. In a robust solve `consistent` is
-    what agrees pairwise, `thresholds`, (m_a,), are those of the edges, and `solved` poses of its
-    own that were found.
+    the ends, (k, 2); `everything` is what was joined at first, of which `edges`, (m_a,), are left.
+    In a robust solve `agrees` and `near` say which edges of everything agree pairwise, and are near
+    the map, `before` is what to go back to, `thresholds`, (m_a,), are those of the edges, and
+    `solved` poses of its own that were found.
     """
 
     graph: PoseGraph
@@ -187,7 +188,10 @@ class JoinedFile:
     given: Array  # as in `Answer`
     rejected: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     everything: JoinedFile | None = None
-    consistent: JoinedFile | None = None
+    edges: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    agrees: BoolArray | None = None
+    near: BoolArray | None = None
+    before: JoinedFile | None = None
     thresholds: Array | None = None
     solved: Poses | None = None
 
