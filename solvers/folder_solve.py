@@ -44,13 +44,11 @@ from solvers.result import Record, Stage, Status
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.robust_solves.attempts import TIGHT_SCALES, with_tight_thresholds
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
-
-# Passes of GNC; two were enough on all graphs tried.
-_MOST_PASSES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,36 +320,52 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
     """The answer after passes of GNC, each from the map of the one before.
 
     From a certified map the edges near it come back, and the passes end. Else the first pass has
-    those that agree pairwise, later ones have all. A later pass that has not lowered the truncated
-    cost is the last.
+    those that agree pairwise, and later ones have all, at last with tight thresholds. Maps that no
+    pass follows have all steps of the pipeline.
     """
-    for number in range(_MOST_PASSES):
-        if answer.best.is_out_of_time:
-            break
-        place = answer.place
+    newton_alone = pipeline.with_newton_alone(pipeline.newton)
+    scale = answer.opened.threshold_scale
+    settings = gnc if scale == 1.0 else with_tight_thresholds(gnc, scale)
+    tight = [with_tight_thresholds(settings, factor) for factor in TIGHT_SCALES]
+    without_map = [
+        (settings, ComesBack.AGREEING),
+        *((each, ComesBack.EVERYTHING) for each in (settings, *tight)),
+    ]
+    is_first = True
+    while not answer.best.is_out_of_time:
         has_map = answer.best.proof.is_certified
-        is_first = number == 0
-        comes_back = ComesBack.EVERYTHING
-        if gnc.consistent or (is_first and not has_map):
+        comes_back = ComesBack.NEAR
+        if not has_map:
+            if not without_map:
+                break
+            settings, comes_back = without_map.pop(0)
+        if gnc.consistent:
             comes_back = ComesBack.AGREEING
-        elif has_map:
-            comes_back = ComesBack.NEAR
-        job = Pass(comes_back, has_map, is_first)
-        revision = revised(answer.opened, gnc, job, place.monitor)
-        place.stages.append(revision.stage)
-        start = "poses of GNC" if revision.is_better else "poses found before GNC"
-        place = replace(place, driver=revision.opened.driver, kept=[], begins_at=start)
-        answer = replace(
-            answer,
-            opened=revision.opened,
-            place=place,
-            best=solve_at(place, replace(pipeline, soc=None), None),
-        )
-        if revision.is_better:
-            answer = replace(answer, rejected_by="the map of the others contradicts")
-        if has_map or not (revision.is_better or is_first):
+        answer = _after_pass(answer, Pass(settings, comes_back, has_map, is_first), newton_alone)
+        if has_map:
             break
+        is_first = False
+    if not (answer.best.proof.is_certified or answer.best.is_out_of_time):
+        answer = _solved_from(answer, "poses of GNC", replace(pipeline, soc=None))
     return answer
+
+
+def _after_pass(answer: _Answer, job: Pass, pipeline: Pipeline) -> _Answer:
+    """The answer after a pass, with the edges before where that finds nothing better."""
+    revision = revised(answer.opened, job, answer.place.monitor)
+    answer.place.stages.append(revision.stage)
+    place = replace(answer.place, driver=revision.opened.driver)
+    start = "poses of GNC" if revision.is_better else "poses found before GNC"
+    answer = replace(answer, opened=revision.opened, place=place)
+    if revision.is_better:
+        answer = replace(answer, rejected_by="the map of the others contradicts")
+    return _solved_from(answer, start, pipeline)
+
+
+def _solved_from(answer: _Answer, start: str, pipeline: Pipeline) -> _Answer:
+    """The answer solved for from poses that the robots have found, the start of this name."""
+    place = replace(answer.place, kept=[], begins_at=start)
+    return replace(answer, place=place, best=solve_at(place, pipeline, None))
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:

@@ -35,6 +35,7 @@ from solvers.distributed.robots.own_consistency import (
     ConsistentPart,
     judge_closures,
     keep_agreeing,
+    tell_error_scale,
     tell_trajectories,
 )
 from solvers.distributed.robots.own_file import (
@@ -57,6 +58,7 @@ from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.robust.revision import threshold_scale
 from solvers.soc.subgraph import RobotSummary, place_poses
 
 SOLVE_PARTS = "solve each part in a folder of its own"
@@ -82,6 +84,8 @@ class OpenedFiles:
         Number of poses of robots without a file, as `PoseGraph.absent`.
     num_rejected : int
         Edges that robots have left out, as they do not agree with others.
+    threshold_scale : float
+        Scale of the thresholds of a robust solve, for errors as they are among own poses.
     """
 
     driver: Driver
@@ -91,6 +95,7 @@ class OpenedFiles:
     has_indefinite: bool
     num_absent: int
     num_rejected: int = 0
+    threshold_scale: float = 1.0
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
         """The same robots with other edges, of which they have told the borders.
@@ -138,16 +143,26 @@ def open_files(
         if weighting is Weighting.OWN:
             weighting = _own_weighting(borders)
         folder = files[0][1].parent
+        scale = 1.0  # of the errors
+        if isinstance(robust, GNC):
+            scale = _error_scale(network, weighting, robust.quantile)
 
         def opened(borders: Sequence[Border], num_rejected: int = 0) -> OpenedFiles:
             driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
             return OpenedFiles(
-                driver, sizes, folder, weighting, has_indefinite, numbered.num_absent, num_rejected
+                driver,
+                sizes,
+                folder,
+                weighting,
+                has_indefinite,
+                numbered.num_absent,
+                num_rejected,
+                threshold_scale(scale),
             )
 
         if robust is None:
             return opened(borders)
-        agreements = _agreements(network, robust.quantile)
+        agreements = _agreements(network, robust.quantile, scale)
         if isinstance(robust, GNC) and not robust.consistent:
             try:
                 return opened(*_agreeing(network, strongest_neighbours(agreements)))
@@ -182,10 +197,23 @@ def _placed(
     return Driver(summaries, num_poses, lambda: network, memory), sizes
 
 
-def _agreements(network: CountedPool, quantile: float) -> list[AgreeingCounts]:
-    """Have every two robots judge the edges between them."""
+def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) -> float:
+    """Scale of the errors among the own poses of most robots, where thresholds have to follow.
+
+    It is 1 where the errors are not clearly smaller than claimed, or robots have few closures of
+    their own.
+    """
+    requests = [(weighting, quantile)] * network.ledger.num_robots
+    scales = np.array(network.ask(tell_error_scale, requests, Count.PIGGYBACKED))
+    known = scales[np.isfinite(scales)]
+    scale = float(np.median(known)) if len(known) else 1.0
+    return scale if threshold_scale(scale) < 1.0 else 1.0
+
+
+def _agreements(network: CountedPool, quantile: float, scale: float) -> list[AgreeingCounts]:
+    """Have every two robots judge the edges between them, with errors of a scale."""
     told = network.ask(tell_trajectories, [None] * network.ledger.num_robots, Count.PIGGYBACKED)
-    requests = [(trajectories, quantile) for trajectories in network.exchange(told)]
+    requests = [(trajectories, quantile, scale) for trajectories in network.exchange(told)]
     return network.ask(judge_closures, requests, Count.PIGGYBACKED)
 
 

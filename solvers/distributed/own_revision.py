@@ -56,22 +56,23 @@ class Revision:
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """A run that judges the edges that come back.
+    """A run with these settings that judges the edges that come back.
 
     From poses of a map, which most edges fit, one short schedule will do.
     """
 
+    gnc: GNC
     comes_back: ComesBack
     has_map: bool
     is_first: bool
 
 
-def revised(opened: OpenedFiles, gnc: GNC, job: Pass, monitor: RunMonitor) -> Revision:
+def revised(opened: OpenedFiles, job: Pass, monitor: RunMonitor) -> Revision:
     """Judge edges by a run from the poses that the robots keep."""
     network = opened.driver.network
     objective = opened.driver.current.objective
     try:
-        stage, kept = _judged(opened, gnc, job, monitor)
+        stage, kept = _judged(opened, job, monitor)
     except FAILURES:
         stage, kept = Stage.failure("GNC", objective), None
     if kept is not None:
@@ -82,18 +83,24 @@ def revised(opened: OpenedFiles, gnc: GNC, job: Pass, monitor: RunMonitor) -> Re
 
 
 def _judged(
-    opened: OpenedFiles, gnc: GNC, job: Pass, monitor: RunMonitor
+    opened: OpenedFiles, job: Pass, monitor: RunMonitor
 ) -> tuple[Stage, OpenedFiles | None]:
-    """What a run did, and the robots with the edges that it keeps, if it has found a better map."""
+    """What a run did, and the robots with the edges that it keeps, if it has found a better map.
+
+    Maps are compared by their truncated costs, with thresholds at the scale of the errors.
+    """
     network = opened.driver.network
-    borders = network.ask(take_back, _taken_back(opened, gnc, job), Count.PIGGYBACKED)
+    gnc = job.gnc
+    borders = network.ask(take_back, _taken_back(opened, job), Count.PIGGYBACKED)
     driver = opened.with_edges(borders, 0).driver
     go_to_poses_found(driver)
-    before = _truncated_cost(driver)
+    before = _truncated_cost(driver, opened.threshold_scale)
     finished = monitor.run(SharedGNC.of_files(gnc, driver, job.has_map), driver)
-    driver.return_to(finished.state.edges.newton.moment)
     stage = stage_of(gnc, finished)
-    if finished.status in BROKEN_OFF or not _truncated_cost(driver) < before:
+    if finished.status in BROKEN_OFF:
+        return stage, None
+    driver.return_to(finished.state.edges.newton.moment)
+    if not _truncated_cost(driver, opened.threshold_scale) < before:
         return stage, None
     scale = finished.state.schedule.scale
     covers = [(scale, cover) for cover in driver.poses_of_cover()]
@@ -106,7 +113,7 @@ def _judged(
         return stage, None
 
 
-def _taken_back(opened: OpenedFiles, gnc: GNC, job: Pass) -> list[TakenBack]:
+def _taken_back(opened: OpenedFiles, job: Pass) -> list[TakenBack]:
     """What every robot takes back; neighbours agree on what is near the map."""
     network = opened.driver.network
     num_robots = network.ledger.num_robots
@@ -114,11 +121,11 @@ def _taken_back(opened: OpenedFiles, gnc: GNC, job: Pass) -> list[TakenBack]:
     if job.comes_back is ComesBack.NEAR:
         told = network.ask(tell_solved, [None] * num_robots, Count.PIGGYBACKED)
         requests = [
-            (received, opened.weighting, gnc.quantile) for received in network.exchange(told)
+            (received, opened.weighting, job.gnc.quantile) for received in network.exchange(told)
         ]
         near = network.exchange(network.ask(judge_near, requests, Count.PIGGYBACKED))
     return [
-        TakenBack(job.comes_back, opened.weighting, gnc.quantile, job.is_first, received)
+        TakenBack(job.comes_back, opened.weighting, job.gnc.quantile, job.is_first, received)
         for received in near
     ]
 
@@ -152,6 +159,6 @@ def go_to_poses_found(driver: Driver) -> None:
     driver.choose_cost(final=True)
 
 
-def _truncated_cost(driver: Driver) -> float:
-    """Truncated cost of all edges at the current poses."""
-    return math.fsum(driver.ask(sum_truncated, 1.0))
+def _truncated_cost(driver: Driver, scale: float) -> float:
+    """Truncated cost of all edges at the current poses, with scaled thresholds."""
+    return math.fsum(driver.ask(sum_truncated, scale))

@@ -131,23 +131,38 @@ def pairwise_consistent(
     return largest_sets(Chains.of(graph, is_known), is_whole(graph) & ~is_known, quantile)
 
 
-def largest_sets(chains: Chains, is_tested: BoolArray, quantile: float) -> BoolArray:
-    """Edges, (m,), in the largest consistent sets of those tested, and all that are not tested."""
+def largest_sets(
+    chains: Chains, is_tested: BoolArray, quantile: float, scale: float = 1.0
+) -> BoolArray:
+    """Edges, (m,), in the largest consistent sets of those tested, and all that are not tested.
+
+    `scale` is that of the errors, in the squares of what the matrices claim.
+    """
+    dof = chains.graph.d + tangent_dimension(chains.graph.d)
+    threshold = scale * float(scipy.special.chdtri(dof, 1.0 - quantile))
     kept = ~is_tested
-    for edges, agree in _agreements(chains, np.flatnonzero(is_tested), quantile):
+    for edges, agree in _agreements(chains, np.flatnonzero(is_tested), threshold):
         clique, _ = maximum_clique(agree)
         kept[edges[clique]] = True
     return kept
 
 
+def distances_from_odometry(graph: PoseGraph, known: BoolArray) -> Array:
+    """Squared Mahalanobis distances of the closures on a chain from the chain between their ends.
+
+    They are (k,), of edges that measure whole motions.
+    """
+    chains = Chains.of(graph, known)
+    is_on_chain = chains.chain[graph.i] == chains.chain[graph.j]
+    closures = chains.closures(np.flatnonzero(is_whole(graph) & ~known & is_on_chain))
+    return _from_odometry(closures, chains.covariance)
+
+
 def _agreements(
-    chains: Chains, tested: IntArray, quantile: float
+    chains: Chains, tested: IntArray, threshold: float
 ) -> Iterator[tuple[IntArray, BoolArray]]:
     """Tested edges, (k,), between every two chains, and which of them are consistent, (k, k)."""
-    graph = chains.graph
     closures = chains.closures(tested)
-    dof = graph.d + tangent_dimension(graph.d)
-    threshold = float(scipy.special.chdtri(dof, 1.0 - quantile))
     first = chains.chain[closures.i]
     second = chains.chain[closures.j]
     groups = first * (chains.chain.max(initial=0) + np.int64(1)) + second
@@ -155,16 +170,14 @@ def _agreements(
         members = np.flatnonzero(groups == group)
         is_own_chain = first[members[0]] == second[members[0]]
         if is_own_chain:
-            agrees = _agrees_with_odometry(closures[members], chains.covariance, threshold)
-            members = members[agrees]
+            members = members[_from_odometry(closures[members], chains.covariance) <= threshold]
         yield tested[members], _agreement(closures[members], chains.covariance, threshold)
 
 
-def _agrees_with_odometry(closures: Closures, odometry: Array, threshold: float) -> BoolArray:
-    """Whether a loop closure of a chain with itself agrees with the odometry between its ends."""
+def _from_odometry(closures: Closures, odometry: Array) -> Array:
+    """Squared distances, (k,), of closures of a chain with itself from the odometry between."""
     between = odometry[closures.j] - odometry[closures.i]
-    distances = squared_distances(closures.cycle, closures.covariance + between)
-    return np.asarray(distances <= threshold)
+    return squared_distances(closures.cycle, closures.covariance + between)
 
 
 def _agreement(closures: Closures, odometry: Array, threshold: float) -> BoolArray:

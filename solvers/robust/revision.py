@@ -31,6 +31,10 @@ from pgo_models.problem.thresholds import (
 # Moves poses to the stationary point nearby.
 Settle = Callable[[PGOProblem, Poses], Poses]
 
+# Factor on the error scale of the edges kept: real errors have heavier tails than Gaussian ones,
+# and an attempt that keeps the best edges alone has smaller ones. In cubicle no right edge costs
+# ten times its threshold so scaled.
+_TAIL_FACTOR = 10.0
 # An edge is contradicted if its loss is so many times that of the next edge, and improbable.
 _CONTRADICTED = 1.5
 # Among so many edges or more, the largest loss alone tells: right edges have one of three times the
@@ -77,6 +81,11 @@ def error_scale(residuals: EdgeResiduals) -> float:
     explains.
     """
     return min(1.0, residuals.overall * residuals.overall_allowed)
+
+
+def threshold_scale(error_scale: float) -> float:
+    """Scale of the thresholds, at most 1, where the edges kept have errors of this scale."""
+    return min(1.0, _TAIL_FACTOR * error_scale)
 
 
 @dataclass(frozen=True, eq=False)

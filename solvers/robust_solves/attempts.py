@@ -43,15 +43,15 @@ MAX_PAIRED = 4000
 _CHEAP_ROWS = 4000
 # Operations of a factorisation with all edges that take a few seconds.
 _AFFORDABLE_OPERATIONS = 2e10
-# Cycles from which on the errors of the edges kept can be estimated.
-_MIN_CYCLES = 3
 # Factors of the attempts with tight thresholds on the first thresholds, and on the spread to which
 # these are widened.
-_TIGHT_SCALES = (0.1, 0.01)
+TIGHT_SCALES = (0.1, 0.01)
 _TIGHT_SPREAD = 0.3
 # Settings of the attempt with smaller steps.
 _SLOW_GROWTH = 1.4
 _SLOW_INNER_STEPS = 5
+# Cycles from which on the errors of the edges kept can be estimated.
+_MIN_CYCLES = 3
 # What the names of the stages of graduated non-convexity begin with.
 _OF_GNC = "GNC, "
 
@@ -138,7 +138,7 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
             with_tight_thresholds(settings, factor),
             candidates,
         )
-        for factor in _TIGHT_SCALES
+        for factor in TIGHT_SCALES
     ]
     as_set = Plan("as set", settings, candidates)
     tree = held_together(graph, known, np.zeros(graph.num_edges))

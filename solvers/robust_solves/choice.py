@@ -7,15 +7,12 @@ from dataclasses import dataclass, replace
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from solvers.robust.rejection import Attempt
+from solvers.robust.revision import threshold_scale
 from solvers.robust_solves.attempts import DoubtedProblem, Estimate
 
 # Attempts at most, where they are cheap or most closures were rejected, and no two agree.
 _SEVERAL_ATTEMPTS = 4
 _SEVERAL_IF_LARGE = 2
-# Factor on the error scale of the edges kept: real errors have heavier tails than Gaussian ones,
-# and an attempt that keeps the best edges alone has smaller ones. In cubicle no right edge costs
-# ten times its threshold so scaled.
-_TAIL_FACTOR = 10.0
 # Share of the closures kept on which two attempts that agree may differ.
 _AGREEING_SHARE = 0.01
 
@@ -96,8 +93,3 @@ class Choice:
 
     def _num_closures_kept(self, estimate: Estimate) -> int:
         return int((estimate.kept & ~self.doubted.known).sum())
-
-
-def threshold_scale(error_scale: float) -> float:
-    """Scale of the thresholds, at most 1, where the edges kept have errors of this scale."""
-    return min(1.0, _TAIL_FACTOR * error_scale)

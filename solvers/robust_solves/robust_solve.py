@@ -25,7 +25,7 @@ from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
-from solvers.robust.revision import Fit, drop_contradicted, error_scale
+from solvers.robust.revision import Fit, drop_contradicted, error_scale, threshold_scale
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
@@ -34,7 +34,7 @@ from solvers.robust_solves.attempts import (
     Plan,
     plans_in_order,
 )
-from solvers.robust_solves.choice import Choice, threshold_scale
+from solvers.robust_solves.choice import Choice
 from solvers.solution import Solution, joined_notes
 
 # Newton steps after one edge was dropped.

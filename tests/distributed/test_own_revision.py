@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -114,16 +115,30 @@ def test_four_closures_of_five_may_be_wrong(
 ) -> None:
     """Between robots that have no right closures wrong ones agree, each with itself at least."""
     graph, is_wrong = world_in_files(tmp_path / "in", 0, 2, kind, 0.8)
-    if not is_certified:
+    if not is_certified:  # then all edges come back, in several passes
         monkeypatch.setattr(Certificate, "is_certified", property(lambda _: False))
     solution = solvers.solve_folder(
         tmp_path / "in", robust=solvers.GNC(), trust_folder=True, out=tmp_path / "out"
     )
     kept = edges_of(read_g2o(tmp_path / "out", trust_folder=True))
-    assert kept == edges_of(graph.without_edges(is_wrong))
+    num_mistaken = len(kept ^ edges_of(graph.without_edges(is_wrong)))
+    assert num_mistaken <= (0 if is_certified else 4)
     if is_certified:  # with all edges back it is 120 MB
         assert solution.ledger.rounds < 130
         assert solution.ledger.num_bytes < 6e6
+
+
+def test_thresholds_follow_errors_that_are_smaller_than_the_matrices_claim(tmp_path: Path) -> None:
+    """Of errors that are a tenth of it wrong closures agree with right ones, and all would stay."""
+    graph = pgo.grid_world(4, 60, np.random.default_rng(0), d=3)
+    loose = replace(graph, kappa=1e-2 * graph.kappa, tau=1e-2 * graph.tau, information=None)
+    graph, is_wrong = spoiled(loose, 0.3, "random", 0)
+    write_g2o_folder(graph, tmp_path / "in", pgo.Poses.identity(graph.num_poses, 3))
+    solvers.solve_folder(
+        tmp_path / "in", robust=solvers.GNC(), trust_folder=True, out=tmp_path / "out"
+    )
+    kept = edges_of(read_g2o(tmp_path / "out", trust_folder=True))
+    assert kept == edges_of(graph.without_edges(is_wrong))
 
 
 def test_robots_begin_with_the_pairs_that_agree_most() -> None:

@@ -9,13 +9,19 @@ is told of which neighbours they stay.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # and scipy.special when it is used
 
-from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import edge_residuals
+from pgo_models.problem.weighting import Weighting
 from solvers.distributed.robots.own_file import (
     Border,
     CostedFile,
@@ -24,6 +30,7 @@ from solvers.distributed.robots.own_file import (
     PlacedFile,
     border_of,
 )
+from solvers.riemannian.polish import polish
 from solvers.robust.chains import (
     Chains,
     carried,
@@ -32,7 +39,11 @@ from solvers.robust.chains import (
     measured_covariances,
     product,
 )
-from solvers.robust.consistency import largest_sets, pairwise_consistent
+from solvers.robust.consistency import distances_from_odometry, largest_sets
+from solvers.robust.revision import error_scale
+
+# Closures of a robot with itself from which on the scale of its errors can be told.
+_FEWEST_CLOSURES = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,30 +111,70 @@ def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
     return told
 
 
+def tell_error_scale(agent: FileAgent, request: tuple[Weighting, float]) -> float:
+    """Order: return the scale of the errors among own poses; nan where too few edges tell it.
+
+    It is in the squares of what the matrices claim: the distance between odometry and the closures
+    on it that a quarter of them are within, over that of chi^2. So three closures of four may be
+    wrong. Where odometry has gaps, and carries few closures, it is the scale at the cheapest poses
+    of the edges that agree by a quantile. The request is the cost, and this quantile.
+    """
+    weighting, quantile = request
+    joined = agent.known(JoinedFile)
+    own_graph, odometry, among_own = _own_part(joined, agent.robot)
+    if not len(among_own):
+        return math.nan
+    distances = distances_from_odometry(own_graph, odometry)
+    if len(distances) >= _FEWEST_CLOSURES:
+        dof = own_graph.d + tangent_dimension(own_graph.d)
+        return float(np.quantile(distances, 0.25) / scipy.special.chdtri(dof, 0.75))
+    agreeing = _own_agreeing(joined, agent.robot, quantile, 1.0)[among_own]
+    part = own_graph.components(agreeing)[0]
+    graph = own_graph.without_edges(~(agreeing & np.isin(own_graph.i, part))).subgraph(part)
+    if graph.num_edges - (graph.num_poses - 1) < _FEWEST_CLOSURES:
+        return math.nan
+    problem = PGOProblem(graph, weighting=weighting)
+    return error_scale(edge_residuals(problem, polish(problem, chordal_start(problem))))
+
+
 def judge_closures(
-    agent: FileAgent, request: tuple[Mapping[int, Trajectory], float]
+    agent: FileAgent, request: tuple[Mapping[int, Trajectory], float, float]
 ) -> AgreeingCounts:
-    """Order: find what agrees, with the neighbours' trajectories and a quantile."""
-    received, quantile = request
+    """Order: find what agrees, with the neighbours' trajectories, a quantile and an error scale."""
+    received, quantile, scale = request
     joined = agent.known(JoinedFile)
     robot = agent.robot
-    graph = joined.graph
-    kept = np.ones(graph.num_edges, dtype=bool)
-    is_own = joined.owners == robot
-    among_own = _in_order(joined, np.flatnonzero(is_own[graph.i] & is_own[graph.j]))
-    if len(among_own):
-        own_graph = graph.edge_subgraph(among_own)
-        odometry = own_odometry(graph, is_own)[among_own]
-        kept[among_own] = pairwise_consistent(own_graph, odometry, quantile)
+    kept = _own_agreeing(joined, robot, quantile, scale)
     own = _trajectories(robot, joined)
     num_agreeing = []
     for other, theirs in received.items():
         between = edges_between(joined, robot, other)
         known = {robot: own[other], other: theirs}
-        kept[between] = _agree(joined, between, [known[k] for k in sorted(known)], quantile)
+        both = [known[k] for k in sorted(known)]
+        kept[between] = _agree(joined, between, both, quantile, scale)
         num_agreeing.append(int(kept[between].sum()))
     agent.record = replace(joined, agrees=kept)
     return AgreeingCounts(np.array(list(received), dtype=int), np.array(num_agreeing, dtype=int))
+
+
+def _own_agreeing(joined: JoinedFile, robot: int, quantile: float, scale: float) -> BoolArray:
+    """Which edges join own poses and agree with each other, (m_a,)."""
+    kept = np.zeros(joined.graph.num_edges, dtype=bool)
+    own_graph, odometry, among_own = _own_part(joined, robot)
+    if len(among_own):
+        is_tested = is_whole(own_graph) & ~odometry
+        chains = Chains.of(own_graph, odometry)
+        kept[among_own] = largest_sets(chains, is_tested, quantile, scale)
+    return kept
+
+
+def _own_part(joined: JoinedFile, robot: int) -> tuple[PoseGraph, BoolArray, IntArray]:
+    """Graph of the edges among own poses, whether each is odometry, (k,), and which they are."""
+    graph = joined.graph
+    is_own = joined.owners == robot
+    among_own = _in_order(joined, np.flatnonzero(is_own[graph.i] & is_own[graph.j]))
+    odometry = own_odometry(graph, is_own)[among_own]
+    return graph.edge_subgraph(among_own), odometry, among_own
 
 
 def keep_agreeing(agent: FileAgent, neighbours: IntArray) -> ConsistentPart:
@@ -181,7 +232,7 @@ def go_on_with(agent: FileAgent, left: JoinedFile) -> ConsistentPart:
 
 
 def _agree(
-    joined: JoinedFile, between: IntArray, both: list[Trajectory], quantile: float
+    joined: JoinedFile, between: IntArray, both: list[Trajectory], quantile: float, scale: float
 ) -> BoolArray:
     """Which of the edges between two robots are kept: both find the same."""
     graph = joined.graph
@@ -200,7 +251,7 @@ def _agree(
         measured=measured_covariances(pair),
         covariance=covariance[order],
     )
-    return largest_sets(chains, is_whole(pair), quantile)
+    return largest_sets(chains, is_whole(pair), quantile, scale)
 
 
 def own_odometry(graph: PoseGraph, is_own: BoolArray) -> BoolArray:
