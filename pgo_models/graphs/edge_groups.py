@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -50,12 +51,12 @@ class EdgeGroups:
     def __iter__(self) -> Iterator[IntArray]:
         return (self[g] for g in range(len(self)))
 
-    @property
+    @cached_property
     def beginnings(self) -> IntArray:
         """Place of the first edge of every group, (g,)."""
         return np.asarray(np.cumsum(self.sizes) - self.sizes)
 
-    @property
+    @cached_property
     def group_of(self) -> IntArray:
         """Group of each of `edges`, (k,)."""
         return np.repeat(np.arange(len(self)), self.sizes)

@@ -113,12 +113,12 @@ class Marginals(ReadOnly):
         self._check(*np.concatenate([i, j]).tolist())
         p = self.layout.side // self.layout.num_poses
         joint = np.zeros((len(i), 2 * p, 2 * p))
+        joint[:, :p, :p] = self.diagonal[i]
+        joint[:, p:, p:] = self.diagonal[j]
         across = (i != self.anchor) & (j != self.anchor)
         # The poses but the anchor have the numbers of their unknowns.
         first, second = (ends[across] - (ends[across] > self.anchor) for ends in (i, j))
-        diagonal, blocks = self._blocks(first, second)
-        joint[:, :p, :p] = diagonal[i]
-        joint[:, p:, p:] = diagonal[j]
+        blocks = self._blocks(first, second)
         joint[across, :p, p:] = blocks
         joint[across, p:, :p] = np.swapaxes(blocks, 1, 2)
         return joint
@@ -126,33 +126,34 @@ class Marginals(ReadOnly):
     @cached_property
     def diagonal(self) -> Array:
         """Covariance of every pose, (n, p, p), by selected inversion."""
-        none = np.zeros(0, dtype=int)
-        return self._blocks(none, none)[0]
+        free = np.arange(self.layout.num_poses - 1)
+        return np.insert(self._blocks(free, free), self.anchor, 0.0, axis=0)
 
-    def _blocks(self, i: IntArray, j: IntArray) -> tuple[Array, Array]:
-        """Covariance of every pose, (n, p, p), and blocks (i, j), (k, p, p), between free poses."""
-        num_free = self.layout.num_poses - 1
-        pose_rows = np.arange(self.layout.side).reshape(num_free + 1, -1)[:num_free]
-        # Zeros make room for the blocks (i, j) in the factor; sums keep them.
-        rows, columns = (part.ravel() for part in block_entries(pose_rows[i], pose_rows[j]))
-        matrix = self._information.tocoo()
-        data = np.concatenate([matrix.data, np.zeros(2 * len(rows))])
-        places = (
-            np.concatenate([matrix.row, rows, columns]),
-            np.concatenate([matrix.col, columns, rows]),
-        )
+    def _blocks(self, i: IntArray, j: IntArray) -> Array:
+        """Blocks (i, j) of the inverse, (k, p, p), between poses without the anchor."""
         # A factor of its own, whose memory is freed at the end.
-        L, order = self._factorize(csc_array((data, places), shape=matrix.shape)).take_apart()
-        rows_of_L = np.argsort(order)[pose_rows]
-        every = np.arange(num_free)
-        first, second = rows_of_L[np.append(every, i)], rows_of_L[np.append(every, j)]
-        rows, columns = block_entries(first, second)
+        L, order = self._factorize(self._with_room(i, j)).take_apart()
+        # Rows of L that belong to every pose.
+        pose_rows = np.argsort(order).reshape(self.layout.num_poses - 1, -1)
+        rows, columns = block_entries(pose_rows[i], pose_rows[j])
         # Entries of the lower triangle; those above the diagonal are equal by symmetry.
         positions = entry_positions(L, np.maximum(rows, columns), np.minimum(rows, columns))
-        p = pose_rows.shape[1]
-        covariances = selected_inverse(L)[positions].reshape(-1, p, p)
-        diagonal = np.insert(covariances[:num_free], self.anchor, 0.0, axis=0)
-        return diagonal, covariances[num_free:]
+        return np.asarray(selected_inverse(L)[positions])
+
+    def _with_room(self, i: IntArray, j: IntArray) -> csc_array:
+        """The information, with zeros where a factor is to have the blocks (i, j)."""
+        apart = i != j  # blocks of one pose are there
+        if not apart.any():
+            return self._information
+        pose_rows = np.arange(self._information.shape[0]).reshape(self.layout.num_poses - 1, -1)
+        rows, columns = block_entries(pose_rows[i[apart]], pose_rows[j[apart]])
+        matrix = self._information.tocoo()
+        data = np.concatenate([matrix.data, np.zeros(2 * rows.size)])  # which sums keep
+        places = (
+            np.concatenate([matrix.row, rows.ravel(), columns.ravel()]),
+            np.concatenate([matrix.col, columns.ravel(), rows.ravel()]),
+        )
+        return csc_array((data, places), shape=matrix.shape)
 
     @cached_property
     def _information(self) -> csc_array:

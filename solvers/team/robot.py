@@ -682,7 +682,9 @@ class Robot:
             )
         )
         for name, ask in list(self._drive.waiting.items()):
-            self._drive.take(name, Reply(ask.term, ask.call, self._revisions[name], None, error))
+            self._drive.take(
+                name, Reply(ask.term, ask.call, self._revisions.get(name, 0), None, error)
+            )
         self._after_step(now)
 
     def _take_reply(self, sender: str, reply: Reply, now: float) -> None:

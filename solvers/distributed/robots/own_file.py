@@ -177,9 +177,9 @@ class JoinedFile:
 
     Numbers in the whole graph, (n_a,), ascend. Of edges that were left out since it has the ids of
     the ends, (k, 2); `everything` is what was joined at first, of which `edges`, (m_a,), are left.
-    In a robust solve `agrees` and `near` say which edges of everything agree pairwise, and are near
-    the map, `before` is what to go back to, `thresholds`, (m_a,), are those of the edges, and
-    `solved` poses of its own that were found.
+    In a robust solve `agrees` says which edges of everything agree pairwise, `before` is what to go
+    back to, `thresholds`, (m_a,), are those of the edges, and `solved` poses of its own that were
+    found.
     """
 
     graph: PoseGraph
@@ -190,7 +190,6 @@ class JoinedFile:
     everything: JoinedFile | None = None
     edges: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     agrees: BoolArray | None = None
-    near: BoolArray | None = None
     before: JoinedFile | None = None
     thresholds: Array | None = None
     solved: Poses | None = None
@@ -216,8 +215,10 @@ class PlacedFile:
     left: IntArray | None = None
     larger: Subgraph | None = None
     answer: Poses | None = None  # the poses that were kept
-    # Of a robust solve: edges within their thresholds, (m_a,), as far as this robot counts them.
+    # Of a robust solve: edges within their thresholds, (m_a,), as far as this robot counts them,
+    # and edges of everything that are near the map.
     within: BoolArray | None = None
+    near: BoolArray | None = None
 
     @property
     def kept(self) -> Poses:

@@ -51,8 +51,8 @@ class ComesBack(enum.Enum):
 class TakenBack:
     """Which edges come back, the cost that is solved, and the quantile of the thresholds.
 
-    The first pass has what agrees pairwise to go back to, later ones the edges before. `near` are
-    edges to neighbours of lower numbers that are near the map, by these.
+    The first pass has what agrees pairwise to go back to, later ones the edges before. `near` says
+    which edges to a neighbour of a lower number are near the map, as that neighbour has decided.
     """
 
     comes_back: ComesBack
@@ -123,9 +123,7 @@ def judge_near(
     problem = PartProblem(graph, weighting=weighting)
     near = problem.edge_costs(Poses(R, t)) <= _NEAR * chi2_thresholds(problem, quantile)
     near[placed.joined.edges] = True
-    agent.record = replace(
-        placed, joined=replace(placed.joined, everything=replace(everything, near=near))
-    )
+    agent.record = replace(placed, near=near)
     return {
         other: near[edges_between(everything, agent.robot, other)]
         for other in neighbours_of(everything, agent.robot)
@@ -146,8 +144,8 @@ def take_back(agent: FileAgent, request: TakenBack) -> Border:
     if request.comes_back is ComesBack.AGREEING:
         candidates = everything.agrees
     elif request.comes_back is ComesBack.NEAR:
-        assert everything.near is not None
-        candidates = everything.near.copy()
+        assert placed.near is not None
+        candidates = placed.near.copy()
         for other, near in request.near.items():
             candidates[edges_between(everything, robot, other)] = near
     else:
