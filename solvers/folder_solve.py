@@ -319,28 +319,29 @@ class _Answer:
 def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
     """The answer after passes of GNC, each from the map of the one before.
 
-    From a certified map the edges near it come back, and the passes end. Else the first pass has
-    those that agree pairwise, and later ones have all, at last with tight thresholds. Maps that no
-    pass follows have all steps of the pipeline.
+    From a certified map one last pass judges the edges near it, with the settings that have found
+    it. Without one there are passes with what agrees pairwise, with all edges, and with all edges
+    and tight thresholds; those that agree are all there are where the settings say so. Thresholds
+    follow the errors. The last map has the other steps of the pipeline, if it is not certified.
     """
     newton_alone = pipeline.with_newton_alone(pipeline.newton)
     scale = answer.opened.threshold_scale
     settings = gnc if scale == 1.0 else with_tight_thresholds(gnc, scale)
     tight = [with_tight_thresholds(settings, factor) for factor in TIGHT_SCALES]
-    without_map = [
-        (settings, ComesBack.AGREEING),
-        *((each, ComesBack.EVERYTHING) for each in (settings, *tight)),
-    ]
+    all_edges, near = ComesBack.EVERYTHING, ComesBack.NEAR
+    if gnc.consistent:
+        all_edges = near = ComesBack.AGREEING
+    without_map = [(settings, ComesBack.AGREEING)]
+    without_map += [(each, all_edges) for each in (settings, *tight)]
     is_first = True
     while not answer.best.is_out_of_time:
         has_map = answer.best.proof.is_certified
-        comes_back = ComesBack.NEAR
-        if not has_map:
-            if not without_map:
-                break
+        if has_map:
+            comes_back = near
+        elif without_map:
             settings, comes_back = without_map.pop(0)
-        if gnc.consistent:
-            comes_back = ComesBack.AGREEING
+        else:
+            break
         answer = _after_pass(answer, Pass(settings, comes_back, has_map, is_first), newton_alone)
         if has_map:
             break

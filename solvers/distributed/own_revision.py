@@ -22,6 +22,7 @@ from pgo_models.graphs.pose_graph import least_tree
 from solvers.distributed.driver import Driver
 from solvers.distributed.own_files import OpenedFiles
 from solvers.distributed.robots import current_poses
+from solvers.distributed.robots.own_file import Border
 from solvers.distributed.robots.own_revision import (
     ComesBack,
     Links,
@@ -71,8 +72,9 @@ def revised(opened: OpenedFiles, job: Pass, monitor: RunMonitor) -> Revision:
     """Judge edges by a run from the poses that the robots keep."""
     network = opened.driver.network
     objective = opened.driver.current.objective
+    borders = network.ask(take_back, _taken_back(opened, job), Count.PIGGYBACKED)
     try:
-        stage, kept = _judged(opened, job, monitor)
+        stage, kept = _judged(opened, borders, job, monitor)
     except FAILURES:
         stage, kept = Stage.failure("GNC", objective), None
     if kept is not None:
@@ -83,15 +85,15 @@ def revised(opened: OpenedFiles, job: Pass, monitor: RunMonitor) -> Revision:
 
 
 def _judged(
-    opened: OpenedFiles, job: Pass, monitor: RunMonitor
+    opened: OpenedFiles, borders: Sequence[Border], job: Pass, monitor: RunMonitor
 ) -> tuple[Stage, OpenedFiles | None]:
     """What a run did, and the robots with the edges that it keeps, if it has found a better map.
 
+    Robots have taken edges back, and told their borders.
     Maps are compared by their truncated costs, with thresholds at the scale of the errors.
     """
     network = opened.driver.network
     gnc = job.gnc
-    borders = network.ask(take_back, _taken_back(opened, job), Count.PIGGYBACKED)
     driver = opened.with_edges(borders, 0).driver
     go_to_poses_found(driver)
     before = _truncated_cost(driver, opened.threshold_scale)

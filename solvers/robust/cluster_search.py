@@ -229,11 +229,12 @@ class ClusterSearch:
     def _with_each(
         self, fit: Fit, candidates: Candidates, chosen: list[int]
     ) -> tuple[Fit, list[int]]:
-        """The fit with those of some candidates that pass the test, and those that do not.
+        """The fit with those of some candidates whose T passes the test, and those that do not.
 
         Where all of them together pass, that is one solve; else those that are within their
-        thresholds at its map are tried on their own, and then the others. A cluster that hides
-        among others is found later, by its own rise of the cost.
+        thresholds at the map with all of them are tried on their own, and then the others; halves
+        are if none or all are within. A cluster that hides among others is removed later, by its
+        own rise of the cost. Those that time leaves no trial count as not passing.
         """
         if len(chosen) == 1:
             k = chosen[0]

@@ -108,6 +108,16 @@ def test_closures_between_several_pieces_of_trajectories_are_judged_apart(tmp_pa
     assert solvers.solve_folder(tmp_path / "in", robust=solvers.PCM()).num_rejected == 0
 
 
+@pytest.mark.parametrize("robust", [solvers.PCM(), solvers.GNC()])
+def test_a_robot_may_have_no_edge_of_its_own(
+    tmp_path: Path, robust: solvers.PCM | solvers.GNC
+) -> None:
+    graph = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
+    owners = np.repeat([0, 1, 2], [15, 1, 14])
+    write_g2o_folder(graph.with_robots(owners), tmp_path / "in", graph.truth)
+    assert solvers.solve_folder(tmp_path / "in", robust=robust).certificate.is_certified
+
+
 def test_what_robots_with_files_cannot_judge_is_refused() -> None:
     known = np.ones(212, dtype=bool)
     for robust in (solvers.GNC(known=known), solvers.PCM(known=known)):

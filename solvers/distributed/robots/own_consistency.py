@@ -42,8 +42,10 @@ from solvers.robust.chains import (
 from solvers.robust.consistency import distances_from_odometry, largest_sets
 from solvers.robust.revision import error_scale
 
-# Closures of a robot with itself from which on the scale of its errors can be told.
+# Fewest closures of a robot with itself that tell the scale of its errors, and the share of these
+# that are within the distance which tells it.
 _FEWEST_CLOSURES = 5
+_QUARTILE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,24 +116,26 @@ def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
 def tell_error_scale(agent: FileAgent, request: tuple[Weighting, float]) -> float:
     """Order: return the scale of the errors among own poses; nan where too few edges tell it.
 
-    It is in the squares of what the matrices claim: the distance between odometry and the closures
-    on it that a quarter of them are within, over that of chi^2. So three closures of four may be
-    wrong. Where odometry has gaps, and carries few closures, it is the scale at the cheapest poses
-    of the edges that agree by a quantile. The request is the cost, and this quantile.
+    It multiplies the covariances that the matrices claim: the lower quartile of the squared
+    Mahalanobis distances between closures and odometry, over that of chi^2. Three closures of four
+    may be wrong. Where odometry has gaps, and few closures are on a chain, the edges that agree
+    pairwise by a quantile are solved, and it is what they cost over what is expected
+    (`error_scale`). The request is the cost that is solved, and the quantile.
     """
     weighting, quantile = request
-    joined = agent.known(JoinedFile)
-    own_graph, odometry, among_own = _own_part(joined, agent.robot)
-    if not len(among_own):
+    own_graph, odometry, _ = _own_part(agent.known(JoinedFile), agent.robot)
+    if own_graph is None:
         return math.nan
     distances = distances_from_odometry(own_graph, odometry)
     if len(distances) >= _FEWEST_CLOSURES:
         dof = own_graph.d + tangent_dimension(own_graph.d)
-        return float(np.quantile(distances, 0.25) / scipy.special.chdtri(dof, 0.75))
-    agreeing = _own_agreeing(joined, agent.robot, quantile, 1.0)[among_own]
+        expected = scipy.special.chdtri(dof, 1.0 - _QUARTILE)
+        return float(np.quantile(distances, _QUARTILE) / expected)
+    agreeing = _own_agreeing(own_graph, odometry, quantile, 1.0)
     part = own_graph.components(agreeing)[0]
-    graph = own_graph.without_edges(~(agreeing & np.isin(own_graph.i, part))).subgraph(part)
-    if graph.num_edges - (graph.num_poses - 1) < _FEWEST_CLOSURES:
+    graph = own_graph.without_edges(~agreeing).subgraph(part)
+    num_cycles = graph.num_edges - (graph.num_poses - 1)
+    if num_cycles < _FEWEST_CLOSURES:
         return math.nan
     problem = PGOProblem(graph, weighting=weighting)
     return error_scale(edge_residuals(problem, polish(problem, chordal_start(problem))))
@@ -144,7 +148,10 @@ def judge_closures(
     received, quantile, scale = request
     joined = agent.known(JoinedFile)
     robot = agent.robot
-    kept = _own_agreeing(joined, robot, quantile, scale)
+    kept = np.zeros(joined.graph.num_edges, dtype=bool)
+    own_graph, odometry, among_own = _own_part(joined, robot)
+    if own_graph is not None:
+        kept[among_own] = _own_agreeing(own_graph, odometry, quantile, scale)
     own = _trajectories(robot, joined)
     num_agreeing = []
     for other, theirs in received.items():
@@ -157,24 +164,24 @@ def judge_closures(
     return AgreeingCounts(np.array(list(received), dtype=int), np.array(num_agreeing, dtype=int))
 
 
-def _own_agreeing(joined: JoinedFile, robot: int, quantile: float, scale: float) -> BoolArray:
-    """Which edges join own poses and agree with each other, (m_a,)."""
-    kept = np.zeros(joined.graph.num_edges, dtype=bool)
-    own_graph, odometry, among_own = _own_part(joined, robot)
-    if len(among_own):
-        is_tested = is_whole(own_graph) & ~odometry
-        chains = Chains.of(own_graph, odometry)
-        kept[among_own] = largest_sets(chains, is_tested, quantile, scale)
-    return kept
+def _own_agreeing(
+    own_graph: PoseGraph, odometry: BoolArray, quantile: float, scale: float
+) -> BoolArray:
+    """Which edges among own poses agree with each other, (k,)."""
+    is_tested = is_whole(own_graph) & ~odometry
+    return largest_sets(Chains.of(own_graph, odometry), is_tested, quantile, scale)
 
 
-def _own_part(joined: JoinedFile, robot: int) -> tuple[PoseGraph, BoolArray, IntArray]:
-    """Graph of the edges among own poses, whether each is odometry, (k,), and which they are."""
+def _own_part(joined: JoinedFile, robot: int) -> tuple[PoseGraph | None, BoolArray, IntArray]:
+    """Graph of the edges among own poses, whether each is odometry, (k,), and which they are.
+
+    There is no graph without edges.
+    """
     graph = joined.graph
     is_own = joined.owners == robot
     among_own = _in_order(joined, np.flatnonzero(is_own[graph.i] & is_own[graph.j]))
     odometry = own_odometry(graph, is_own)[among_own]
-    return graph.edge_subgraph(among_own), odometry, among_own
+    return graph.edge_subgraph(among_own) if len(among_own) else None, odometry, among_own
 
 
 def keep_agreeing(agent: FileAgent, neighbours: IntArray) -> ConsistentPart:
@@ -279,5 +286,5 @@ def _in_order(joined: JoinedFile, edges: IntArray) -> IntArray:
     """
     graph = joined.graph
     ends = joined.numbers[graph.i[edges]], joined.numbers[graph.j[edges]]
-    turns = graph.R_ij[edges].reshape(len(edges), -1)
+    turns = graph.R_ij[edges].reshape(len(edges), graph.d**2)
     return edges[np.lexsort([*graph.t_ij[edges].T, *turns.T, *ends])]

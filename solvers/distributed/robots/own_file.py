@@ -175,11 +175,30 @@ class NumberedFile:
 class JoinedFile:
     """After `join_neighbours`: its graph, of its own poses and those at the far end of its edges.
 
-    Numbers in the whole graph, (n_a,), ascend. Of edges that were left out since it has the ids of
-    the ends, (k, 2); `everything` is what was joined at first, of which `edges`, (m_a,), are left.
-    In a robust solve `agrees` says which edges of everything agree pairwise, `before` is what to go
-    back to, `thresholds`, (m_a,), are those of the edges, and `solved` poses of its own that were
-    found.
+    The orders of a robust solve leave another one, with some of the edges.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Its n_a poses and m_a edges.
+    numbers, owners : (n_a,) arrays
+        Numbers of the poses in the whole graph, which ascend, and which robot owns each.
+    given : Array
+        As in `Answer`.
+    rejected : (k, 2) array
+        Ids of the ends of edges that were left out.
+    everything : JoinedFile, optional
+        What was joined at first, with m edges; none if it is this.
+    edges : (m_a,) array
+        The edges of everything that are left; empty if this is everything.
+    agrees : (m,) array, optional
+        Of everything in a robust solve: whether an edge agrees pairwise.
+    before : JoinedFile, optional
+        During a robust solve: what to go back to.
+    thresholds : (m_a,) array, optional
+        During a robust solve: those of the edges.
+    solved : Poses, optional
+        Own poses that the solve before has found.
     """
 
     graph: PoseGraph

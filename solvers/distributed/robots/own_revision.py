@@ -1,8 +1,9 @@
-"""Orders of a robust solve by robots with own files, after one with edges that agree pairwise.
+"""Orders of a robust solve by robots with own files, after a solve with edges that agree pairwise.
 
 They stand in the sequence in which they are given: `tell_solved` and `judge_near` where only edges
 near the map come back, `take_back`, those that place the robot anew, `tell_cover` and
-`go_to_solved`, those of `reweighting`, then `tell_links`, `tell_kept` and `keep`, or `go_back`.
+`go_to_solved`, those of `reweighting`, then `tell_links`, `tell_kept` and `keep`, and `go_back`
+where nothing better was found.
 """
 
 from __future__ import annotations
@@ -51,8 +52,9 @@ class ComesBack(enum.Enum):
 class TakenBack:
     """Which edges come back, the cost that is solved, and the quantile of the thresholds.
 
-    The first pass has what agrees pairwise to go back to, later ones the edges before. `near` says
-    which edges to a neighbour of a lower number are near the map, as that neighbour has decided.
+    What to go back to is what agrees pairwise, if it `is_first`, and the edges before in later
+    passes. `near` says which edges to each neighbour of a lower number are near the map, as that
+    neighbour has decided.
     """
 
     comes_back: ComesBack
@@ -104,9 +106,10 @@ def tell_solved(agent: FileAgent, _: None) -> Mapping[int, SolvedPoses]:
 def judge_near(
     agent: FileAgent, request: tuple[Mapping[int, SolvedPoses], Weighting, float]
 ) -> Mapping[int, BoolArray]:
-    """Order: find the edges near the map, with the poses of neighbours; tell what is near of these.
+    """Order: find the edges near the map, with the poses of neighbours; those kept stay.
 
-    Of an edge between two robots the one of the lower number decides.
+    Of an edge between two robots the one of the lower number decides, and tells the other, so that
+    both have the same edges.
     """
     received, weighting, quantile = request
     placed = agent.known(PlacedFile)
@@ -132,7 +135,7 @@ def judge_near(
 
 
 def take_back(agent: FileAgent, request: TakenBack) -> Border:
-    """Order: have thresholds for a robust solve, of the edges that come back.
+    """Order: hold the edges that come back, with thresholds, and remember what to go back to.
 
     Own odometry is known to be right.
     """
@@ -159,7 +162,7 @@ def take_back(agent: FileAgent, request: TakenBack) -> Border:
     known = own_odometry(graph, joined.owners == robot) & is_whole(graph)
     joined = replace(
         joined,
-        before=replace(before, solved=solved),
+        before=replace(before, solved=solved, before=None),
         thresholds=np.where(known, np.inf, thresholds),
         solved=solved,
     )
@@ -258,7 +261,7 @@ def keep(agent: FileAgent, received: Mapping[int, BoolArray]) -> ConsistentPart:
 
 
 def go_back(agent: FileAgent, _: None) -> ConsistentPart:
-    """Order: go back to the edges before, and to the poses found with them."""
+    """Order: go back to the edges before, or to what agrees pairwise, at the poses found before."""
     before = joined_of(agent).before
     assert before is not None
     return go_on_with(agent, before)
