@@ -41,7 +41,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
-from solvers.riemannian.newton_step import scaled_decrement
+from solvers.riemannian.newton_step import ROUNDING, scaled_decrement
 from solvers.riemannian.polish import polish
 from solvers.riemannian.trust_region import Precision, first_radius, trust_region_step
 
@@ -97,6 +97,11 @@ class ComplexCost:
         of_t = slice(None, 2 * n)
         of_r = slice(2 * n, None)
         return cls(problem, M[of_r, of_r].tocsr(), M[of_t, of_r].tocsr(), found[1])
+
+    @property
+    def rounding_level(self) -> float:
+        """Size of the rounding errors of a value, a difference of sums as large as tr(M_rr)."""
+        return ROUNDING * float(self.M_rr.diagonal().sum())
 
     def apply_Q(self, Y: Array) -> Array:
         """The rows of rotations of M X, (n, 1, 2 q), with the best translations for Y."""
@@ -197,7 +202,7 @@ class ComplexRelaxation:
         lengths = np.linalg.norm(rows, axis=(1, 2), keepdims=True)
         Y = (rows / lengths).reshape(n, 1, -1)
         cost = ComplexCost.of(problem.tangent_at(ground))
-        level = rounding_level(problem, ground)
+        level = max(rounding_level(problem, ground), cost.rounding_level)
         return self._arrive(0, cost, ground, cost.evaluate(Y), level)
 
     def step(self, problem: PGOProblem, state: ComplexState) -> ComplexState:

@@ -12,7 +12,7 @@ import pytest
 from budget import examples
 from exact_arithmetic import ExactGraph
 from graphs import SEEDS, best_known, informed, planar_lattice, random_poses, varied_graph
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import assume, example, given, settings, strategies as st
 
 import solvers
 from pgo_models.certificates.certificate import BoundSource
@@ -20,6 +20,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import project_to_tangent, retract
 from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.problem.initialization import spanning_tree
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.given_poses import certify
@@ -95,6 +96,7 @@ def test_gradient_and_hessian_are_those_of_the_cost(seed: int, n: int, columns: 
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @settings(max_examples=examples(40))
 @given(seed=SEEDS, n=st.integers(3, 9), rotation_std=st.sampled_from([0.5, 1.0, 2.0]))
+@example(seed=1294109, n=3, rotation_std=0.5)  # a tree, whose least cost is zero
 def test_its_optimum_is_that_of_the_semidefinite_program(
     seed: int, n: int, rotation_std: float
 ) -> None:
@@ -123,6 +125,17 @@ def test_its_bound_is_below_the_best_known_poses_and_close_to_its_optimum(
     assert relaxed.lower_bound >= (1 - 1e-3) * outcome.state.point.value
     assert relaxed.source is BoundSource.COMPLEX
     assert relaxed.bound.is_complex
+
+
+@settings(max_examples=examples(40))
+@given(seed=SEEDS, n=st.integers(3, 9))
+def test_of_a_tree_its_optimum_is_zero(seed: int, n: int) -> None:
+    graph = varied_graph(seed, n, 2, LOUD)
+    in_tree = np.isin(np.arange(graph.num_edges), spanning_tree(graph, 0)[2])
+    problem = PGOProblem(graph.without_edges(~in_tree))
+    outcome = run(ComplexRelaxation(), problem)
+    assert outcome.status is Status.CONVERGED
+    assert outcome.state.point.value <= outcome.state.rounding_level
 
 
 @settings(max_examples=examples(24))
