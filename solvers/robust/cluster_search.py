@@ -57,6 +57,9 @@ _MOST_ROUNDS = 3
 # so many of them are looked at.
 _FAR = 4.0
 _MOST_SAMPLED = 100
+# Share of the rejected edges near a map from which on these tell nothing of wrong ones nearer by: 1
+# in 70 lie there on cubicle, and all on grid worlds whose matrices allow any motion of a closure.
+_FEW = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,41 +132,88 @@ class ClusterSearch:
         rejected ones between 1 and x = 4 times, and two standard deviations of their number, tell
         how many are expected below 1 at most. Of more than a hundred, a hundred are looked at.
         """
-        candidates = self._candidates(fit, _FAR)
-        chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
+        number, deviation = self._number_between(fit, 1.0, _FAR)
         p = self.sets.motion_dimension
+        return (number + 2.0 * deviation) / float(_FAR ** (0.5 * p) - 1.0)
+
+    def _number_between(self, fit: Fit, least: float, most: float) -> tuple[float, float]:
+        """How many rejected edges lie between two multiples of their thresholds to first order.
+
+        The second number is its standard deviation, where clusters lie there by chance.
+        """
+        candidates = self._candidates(fit, most)
+        chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
         ratios = candidates.ratios(chosen)
-        sizes = candidates.groups.sizes[chosen[(ratios > 1.0) & (ratios <= _FAR)]]
-        num_near = float(sizes.sum() + 2.0 * np.sqrt(np.sum(sizes**2)))
-        share_looked_at = len(chosen) / max(1, len(candidates.order))
-        return float(num_near / (_FAR ** (0.5 * p) - 1.0) / max(share_looked_at, 1e-300))
+        sizes = candidates.groups.sizes[chosen[(ratios > least) & (ratios <= most)]]
+        for_each = len(candidates.order) / max(1, len(chosen))
+        return for_each * float(sizes.sum()), for_each * float(np.sqrt(np.sum(sizes**2)))
 
     def with_likely(self, fit: Fit) -> Fit:
-        """The fit with rejected edges beyond the quantile 0.99 that are likely right.
+        """The fit with rejected edges beyond their thresholds that are likely right.
 
-        Between this and the quantile 0.999 lie 0.9 % of the right edges. How many wrong ones lie
-        there is estimated as in `expected_by_chance`. An edge below the quantile 0.99 was rejected
-        for another reason, and stays so.
+        Where errors are smaller than the matrices claim, but some much larger than most, edges come
+        back that lie within what the matrices claim, if most of these are right. Else edges come
+        back between the quantiles 0.99 and 0.999 of their costs, where 0.9 % of the
+        right ones lie, if fewer wrong ones are expected there. An edge within its threshold was
+        rejected for another reason, and stays so.
         """
         p = self.sets.motion_dimension
         farther, nearer = scipy.special.chdtri(p, [1.0 - _LIKELY_QUANTILE, 1.0 - QUANTILE])
-        candidates = self.singly._candidates(fit, farther / nearer)
-        near = list(candidates.near(candidates.order[:_MOST_FAILURES], farther / nearer))
-        if not near:
-            return fit
+        claimed = 1.0 / self.sets.scale
+        if claimed > farther / nearer and self._are_likely_within(fit, claimed):
+            return self._with_claimed(fit)
         num_kept = int((fit.kept & ~self.sets.known).sum())
         num_right = (_LIKELY_QUANTILE - QUANTILE) * num_kept
         num_wrong = self.expected_by_chance(fit) * ((farther / nearer) ** (0.5 * p) - 1.0)
         if num_wrong > num_right:
             return fit
+        candidates = self.singly._candidates(fit, farther / nearer)
         right_costs = self.sets.right_costs
         most = self.sets.scale * right_costs.thresholds(candidates.groups, _LIKELY_QUANTILE)
-        for k in near:
+        for k in candidates.near(candidates.order[:_MOST_FAILURES], farther / nearer):
             if not self.sets.has_time():
                 break
             larger = self._with_cluster(fit, candidates.groups[k], most[k])
             if larger is not None and larger.cost - fit.cost > candidates.thresholds[k]:
                 fit = larger
+        return fit
+
+    def _are_likely_within(self, fit: Fit, reach: float) -> bool:
+        """Whether most rejected edges between 1 and `reach` times their thresholds are right.
+
+        The wrong ones are told from those between `reach` and x = 4 times that, as in
+        `expected_by_chance`, for half of the numbers of a motion: matrices that claim much can
+        allow all translations that are measured. Nothing is told if more than a tenth of all
+        rejected edges lie within x times `reach`.
+        """
+        number, deviation = self._number_between(fit, 1.0, reach)
+        num_beyond, deviation_beyond = self._number_between(fit, reach, _FAR * reach)
+        num_rejected = int((~fit.kept).sum())
+        if number + num_beyond > _FEW * num_rejected:
+            return False
+        p = self.sets.motion_dimension
+        num_wrong = (num_beyond + 2.0 * deviation_beyond) / float(_FAR ** (0.25 * p) - 1.0)
+        return number - 2.0 * deviation >= 2.0 * num_wrong
+
+    def _with_claimed(self, fit: Fit) -> Fit:
+        """The fit with the rejected edges beyond their thresholds that the matrices allow.
+
+        They are added together, and those leave that cost more at the map with all of them.
+        """
+        claimed = 1.0 / self.sets.scale
+        candidates = self.singly._candidates(fit, claimed)
+        ratios = candidates.ratios(candidates.order)
+        within = candidates.order[(ratios > 1.0) & (ratios <= claimed)]
+        added = np.zeros_like(fit.kept)
+        added[candidates.groups.edges[within]] = True
+        larger = self.sets.settled(fit.kept | added, fit.poses)
+        while self.sets.has_time():
+            costs = self.sets.problem.edge_costs(larger.poses)
+            too_far = added & (costs > claimed * self.sets.allowed)
+            if not too_far.any():
+                return larger
+            added &= ~too_far
+            larger = self.sets.settled(fit.kept | added, larger.poses)
         return fit
 
     # Adding clusters

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.special
 from wrong_edges import ring_road, spoiled
 
 import pgo_models as pgo
-from pgo_models.geometry.rotations import BoolArray
+import solvers
+from pgo_models.geometry.rotations import BoolArray, exp_map, tangent_dimension
 from pgo_models.graphs.edge_groups import EdgeGroups
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
@@ -18,14 +22,14 @@ from solvers.robust.clusters import ClosurePairs
 from solvers.robust.consistency import odometry
 from solvers.robust.distances import FirstOrder
 from solvers.robust.edge_sets import EdgeSets
-from solvers.robust.revision import inlier_problem, truncated_cost
+from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
 
-def search_of(problem: pgo.PGOProblem, has_time: bool = True) -> ClusterSearch:
+def search_of(problem: pgo.PGOProblem, has_time: bool = True, scale: float = 1.0) -> ClusterSearch:
     known = odometry(problem.graph)
-    thresholds = pgo.chi2_thresholds(problem)
+    thresholds = scale * pgo.chi2_thresholds(problem)
     pairs = ClosurePairs.of(problem.graph, known)
-    return ClusterSearch(EdgeSets(problem, pairs, thresholds, 1.0, lambda: has_time))
+    return ClusterSearch(EdgeSets(problem, pairs, thresholds, scale, lambda: has_time))
 
 
 def street(seed: int, share: float = 0.5, kind: str = "random") -> tuple[pgo.PoseGraph, BoolArray]:
@@ -160,6 +164,59 @@ def test_a_wrong_run_that_is_kept_goes_as_a_whole_and_right_ones_take_its_place(
     kept[np.flatnonzero(is_wrong)[:5]] = True
     poses = polish(inlier_problem(problem, kept), pgo.odometry_start(graph))
     np.testing.assert_array_equal(search.improved(kept, poses).kept, ~is_wrong)
+
+
+def few_large_errors(
+    seed: int, kind: str, d: int, noise: NoiseModel, claim: float
+) -> tuple[pgo.PoseGraph, BoolArray, IntArray]:
+    """A spoiled grid world whose matrices claim errors `claim` times as large as most of them are.
+
+    The errors of some closures, which are returned too, are ten times as large as the others'.
+    """
+    rng = np.random.default_rng(seed)
+    graph = pgo.grid_world(2, 60, rng, d=d, noise=noise)
+    some = np.flatnonzero(~odometry(graph))[::5]
+    R_ij = graph.R_ij.copy()
+    t_ij = graph.t_ij.copy()
+    turns = 10.0 * noise.rotation_std * rng.standard_normal((len(some), tangent_dimension(d)))
+    R_ij[some] = R_ij[some] @ exp_map(turns)
+    t_ij[some] += 10.0 * noise.translation_std * rng.standard_normal((len(some), d))
+    kappa = graph.kappa / claim**2
+    tau = graph.tau / claim**2
+    claimed = replace(graph, R_ij=R_ij, t_ij=t_ij, kappa=kappa, tau=tau, information=None)
+    return *spoiled(claimed, 0.8, kind, seed), some
+
+
+@pytest.mark.parametrize("kind", ["random", "aliased"])
+@pytest.mark.parametrize("seed", range(3))
+def test_right_edges_with_large_errors_come_back_where_wrong_ones_are_far(
+    kind: str, seed: int
+) -> None:
+    """Errors of a millimetre, some of a centimetre, and matrices that claim two."""
+    graph, is_wrong, some = few_large_errors(seed, kind, 3, NoiseModel(1e-3, 1e-3), 20.0)
+    problem = pgo.PGOProblem(graph)
+    kept = ~is_wrong
+    kept[some] = False
+    search = search_of(problem, scale=0.0025)
+    fit = search.improved(kept, solvers.solve(inlier_problem(problem, kept)).poses)
+    assert not fit.kept[some].any()
+    likely = search.with_likely(fit)
+    assert not (likely.kept & is_wrong).any()
+    assert likely.kept[some].mean() >= 0.9
+
+
+@pytest.mark.parametrize("kind", ["random", "aliased"])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_matrices_allow_stays_out_where_they_allow_wrong_edges(kind: str, seed: int) -> None:
+    """Of a metre and more than a radian, which most wrong closures are within."""
+    graph, is_wrong, some = few_large_errors(seed, kind, 3, NoiseModel(0.05, 0.05), 20.0)
+    problem = pgo.PGOProblem(graph)
+    kept = ~is_wrong
+    kept[some] = False
+    fit = search_of(problem, scale=0.025).with_likely(
+        Fit.of(problem, kept, solvers.solve(inlier_problem(problem, kept)).poses)
+    )
+    assert not (fit.kept & is_wrong).any()
 
 
 def test_without_time_the_search_returns_what_it_was_given() -> None:
