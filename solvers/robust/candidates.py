@@ -13,7 +13,7 @@ from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.robust.distances import FirstOrder
 from solvers.robust.edge_sets import QUANTILE, EdgeSets
-from solvers.robust.revision import Fit, inlier_problem
+from solvers.robust.revision import Fit
 
 # Distances that are found together. With more, the fill of wrong closures makes each one slower.
 _TOGETHER = 100
@@ -44,7 +44,7 @@ class Candidates:
         """
         groups = clusters.of_edges(~fit.kept)
         thresholds = sets.scale * sets.right_costs.thresholds(groups, QUANTILE)
-        first_order = FirstOrder(sets.chains, inlier_problem(sets.problem, fit.kept), fit.poses)
+        first_order = FirstOrder(sets.chains, fit.inliers, fit.poses)
         quantiles = scipy.special.chdtri(groups.sizes * sets.motion_dimension, 1.0 - QUANTILE)
         largest = np.asarray(sets.scale * quantiles, dtype=float)
         distances = first_order.least_distances(groups.edges)

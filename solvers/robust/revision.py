@@ -32,8 +32,8 @@ from pgo_models.problem.thresholds import (
 Settle = Callable[[PGOProblem, Poses], Poses]
 
 # Factor on the error scale of the edges kept: real errors have heavier tails than Gaussian ones,
-# and an attempt that keeps the best edges alone has smaller ones. In cubicle no right edge costs
-# ten times its threshold so scaled.
+# and an attempt that keeps the best edges alone has smaller ones. In cubicle 1 % of the right
+# closures cost more than their thresholds so scaled.
 _TAIL_FACTOR = 10.0
 # An edge is contradicted if its loss is so many times that of the next edge, and improbable.
 _CONTRADICTED = 1.5
@@ -90,20 +90,27 @@ def threshold_scale(error_scale: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Edges kept, (m,), stationary poses of these, and their cost."""
+    """Edges kept, (m,), their problem, stationary poses of it, and the cost of these."""
 
     kept: BoolArray
+    inliers: PGOProblem
     poses: Poses
     cost: float
 
     @classmethod
-    def of(cls, problem: PGOProblem, kept: BoolArray, poses: Poses) -> Fit:
-        """Fit of the edges kept at given poses."""
-        return cls(kept, poses, inlier_problem(problem, kept).objective(poses))
+    def of(
+        cls, problem: PGOProblem, kept: BoolArray, poses: Poses, settle: Settle | None = None
+    ) -> Fit:
+        """Fit of the edges kept at given poses, or at those to which these settle."""
+        inliers = inlier_problem(problem, kept)
+        if settle is not None:
+            poses = settle(inliers, poses)
+        return cls(kept, inliers, poses, inliers.objective(poses))
 
-    def error_scale(self, problem: PGOProblem) -> float:
+    @property
+    def error_scale(self) -> float:
         """Scale of the errors of the edges kept."""
-        return error_scale(edge_residuals(inlier_problem(problem, self.kept), self.poses))
+        return error_scale(edge_residuals(self.inliers, self.poses))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +158,7 @@ def drop_contradicted(
         least_loss = float(_ratios(problem, known, allowed, suspect.fit).max())
         if not is_contradicted(suspect, least_loss):
             break
-        if suspect.loss <= suspect.fit.error_scale(problem):
+        if suspect.loss <= 1.0 and suspect.loss <= suspect.fit.error_scale:
             break
         following = _remove_worst(problem, known, allowed, suspect.fit, settle)
         if following is None or not is_contradicted(suspect, following.loss):
@@ -171,8 +178,7 @@ def _remove_worst(
     others[worst] = False
     if ratio[worst] == 0.0 or not is_held(problem.graph, others):
         return None
-    poses = settle(inlier_problem(problem, others), fit.poses)
-    without = Fit.of(problem, others, poses)
+    without = Fit.of(problem, others, fit.poses, settle)
     return _Removal(worst, without, (fit.cost - without.cost) / allowed[worst])
 
 
