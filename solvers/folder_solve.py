@@ -50,6 +50,8 @@ from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 
+_BEFORE_GNC = "poses found before GNC"  # name of a start
+
 
 @dataclass(frozen=True, eq=False)
 class FolderSolution(Summarised):
@@ -347,7 +349,8 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
             break
         is_first = False
     if not (answer.best.proof.is_certified or answer.best.is_out_of_time):
-        answer = _solved_from(answer, "poses of GNC", replace(pipeline, soc=None))
+        start = answer.place.begins_at or _BEFORE_GNC
+        answer = _solved_from(answer, start, replace(pipeline, soc=None))
     return answer
 
 
@@ -356,7 +359,7 @@ def _after_pass(answer: _Answer, job: Pass, pipeline: Pipeline) -> _Answer:
     revision = revised(answer.opened, job, answer.place.monitor)
     answer.place.stages.append(revision.stage)
     place = replace(answer.place, driver=revision.opened.driver)
-    start = "poses of GNC" if revision.is_better else "poses found before GNC"
+    start = "poses of GNC" if revision.is_better else _BEFORE_GNC
     answer = replace(answer, opened=revision.opened, place=place)
     if revision.is_better:
         answer = replace(answer, rejected_by="the map of the others contradicts")

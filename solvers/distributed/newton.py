@@ -82,9 +82,13 @@ class CoverTrial:
 
 @dataclass(frozen=True)
 class EliminatedAlgebra:
-    """`newton_step.NewtonAlgebra` by driver and robots: two rounds a factorisation, two a move."""
+    """`newton_step.NewtonAlgebra` by driver and robots: two rounds a factorisation.
+
+    A move takes two rounds, or one if it `is_straight`.
+    """
 
     driver: Driver
+    is_straight: bool = False
 
     @property
     def has_secants(self) -> bool:
@@ -98,12 +102,12 @@ class EliminatedAlgebra:
     def evaluate(self, model: Model, length: float) -> CoverTrial:
         """Return the poses after a move.
 
-        Their translations are the best ones for the rotations, but not of chi2: there the matrix of
-        the translations differs from rotations to rotations. Nor where F is near its rounding level
-        (`refine`).
+        Their translations are the best ones for the rotations, unless the move is straight, but not
+        of chi2: there the matrix of the translations differs from rotations to rotations. Nor where
+        F is near its rounding level (`refine`).
         """
         is_nearly_exact = model.objective <= NEARLY_EXACT * model.rounding_level
-        if self.driver.is_final or is_nearly_exact:
+        if self.is_straight or self.driver.is_final or is_nearly_exact:
             return self._straight_trial(model, length)
         return self._trial_with_best_translations(model, length)
 
@@ -174,11 +178,13 @@ class SubstructuredNewton:
 
     Where the Hessian is not positive definite it is that of S + eta blockdiag(0, I), with a small
     eta that makes it so, if the model `is_shifted`, which follows negative curvature; else the
-    damped Gauss-Newton matrix.
+    damped Gauss-Newton matrix. Where `is_straight`, translations move with the rotations, and not
+    to the best ones for these, which takes a round more for each move.
     """
 
     newton: Newton = field(default_factory=Newton)
     is_shifted: bool = False
+    is_straight: bool = False
 
     @property
     def max_iterations(self) -> int:
@@ -203,7 +209,7 @@ class SubstructuredNewton:
             num_rows = driver.num_poses * driver.d
             shift = first_shift(state.eta, driver.current.objective, num_rows)
         rules = StepRules(tolerance, self.newton.second_order, shift)
-        algebra = EliminatedAlgebra(driver)
+        algebra = EliminatedAlgebra(driver, self.is_straight)
         result = newton_step(algebra, rules)
         is_stationary = result.decrement <= tolerance or result.is_at_rounding
         if is_stationary and driver.current.objective <= driver.current.rounding_level:

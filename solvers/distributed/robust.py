@@ -25,6 +25,7 @@ from solvers.distributed.robots.reweighting import (
 )
 from solvers.network.counted_pool import Count
 from solvers.result import Measurement, Outcome, Stage, Status
+from solvers.riemannian.newton import Newton
 from solvers.robust.chains import is_whole
 from solvers.robust.gnc import (
     GNC,
@@ -58,12 +59,15 @@ class SharedEdges:
     """The edges that robots hold at their poses.
 
     Weights up to `least_weight` become `left_out`. `newton` has the figures of the last weighted
-    cost, and the moment when driver and robots hold these edges and poses.
+    cost, and the moment when driver and robots hold these edges and poses. `tolerance` is on the
+    relative decrease that Newton's steps leave: closer to a weighted cost that changes with the
+    poses, moves would only take rounds.
     """
 
     driver: Driver
     least_weight: float
     left_out: float
+    tolerance: float
     newton: SubstructuredNewtonState
 
     @property
@@ -92,11 +96,15 @@ class SharedEdges:
         """Edges with the weights that belong to their residuals."""
         self.driver.return_to(self.newton.moment)
         self.driver.reweigh(self._order(loss, mu, scale))
-        return replace(self, newton=SubstructuredNewton().init(self.driver, None))
+        return replace(self, newton=self._method.init(self.driver, None))
 
     def newton_step(self) -> SharedEdges:
         """Edges after a Newton step on the weighted cost, which moves the robots' poses."""
-        return replace(self, newton=SubstructuredNewton().step(self.driver, self.newton))
+        return replace(self, newton=self._method.step(self.driver, self.newton))
+
+    @property
+    def _method(self) -> SubstructuredNewton:
+        return SubstructuredNewton(Newton(tolerance=self.tolerance), is_straight=True)
 
     def _order(self, loss: RobustLoss, mu: float, scale: float) -> Reweigh:
         is_truncated = loss is RobustLoss.TRUNCATED
@@ -146,7 +154,8 @@ class SharedGNC:
     def init(self, driver: Driver, start: SharedGNCState | None) -> SharedGNCState:
         """State 0, at the poses that driver and robots hold."""
         newton = SubstructuredNewton().init(driver, None)
-        edges = SharedEdges(driver, self.least_weight, self.left_out, newton)
+        tolerance = self.gnc.tolerance
+        edges = SharedEdges(driver, self.least_weight, self.left_out, tolerance, newton)
         schedule, sums = first_schedule(self.gnc, edges, self.has_map)
         return ScheduleState(0, schedule, sums, edges)
 

@@ -60,7 +60,7 @@ def test_they_keep_what_the_whole_graph_keeps(
     assert solution.num_rejected == graph.num_edges - len(kept)
     assert solution.certificate.objective == pytest.approx(central.objective, rel=1e-6)
     assert solution.certificate.is_certified
-    assert solution.ledger.rounds < 130  # 106 at most, with two solves and their proofs
+    assert solution.ledger.rounds < 85  # 69 at most, with two solves and their proofs
     assert "which the map of the others contradicts" in " ".join(str(solution).split())
 
 
