@@ -1,34 +1,39 @@
-"""Graphs with wrong loop closures: ours and GTSAM's GncLMOptimizer on the same files (extra
-`peers`), CPU seconds.
+"""Graphs with wrong loop closures: what a robust solve says of itself, and GTSAM on the same files.
 
     python tests/benchmarks/robust.py [--graphs intel MIT ..] [--shares 0.3 ..] [--kinds random
-    aliased] [--seeds 0 ..] python tests/benchmarks/robust.py --summary rows.jsonl python
-    tests/benchmarks/robust.py --verdicts
+    aliased] [--seeds 0 ..] [--rows rows.jsonl] [--no-gtsam]
 
-Both start from odometry, which both are told is right. Each run is a process of its own with a time
-limit; a row a run is printed and appended to --rows, which --summary reads. precision: of the loop
-closures kept, the share that is right; recall: of the right ones, the share kept; ATE: metres to
-the optimum of the same cost without wrong edges.
+Without --graphs the cases are those of `CASES`. Costs are those of the files (F where a file has
+indefinite matrices). GTSAM's GncLMOptimizer (extra `peers`) starts from the same poses, is told as
+we are that odometry is right, and has the same quantile for its thresholds. A run is a process of
+its own, with a limit of CPU seconds; it is appended to --rows, and one that is there already is
+not made again.
 
-`--verdicts` runs ours alone on the cases of `VERDICTS`, or on those of --graphs, --shares, --kinds
-and --seeds, in the cost of the files. It appends each run to --rows, and takes from there those
-that were made before. It prints each run with its truncated cost over that of the planted truth,
-precision, recall, the exit code of `pgo solve` and the line of the verdict, the worst first, and
-then a row for each graph. A run is silent where precision or recall is below 0.95 and the exit code
-is 0.
+It prints each run, the worst first, and a row for each graph:
+
+- cost / planted: the truncated cost over that of the map of the right edges alone, both with the
+  thresholds that ours ended with.
+- P: of the closures kept, the share that is right; R: of the right ones, the share kept.
+- exit: of `pgo solve` (3: doubtful, or not certified), with the line of the verdict.
+
+A run is silent where P or R is below 0.95 and the exit code is 0.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import itertools
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -38,10 +43,11 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models.figures import rounded_up
-from pgo_models.geometry.poses import absolute_trajectory_error
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
 from pgo_models.graphs.precisions import indefinite_edges
 from pgo_models.graphs.scenes import NoiseModel
+from solvers.baselines.gtsam import poses_of_values
 from solvers.robust.consistency import odometry
 from solvers.robust.revision import truncated_cost
 from solvers.robust.weighted_edges import first_poses
@@ -49,25 +55,12 @@ from solvers.robust.weighted_edges import first_poses
 sys.path.insert(0, str(Path(__file__).parent.parent))  # of the tests, whose graphs are used
 from wrong_edges import noisy_sphere, ring_road
 
-NAMES = "smallGrid3D sphere2500 torus3D parking-garage cubicle CSAIL intel manhattan MIT kitti_00"
 TAGS = {"EDGE_SE2": (2, 3), "EDGE_SE3:QUAT": (3, 7)}
-HEADS = (
-    "graph",
-    "share",
-    "kind",
-    "seed",
-    "ours P / R",
-    "ATE m",
-    "s",
-    "verdict (gap)",
-    "GTSAM P / R",
-    "ATE m",
-    "s",
-)
+CHEAP = 1.001  # of the planted truth's truncated cost
 LOST = 0.99  # precision or recall below it is a failure
 SILENT = 0.95  # precision or recall below it has to be said
 # Graphs, shares of wrong closures, kinds and seeds. Graphs of `SCENES` are generated.
-VERDICTS = [
+CASES = [
     ("noisy_sphere", (0.0,), ("random",), (0,)),
     *(
         (name, (0.5, 0.9), ("random", "aliased"), (0,))
@@ -76,7 +69,7 @@ VERDICTS = [
 ]
 # Graph, share, kind, seed.
 Case = tuple[str, float, str, int]
-VERDICT_HEADS = (
+HEADS = (
     "graph",
     "share",
     "kind",
@@ -86,6 +79,9 @@ VERDICT_HEADS = (
     "s",
     "exit",
     "verdict",
+    "GTSAM: cost / planted",
+    "P / R",
+    "s",
 )
 GRAPH_HEADS = (
     "graph",
@@ -94,6 +90,10 @@ GRAPH_HEADS = (
     "P and R at least 0.99",
     "alarmed of these",
     "silent",
+    "mean s",
+    "GTSAM: finished",
+    "cost at most 1.001",
+    "P and R at least 0.99",
     "mean s",
 )
 
@@ -141,65 +141,54 @@ def spoil(source: Path, out: Path, share: float, kind: str, seed: int) -> list[i
     return list(range(len(edges), len(edges) + len(wrong)))
 
 
-def posed(path: Path, information: bool) -> pgo.PGOProblem:
-    """Problem of a file in the cost that is compared; F where its matrices are indefinite."""
+def posed(path: Path) -> pgo.PGOProblem:
+    """Problem of a file in its own cost; in F where its matrices are indefinite."""
     graph = pgo.read_g2o(path)
-    has_chi2 = information and not indefinite_edges(graph).any()
-    weighting = pgo.Weighting.INFORMATION if has_chi2 else pgo.Weighting.ISOTROPIC
+    weighting = pgo.Weighting.INFORMATION
+    if indefinite_edges(graph).any():
+        weighting = pgo.Weighting.ISOTROPIC
     return pgo.PGOProblem(graph, weighting=weighting)
 
 
-def ours(path: Path, information: bool) -> dict[str, Any]:
+def ours(path: Path) -> dict[str, Any]:
     """Edges kept, poses, seconds and verdict of a robust solve."""
-    problem = posed(path, information)
+    problem = posed(path)
     began = time.process_time()
     solution = solvers.solve(problem, robust=solvers.GNC(), progress=False)
     seconds = time.process_time() - began
-    verdict = solution.verdict.name
     found = solution.robust
+    assert found is not None
     exit_code = 2
     if solution.status.is_success:
         exit_code = 0 if solution.is_certified else 3
     return {
         "kept": np.flatnonzero(found.kept).tolist(),
+        "R": solution.poses.R.tolist(),
         "t": solution.poses.t.tolist(),
         "seconds": seconds,
-        "verdict": verdict,
-        "gap": solution.certificate.proven_gap,
-        "start": found.start,
         "headline": found.headline,
         "exit": exit_code,
-        "certified": solution.is_certified,
-        "cost": found.cost,
         "threshold_scale": found.threshold_scale,
     }
 
 
-def theirs(path: Path, _: bool) -> dict[str, Any]:
-    """The same of GTSAM."""
+def gtsams(path: Path) -> dict[str, Any]:
+    """Edges kept, poses and seconds of GTSAM."""
     gtsam: ModuleType = importlib.import_module("gtsam")
     graph = pgo.read_g2o(path)
-    is_3d = graph.d == 3
+    d = graph.d
     ids = graph.pose_ids.tolist()
-    factors, _ = gtsam.readG2o(str(path), is_3d)
-    poses = first_poses(graph, odometry(graph))
+    factors, _ = gtsam.readG2o(str(path), d == 3)
+    first = poses_in_gtsam(gtsam, first_poses(graph, odometry(graph)))
     start = gtsam.Values()
-    for k, R, t in zip(ids, poses.R, poses.t, strict=True):
-        start.insert(
-            k,
-            (
-                gtsam.Pose3(gtsam.Rot3(R), t)
-                if is_3d
-                else gtsam.Pose2(*t, np.arctan2(R[1, 0], R[0, 0]))
-            ),
-        )
+    for key, pose in zip(ids, first, strict=True):
+        start.insert(key, pose)
     ends = [tuple(factors.at(e).keys()) for e in range(factors.size())]
-    assert ends == [
-        (ids[i], ids[j]) for i, j in zip(graph.i.tolist(), graph.j.tolist(), strict=True)
-    ]
-    tight = gtsam.noiseModel.Isotropic.Sigma(6 if is_3d else 3, 1e-4)
-    prior = gtsam.PriorFactorPose3 if is_3d else gtsam.PriorFactorPose2
-    factors.add(prior(ids[0], (start.atPose3 if is_3d else start.atPose2)(ids[0]), tight))
+    of_graph = zip(graph.i.tolist(), graph.j.tolist(), strict=True)
+    assert ends == [(ids[i], ids[j]) for i, j in of_graph]
+    tight = gtsam.noiseModel.Isotropic.Sigma(6 if d == 3 else 3, 1e-4)
+    prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
+    factors.add(prior(ids[0], first[0], tight))
     params = gtsam.GncLMParams()
     params.setKnownInliers([*np.flatnonzero(odometry(graph)).tolist(), graph.num_edges])
     began = time.process_time()
@@ -208,125 +197,61 @@ def theirs(path: Path, _: bool) -> dict[str, Any]:
     answer = optimizer.optimize()
     seconds = time.process_time() - began
     weights = np.asarray(optimizer.getWeights())[: graph.num_edges]
-    at = answer.atPose3 if is_3d else answer.atPose2
-    t = [np.atleast_1d(at(k).translation()).tolist() for k in ids]
-    return {"kept": np.flatnonzero(weights > 0.5).tolist(), "t": t, "seconds": seconds}
+    at = answer.atPose3 if d == 3 else answer.atPose2
+    values = gtsam.Values()
+    for k, key in enumerate(ids):
+        values.insert(k, at(key))
+    poses = poses_of_values(gtsam, values, d)
+    kept = np.flatnonzero(weights > 0.5).tolist()
+    return {"kept": kept, "R": poses.R.tolist(), "t": poses.t.tolist(), "seconds": seconds}
 
 
-def judged(
-    result: dict[str, Any] | None, problem: pgo.PGOProblem, wrong: list[int], clean: pgo.Poses
-) -> dict:
-    """Precision, recall and ATE of a run; nothing of one that did not finish."""
-    if result is None:
-        return {"precision": None, "recall": None, "ate": None, "seconds": None}
-    graph = problem.graph
-    kept, is_wrong, loops = (np.zeros(graph.num_edges, dtype=bool) for _ in range(3))
-    kept[result.pop("kept")], is_wrong[wrong], loops = True, True, ~odometry(graph)
-    right = int((kept & loops & ~is_wrong).sum())
-    poses = pgo.Poses(clean.R, np.array(result.pop("t")))
-    return {
-        "precision": right / max(1, int((kept & loops).sum())),
-        "recall": right / max(1, int((loops & ~is_wrong).sum())),
-        "ate": absolute_trajectory_error(poses, clean),
-        **result,
-    }
+METHODS = {"ours": ours, "gtsam": gtsams}
 
 
-def child(which: str, path: Path, information: bool, limit: float) -> dict[str, Any] | None:
+def child(which: str, path: Path, limit: float) -> dict[str, Any] | None:
     """Result of a run in a process of its own; None where it fails or takes too long."""
-    command = [
-        sys.executable,
-        __file__,
-        "--child",
-        which,
-        "--graphs",
-        str(path),
-        *["--information"] * information,
-    ]
+    command = [sys.executable, __file__, "--child", which, "--graphs", str(path)]
+    most = round(limit)
+    capped = partial(resource.setrlimit, resource.RLIMIT_CPU, (most, most))
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=limit)
-    except (subprocess.TimeoutExpired, subprocess.CalledProcessError) as error:
-        print(str(getattr(error, "stderr", "") or error)[-300:], file=sys.stderr)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=True, preexec_fn=capped
+        )
+    except subprocess.CalledProcessError as error:
+        print(str(error.stderr or error)[-300:], file=sys.stderr)
         return None
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def row(one: dict[str, Any]) -> str:
-    """A row of the table."""
+@dataclass(frozen=True, eq=False)
+class Spoiled:
+    """A graph with wrong closures, and what the answers of methods are measured by."""
 
-    def cells(run: dict[str, Any]) -> list[str]:
-        if run["seconds"] is None:
-            return ["-", "-", "not finished"]
-        return [
-            f"{run['precision']:.3f} / {run['recall']:.3f}",
-            f"{run['ate']:.3g}",
-            f"{run['seconds']:.2f}",
-        ]
+    problem: pgo.PGOProblem
+    is_wrong: Array  # (m,) bool
+    planted: pgo.Poses  # the map of the right edges alone
+    thresholds: Array  # (m,)
 
-    a = one["ours"]
-    verdict = "-" if a["seconds"] is None else f"{a['verdict']} ({rounded_up(a['gap'], 2)})"
-    first = [one["graph"], str(one["share"]), one["kind"], str(one["seed"])]
-    return (
-        "| "
-        + " | ".join(
-            [*first, *cells(a), verdict, *(cells(one["gtsam"]) if one["gtsam"] else "---")]
-        )
-        + " |"
-    )
+    def cost(self, poses: pgo.Poses) -> float:
+        return truncated_cost(self.problem, odometry(self.problem.graph), self.thresholds, poses)
 
-
-def summary(rows: list[dict[str, Any]]) -> None:
-    """Print what all rows say together."""
-    ours = [one["ours"] for one in rows if one["ours"]["seconds"] is not None]
-    failed = [min(run["precision"], run["recall"]) < LOST for run in ours]
-    spoiled = [run["precision"] < 1.0 for run in ours]
-    alarm = [not run["certified"] for run in ours]
-    print(
-        f"{len(rows)} runs, {len(ours)} finished; precision and recall of {LOST} or more in"
-        f" {failed.count(False)}"
-    )
-    for what, bad in (
-        (f"precision or recall under {LOST}", failed),
-        ("a wrong edge kept", spoiled),
-    ):
-        caught = sum(b and a for b, a in zip(bad, alarm, strict=True))
-        print(f"{what}: {sum(bad)}, not certified of them: {caught}")
-    print(
-        "not certified and all is well:"
-        f" {sum(a and not b for a, b in zip(alarm, failed, strict=True))}"
-    )
-    both = [
-        (one["ours"], one["gtsam"])
-        for one in rows
-        if one["gtsam"] and one["ours"]["seconds"] is not None
-    ]
-    done = [(a, b) for a, b in both if b["seconds"] is not None]
-    if not done:
-        print(f"GTSAM finished none of {len(both)}")
-        return
-    ratio = [b["seconds"] / a["seconds"] for a, b in done]
-    print(
-        f"GTSAM finished {len(done)} of {len(both)}; its seconds over ours, geometric mean of"
-        " these:",
-        end=" ",
-    )
-    print(f"{np.exp(np.mean(np.log(ratio))):.3g}, from {min(ratio):.3g} to {max(ratio):.3g}")
-    for name in ("precision", "recall"):
-        less = [
-            (one["ours"][name] - one["gtsam"][name], one["graph"])
-            for one in rows
-            if (one["ours"], one["gtsam"]) in done
-        ]
-        lost = sum(b[name] >= LOST > a[name] for a, b in done)
-        print(
-            f"{name}: ours less GTSAM's at worst {min(less)[0]:+.3f} ({min(less)[1]}), at least as"
-            " good in",
-            end=" ",
-        )
-        print(
-            f"{sum(x >= 0 for x, _ in less)} of {len(less)}; under {LOST} where GTSAM is not:"
-            f" {lost}"
-        )
+    def judged(self, found: dict[str, Any]) -> dict[str, Any]:
+        """Ratio of costs, precision and recall of what a method found, and its other figures."""
+        is_closure = ~odometry(self.problem.graph)
+        kept = np.zeros(len(self.is_wrong), dtype=bool)
+        kept[found.pop("kept")] = True
+        poses = pgo.Poses(np.array(found.pop("R")), np.array(found.pop("t")))
+        right = int((kept & is_closure & ~self.is_wrong).sum())
+        precision = right / max(1, int((kept & is_closure).sum()))
+        recall = right / max(1, int((is_closure & ~self.is_wrong).sum()))
+        return {
+            "ratio": self.cost(poses) / self.cost(self.planted),
+            "precision": precision,
+            "recall": recall,
+            "quality": min(precision, recall),
+            **found,
+        }
 
 
 def source_of(name: str, folder: Path) -> Path:
@@ -338,146 +263,105 @@ def source_of(name: str, folder: Path) -> Path:
     return path
 
 
-def planted_cost(source: Path, problem: pgo.PGOProblem, scale: float) -> float:
-    """Truncated cost of the map of the right edges alone, thresholds times `scale`."""
-    right = solvers.solve(posed(source, True), progress=False).poses
-    thresholds = scale * pgo.chi2_thresholds(problem)
-    return truncated_cost(problem, odometry(problem.graph), thresholds, right)
-
-
-def verdict_of(case: Case, limit: float) -> dict[str, Any] | None:
-    """A run of `--verdicts`, with its truncated cost over that of the planted truth."""
+def run_of(case: Case, limit: float, gtsam_limit: float) -> dict[str, Any]:
+    """Run of both methods; None for one that did not finish, or was not asked for."""
     name, share, kind, seed = case
     with tempfile.TemporaryDirectory() as folder:
         source = source_of(name, Path(folder))
         path = Path(folder) / f"{name}.g2o"
         wrong = spoil(source, path, share, kind, seed)
-        found = child("ours", path, True, limit)
-        problem = posed(path, True)
-        if found is None:
-            return None
-        planted = planted_cost(source, problem, found["threshold_scale"])
-    start = first_poses(problem.graph, odometry(problem.graph))
-    run = judged(found, problem, wrong, start)
-    return {**run, "ratio": run["cost"] / planted, "quality": min(run["precision"], run["recall"])}
+        problem = posed(path)
+        is_wrong = np.isin(np.arange(problem.graph.num_edges), wrong)
+        planted = solvers.solve(posed(source), progress=False).poses
+        found = child("ours", path, limit)
+        scale = 1.0 if found is None else found["threshold_scale"]
+        spoiled = Spoiled(problem, is_wrong, planted, scale * pgo.chi2_thresholds(problem))
+        theirs = child("gtsam", path, gtsam_limit) if gtsam_limit else None
+    both = {"ours": found, "gtsam": theirs}
+    return {name: spoiled.judged(each) if each else None for name, each in both.items()}
 
 
-def verdicts(cases: list[Case], rows: Path | None, limit: float) -> None:
-    """Print the table of `--verdicts`, the worst runs first, and how many runs were silent."""
-    made: dict[Case, dict[str, Any] | None] = {}
-    if rows is not None and rows.exists():
-        for line in rows.read_text().splitlines():
-            row = json.loads(line)
-            made[tuple(row["case"])] = row["run"]
-    runs = []
-    for case in cases:
-        if case not in made:
-            made[case] = verdict_of(case, limit)
-            if rows is not None:
-                with rows.open("a") as file:
-                    file.write(json.dumps({"case": case, "run": made[case]}) + "\n")
-        run = made[case]
-        if run is None:
-            print(f"not finished: {case}", file=sys.stderr, flush=True)
-            continue
-        runs.append((case, run))
-    runs.sort(key=lambda each: (-each[1]["ratio"], each[1]["quality"]))
-    print(f"| {' | '.join(VERDICT_HEADS)} |\n|{'---|' * len(VERDICT_HEADS)}")
-    for case, run in runs:
-        quality = f"{run['precision']:.3f} / {run['recall']:.3f}"
-        figures = f"{run['ratio']:.5f}", quality, f"{run['seconds']:.1f}", run["exit"]
-        print(f"| {' | '.join(map(str, [*case, *figures, run['headline']]))} |")
-    print(f"\n| {' | '.join(GRAPH_HEADS)} |\n|{'---|' * len(GRAPH_HEADS)}")
-    for name in dict.fromkeys(case[0] for case in cases):
-        num_cases = sum(case[0] == name for case in cases)
-        _print_summary(name, [run for case, run in runs if case[0] == name], num_cases)
-    _print_summary("all", [run for _, run in runs], len(cases))
+def cells(run: dict[str, Any] | None) -> list[str]:
+    """Cost, precision and recall, and seconds of a run."""
+    if run is None:
+        return ["-", "-", "not finished"]
+    quality = f"{run['precision']:.3f} / {run['recall']:.3f}"
+    return [f"{run['ratio']:.5f}", quality, f"{run['seconds']:.1f}"]
 
 
-def _print_summary(name: str, runs: list[dict[str, Any]], num_cases: int) -> None:
-    """Print the row of a graph."""
-    cheap = sum(run["ratio"] <= 1.001 for run in runs)
-    good = [run for run in runs if run["quality"] >= LOST]
-    silent = sum(run["quality"] < SILENT and run["exit"] == 0 for run in runs)
+def print_table(heads: Iterable[str], lines: Iterable[Sequence[object]]) -> None:
+    heads = list(heads)
+    print(f"\n| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
+    for line in lines:
+        print(f"| {' | '.join(map(str, line))} |")
+
+
+def summary(name: str, runs: list[dict[str, Any]]) -> list[object]:
+    """Row of a graph."""
+
+    def counts(runs: list[dict[str, Any]]) -> tuple[int, list[dict[str, Any]], str]:
+        cheap = sum(run["ratio"] <= CHEAP for run in runs)
+        good = [run for run in runs if run["quality"] >= LOST]
+        return cheap, good, f"{sum(run['seconds'] for run in runs) / max(1, len(runs)):.1f}"
+
+    done = [run["ours"] for run in runs if run["ours"]]
+    cheap, good, seconds = counts(done)
+    silent = sum(run["quality"] < SILENT and run["exit"] == 0 for run in done)
     alarmed = sum(run["exit"] != 0 for run in good)
-    seconds = sum(run["seconds"] for run in runs) / max(1, len(runs))
-    counts = f"{len(runs)} of {num_cases}", cheap, len(good), alarmed, silent, f"{seconds:.1f}"
-    print(f"| {' | '.join(map(str, [name, *counts]))} |")
-
-
-def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--graphs", nargs="+", default=NAMES.split())
-    parser.add_argument("--shares", nargs="+", type=float, default=[0.1, 0.3, 0.5, 0.7])
-    parser.add_argument("--kinds", nargs="+", default=["random", "aliased"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--information", action="store_true", help="ours in chi2, not in F")
-    parser.add_argument(
-        "--limit",
-        type=float,
-        default=120.0,
-        help="seconds of a run of GTSAM; ours: five times that",
-    )
-    parser.add_argument("--no-gtsam", action="store_true")
-    parser.add_argument("--rows", type=Path, help="JSON lines to append to")
-    parser.add_argument(
-        "--summary", type=Path, help="print what the rows of this file say, and run nothing"
-    )
-    parser.add_argument("--child", choices=("ours", "gtsam"), help=argparse.SUPPRESS)
-    parser.add_argument(
-        "--verdicts", action="store_true", help="ours alone, and what it says of its answers"
-    )
-    return parser.parse_args()
+    theirs = [run["gtsam"] for run in runs if run["gtsam"]]
+    their_cheap, their_good, their_seconds = counts(theirs)
+    of_ours = [f"{len(done)} of {len(runs)}", cheap, len(good), alarmed, silent, seconds]
+    return [name, *of_ours, len(theirs), their_cheap, len(their_good), their_seconds]
 
 
 def main() -> None:
     options = arguments()
-    if options.verdicts:
-        lists = [(name, options.shares, options.kinds, options.seeds) for name in options.graphs]
-        of_options = [(name, *case) for name, *each in lists for case in itertools.product(*each)]
-        of_table = [(name, *case) for name, *each in VERDICTS for case in itertools.product(*each)]
-        cases = of_table if options.graphs == NAMES.split() else of_options
-        verdicts(cases, options.rows, 5 * options.limit)
-        return
     if options.child:
-        run = ours if options.child == "ours" else theirs
-        print(json.dumps(run(Path(options.graphs[0]), options.information)))
+        print(json.dumps(METHODS[options.child](Path(options.graphs[0]))))
         return
-    if options.summary:
-        rows = [json.loads(line) for line in options.summary.read_text().splitlines()]
-        summary(rows)
-        return
+    lists = CASES
+    if options.graphs:
+        lists = [(name, options.shares, options.kinds, options.seeds) for name in options.graphs]
+    cases = [(name, *case) for name, *each in lists for case in itertools.product(*each)]
     has_gtsam = not options.no_gtsam and importlib.util.find_spec("gtsam") is not None
-    rows = []
-    print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
-    for name in options.graphs:
-        source = Path(os.environ["PGO_DATA"]) / f"{name}.g2o"
-        clean = {
-            w: solvers.solve(posed(source, w), progress=False).poses
-            for w in {options.information, True}
-        }
-        for share, kind, seed in (
-            (a, b, c) for a in options.shares for b in options.kinds for c in options.seeds
-        ):
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / f"{name}.g2o"
-                wrong = spoil(source, path, share, kind, seed)
-                problem = posed(path, options.information)
-                w = options.information
-                one = {"graph": name, "share": share, "kind": kind, "seed": seed, "gtsam": None}
-                one["ours"] = judged(
-                    child("ours", path, w, 5 * options.limit), problem, wrong, clean[w]
-                )
-                if has_gtsam:
-                    one["gtsam"] = judged(
-                        child("gtsam", path, w, options.limit), problem, wrong, clean[True]
-                    )
-            rows.append(one)
-            print(row(one), flush=True)
-            if options.rows:
+    gtsam_limit = options.gtsam_limit if has_gtsam else 0.0
+    made: dict[Case, dict[str, Any]] = {}
+    if options.rows is not None and options.rows.exists():
+        for line in options.rows.read_text().splitlines():
+            row = json.loads(line)
+            made[tuple(row["case"])] = row["run"]
+    for case in cases:
+        if case not in made:
+            made[case] = run_of(case, options.limit, gtsam_limit)
+            if options.rows is not None:
                 with options.rows.open("a") as file:
-                    file.write(json.dumps(one) + "\n")
-    summary(rows)
+                    file.write(json.dumps({"case": case, "run": made[case]}) + "\n")
+        if made[case]["ours"] is None:
+            print(f"not finished: {case}", file=sys.stderr, flush=True)
+    finished = [(case, run) for case in cases if (run := made[case])["ours"]]
+    finished.sort(key=lambda each: (-each[1]["ours"]["ratio"], each[1]["ours"]["quality"]))
+    lines = []
+    for case, run in finished:
+        one = run["ours"]
+        lines.append([*case, *cells(one), one["exit"], one["headline"], *cells(run["gtsam"])])
+    print_table(HEADS, lines)
+    of_graphs = {name: [made[case] for case in cases if case[0] == name] for name, *_ in cases}
+    everything = [made[case] for case in cases]
+    print_table(GRAPH_HEADS, [summary(*each) for each in [*of_graphs.items(), ("all", everything)]])
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--graphs", nargs="+")
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.3, 0.5, 0.7, 0.9])
+    parser.add_argument("--kinds", nargs="+", default=["random", "aliased"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--limit", type=float, default=600.0, help="CPU seconds of a run of ours")
+    parser.add_argument("--gtsam-limit", type=float, default=180.0, help="the same of GTSAM")
+    parser.add_argument("--no-gtsam", action="store_true")
+    parser.add_argument("--rows", type=Path, help="JSON lines to read, and to append to")
+    parser.add_argument("--child", choices=METHODS, help=argparse.SUPPRESS)
+    return parser.parse_args()
 
 
 if __name__ == "__main__":
