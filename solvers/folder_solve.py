@@ -359,7 +359,7 @@ def _after_pass(answer: _Answer, job: Pass, pipeline: Pipeline) -> _Answer:
     revision = revised(answer.opened, job, answer.place.monitor)
     answer.place.stages.append(revision.stage)
     place = replace(answer.place, driver=revision.opened.driver)
-    start = "poses of GNC" if revision.is_better else _BEFORE_GNC
+    start = "poses of GNC" if revision.is_better else answer.place.begins_at or _BEFORE_GNC
     answer = replace(answer, opened=revision.opened, place=place)
     if revision.is_better:
         answer = replace(answer, rejected_by="the map of the others contradicts")

@@ -178,8 +178,8 @@ class SubstructuredNewton:
 
     Where the Hessian is not positive definite it is that of S + eta blockdiag(0, I), with a small
     eta that makes it so, if the model `is_shifted`, which follows negative curvature; else the
-    damped Gauss-Newton matrix. Where `is_straight`, translations move with the rotations, and not
-    to the best ones for these, which takes a round more for each move.
+    damped Gauss-Newton matrix. Where `is_straight`, translations move along with the rotations,
+    one round a move; else they are solved for, two rounds a move.
     """
 
     newton: Newton = field(default_factory=Newton)
@@ -201,7 +201,7 @@ class SubstructuredNewton:
         return SubstructuredNewtonState(k=0, moment=moment, objective=driver.current.objective)
 
     def step(self, driver: Driver, state: SubstructuredNewtonState) -> SubstructuredNewtonState:
-        """One factorisation and the moves it serves, two rounds each."""
+        """One factorisation and the moves it serves."""
         driver.return_to(state.moment)
         tolerance = stationary_tolerance(not driver.is_final, self.newton.share)
         shift = None

@@ -60,8 +60,8 @@ class SharedEdges:
 
     Weights up to `least_weight` become `left_out`. `newton` has the figures of the last weighted
     cost, and the moment when driver and robots hold these edges and poses. `tolerance` is on the
-    relative decrease that Newton's steps leave: closer to a weighted cost that changes with the
-    poses, moves would only take rounds.
+    relative decrease that Newton's steps leave, of F: the weights change with the poses, so that a
+    more accurate minimum of one weighted cost would be wasted rounds.
     """
 
     driver: Driver

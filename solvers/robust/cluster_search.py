@@ -31,7 +31,7 @@ from pgo_models.problem.thresholds import FALSE_ALARM
 from solvers.robust.candidates import Candidates
 from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
 from solvers.robust.linear_search import LinearSearch
-from solvers.robust.revision import Fit, inlier_problem, is_held
+from solvers.robust.revision import Fit, is_held
 from solvers.robust.weighted_edges import first_poses, held_together
 
 # Probability with which a right edge comes back in the end, where few wrong ones lie between this
@@ -57,8 +57,8 @@ _MOST_ROUNDS = 3
 # so many of them are looked at.
 _FAR = 4.0
 _MOST_SAMPLED = 100
-# Share of the rejected edges near a map from which on these tell nothing of wrong ones nearer by: 1
-# in 70 lie there on cubicle, and all on grid worlds whose matrices allow any motion of a closure.
+# If more than this share of the rejected edges lie near a map, their number does not tell how many
+# wrong ones lie nearer: 1 in 70 do on cubicle, and all where matrices allow any motion.
 _FEW = 0.1
 
 
@@ -151,12 +151,14 @@ class ClusterSearch:
     def with_likely(self, fit: Fit) -> Fit:
         """The fit with rejected edges beyond their thresholds that are likely right.
 
-        Where errors are smaller than the matrices claim, but some much larger than most, edges come
-        back that lie within what the matrices claim, if most of these are right. Else edges come
+        Where most errors are smaller than the matrices claim, edges come back that lie within what
+        the matrices claim, if most of these are right (`_are_likely_within`). Else edges come
         back between the quantiles 0.99 and 0.999 of their costs, where 0.9 % of the
         right ones lie, if fewer wrong ones are expected there. An edge within its threshold was
         rejected for another reason, and stays so.
         """
+        if not self.sets.scale > 0.0:  # the edges kept fit exactly
+            return fit
         p = self.sets.motion_dimension
         farther, nearer = scipy.special.chdtri(p, [1.0 - _LIKELY_QUANTILE, 1.0 - QUANTILE])
         claimed = 1.0 / self.sets.scale
@@ -181,15 +183,16 @@ class ClusterSearch:
     def _are_likely_within(self, fit: Fit, reach: float) -> bool:
         """Whether most rejected edges between 1 and `reach` times their thresholds are right.
 
-        The wrong ones are told from those between `reach` and x = 4 times that, as in
-        `expected_by_chance`, for half of the numbers of a motion: matrices that claim much can
-        allow all translations that are measured. Nothing is told if more than a tenth of all
-        rejected edges lie within x times `reach`.
+        With n edges between `reach` and x = 4 times that, and s their standard deviation, (n + 2 s)
+        / (x^(p / 4) - 1) wrong ones are expected within `reach`. The exponent is half of that in
+        `expected_by_chance`, as matrices that claim much can allow all translations. It is False,
+        too, if more than a tenth of all rejected edges lie within x times `reach`: where few edges
+        are rejected, this cannot be told.
         """
         number, deviation = self._number_between(fit, 1.0, reach)
         num_beyond, deviation_beyond = self._number_between(fit, reach, _FAR * reach)
         num_rejected = int((~fit.kept).sum())
-        if number + num_beyond > _FEW * num_rejected:
+        if number == 0.0 or number + num_beyond > _FEW * num_rejected:
             return False
         p = self.sets.motion_dimension
         num_wrong = (num_beyond + 2.0 * deviation_beyond) / float(_FAR ** (0.25 * p) - 1.0)
@@ -198,7 +201,8 @@ class ClusterSearch:
     def _with_claimed(self, fit: Fit) -> Fit:
         """The fit with the rejected edges beyond their thresholds that the matrices allow.
 
-        They are added together, and those leave that cost more at the map with all of them.
+        They are added together. An edge leaves again that costs more than the matrices allow at the
+        map with all that are left, until there is none.
         """
         claimed = 1.0 / self.sets.scale
         candidates = self.singly._candidates(fit, claimed)
@@ -312,7 +316,7 @@ class ClusterSearch:
         kept = with_edges(fit.kept, cluster)
         larger = self.sets.settled(kept, fit.poses)
         if larger.cost - fit.cost > threshold and self._has_drifted(fit, cluster):
-            start = chordal_start(inlier_problem(self.sets.problem, kept))
+            start = chordal_start(larger.inliers)
             larger = min(larger, self.sets.settled(kept, start), key=lambda other: other.cost)
         return larger if larger.cost - fit.cost <= threshold else None
 

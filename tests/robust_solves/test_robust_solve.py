@@ -479,3 +479,18 @@ def test_a_large_graph_begins_with_tight_thresholds_and_needs_two_attempts(clean
     assert first.name.startswith("thresholds times 0.01 at first")
     assert second.name.startswith("thresholds times 0.1 at first")  # the first found known inliers
     np.testing.assert_array_equal(solution.robust.rejected, is_wrong)
+
+
+def test_a_map_that_fits_exactly_has_nothing_to_take_back():
+    n = 12
+    ends = np.arange(n - 1)
+    motions = pgo.Poses(np.tile(np.eye(2), (n - 1, 1, 1)), np.tile([1.0, 0.0], (n - 1, 1)))
+    weights = np.full(n - 1, 50.0)
+    exact = pgo.PoseGraph(n, ends, ends + 1, motions.R, motions.t, kappa=weights, tau=weights)
+    wrong = pgo.Poses(np.tile(np.eye(2), (4, 1, 1)), np.array([[0, 3], [3, 0], [0, -4], [5, 5.0]]))
+    graph = exact.with_edges(
+        np.array([0, 1, 2, 3]), np.array([6, 8, 10, 11]), wrong, np.full(4, 50.0), np.full(4, 50.0)
+    )
+    solution = solvers.solve(graph, robust=solvers.GNC())
+    assert solution.robust.rejected.sum() == 4
+    assert "failed" not in solution.note
