@@ -50,8 +50,6 @@ from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
 from solvers.solution import joined_notes, note_of_absence, verdict_suffix
 
-_BEFORE_GNC = "poses found before GNC"  # name of a start
-
 
 @dataclass(frozen=True, eq=False)
 class FolderSolution(Summarised):
@@ -317,6 +315,11 @@ class _Answer:
     best: Attempt
     rejected_by: str = FolderSolution.rejected_by
 
+    @property
+    def found(self) -> str:
+        """Name of the poses that the robots have found, as a start."""
+        return self.place.begins_at or "poses found before GNC"
+
 
 def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
     """The answer after passes of GNC, each from the map of the one before.
@@ -349,8 +352,7 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
             break
         is_first = False
     if not (answer.best.proof.is_certified or answer.best.is_out_of_time):
-        start = answer.place.begins_at or _BEFORE_GNC
-        answer = _solved_from(answer, start, replace(pipeline, soc=None))
+        answer = _solved_from(answer, answer.found, replace(pipeline, soc=None))
     return answer
 
 
@@ -359,7 +361,7 @@ def _after_pass(answer: _Answer, job: Pass, pipeline: Pipeline) -> _Answer:
     revision = revised(answer.opened, job, answer.place.monitor)
     answer.place.stages.append(revision.stage)
     place = replace(answer.place, driver=revision.opened.driver)
-    start = "poses of GNC" if revision.is_better else answer.place.begins_at or _BEFORE_GNC
+    start = "poses of GNC" if revision.is_better else answer.found
     answer = replace(answer, opened=revision.opened, place=place)
     if revision.is_better:
         answer = replace(answer, rejected_by="the map of the others contradicts")

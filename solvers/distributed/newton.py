@@ -102,9 +102,9 @@ class EliminatedAlgebra:
     def evaluate(self, model: Model, length: float) -> CoverTrial:
         """Return the poses after a move.
 
-        Their translations are the best ones for the rotations, unless the move is straight, but not
-        of chi2: there the matrix of the translations differs from rotations to rotations. Nor where
-        F is near its rounding level (`refine`).
+        Their translations are the best ones for the rotations. They move straight on if the algebra
+        `is_straight`; of chi2, where the matrix of the translations differs from rotations to
+        rotations; and where F is near its rounding level (`refine`).
         """
         is_nearly_exact = model.objective <= NEARLY_EXACT * model.rounding_level
         if self.is_straight or self.driver.is_final or is_nearly_exact:

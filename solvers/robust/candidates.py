@@ -58,8 +58,12 @@ class Candidates:
         """First-order distances of the farthest edges of some, over their quantiles."""
         return self.first_order.distances(self.farthest[chosen]) / self.largest[chosen]
 
-    def near(self, chosen: IntArray, most: float) -> Iterator[int]:
-        """Those of some that are within `most` times their thresholds to first order."""
+    def near(self, chosen: IntArray, most: float, beyond: float = -np.inf) -> Iterator[int]:
+        """Those of some that are within `most` times their thresholds to first order.
+
+        They are farther than `beyond` times these.
+        """
         for first in range(0, len(chosen), _TOGETHER):
             looked_at = chosen[first : first + _TOGETHER]
-            yield from looked_at[self.ratios(looked_at) <= most].tolist()
+            ratios = self.ratios(looked_at)
+            yield from looked_at[(ratios > beyond) & (ratios <= most)].tolist()

@@ -132,21 +132,26 @@ class ClusterSearch:
         rejected ones between 1 and x = 4 times, and two standard deviations of their number, tell
         how many are expected below 1 at most. Of more than a hundred, a hundred are looked at.
         """
-        number, deviation = self._number_between(fit, 1.0, _FAR)
+        [(number, deviation)] = self._numbers_between(fit, 1.0, _FAR)
         p = self.sets.motion_dimension
         return (number + 2.0 * deviation) / float(_FAR ** (0.5 * p) - 1.0)
 
-    def _number_between(self, fit: Fit, least: float, most: float) -> tuple[float, float]:
-        """How many rejected edges lie between two multiples of their thresholds to first order.
+    def _numbers_between(self, fit: Fit, *multiples: float) -> list[tuple[float, float]]:
+        """How many rejected edges lie between each two multiples of their thresholds.
 
-        The second number is its standard deviation, where clusters lie there by chance.
+        The multiples go up, and distances are those to first order. Beside each number stands its
+        standard deviation, where clusters come by chance, each with all of its edges.
         """
-        candidates = self._candidates(fit, most)
+        candidates = self._candidates(fit, multiples[-1])
         chosen = candidates.order[:: len(candidates.order) // _MOST_SAMPLED + 1]
         ratios = candidates.ratios(chosen)
-        sizes = candidates.groups.sizes[chosen[(ratios > least) & (ratios <= most)]]
         for_each = len(candidates.order) / max(1, len(chosen))
-        return for_each * float(sizes.sum()), for_each * float(np.sqrt(np.sum(sizes**2)))
+        numbers = []
+        for least, most in itertools.pairwise(multiples):
+            sizes = candidates.groups.sizes[chosen[(ratios > least) & (ratios <= most)]]
+            deviation = float(np.sqrt(np.sum(sizes**2)))
+            numbers.append((for_each * float(sizes.sum()), for_each * deviation))
+        return numbers
 
     def with_likely(self, fit: Fit) -> Fit:
         """The fit with rejected edges beyond their thresholds that are likely right.
@@ -189,8 +194,9 @@ class ClusterSearch:
         too, if more than a tenth of all rejected edges lie within x times `reach`: where few edges
         are rejected, this cannot be told.
         """
-        number, deviation = self._number_between(fit, 1.0, reach)
-        num_beyond, deviation_beyond = self._number_between(fit, reach, _FAR * reach)
+        within, beyond = self._numbers_between(fit, 1.0, reach, _FAR * reach)
+        number, deviation = within
+        num_beyond, deviation_beyond = beyond
         num_rejected = int((~fit.kept).sum())
         if number == 0.0 or number + num_beyond > _FEW * num_rejected:
             return False
@@ -206,10 +212,11 @@ class ClusterSearch:
         """
         claimed = 1.0 / self.sets.scale
         candidates = self.singly._candidates(fit, claimed)
-        ratios = candidates.ratios(candidates.order)
-        within = candidates.order[(ratios > 1.0) & (ratios <= claimed)]
         added = np.zeros_like(fit.kept)
-        added[candidates.groups.edges[within]] = True
+        for k in candidates.near(candidates.order, claimed, beyond=1.0):
+            if not self.sets.has_time():
+                return fit
+            added[candidates.groups[k]] = True
         larger = self.sets.settled(fit.kept | added, fit.poses)
         while self.sets.has_time():
             costs = self.sets.problem.edge_costs(larger.poses)

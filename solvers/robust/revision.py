@@ -90,7 +90,7 @@ def threshold_scale(error_scale: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Edges kept, (m,), their problem, stationary poses of it, and the cost of these."""
+    """Edges kept, (m,), their problem, poses, which are stationary if settled, and F there."""
 
     kept: BoolArray
     inliers: PGOProblem
@@ -101,7 +101,7 @@ class Fit:
     def of(
         cls, problem: PGOProblem, kept: BoolArray, poses: Poses, settle: Settle | None = None
     ) -> Fit:
-        """Fit of the edges kept at given poses, or at those to which these settle."""
+        """Fit of the edges kept at the given poses, which `settle` first makes stationary."""
         inliers = inlier_problem(problem, kept)
         if settle is not None:
             poses = settle(inliers, poses)
@@ -158,6 +158,7 @@ def drop_contradicted(
         least_loss = float(_ratios(problem, known, allowed, suspect.fit).max())
         if not is_contradicted(suspect, least_loss):
             break
+        # The scale is at most 1, and takes the residuals of all edges.
         if suspect.loss <= 1.0 and suspect.loss <= suspect.fit.error_scale:
             break
         following = _remove_worst(problem, known, allowed, suspect.fit, settle)
