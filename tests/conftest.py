@@ -13,6 +13,8 @@ from hypothesis import settings
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
+from pgo_models.problem.cholesky import CholeskyBackend, default_backend
+from pgo_models.problem.cholmod import import_cvxopt
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -42,6 +44,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--rest"):
         config.option.markexpr = ""  # instead of "not slow"
+    # Before a test module imports CVXOPT, whose OpenBLAS would then choose other kernels than those
+    # of the processes that tests start: last bits would differ on CPUs with AVX-512.
+    if default_backend() is CholeskyBackend.CHOLMOD:
+        import_cvxopt()
 
 
 def parameters_of(item: pytest.Item) -> tuple[str, ...]:
