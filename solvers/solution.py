@@ -1,6 +1,7 @@
 """Solution: poses, cost, certificate and what each stage did; it prints and saves itself."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -148,7 +149,7 @@ class Solution:
         """
         return self.certificate.verdict if self.robust is None else self.robust.standing
 
-    @property
+    @cached_property
     def edge_residuals(self) -> EdgeResiduals:
         """How well every edge fits the poses, in the cost that was solved, and whether it may."""
         return edge_residuals(self.problem, self.poses)

@@ -195,7 +195,7 @@ def cheaper_end(
 
     If the start costs less than the end of a run that has converged, the start itself has not
     converged, unless its gradient is within tolerance. The robots have summed up that gradient
-    before the first step.
+    before the first step: it is in the first row of the history, which is of the start.
     """
     if not problem.objective(start) < problem.objective(end):
         return end, outcome.status

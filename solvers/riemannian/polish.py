@@ -320,12 +320,17 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
     >>> bool(problem.objective(polish(problem, start)) < problem.objective(start))
     True
     """
+    return polished(problem, poses, max_steps).poses
+
+
+def polished(problem: PGOProblem, poses: Poses, max_steps: int) -> PolishState:
+    """The last state of `polish`, with the factor of its last step."""
     state = start_run(problem, poses)
     for _ in range(max_steps):
         state = polish_step(problem, state)
         if state.is_stationary or not state.moved:
             break
-    return state.poses
+    return state
 
 
 def relative_decrement(problem: PGOProblem, poses: Poses) -> float:

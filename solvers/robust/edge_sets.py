@@ -10,10 +10,10 @@ from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.right_costs import RightCosts
-from solvers.riemannian.polish import polish
+from solvers.riemannian.polish import polished
 from solvers.robust.chains import Chains
 from solvers.robust.clusters import ClosurePairs
-from solvers.robust.revision import Fit, truncated_cost
+from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
 # Probability with which a right cluster, or edge, passes a test.
 QUANTILE = 0.99
@@ -60,7 +60,8 @@ class EdgeSets:
 
     def settled(self, kept: BoolArray, poses: Poses) -> Fit:
         """The fit of edges kept, (m,), at the poses to which Newton steps lead."""
-        return Fit.of(self.problem, kept, poses, _settle)
+        inliers = inlier_problem(self.problem, kept)
+        return Fit.of_state(kept, polished(inliers, poses, _MOST_STEPS))
 
     def cost(self, fit: Fit) -> float:
         """Truncated cost of the poses of a fit."""
@@ -69,10 +70,6 @@ class EdgeSets:
     def is_better(self, fit: Fit, other: Fit) -> bool:
         """Whether a fit costs less than another one, by more than rounding."""
         return self.cost(fit) < (1.0 - _LEAST_DECREASE) * self.cost(other)
-
-
-def _settle(inliers: PGOProblem, poses: Poses) -> Poses:
-    return polish(inliers, poses, max_steps=_MOST_STEPS)
 
 
 def with_edges(kept: BoolArray, edges: IntArray) -> BoolArray:

@@ -11,7 +11,6 @@ claim.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +19,8 @@ from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.problem.cholesky import CholeskyFactor
+from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import (
     FALSE_ALARM,
@@ -27,10 +28,10 @@ from pgo_models.problem.thresholds import (
     chi2_thresholds,
     edge_residuals,
 )
+from solvers.riemannian.polish import PolishState, polished
 
-# Moves poses to the stationary point nearby.
-Settle = Callable[[PGOProblem, Poses], Poses]
-
+# Newton steps after one edge was dropped.
+_STEPS_AFTER_EDGE = 4
 # Factor on the error scale of the edges kept: real errors have heavier tails than Gaussian ones,
 # and an attempt that keeps the best edges alone has smaller ones. In cubicle 1 % of the right
 # closures cost more than their thresholds so scaled.
@@ -90,7 +91,7 @@ def threshold_scale(error_scale: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Edges kept, (m,), their problem, poses, which are stationary if settled, and F there."""
+    """Edges kept, (m,), their problem, poses, and the cost there."""
 
     kept: BoolArray
     inliers: PGOProblem
@@ -98,14 +99,15 @@ class Fit:
     cost: float
 
     @classmethod
-    def of(
-        cls, problem: PGOProblem, kept: BoolArray, poses: Poses, settle: Settle | None = None
-    ) -> Fit:
-        """Fit of the edges kept at the given poses, which `settle` first makes stationary."""
+    def of(cls, problem: PGOProblem, kept: BoolArray, poses: Poses) -> Fit:
+        """Fit of the edges kept at the given poses."""
         inliers = inlier_problem(problem, kept)
-        if settle is not None:
-            poses = settle(inliers, poses)
         return cls(kept, inliers, poses, inliers.objective(poses))
+
+    @classmethod
+    def of_state(cls, kept: BoolArray, state: PolishState) -> Fit:
+        """Fit of the edges kept at the poses that `polished` has found for them."""
+        return cls(kept, state.here.problem, state.poses, state.objective)
 
     @property
     def error_scale(self) -> float:
@@ -113,25 +115,16 @@ class Fit:
         return error_scale(edge_residuals(self.inliers, self.poses))
 
 
-@dataclass(frozen=True, eq=False)
-class _Removal:
-    """An edge taken out, the fit without it, and by how much the cost fell, over its threshold."""
-
-    edge: int
-    fit: Fit
-    loss: float
-
-
 def drop_contradicted(
-    problem: PGOProblem, known: BoolArray, kept: BoolArray, poses: Poses, settle: Settle
+    problem: PGOProblem, known: BoolArray, kept: BoolArray, poses: Poses
 ) -> BoolArray:
     """Edges kept, (m,), without those that all others contradict.
 
     A sparsely constrained map deforms to fit a wrong closure, so that all residuals are small (data
     snooping, Baarda 1968, tests what they lose). The suspect e is the edge of the largest residual
-    that is not known, and its loss T_e the decrease of the cost without e, at the poses `settle`
-    finds then, over the quantile 0.99 of the edge. T is the same for the edge that would be the
-    next one. Edge e is dropped where
+    that is not known, and its loss T_e the decrease of the cost without e, as a few Newton steps
+    find it, over the quantile 0.99 of the edge. T is the same for the edge that would be the next
+    one. Edge e is dropped where
 
     - all others contradict it: T_e > 3 T among many edges, or T_e > 1.5 T and T_e beyond the
       quantile 1 - `FALSE_ALARM` over their number;
@@ -144,45 +137,87 @@ def drop_contradicted(
     improbable = chi2_thresholds(problem, 1.0 - FALSE_ALARM / num_tested) / allowed
     clear_factor = _CLEARLY_CONTRADICTED if num_tested >= _NUM_FOR_CLEAR else np.inf
 
-    def is_contradicted(suspect: _Removal, next_loss: float) -> bool:
-        is_clear = suspect.loss > clear_factor * next_loss
-        is_far = suspect.loss > _CONTRADICTED * next_loss
-        is_improbable = suspect.loss > improbable[suspect.edge]
+    def is_contradicted(removal: _Removal, next_loss: float) -> bool:
+        is_clear = removal.loss > clear_factor * next_loss
+        is_far = removal.loss > _CONTRADICTED * next_loss
+        is_improbable = removal.loss > improbable[removal.edge]
         return is_clear or bool(is_far and is_improbable)
 
     fit = Fit.of(problem, kept, poses)
-    suspect = _remove_worst(problem, known, allowed, fit, settle)
-    while suspect is not None:
-        # The loss of the next edge is at least its residual: where that is too large already, its
-        # removal need not be tried.
-        least_loss = float(_ratios(problem, known, allowed, suspect.fit).max())
-        if not is_contradicted(suspect, least_loss):
+    suspect = _Suspect.of(problem, known, allowed, fit)
+    removal = suspect.removed() if suspect is not None else None
+    while removal is not None:
+        suspect = _Suspect.of(problem, known, allowed, removal.fit)
+        # A lower bound of the next loss mostly tells, and its removal need not be tried.
+        if suspect is None or not is_contradicted(removal, suspect.least_loss(removal.factor)):
             break
         # The scale is at most 1, and takes the residuals of all edges.
-        if suspect.loss <= 1.0 and suspect.loss <= suspect.fit.error_scale:
+        if removal.loss <= 1.0 and removal.loss <= removal.fit.error_scale:
             break
-        following = _remove_worst(problem, known, allowed, suspect.fit, settle)
-        if following is None or not is_contradicted(suspect, following.loss):
+        following = suspect.removed()
+        if not is_contradicted(removal, following.loss):
             break
-        fit = suspect.fit
-        suspect = following
+        fit = removal.fit
+        removal = following
     return fit.kept
 
 
-def _remove_worst(
-    problem: PGOProblem, known: BoolArray, allowed: Array, fit: Fit, settle: Settle
-) -> _Removal | None:
-    """The fit without the edge of the largest residual; None where poses need it to connect."""
-    ratio = _ratios(problem, known, allowed, fit)
-    worst = int(ratio.argmax())
-    others = fit.kept.copy()
-    others[worst] = False
-    if ratio[worst] == 0.0 or not is_held(problem.graph, others):
-        return None
-    without = Fit.of(problem, others, fit.poses, settle)
-    return _Removal(worst, without, (fit.cost - without.cost) / allowed[worst])
+@dataclass(frozen=True, eq=False)
+class _Suspect:
+    """The edge of a fit that costs the most thresholds, its threshold, and the other edges, (m,).
+
+    `inliers` is the problem of these.
+    """
+
+    fit: Fit
+    edge: int
+    threshold: float
+    others: BoolArray
+    inliers: PGOProblem
+
+    @classmethod
+    def of(cls, problem: PGOProblem, known: BoolArray, allowed: Array, fit: Fit) -> _Suspect | None:
+        """The suspect of a fit; None where it costs nothing, or poses need it to connect."""
+        is_tested = fit.kept & ~known
+        ratio = np.where(is_tested, problem.edge_costs(fit.poses) / allowed, 0.0)
+        worst = int(ratio.argmax())
+        others = fit.kept.copy()
+        others[worst] = False
+        if ratio[worst] == 0.0 or not is_held(problem.graph, others):
+            return None
+        return cls(fit, worst, float(allowed[worst]), others, inlier_problem(problem, others))
+
+    def removed(self) -> _Removal:
+        """The fit of the other edges, as the poses follow."""
+        state = polished(self.inliers, self.fit.poses, _STEPS_AFTER_EDGE)
+        loss = (self.fit.cost - state.objective) / self.threshold
+        return _Removal(self.edge, Fit.of_state(self.others, state), loss, state.factor)
+
+    def least_loss(self, factor: CholeskyFactor | None) -> float:
+        """Lower bound of the loss, with the factor of the Hessian near the poses of the fit.
+
+        The other edges cost no more than after one move by that factor, which has the edge, and so
+        moves the poses too little, but in about the right direction; nor more than before it.
+        """
+        poses = self.fit.poses
+        here = self.inliers.at(poses)
+        least_cost = here.value
+        if factor is not None:
+            layout = TangentLayout(self.inliers.num_poses, self.inliers.d)
+            step = -factor.solve(layout.join(*here.riemannian_gradient))
+            moved = poses.moved_along(*layout.split(step))
+            least_cost = min(least_cost, self.inliers.objective(moved))
+        return (self.fit.cost - least_cost) / self.threshold
 
 
-def _ratios(problem: PGOProblem, known: BoolArray, allowed: Array, fit: Fit) -> Array:
-    """Costs over thresholds of the edges kept that are not known, (m,); zeros for the others."""
-    return np.where(fit.kept & ~known, problem.edge_costs(fit.poses) / allowed, 0.0)
+@dataclass(frozen=True, eq=False)
+class _Removal:
+    """An edge taken out, the fit without it, and by how much the cost fell, over its threshold.
+
+    `factor` is that of the Hessian of the cost near the poses of the fit.
+    """
+
+    edge: int
+    fit: Fit
+    loss: float
+    factor: CholeskyFactor | None

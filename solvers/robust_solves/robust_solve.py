@@ -12,13 +12,11 @@ from pgo_models.errors import FAILURES, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.network.ledger import Ledger
 from solvers.places import with_partition
 from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
-from solvers.riemannian.polish import polish
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.consistency import PCM, pairwise_consistent
@@ -37,8 +35,6 @@ from solvers.robust_solves.attempts import (
 from solvers.robust_solves.choice import Choice
 from solvers.solution import Solution, joined_notes
 
-# Newton steps after one edge was dropped.
-_STEPS_AFTER_EDGE = 4
 # A plain solve comes first on a large graph where this share of closures is at most so many times
 # beyond its thresholds at the chordal start.
 _NEAR_AT_START = 10.0
@@ -200,7 +196,7 @@ class _RobustSolve:
         if not (known | (residuals.cost <= scale * chi2_thresholds(problem, quantile))).all():
             return False
         every_edge = self.doubted.every_edge
-        remaining = drop_contradicted(problem, known, every_edge, solution.poses, _settled)
+        remaining = drop_contradicted(problem, known, every_edge, solution.poses)
         return bool(remaining.all())
 
     def _noise_of_every_edge(self, solution: Solution) -> float | None:
@@ -322,7 +318,7 @@ class _RobustSolve:
         fit = search.improved(estimate.kept, estimate.poses)
         kept = fit.kept
         if self._has_time():
-            kept = drop_contradicted(doubted.problem, doubted.known, kept, fit.poses, _settled)
+            kept = drop_contradicted(doubted.problem, doubted.known, kept, fit.poses)
         if np.array_equal(kept, estimate.kept):
             return estimate
         revised = self.places.revised(estimate, kept, fit.poses)
@@ -452,8 +448,3 @@ class _RobustSolve:
         seconds = time.perf_counter() - self.began
         note = joined_notes(solution.note, *self.failures)
         return replace(solution, robust=rejection, ledger=ledger, seconds=seconds, note=note)
-
-
-def _settled(inliers: PGOProblem, poses: Poses) -> Poses:
-    """Stationary poses near the given ones."""
-    return polish(inliers, poses, max_steps=_STEPS_AFTER_EDGE)

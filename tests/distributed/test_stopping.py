@@ -42,16 +42,16 @@ LOSSY = Faults(loss=0.2, max_delay=2, seed=1)
 
 @dataclass(frozen=True)
 class Ended:
-    """Status and poses of a run, and the figures that it gave of them."""
+    """Status and poses of a run, and what it gave of its start and of its end."""
 
     status: Status
     poses: Poses
-    measurement: Measurement
+    history: History
 
 
 def in_one_place(problem: PGOProblem, soc: SOC) -> Ended:
     outcome = run(soc, problem)
-    return Ended(outcome.status, outcome.poses, outcome.history.records[-1].measurement)
+    return Ended(outcome.status, outcome.poses, outcome.history)
 
 
 def with_driver(problem: PGOProblem, soc: SOC) -> Ended:
@@ -59,15 +59,13 @@ def with_driver(problem: PGOProblem, soc: SOC) -> Ended:
     driver = open_driver(problem, soc.robots, InProcess())
     driver.go_to_chordal_start()
     outcome = run(ConsensusSOC(soc), driver)
-    return Ended(outcome.status, collect_copies(driver), outcome.history.records[-1].measurement)
+    return Ended(outcome.status, collect_copies(driver), outcome.history)
 
 
 def alone(problem: PGOProblem, soc: SOC, faults: Faults | None = None) -> Ended:
     robots = Robots(soc.robots, driver_memory=0, faults=faults)
     solution = solve(problem, Pipeline(soc=soc), robots=robots)
-    return Ended(
-        solution.status, solution.poses, solution.stages[-1].history.records[-1].measurement
-    )
+    return Ended(solution.status, solution.poses, solution.stages[-1].history)
 
 
 def under_faults(problem: PGOProblem, soc: SOC) -> Ended:
@@ -97,14 +95,15 @@ def random_case(seed: int) -> tuple[PGOProblem, SOC]:
 
 
 def check_claim(problem: PGOProblem, soc: SOC, way: Way) -> Status:
-    """What CONVERGED says holds of the poses returned, and the last row of the history is of these
-    poses.
+    """What CONVERGED says holds of the poses returned, and a row of the history is of these poses:
+    the last one, or the first one where the start costs less.
     """
     ended = way(problem, soc)
+    rows = ended.history.records
     if ended.status is Status.CONVERGED:
         gradient = dense_relative_gradient(problem, ended.poses)
         F = problem.objective(ended.poses)
-        told = ended.measurement
+        told = min(rows[-1].measurement, rows[0].measurement, key=lambda row: row.objective)
         assert gradient <= soc.tolerance * (1 + ROUNDING)
         if F > 1e-9:  # else both are rounding
             assert told.objective == pytest.approx(F, rel=1e-6)
@@ -120,6 +119,15 @@ def test_the_gradient_is_within_tolerance_at_the_poses_returned(
 ) -> None:
     problem, soc = random_case(seed)
     check_claim(problem, replace(soc, tolerance=tolerance), way)
+
+
+def test_a_start_that_costs_less_than_the_end_is_of_the_first_row() -> None:
+    # Found by a drawn test: without acceleration F may rise within a loose tolerance.
+    problem, soc = random_case(35697)
+    loose = replace(soc, tolerance=1e-3)
+    rows = under_faults(problem, loose).history.records
+    assert rows[0].measurement.objective < rows[-1].measurement.objective
+    assert check_claim(problem, loose, under_faults) is Status.CONVERGED
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import solvers
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
-from solvers.riemannian.polish import polish
+from solvers.robust import revision
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.edge_sets import EdgeSets
@@ -24,7 +23,6 @@ from solvers.robust_solves.attempts import Plan
 pytestmark = pytest.mark.slow  # robust solves from end to end
 
 CASES = Path(__file__).parent.parent / "cases"
-POLISHED = partial(polish, max_steps=4)
 KINDS = pytest.mark.parametrize("kind", ["random", "aliased"])
 
 
@@ -337,7 +335,7 @@ def test_a_closure_within_its_threshold_that_all_others_contradict_is_taken_out(
     everything = np.ones(graph.num_edges, dtype=bool)
     poses = solvers.solve(problem).poses
     assert problem.edge_costs(poses)[-1] < 0.5 * pgo.chi2_thresholds(problem)[-1]
-    kept = drop_contradicted(problem, known, everything, poses, POLISHED)
+    kept = drop_contradicted(problem, known, everything, poses)
     np.testing.assert_array_equal(np.flatnonzero(~kept), [right.num_edges])
 
 
@@ -348,9 +346,31 @@ def test_right_closures_are_hardly_ever_taken_out():
         known = known_inliers(problem.graph, None)
         everything = np.ones(problem.graph.num_edges, dtype=bool)
         poses = solvers.solve(problem).poses
-        kept = drop_contradicted(problem, known, everything, poses, POLISHED)
+        kept = drop_contradicted(problem, known, everything, poses)
         num_dropped += int((~kept).sum())
     assert num_dropped <= 3
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("weighting", [pgo.Weighting.ISOTROPIC, pgo.Weighting.INFORMATION])
+def test_the_bound_that_spares_removals_changes_no_decision(seed, weighting, monkeypatch):
+    graph = with_shifted(careful(100, seed))
+    problem = pgo.PGOProblem(graph, weighting=weighting)
+    known = known_inliers(graph, None)
+    everything = np.ones(graph.num_edges, dtype=bool)
+    poses = solvers.solve(problem).poses
+    bound_of = revision._Suspect.least_loss
+    bounds = []
+
+    def no_bound(suspect, factor):
+        bounds.append((bound_of(suspect, factor), suspect.removed().loss))
+        return 0.0
+
+    kept = drop_contradicted(problem, known, everything, poses)
+    monkeypatch.setattr(revision._Suspect, "least_loss", no_bound)
+    np.testing.assert_array_equal(drop_contradicted(problem, known, everything, poses), kept)
+    assert all(0.0 < bound <= loss for bound, loss in bounds)
+    assert bounds
 
 
 def test_few_closures_contradict_nothing_within_its_threshold():
@@ -361,9 +381,7 @@ def test_few_closures_contradict_nothing_within_its_threshold():
     known = known_inliers(right, None)
     assert 0 < (~known).sum() < 15
     everything = np.ones(right.num_edges, dtype=bool)
-    assert drop_contradicted(
-        problem, known, everything, solvers.solve(problem).poses, POLISHED
-    ).all()
+    assert drop_contradicted(problem, known, everything, solvers.solve(problem).poses).all()
 
 
 def test_robots_take_out_what_one_place_does():
