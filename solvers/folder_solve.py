@@ -279,6 +279,7 @@ class FilesOfRobots:
                 self.robust, GNC
             ):  # which goes on from it, whether it is certified or not
                 first = replace(pipeline.with_newton_alone(pipeline.newton), soc=pipeline.soc)
+                place = replace(place, is_on_the_way=True)
             answer = _Answer(opened, place, solve_at(place, first, None))
             if isinstance(self.robust, GNC):
                 answer = _after_passes(answer, self.robust, pipeline)
@@ -352,6 +353,7 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
             break
         is_first = False
     if not (answer.best.proof.is_certified or answer.best.is_out_of_time):
+        answer = replace(answer, place=replace(answer.place, is_on_the_way=False))
         answer = _solved_from(answer, answer.found, replace(pipeline, soc=None))
     return answer
 

@@ -84,6 +84,7 @@ from solvers.network.ledger import Ledger
 from solvers.network.messages import Snapshot, restore, take_snapshot
 from solvers.network.moments import Moment
 from solvers.result import Measurement
+from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.subgraph import RobotSummary
 
 Q = TypeVar("Q")
@@ -101,6 +102,7 @@ class CoverPoses:
     objective: float = math.nan  # F of all poses
     # F if every residual were as large as rounding can make it.
     rounding_level: float = 0.0
+    ratios: RatioSums | None = None  # of all edges in a robust solve, for the last `Reweigh`
 
     @property
     def multipliers(self) -> Array:
@@ -543,11 +545,13 @@ class Driver:
 
     def with_cost(self, poses: CoverPoses, answers: Sequence[CostParts]) -> CoverPoses:
         """Poses with F, its rounding level and M X on the cover, summed over the robots' parts."""
+        ratios = [answer.ratios for answer in answers if answer.ratios is not None]
         return replace(
             poses,
             force=self.interface(1, self.d).gather([answer.force for answer in answers]),
             objective=math.fsum(answer.objective for answer in answers),
             rounding_level=math.fsum(answer.level for answer in answers),
+            ratios=RatioSums.total(ratios) if ratios else None,
         )
 
     def scattered_rotations(self, z: Array) -> list[Array]:

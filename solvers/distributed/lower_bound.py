@@ -46,11 +46,14 @@ class InterfaceProof:
     traces: list[float]  # parts of tr(Lambda)
 
 
-def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
+def best_bound_distributed(
+    driver: Driver, gap: float, most_lost: float | None = None
+) -> LowerBound:
     """Return the bound at the current poses, as `central.best_bound` does in one place.
 
     It is grounded without eta where that goes through, with handedness terms in closed form where
-    it goes through with these, else the better form with the smallest eta found.
+    it goes through with these, else the better form with the smallest eta found. That is looked for
+    as long as eta takes less than `most_lost` from the bound, or all of it unless that is given.
     """
     is_near_zero = driver.current.objective <= driver.current.rounding_level
     if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
@@ -68,7 +71,7 @@ def best_bound_distributed(driver: Driver, gap: float) -> LowerBound:
             with_terms = _bound_with_terms(driver, diagonal_less_terms(driver, described))
             if with_terms is not None:
                 return with_terms
-    return _search_forms(driver, gap) if has_scale else central.NO_BOUND
+    return _search_forms(driver, gap, most_lost=most_lost) if has_scale else central.NO_BOUND
 
 
 def best_bound_with_terms(driver: Driver, gap: float, less_terms: Array) -> LowerBound:
@@ -90,16 +93,18 @@ def diagonal_less_terms(driver: Driver, described: Sequence[TermsAnswer]) -> Arr
     return driver.gather_diagonal([answer.diagonal for answer in described])
 
 
-def _search_forms(driver: Driver, gap: float, less_terms: Array | None = None) -> LowerBound:
+def _search_forms(
+    driver: Driver, gap: float, less_terms: Array | None = None, most_lost: float | None = None
+) -> LowerBound:
     """Return the better of both forms of the bound, each with the smallest eta found."""
     count = driver.num_poses * driver.d
     smallest = central.smallest_shift(gap, driver.current.objective, count)
-    # At stationary poses tr(Lambda) is F; it only says where the search ends.
+    # At stationary poses tr(Lambda) is F.
     return central.search_forms(
         partial(prove_with_eta, driver, less_terms=less_terms),
         partial(prove_grounded, driver, less_terms=less_terms),
         smallest,
-        driver.current.objective,
+        driver.current.objective if most_lost is None else most_lost,
         count,
     )
 

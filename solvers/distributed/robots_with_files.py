@@ -60,7 +60,8 @@ class RobotsWithFiles(DriverPlace):
     """A solve by robots with own files: of the folder `name`, to a relative `gap`.
 
     `kept` are the answers that the robots have kept, the last of which is theirs. With
-    `begins_at`, the name of a start, it begins at poses that the robots have found before.
+    `begins_at`, the name of a start, it begins at poses that the robots have found before. A map
+    that `is_on_the_way` to another one has a bound to the gap or none.
     """
 
     name: str
@@ -68,6 +69,7 @@ class RobotsWithFiles(DriverPlace):
     weighting: Weighting
     kept: list[KeptAnswer] = field(default_factory=list)
     begins_at: str | None = None
+    is_on_the_way: bool = False
 
     @property
     def has_landmarks(self) -> bool:
@@ -99,7 +101,8 @@ class RobotsWithFiles(DriverPlace):
     def certify(self, attempt: Attempt) -> Attempt:
         """Find a bound, and have the robots keep the current poses if these are the cheapest."""
         driver = self.driver
-        bound = best_bound_distributed(driver, self.gap)
+        most_lost = self.gap * driver.current.objective if self.is_on_the_way else None
+        bound = best_bound_distributed(driver, self.gap, most_lost)
         source = BoundSource.GIVEN
         dual = attempt.dual_bound
         if dual is not None and dual.lower_bound > bound.value:

@@ -47,11 +47,11 @@ from solvers.robust.weighted_edges import (
 # Share of the least weight that stays with an edge that a run in one place leaves out, where known
 # inliers alone may leave poses apart.
 _LEFT_OUT_SHARE = 1e-4
-# The median of ratios between 10^-24 and 1 by division of the exponent, to 1e-6 of itself: each of
+# The median of ratios between 10^-24 and 1 by division of the exponent, to 2e-6 of itself: each of
 # the rounds counts the ratios below so many bounds.
 _LEAST_EXPONENT = -24.0
-_NUM_BOUNDS = 127
-_NUM_DIVISIONS = 4
+_NUM_BOUNDS = 299
+_NUM_DIVISIONS = 3
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,10 @@ class SharedEdges:
 
     Weights up to `least_weight` become `left_out`. `newton` has the figures of the last weighted
     cost, and the moment when driver and robots hold these edges and poses. `tolerance` is on the
-    relative decrease that Newton's steps leave, of F: the weights change with the poses, so that a
-    more accurate minimum of one weighted cost would be wasted rounds.
+    relative decrease that Newton's steps leave, of F. It is the root of that of the run: the
+    weights change with the poses, so that a more accurate minimum of one weighted cost would be
+    wasted rounds, and once they do not, one more step squares what is left. `weighed` is how the
+    weights came about, once they have: robots then send the sums that belong to it with every cost.
     """
 
     driver: Driver
@@ -69,6 +71,7 @@ class SharedEdges:
     left_out: float
     tolerance: float
     newton: SubstructuredNewtonState
+    weighed: Reweigh | None = None
 
     @property
     def d(self) -> int:
@@ -78,7 +81,10 @@ class SharedEdges:
     def sums(self, loss: RobustLoss, mu: float, scale: float) -> RatioSums:
         """Sums over the edges of all robots."""
         self.driver.return_to(self.newton.moment)
-        return RatioSums.total(self.driver.ask(sum_ratios, self._order(loss, mu, scale)))
+        order = self._order(loss, mu, scale)
+        if order == self.weighed and self.driver.current.ratios is not None:
+            return self.driver.current.ratios
+        return RatioSums.total(self.driver.ask(sum_ratios, order))
 
     def median_ratio(self, scale: float, num_kept: float) -> float:
         """Median ratio of the edges within their thresholds, by counts of those below a bound."""
@@ -95,8 +101,9 @@ class SharedEdges:
     def reweighted(self, loss: RobustLoss, mu: float, scale: float) -> SharedEdges:
         """Edges with the weights that belong to their residuals."""
         self.driver.return_to(self.newton.moment)
-        self.driver.reweigh(self._order(loss, mu, scale))
-        return replace(self, newton=self._method.init(self.driver, None))
+        order = self._order(loss, mu, scale)
+        self.driver.reweigh(order)
+        return replace(self, newton=self._method.init(self.driver, None), weighed=order)
 
     def newton_step(self) -> SharedEdges:
         """Edges after a Newton step on the weighted cost, which moves the robots' poses."""
@@ -154,7 +161,7 @@ class SharedGNC:
     def init(self, driver: Driver, start: SharedGNCState | None) -> SharedGNCState:
         """State 0, at the poses that driver and robots hold."""
         newton = SubstructuredNewton().init(driver, None)
-        tolerance = self.gnc.tolerance
+        tolerance = math.sqrt(self.gnc.tolerance)
         edges = SharedEdges(driver, self.least_weight, self.left_out, tolerance, newton)
         schedule, sums = first_schedule(self.gnc, edges, self.has_map)
         return ScheduleState(0, schedule, sums, edges)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import MILD_NOISE, varied_graph
+from robots import Recording
 from wrong_edges import spoiled
 
 import pgo_models as pgo
@@ -107,6 +108,28 @@ def test_sums_and_costs_are_those_of_the_whole_graph(wrong, loss: RobustLoss) ->
         )
 
 
+@pytest.mark.parametrize("loss", RobustLoss)
+def test_sums_come_with_the_costs_of_moves(wrong, loss: RobustLoss) -> None:
+    problem = pgo.PGOProblem(wrong[0])
+    engine = Recording()
+    with closing(
+        open_driver(problem, partition(problem.graph, 3), engine, thresholds=allowed(problem))
+    ) as driver:
+        driver.set_poses(first_poses(problem.graph, subgraph_known(problem)))
+        method = SharedGNC(GNC(loss=loss), 1e-9, 1e-13)
+        state = method.init(driver, None)
+        for _ in range(12):
+            mu, scale = state.schedule.mu, state.schedule.scale
+            state = method.step(driver, state)
+            if state.schedule.scale == scale:
+                asked = replace(state.edges, weighed=None).sums(loss, mu, scale)
+                for name, value in vars(asked).items():
+                    assert getattr(state.sums, name) == pytest.approx(value, rel=1e-12)
+        num_asked = engine.times(sum_ratios)
+        method.step(driver, state)
+        assert engine.times(sum_ratios) == num_asked
+
+
 def test_what_is_asked_and_told_does_not_grow_with_the_edges() -> None:
     sizes = []
     for length in (40, 80):
@@ -118,7 +141,7 @@ def test_what_is_asked_and_told_does_not_grow_with_the_edges() -> None:
         sums = order_interior(sum_ratios, agent, order)
         reply = order_interior(reweigh, agent, order)
         boundary = (graph.d + 1) * len(subgraph.part.boundary)
-        assert count_bytes(reply) == 8 * (boundary + 2 + graph.d * boundary)
+        assert count_bytes(reply) == 8 * (boundary + 2 + graph.d * boundary) + count_bytes(sums)
         sizes.append((count_bytes(order), count_bytes(sums)))
     assert sizes == [(40, 56), (40, 56)]
 

@@ -15,7 +15,7 @@ from pgo_models.relaxations.low_rank import LiftedPoses
 from solvers.distributed.robots.elimination import FrontFactor, HeldFront
 from solvers.distributed.robots.interior import Interior, interior_of
 from solvers.distributed.robots.proof import RobotProof
-from solvers.distributed.robots.records import RobotAscent
+from solvers.distributed.robots.records import Reweigh, RobotAscent
 from solvers.distributed.robots.state import (
     AveragingSession,
     DescentSession,
@@ -100,6 +100,7 @@ CLASSES = (
     RStep,
     RobotProof,
     HandednessTerms,
+    Reweigh,
     RobotAscent,
     System,
     RelaxationSession,

@@ -12,16 +12,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers_at
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
-from solvers.distributed.robots.records import CostParts
+from solvers.distributed.robots.records import CostParts, Reweigh
 from solvers.distributed.robots.state import (
     AveragingSession,
     DescentSession,
@@ -30,6 +31,7 @@ from solvers.distributed.robots.state import (
 )
 from solvers.distributed.robots.subdomain_blocks import Widths
 from solvers.distributed.robots.system import FactoredPart, System
+from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.subgraph import Part, Subgraph
 
 S = TypeVar("S", bound=Session)
@@ -136,10 +138,31 @@ class Interior:
         return self.problem.at(poses)
 
     def evaluation(self, poses: Poses) -> CostParts:
-        """Evaluate the parts of F and of M X on the boundary, at poses."""
+        """Evaluate the parts of F and of M X on the boundary, at poses, and sums of ratios."""
         here = self.at(poses)
         force = here.half_gradient[self.boundary_rows]
-        return CostParts(here.value, rounding_level(self.problem, poses), force)
+        reweighing = self.state.reweighing
+        ratios = self.ratio_sums(poses, reweighing) if reweighing is not None else None
+        return CostParts(here.value, rounding_level(self.problem, poses), force, ratios)
+
+    # Its edges in a robust solve, each with its full weight.
+
+    @property
+    def thresholds(self) -> Array:
+        """Thresholds of the robot's edges, (k,), infinite for known inliers."""
+        assert self.whole.thresholds is not None
+        return self.whole.thresholds
+
+    @property
+    def is_known(self) -> BoolArray:
+        """Whether an edge is known to be right, (k,)."""
+        return np.isinf(self.thresholds)
+
+    def ratio_sums(self, poses: Poses, order: Reweigh) -> RatioSums:
+        """Sums over the edges at poses."""
+        costs = self.whole.costs(poses)
+        thresholds = order.scale * self.thresholds
+        return RatioSums.of_edges(costs, thresholds, self.is_known, order.loss, order.mu)
 
     def multipliers(self) -> Array:
         """Compute Lambda_i, which hold in the interior alone, where the robot has every edge."""

@@ -9,6 +9,8 @@ import numpy as np
 
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.robots.proof import ProofSums
+from solvers.robust.losses import RobustLoss
+from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.copies import OwnPoses
 from solvers.soc.recursion_block import Agreement
 
@@ -42,11 +44,15 @@ class ReducedTranslations:
 
 @dataclass(frozen=True, eq=False)
 class CostParts:
-    """Part of F and of its rounding level, and the rows of M X on the boundary, ((d+1) g, d)."""
+    """Part of F and of its rounding level, and the rows of M X on the boundary, ((d+1) g, d).
+
+    In a robust solve, `ratios` are the sums that belong to the last `Reweigh`.
+    """
 
     objective: float
     level: float
     force: Array
+    ratios: RatioSums | None = None
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,11 @@ class Reweigh:
     scale: float  # of the thresholds
     least: float  # weight under which an edge hardly counts
     left_out: float  # weight of such an edge, which keeps its place in the matrices
+
+    @property
+    def loss(self) -> RobustLoss:
+        """The robust loss."""
+        return RobustLoss.TRUNCATED if self.is_truncated else RobustLoss.GEMAN_MCCLURE
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.distributed.robots.proof import RobotProof
-from solvers.distributed.robots.records import RobotAscent
+from solvers.distributed.robots.records import Reweigh, RobotAscent
 from solvers.distributed.robots.system import System
 from solvers.soc.recursion_block import RecursionBlock
 
@@ -71,6 +71,7 @@ class InteriorState:
     # whether the current cost is the one that is solved, not the one that SOC is run on
     is_final: bool = False
     weights: Array | None = None  # (k,): of its edges, in a robust solve
+    reweighing: Reweigh | None = None  # how these weights came about
     has_sent_laplacian: bool = False  # whether the driver has the matrix of the translations
     terms: HandednessTerms | None = None  # of its edges, for proofs with them
     ascent: RobotAscent | None = None  # the search for such terms
