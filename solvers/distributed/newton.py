@@ -179,12 +179,13 @@ class SubstructuredNewton:
     Where the Hessian is not positive definite it is that of S + eta blockdiag(0, I), with a small
     eta that makes it so, if the model `is_shifted`, which follows negative curvature; else the
     damped Gauss-Newton matrix. Where `is_straight`, translations move along with the rotations,
-    one round a move; else they are solved for, two rounds a move.
+    one round a move; else they are solved for, two rounds a move. `enough` is as in `StepRules`.
     """
 
     newton: Newton = field(default_factory=Newton)
     is_shifted: bool = False
     is_straight: bool = False
+    enough: float = 0.0
 
     @property
     def max_iterations(self) -> int:
@@ -208,7 +209,7 @@ class SubstructuredNewton:
         if self.is_shifted:
             num_rows = driver.num_poses * driver.d
             shift = first_shift(state.eta, driver.current.objective, num_rows)
-        rules = StepRules(tolerance, self.newton.second_order, shift)
+        rules = StepRules(tolerance, self.newton.second_order, shift, self.enough)
         algebra = EliminatedAlgebra(driver, self.is_straight)
         result = newton_step(algebra, rules)
         is_stationary = result.decrement <= tolerance or result.is_at_rounding

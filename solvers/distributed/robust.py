@@ -59,11 +59,11 @@ class SharedEdges:
     """The edges that robots hold at their poses.
 
     Weights up to `least_weight` become `left_out`. `newton` has the figures of the last weighted
-    cost, and the moment when driver and robots hold these edges and poses. `tolerance` is on the
-    relative decrease that Newton's steps leave, of F. It is the root of that of the run: the
-    weights change with the poses, so that a more accurate minimum of one weighted cost would be
-    wasted rounds, and once they do not, one more step squares what is left. `weighed` is how the
-    weights came about, once they have: robots then send the sums that belong to it with every cost.
+    cost, and the moment when driver and robots hold these edges and poses. Newton moves where the
+    relative decrease to come, of F, is above `tolerance`, and once more with the same factor where
+    it is above the root of that: the weights change with the poses, so that a more accurate minimum
+    of one weighted cost would be wasted rounds. `weighed` is how the weights came about, once they
+    have: robots then send the sums that belong to it with every cost.
     """
 
     driver: Driver
@@ -111,7 +111,10 @@ class SharedEdges:
 
     @property
     def _method(self) -> SubstructuredNewton:
-        return SubstructuredNewton(Newton(tolerance=self.tolerance), is_straight=True)
+        enough = math.sqrt(self.tolerance)
+        return SubstructuredNewton(
+            Newton(tolerance=self.tolerance), is_straight=True, enough=enough
+        )
 
     def _order(self, loss: RobustLoss, mu: float, scale: float) -> Reweigh:
         is_truncated = loss is RobustLoss.TRUNCATED
@@ -161,7 +164,7 @@ class SharedGNC:
     def init(self, driver: Driver, start: SharedGNCState | None) -> SharedGNCState:
         """State 0, at the poses that driver and robots hold."""
         newton = SubstructuredNewton().init(driver, None)
-        tolerance = math.sqrt(self.gnc.tolerance)
+        tolerance = self.gnc.tolerance
         edges = SharedEdges(driver, self.least_weight, self.left_out, tolerance, newton)
         schedule, sums = first_schedule(self.gnc, edges, self.has_map)
         return ScheduleState(0, schedule, sums, edges)

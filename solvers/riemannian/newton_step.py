@@ -111,12 +111,14 @@ class StepRules:
 
     `tolerance` is the decrement at which a point is stationary. `second_order` asks for the
     Hessian, not for its Gauss-Newton part. `first_shift`, of S, is where shifts begin; None stands
-    for the damped Gauss-Newton matrix where the Hessian is not positive definite.
+    for the damped Gauss-Newton matrix where the Hessian is not positive definite. `enough` is the
+    decrement at which a factor serves no further move, where that is above the tolerance.
     """
 
     tolerance: float
     second_order: bool = True
     first_shift: float | None = None
+    enough: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +189,8 @@ def newton_step(algebra: NewtonAlgebra[M, T], rules: StepRules) -> NewtonStep[M]
         model = following
         decrement = after
         moved = True
+        if decrement <= rules.enough:
+            break
         if cut > PROGRESS:
             foreseen = decrement * cut ** (moves_left - 1)
             if not algebra.has_secants or foreseen > rules.tolerance:
