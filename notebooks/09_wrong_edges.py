@@ -223,7 +223,9 @@ print(robust)
 # that the rejected edge is wrong, nor that no other set has a lower truncated cost. The verdict
 # also says how many closures constrain the map, here six. Fewer edges are certified more easily,
 # and a tree always is, so a certificate alone says little. If only a tree is left, the verdict is
-# UNCHECKED, and if so loose a map is expected to fit wrong closures by chance, it is DOUBTFUL.
+# UNCHECKED. It is DOUBTFUL if so loose a map is expected to fit wrong closures by chance, and if
+# one edge alone joins two parts of it, as the only closure between two robots does: nothing checks
+# that edge.
 #
 # ## Huber's loss: convex, but never zero weight
 #

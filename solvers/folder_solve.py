@@ -44,6 +44,7 @@ from solvers.result import Record, Stage, Status
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.robust.rejection import text_of_unchecked
 from solvers.robust_solves.attempts import TIGHT_SCALES, with_tight_thresholds
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
@@ -87,6 +88,8 @@ class FolderSolution(Summarised):
         judged.
     rejected_by : str
         What they do not agree with.
+    num_unchecked : int
+        Number of edges kept that alone join two parts of the team, so that nothing checks them.
     """
 
     name: str
@@ -102,6 +105,7 @@ class FolderSolution(Summarised):
     num_absent: int = 0
     num_rejected: int | None = None
     rejected_by: str = "do not agree pairwise with others"
+    num_unchecked: int = 0
 
     @property
     def robust_text(self) -> str:
@@ -109,10 +113,13 @@ class FolderSolution(Summarised):
         if self.num_rejected is None:
             return ""
         kept = int(self.sizes[1].sum())
-        return (
+        text = (
             f"{self.num_rejected} of {kept + self.num_rejected} edges left out, which "
             f"{self.rejected_by}; the answer is for those kept, and nobody has checked them"
         )
+        if self.num_unchecked:
+            text += f"; {text_of_unchecked(self.num_unchecked)}"
+        return text
 
     def __str__(self) -> str:
         num_poses, num_edges = self.sizes
@@ -303,6 +310,7 @@ class FilesOfRobots:
             num_absent=opened.num_absent,
             num_rejected=None if self.robust is None else opened.num_rejected,
             rejected_by=answer.rejected_by,
+            num_unchecked=opened.num_unchecked,
             seconds=time.perf_counter() - monitor.began,
         )
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray, exp_map, random_rotations
+from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers.robust.consistency import odometry
@@ -83,3 +84,12 @@ def ring_road(seed: int, num_poses: int = 500, per_turn: int = 320) -> PoseGraph
     truth = Poses(exp_map(heading[:, None]), t)
     noise = NoiseModel(0.03, 0.01)
     return observe("ring_road", truth, i, j, noise, noise.kappa(2), noise.tau, rng)
+
+
+def joined_by(num_between: int) -> PoseGraph:
+    """Two robots with closures of their own, and so many between them."""
+    graph = grid_world(2, 60, np.random.default_rng(0), d=2)
+    between = np.flatnonzero(graph.robots[graph.i] != graph.robots[graph.j])
+    left_out = np.zeros(graph.num_edges, dtype=bool)
+    left_out[between[num_between:]] = True
+    return graph.without_edges(left_out)

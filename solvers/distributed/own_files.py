@@ -59,6 +59,7 @@ from solvers.network.engine import Engine
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.revision import threshold_scale
+from solvers.robust.unchecked import lone_links
 from solvers.soc.subgraph import RobotSummary, place_poses
 
 SOLVE_PARTS = "solve each part in a folder of its own"
@@ -86,6 +87,8 @@ class OpenedFiles:
         Edges that robots have left out, as they do not agree with others.
     threshold_scale : float
         Scale of the thresholds of a robust solve, for errors as they are among own poses.
+    num_unchecked : int
+        Number of edges that alone join two parts of the team (`lone_links`).
     """
 
     driver: Driver
@@ -96,6 +99,7 @@ class OpenedFiles:
     num_absent: int
     num_rejected: int = 0
     threshold_scale: float = 1.0
+    num_unchecked: int = 0
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
         """The same robots with other edges, of which they have told the borders.
@@ -106,7 +110,13 @@ class OpenedFiles:
         driver, sizes = _placed(
             old.network, borders, old.num_poses, old.memory, self.weighting, self.folder
         )
-        return replace(self, driver=driver, sizes=sizes, num_rejected=num_rejected)
+        return replace(
+            self,
+            driver=driver,
+            sizes=sizes,
+            num_rejected=num_rejected,
+            num_unchecked=_num_unchecked(borders),
+        )
 
     def with_parts(self, parts: Sequence[ConsistentPart]) -> OpenedFiles:
         """The same robots with what they report to be left."""
@@ -158,6 +168,7 @@ def open_files(
                 numbered.num_absent,
                 num_rejected,
                 threshold_scale(scale),
+                _num_unchecked(borders),
             )
 
         if robust is None:
@@ -195,6 +206,16 @@ def _placed(
     if memory != 0:
         summaries = _chosen_elimination(network, summaries)
     return Driver(summaries, num_poses, lambda: network, memory), sizes
+
+
+def _num_unchecked(borders: Sequence[Border]) -> int:
+    """Number of edges that alone join two parts of the team: nothing checks them."""
+    owners = []
+    for robot, border in enumerate(borders):
+        is_first = border.owners.min(axis=1) == robot
+        owners.append(np.repeat(border.owners[is_first], border.num_edges[is_first], axis=0))
+    i, j = np.concatenate(owners).T
+    return len(lone_links(i, j, np.ones(len(borders), dtype=bool)))
 
 
 def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.summaries import Summarised
 from solvers.robust.outlier_record import OutlierProof
+from solvers.robust.unchecked import unchecked_edges
 
 # Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
 # half their threshold.
@@ -35,7 +37,10 @@ class Support(enum.Enum):
         "the closures kept agree with each other and with known edges, "
         "and nothing speaks against them"
     )
-    DOUBTFUL = "there are signs that right closures were rejected or wrong ones kept"
+    DOUBTFUL = (
+        "there are signs that right closures were rejected or wrong ones kept, "
+        "or nothing checks some of those kept"
+    )
     UNCHECKED = "the edges kept form a tree: nothing checks them"
 
 
@@ -162,10 +167,18 @@ class Rejection(Summarised):
         num_nearer = int((self.rejected & self.doubtful & (self.ratio < 0.5 * NEAR)).sum())
         return max(0.0, (num_nearer - share * num_near) / (1.0 - share))
 
+    @cached_property
+    def unchecked(self) -> BoolArray:
+        """Edges kept that alone join two parts of the map (`unchecked_edges`), (m,)."""
+        return unchecked_edges(self.problem.graph, self.known, self.kept)
+
     @property
     def doubts(self) -> tuple[str, ...]:
         """What speaks against the edges kept, in a few words each."""
         doubts = []
+        num_unchecked = int(self.unchecked.sum())
+        if num_unchecked:
+            doubts.append(text_of_unchecked(num_unchecked))
         if self.is_misfit:
             doubts.append("the edges kept do not fit together")
         if self.by_chance > _TOLERATED_SHARE * self.num_closures_kept:
@@ -267,6 +280,8 @@ class Rejection(Summarised):
             ("doubtful", self.named(self.doubtful)),
             ("found by", self.start),
         ]
+        if self.unchecked.any():
+            rows.insert(-1, ("unchecked", self.named(self.unchecked)))
         if self.proof is not None:
             rows.append(("proven", f"{self.proof}"))
         if len(self.attempts) > 1:
@@ -310,6 +325,7 @@ class Rejection(Summarised):
             lines["rejected_lines"] = [self.places[e] for e in rejected]
         robust = {
             "doubtful": np.flatnonzero(self.doubtful).tolist(),
+            "unchecked": np.flatnonzero(self.unchecked).tolist(),
             "known": np.flatnonzero(self.known).tolist(),
             **lines,
             "quantile": self.quantile,
@@ -356,6 +372,13 @@ class Rejection(Summarised):
         """Name of an edge, with file and line where they are known."""
         label = self.problem.graph.edge_label(e)
         return f"{label} {self.places[e]}" if self.places else label
+
+
+def text_of_unchecked(number: int) -> str:
+    """What is said of so many edges that alone join two parts of a map, at least one."""
+    if number == 1:
+        return "one edge alone joins two parts of the map, and nothing checks it"
+    return f"{number} edges each alone join two parts of the map, and nothing checks them"
 
 
 def _summary(attempt: Attempt) -> str:

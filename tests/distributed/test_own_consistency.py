@@ -9,7 +9,7 @@ from graphs import DIMENSIONS, SEEDS
 from hypothesis import given, settings, strategies as st
 from networks import KEY, Network, robots_with_files
 from robots import Recording
-from wrong_edges import spoiled
+from wrong_edges import joined_by, spoiled
 
 import pgo_models as pgo
 import solvers
@@ -123,6 +123,16 @@ def test_what_robots_with_files_cannot_judge_is_refused() -> None:
     for robust in (solvers.GNC(known=known), solvers.PCM(known=known)):
         with pytest.raises(SettingError, match=r"no other known edges; .* --split given"):
             solvers.solve_folder("robots", robust=robust)
+
+
+def test_the_only_edge_between_two_robots_is_named(tmp_path: Path) -> None:
+    for num_between, num_unchecked in ((1, 1), (2, 0)):
+        folder = tmp_path / f"{num_between}"
+        write_g2o_folder(joined_by(num_between), folder)
+        for robust in (solvers.PCM(), solvers.GNC()):
+            solution = solvers.solve_folder(folder, robust=robust, trust_folder=True)
+            assert solution.num_unchecked == num_unchecked
+            assert ("joins two parts" in solution.robust_text) == bool(num_unchecked)
 
 
 def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrong_edges import noisy_sphere, spoiled
+from wrong_edges import joined_by, noisy_sphere, spoiled
 
 import pgo_models as pgo
 import solvers
@@ -165,6 +165,21 @@ def test_odometry_alone_is_unchecked() -> None:
     solution = solvers.solve(graph.without_edges(is_wrong), robust=solvers.GNC())
     assert solution.robust.kept.all()
     assert solution.verdict is Support.UNCHECKED
+
+
+@pytest.mark.parametrize("robust", [solvers.GNC(), solvers.PCM()])
+def test_the_only_edge_between_two_robots_is_doubted(robust: solvers.GNC | solvers.PCM) -> None:
+    graph = joined_by(1)
+    solution = solvers.solve(graph, robust=robust)
+    assert solution.robust.kept.all()
+    assert solution.certificate.is_certified
+    assert solution.verdict is Support.DOUBTFUL
+    doubt = "one edge alone joins two parts of the map, and nothing checks it"
+    assert solution.robust.headline.startswith(f"DOUBTFUL, {doubt}: CERTIFIED")
+    (unchecked,) = solution.as_json()["robust"]["unchecked"]
+    assert graph.robots[graph.i[unchecked]] != graph.robots[graph.j[unchecked]]
+    assert graph.edge_label(unchecked) in str(solution)
+    assert solvers.solve(joined_by(2), robust=robust).verdict is not Support.DOUBTFUL
 
 
 def test_the_command_ends_with_3_where_nothing_checks_the_edges(

@@ -117,6 +117,7 @@ class Border:
     counts: tuple[int, int]  # own poses, and edges, where a shared edge counts at one end
     pairs: IntArray  # (k, 2): poses that its edges to others join
     owners: IntArray  # (k, 2): owners of these poses
+    num_edges: IntArray  # (k,): how many edges join them
     poses: IntArray  # (h,): all of these poses, ascending
     # (3, h): their components in the graph of all edges, of those with tau > 0, and of those with
     # kappa > 0.
@@ -391,7 +392,8 @@ def border_of(robot: int, joined: JoinedFile) -> Border:
     numbers = joined.numbers
     owners = joined.owners
     ends = np.stack([graph.i, graph.j], axis=1)
-    pairs = np.unique(ends[owners[graph.i] != owners[graph.j]], axis=0)
+    between = ends[owners[graph.i] != owners[graph.j]]
+    pairs, num_of_pair = np.unique(between, axis=0, return_counts=True)
     poses = np.unique(pairs)
     labels = []
     for kind in (graph.tau >= 0, graph.tau > 0, graph.kappa > 0):
@@ -404,6 +406,7 @@ def border_of(robot: int, joined: JoinedFile) -> Border:
         counts=(num_poses, num_edges),
         pairs=numbers[pairs],
         owners=owners[pairs],
+        num_edges=num_of_pair,
         poses=numbers[poses],
         labels=np.stack(labels)[:, poses],
         alone=np.array([len(np.setdiff1d(label, label[poses])) for label in labels]),
