@@ -224,8 +224,7 @@ print(robust)
 # also says how many closures constrain the map, here six. Fewer edges are certified more easily,
 # and a tree always is, so a certificate alone says little. If only a tree is left, the verdict is
 # UNCHECKED. It is DOUBTFUL if so loose a map is expected to fit wrong closures by chance, and if
-# one edge alone joins two parts of it, as the only closure between two robots does: nothing checks
-# that edge.
+# one edge is the only one between two parts of it, as between two robots: nothing checks that edge.
 #
 # ## Huber's loss: convex, but never zero weight
 #

@@ -44,7 +44,7 @@ from solvers.result import Record, Stage, Status
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
-from solvers.robust.rejection import text_of_unchecked
+from solvers.robust.rejection import text_of_bridges
 from solvers.robust_solves.attempts import TIGHT_SCALES, with_tight_thresholds
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
@@ -88,8 +88,9 @@ class FolderSolution(Summarised):
         judged.
     rejected_by : str
         What they do not agree with.
-    num_unchecked : int
-        Number of edges kept that alone join two parts of the team, so that nothing checks them.
+    num_bridges : int
+        Number of edges kept that are the only ones between two parts of the team, so that nothing
+        checks them. That a robot's own odometry may have gaps is not looked at.
     """
 
     name: str
@@ -105,7 +106,7 @@ class FolderSolution(Summarised):
     num_absent: int = 0
     num_rejected: int | None = None
     rejected_by: str = "do not agree pairwise with others"
-    num_unchecked: int = 0
+    num_bridges: int = 0
 
     @property
     def robust_text(self) -> str:
@@ -117,8 +118,8 @@ class FolderSolution(Summarised):
             f"{self.num_rejected} of {kept + self.num_rejected} edges left out, which "
             f"{self.rejected_by}; the answer is for those kept, and nobody has checked them"
         )
-        if self.num_unchecked:
-            text += f"; {text_of_unchecked(self.num_unchecked)}"
+        if self.num_bridges:
+            text += f"; {text_of_bridges(self.num_bridges)}"
         return text
 
     def __str__(self) -> str:
@@ -310,7 +311,7 @@ class FilesOfRobots:
             num_absent=opened.num_absent,
             num_rejected=None if self.robust is None else opened.num_rejected,
             rejected_by=answer.rejected_by,
-            num_unchecked=opened.num_unchecked,
+            num_bridges=opened.num_bridges,
             seconds=time.perf_counter() - monitor.began,
         )
 

@@ -1175,7 +1175,7 @@ def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
     return np.asarray(order)
 
 
-def bridges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
+def connecting_edges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
     """Edges that connect the components of the kept edges, with the smallest ratios.
 
     They are a minimum spanning tree (Kruskal) of the graph whose nodes are these components; kept

@@ -10,7 +10,7 @@ import numpy as np
 
 from pgo_models.errors import GraphError, SettingError, door
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import PoseGraph, bridges, isotropic_information
+from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges, isotropic_information
 
 # Bounds on eigenvalues of a matrix that is scaled to ones on its diagonal. An eigenvalue above the
 # first counts as positive. One below the second is negative beyond all rounding, also that of the
@@ -344,7 +344,7 @@ def _extreme_weight_of(graph: PoseGraph, kind: str, weight: Array) -> tuple[floa
     """Like `extreme_weight`, for the positive kappa or tau of the graph alone."""
     ratio_to_median = weight / np.median(weight)
     no_edges = np.zeros(graph.num_edges, dtype=bool)
-    maximum_tree = bridges(graph, no_edges, -weight)
+    maximum_tree = connecting_edges(graph, no_edges, -weight)
     heaviest = int(np.argmax(weight))
     lightest = int(maximum_tree[np.argmin(weight[maximum_tree])])
     e = max(heaviest, lightest, key=lambda edge: abs(np.log(ratio_to_median[edge])))

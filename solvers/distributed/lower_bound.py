@@ -52,8 +52,8 @@ def best_bound_distributed(
     """Return the bound at the current poses, as `central.best_bound` does in one place.
 
     It is grounded without eta where that goes through, with handedness terms in closed form where
-    it goes through with these, else the better form with the smallest eta found. That is looked for
-    as long as eta takes less than `most_lost` from the bound, or all of it unless that is given.
+    it goes through with these, else the better form with the smallest eta found. The search ends
+    where eta n d, which eta takes from tr(Lambda), reaches `most_lost`, or F if that is not given.
     """
     is_near_zero = driver.current.objective <= driver.current.rounding_level
     if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
@@ -99,7 +99,7 @@ def _search_forms(
     """Return the better of both forms of the bound, each with the smallest eta found."""
     count = driver.num_poses * driver.d
     smallest = central.smallest_shift(gap, driver.current.objective, count)
-    # At stationary poses tr(Lambda) is F.
+    # At stationary poses tr(Lambda) is F; it only says where the search ends.
     return central.search_forms(
         partial(prove_with_eta, driver, less_terms=less_terms),
         partial(prove_grounded, driver, less_terms=less_terms),

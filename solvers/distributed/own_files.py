@@ -56,10 +56,10 @@ from solvers.distributed.robots.own_file import (
 )
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
+from solvers.robust.bridges import bridges
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.revision import threshold_scale
-from solvers.robust.unchecked import lone_links
 from solvers.soc.subgraph import RobotSummary, place_poses
 
 SOLVE_PARTS = "solve each part in a folder of its own"
@@ -87,8 +87,8 @@ class OpenedFiles:
         Edges that robots have left out, as they do not agree with others.
     threshold_scale : float
         Scale of the thresholds of a robust solve, for errors as they are among own poses.
-    num_unchecked : int
-        Number of edges that alone join two parts of the team (`lone_links`).
+    num_bridges : int
+        Number of edges that are the only ones between two parts of the team (`bridges`).
     """
 
     driver: Driver
@@ -99,7 +99,7 @@ class OpenedFiles:
     num_absent: int
     num_rejected: int = 0
     threshold_scale: float = 1.0
-    num_unchecked: int = 0
+    num_bridges: int = 0
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
         """The same robots with other edges, of which they have told the borders.
@@ -115,7 +115,7 @@ class OpenedFiles:
             driver=driver,
             sizes=sizes,
             num_rejected=num_rejected,
-            num_unchecked=_num_unchecked(borders),
+            num_bridges=_num_bridges(borders),
         )
 
     def with_parts(self, parts: Sequence[ConsistentPart]) -> OpenedFiles:
@@ -168,7 +168,7 @@ def open_files(
                 numbered.num_absent,
                 num_rejected,
                 threshold_scale(scale),
-                _num_unchecked(borders),
+                _num_bridges(borders),
             )
 
         if robust is None:
@@ -208,14 +208,17 @@ def _placed(
     return Driver(summaries, num_poses, lambda: network, memory), sizes
 
 
-def _num_unchecked(borders: Sequence[Border]) -> int:
-    """Number of edges that alone join two parts of the team: nothing checks them."""
+def _num_bridges(borders: Sequence[Border]) -> int:
+    """Number of edges between robots that are bridges of the graph of robots.
+
+    Nothing checks these. A robot is one node, whatever gaps its own odometry has.
+    """
     owners = []
     for robot, border in enumerate(borders):
         is_first = border.owners.min(axis=1) == robot
         owners.append(np.repeat(border.owners[is_first], border.num_edges[is_first], axis=0))
     i, j = np.concatenate(owners).T
-    return len(lone_links(i, j, np.ones(len(borders), dtype=bool)))
+    return len(bridges(i, j, np.ones(len(borders), dtype=bool)))
 
 
 def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) -> float:

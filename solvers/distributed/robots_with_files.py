@@ -60,8 +60,9 @@ class RobotsWithFiles(DriverPlace):
     """A solve by robots with own files: of the folder `name`, to a relative `gap`.
 
     `kept` are the answers that the robots have kept, the last of which is theirs. With
-    `begins_at`, the name of a start, it begins at poses that the robots have found before. A map
-    that `is_on_the_way` to another one has a bound to the gap or none.
+    `begins_at`, the name of a start, it begins at poses that the robots have found before. While
+    the map `is_on_the_way` to another one, no shift of the bound is looked for that would cost more
+    than the gap.
     """
 
     name: str
@@ -101,7 +102,8 @@ class RobotsWithFiles(DriverPlace):
     def certify(self, attempt: Attempt) -> Attempt:
         """Find a bound, and have the robots keep the current poses if these are the cheapest."""
         driver = self.driver
-        most_lost = self.gap * driver.current.objective if self.is_on_the_way else None
+        goes_on = self.is_on_the_way and not attempt.is_out_of_time
+        most_lost = self.gap * driver.current.objective if goes_on else None
         bound = best_bound_distributed(driver, self.gap, most_lost)
         source = BoundSource.GIVEN
         dual = attempt.dual_bound

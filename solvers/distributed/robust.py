@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.graphs.pose_graph import PoseGraph, bridges
+from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.distributed.driver import Driver, collect
@@ -59,10 +59,11 @@ class SharedEdges:
     """The edges that robots hold at their poses.
 
     Weights up to `least_weight` become `left_out`. `newton` has the figures of the last weighted
-    cost, and the moment when driver and robots hold these edges and poses. Newton moves where the
-    relative decrease to come, of F, is above `tolerance`, and once more with the same factor where
-    it is above the root of that: the weights change with the poses, so that a more accurate minimum
-    of one weighted cost would be wasted rounds. `weighed` is how the weights came about, once they
+    cost, and the moment when driver and robots hold these edges and poses. Newton factors its
+    matrix and moves where the relative decrease to come is above `tolerance`, of F, or above a
+    thousandth of it, of chi2. Further moves with the same factor are made only while it is above
+    the root of `tolerance`: the weights change with the poses, so that a more accurate minimum of
+    one weighted cost would be wasted rounds. `weighed` is how the weights came about, once they
     have: robots then send the sums that belong to it with every cost.
     """
 
@@ -145,7 +146,7 @@ class SharedGNC:
         """
         known = known_inliers(graph, gnc.known)
         least_weight = negligible_weight(float((~known).sum()), graph.num_poses)
-        apart = bridges(graph, known & is_whole(graph), np.zeros(graph.num_edges))
+        apart = connecting_edges(graph, known & is_whole(graph), np.zeros(graph.num_edges))
         is_held = len(apart) == 0 and not graph.is_world_loose
         return cls(gnc, least_weight, 0.0 if is_held else _LEFT_OUT_SHARE * least_weight)
 

@@ -248,7 +248,8 @@ def polish_step(
     try:
         result = newton_step(algebra, rules)
     except NotPositiveDefiniteError:
-        return replace(state, is_newton=False, moved=False)
+        # Its factor may have been overwritten.
+        return replace(state, is_newton=False, moved=False, factor=None)
     model = result.model
     now = PolishState(
         here=model.here,

@@ -15,8 +15,8 @@ from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.summaries import Summarised
+from solvers.robust.bridges import unchecked_bridges
 from solvers.robust.outlier_record import OutlierProof
-from solvers.robust.unchecked import unchecked_edges
 
 # Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
 # half their threshold.
@@ -168,17 +168,17 @@ class Rejection(Summarised):
         return max(0.0, (num_nearer - share * num_near) / (1.0 - share))
 
     @cached_property
-    def unchecked(self) -> BoolArray:
-        """Edges kept that alone join two parts of the map (`unchecked_edges`), (m,)."""
-        return unchecked_edges(self.problem.graph, self.known, self.kept)
+    def bridges(self) -> BoolArray:
+        """Edges kept, not known ones, each the only one between two parts of the map, (m,)."""
+        return unchecked_bridges(self.problem.graph, self.known, self.kept)
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """What speaks against the edges kept, in a few words each."""
         doubts = []
-        num_unchecked = int(self.unchecked.sum())
-        if num_unchecked:
-            doubts.append(text_of_unchecked(num_unchecked))
+        num_bridges = int(self.bridges.sum())
+        if num_bridges:
+            doubts.append(text_of_bridges(num_bridges))
         if self.is_misfit:
             doubts.append("the edges kept do not fit together")
         if self.by_chance > _TOLERATED_SHARE * self.num_closures_kept:
@@ -280,8 +280,8 @@ class Rejection(Summarised):
             ("doubtful", self.named(self.doubtful)),
             ("found by", self.start),
         ]
-        if self.unchecked.any():
-            rows.insert(-1, ("unchecked", self.named(self.unchecked)))
+        if self.bridges.any():
+            rows.insert(-1, ("bridges", self.named(self.bridges)))
         if self.proof is not None:
             rows.append(("proven", f"{self.proof}"))
         if len(self.attempts) > 1:
@@ -325,7 +325,7 @@ class Rejection(Summarised):
             lines["rejected_lines"] = [self.places[e] for e in rejected]
         robust = {
             "doubtful": np.flatnonzero(self.doubtful).tolist(),
-            "unchecked": np.flatnonzero(self.unchecked).tolist(),
+            "bridges": np.flatnonzero(self.bridges).tolist(),
             "known": np.flatnonzero(self.known).tolist(),
             **lines,
             "quantile": self.quantile,
@@ -374,11 +374,10 @@ class Rejection(Summarised):
         return f"{label} {self.places[e]}" if self.places else label
 
 
-def text_of_unchecked(number: int) -> str:
-    """What is said of so many edges that alone join two parts of a map, at least one."""
-    if number == 1:
-        return "one edge alone joins two parts of the map, and nothing checks it"
-    return f"{number} edges each alone join two parts of the map, and nothing checks them"
+def text_of_bridges(number: int) -> str:
+    """What is said of so many bridges, at least one."""
+    one = "one edge" if number == 1 else f"each of {number} edges"
+    return f"{one} is the only one between two parts of the map, and nothing checks it"
 
 
 def _summary(attempt: Attempt) -> str:

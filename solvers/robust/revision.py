@@ -128,7 +128,8 @@ def drop_contradicted(
 
     - all others contradict it: T_e > 3 T among many edges, or T_e > 1.5 T and T_e beyond the
       quantile 1 - `FALSE_ALARM` over their number;
-    - the truncated cost falls: T_e > s, with s the `error_scale` of the others.
+    - the truncated cost falls with thresholds at the scale of the errors: T_e > s, with s the
+      `error_scale` of the others.
 
     Then the next edge is the suspect.
     """
@@ -147,18 +148,19 @@ def drop_contradicted(
     suspect = _Suspect.of(problem, known, allowed, fit)
     removal = suspect.removed() if suspect is not None else None
     while removal is not None:
-        suspect = _Suspect.of(problem, known, allowed, removal.fit)
-        # A lower bound of the next loss mostly tells, and its removal need not be tried.
-        if suspect is None or not is_contradicted(removal, suspect.least_loss(removal.factor)):
+        following = _Suspect.of(problem, known, allowed, removal.fit)
+        # If the edge does not stand out beside a lower bound of the next loss, the next removal
+        # need not be computed.
+        if following is None or not is_contradicted(removal, following.least_loss(removal.factor)):
             break
         # The scale is at most 1, and takes the residuals of all edges.
         if removal.loss <= 1.0 and removal.loss <= removal.fit.error_scale:
             break
-        following = suspect.removed()
-        if not is_contradicted(removal, following.loss):
+        next_removal = following.removed()
+        if not is_contradicted(removal, next_removal.loss):
             break
         fit = removal.fit
-        removal = following
+        removal = next_removal
     return fit.kept
 
 
@@ -194,10 +196,11 @@ class _Suspect:
         return _Removal(self.edge, Fit.of_state(self.others, state), loss, state.factor)
 
     def least_loss(self, factor: CholeskyFactor | None) -> float:
-        """Lower bound of the loss, with the factor of the Hessian near the poses of the fit.
+        """Lower bound of what the least cost loses with the edge, by a factor near the fit.
 
-        The other edges cost no more than after one move by that factor, which has the edge, and so
-        moves the poses too little, but in about the right direction; nor more than before it.
+        The least cost of the other edges is at most their cost here, and at most that after one
+        step. The step takes the factor of Newton's matrix that still has the edge: it is too short,
+        but its direction is about right.
         """
         poses = self.fit.poses
         here = self.inliers.at(poses)
@@ -214,7 +217,7 @@ class _Suspect:
 class _Removal:
     """An edge taken out, the fit without it, and by how much the cost fell, over its threshold.
 
-    `factor` is that of the Hessian of the cost near the poses of the fit.
+    `factor` is that of Newton's matrix near the poses of the fit.
     """
 
     edge: int

@@ -11,7 +11,7 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import PoseGraph, bridges
+from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
@@ -178,7 +178,7 @@ def held_together(graph: PoseGraph, kept: BoolArray, ratio: Array) -> BoolArray:
     rotation of the world.
     """
     held = kept.copy()
-    held[bridges(graph, kept, ratio)] = True
+    held[connecting_edges(graph, kept, ratio)] = True
     if not graph.is_world_loose:
         return held
     others = np.flatnonzero(graph.is_prior & ~held)

@@ -16,6 +16,7 @@ from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.scenes import NoiseModel
 from solvers.distributed import own_revision
 from solvers.distributed.own_files import strongest_neighbours
 from solvers.distributed.robots.own_consistency import AgreeingCounts
@@ -106,6 +107,18 @@ def test_a_run_that_fails_leaves_the_answer_as_it_was(
     assert solution.certificate.objective == pytest.approx(agreeing.certificate.objective)
     assert solution.certificate.is_certified
     assert [stage.status.name for stage in solution.stages if stage.name == "GNC"] == ["FAILED"]
+
+
+def test_a_solve_that_is_out_of_time_has_the_best_bound(tmp_path: Path) -> None:
+    noise = NoiseModel(0.2, 0.2)
+    rng = np.random.default_rng(1)
+    write_g2o_folder(
+        pgo.grid_world(3, 12, rng, noise=noise, loop_closure_probability=0.3), tmp_path
+    )
+    solution = solvers.solve_folder(tmp_path, robust=solvers.GNC(), time_limit=1e-6)
+    assert solution.status is solvers.Status.TIME_LIMIT
+    assert not solution.certificate.is_certified
+    assert solution.certificate.lower_bound > 0.3 * solution.certificate.objective
 
 
 @pytest.mark.parametrize("kind", ["random", "aliased"])

@@ -121,12 +121,15 @@ def test_the_gradient_is_within_tolerance_at_the_poses_returned(
     check_claim(problem, replace(soc, tolerance=tolerance), way)
 
 
-def test_a_start_that_costs_less_than_the_end_is_of_the_first_row() -> None:
+def test_where_the_start_costs_less_the_first_row_is_of_the_poses_returned() -> None:
     # Found by a drawn test: without acceleration F may rise within a loose tolerance.
     problem, soc = random_case(35697)
     loose = replace(soc, tolerance=1e-3)
-    rows = under_faults(problem, loose).history.records
+    ended = under_faults(problem, loose)
+    rows = ended.history.records
     assert rows[0].measurement.objective < rows[-1].measurement.objective
+    F = problem.objective(ended.poses)
+    assert rows[0].measurement.objective == pytest.approx(F, rel=1e-12)
     assert check_claim(problem, loose, under_faults) is Status.CONVERGED
 
 

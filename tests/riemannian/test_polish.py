@@ -30,7 +30,10 @@ from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting
 from solvers.loop import run
 from solvers.riemannian.newton import Newton
+from solvers.riemannian.newton_step import StepRules, newton_step
 from solvers.riemannian.polish import (
+    CentralAlgebra,
+    PolishTrial,
     Secant,
     _apply_inverse,
     polish,
@@ -232,6 +235,28 @@ def test_secants_save_a_factorisation(
         assert not state.is_stationary
         state = polish_step(problem, state, secants=secants)
     assert state.is_stationary
+
+
+def moves_of_one_step(problem: PGOProblem, start: Poses, enough: float) -> list[float]:
+    """Costs of the poses that a step without secants moves to."""
+    costs = []
+
+    class Counting(CentralAlgebra):
+        def accept(self, trial: PolishTrial) -> None:
+            costs.append(trial.objective)
+
+    algebra = Counting(problem, start_polish(problem, start), has_secants=False)
+    newton_step(algebra, StepRules(STATIONARY_DECREMENT, enough=enough))
+    return costs
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_factor_serves_no_further_move_once_little_enough_is_left(seed: int) -> None:
+    problem = PGOProblem(varied_graph(seed, 20, 3, LOUD_NOISE))
+    start = polish(problem, chordal_start(problem), max_steps=1)
+    all_moves = moves_of_one_step(problem, start, 0.0)
+    assert len(all_moves) > 1
+    assert moves_of_one_step(problem, start, np.inf) == all_moves[:1]
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)

@@ -14,7 +14,12 @@ from pgo_models.errors import SettingError
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.result import Status
 from solvers.robust.gnc import GNCSchedule, advanced, ending
-from solvers.robust.weighted_edges import bridges, first_poses, known_inliers, weighted_problem
+from solvers.robust.weighted_edges import (
+    connecting_edges,
+    first_poses,
+    known_inliers,
+    weighted_problem,
+)
 
 TLS = solvers.RobustLoss.TRUNCATED
 GM = solvers.RobustLoss.GEMAN_MCCLURE
@@ -76,7 +81,7 @@ def test_a_weighted_problem_costs_its_edges_times_their_weights_in_both_costs(se
         problem = pgo.PGOProblem(graph, weighting=weighting)
         weights = rng.uniform(0.1, 1.0, graph.num_edges)
         kept = rng.random(graph.num_edges) < 0.7
-        kept[bridges(graph, kept, weights)] = True
+        kept[connecting_edges(graph, kept, weights)] = True
         weighted = weighted_problem(problem, weights, kept)
         np.testing.assert_allclose(
             weighted.edge_costs(graph.truth),
@@ -88,12 +93,12 @@ def test_a_weighted_problem_costs_its_edges_times_their_weights_in_both_costs(se
 
 @settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS, share=st.floats(0.0, 1.0))
-def test_bridges_connect_with_as_few_edges_as_possible(seed, share):
+def test_connecting_edges_connect_with_as_few_edges_as_possible(seed, share):
     graph = informed(seed, 10, 2, False)
     rng = np.random.default_rng(seed)
     kept = rng.random(graph.num_edges) < share
     ratio = rng.random(graph.num_edges)
-    added = bridges(graph, kept, ratio)
+    added = connecting_edges(graph, kept, ratio)
     assert not kept[added].any()
     assert len(added) == len(graph.components(kept)) - 1
     kept[added] = True

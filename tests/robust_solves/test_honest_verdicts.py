@@ -174,11 +174,11 @@ def test_the_only_edge_between_two_robots_is_doubted(robust: solvers.GNC | solve
     assert solution.robust.kept.all()
     assert solution.certificate.is_certified
     assert solution.verdict is Support.DOUBTFUL
-    doubt = "one edge alone joins two parts of the map, and nothing checks it"
+    doubt = "one edge is the only one between two parts of the map, and nothing checks it"
     assert solution.robust.headline.startswith(f"DOUBTFUL, {doubt}: CERTIFIED")
-    (unchecked,) = solution.as_json()["robust"]["unchecked"]
-    assert graph.robots[graph.i[unchecked]] != graph.robots[graph.j[unchecked]]
-    assert graph.edge_label(unchecked) in str(solution)
+    (bridge,) = solution.as_json()["robust"]["bridges"]
+    assert graph.robots[graph.i[bridge]] != graph.robots[graph.j[bridge]]
+    assert graph.edge_label(bridge) in str(solution)
     assert solvers.solve(joined_by(2), robust=robust).verdict is not Support.DOUBTFUL
 
 
