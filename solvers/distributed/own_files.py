@@ -73,6 +73,8 @@ class OpenedFiles:
     ----------
     driver : Driver
         The driver of the robots.
+    borders : sequence of Border
+        What the robots have told of their edges to others.
     sizes : (2, num_robots) array
         How many poses, and edges, every robot has.
     folder : Path
@@ -87,11 +89,10 @@ class OpenedFiles:
         Edges that robots have left out, as they do not agree with others.
     threshold_scale : float
         Scale of the thresholds of a robust solve, for errors as they are among own poses.
-    num_bridges : int
-        Number of edges that are the only ones between two parts of the team (`bridges`).
     """
 
     driver: Driver
+    borders: Sequence[Border]
     sizes: IntArray
     folder: Path
     weighting: Weighting
@@ -99,7 +100,19 @@ class OpenedFiles:
     num_absent: int
     num_rejected: int = 0
     threshold_scale: float = 1.0
-    num_bridges: int = 0
+
+    @property
+    def num_bridges(self) -> int:
+        """Number of edges between robots that are bridges of the graph of robots.
+
+        Nothing checks these. A robot is one node, whatever gaps its own odometry has.
+        """
+        owners = []
+        for robot, border in enumerate(self.borders):
+            is_first = border.owners.min(axis=1) == robot
+            owners.append(np.repeat(border.owners[is_first], border.num_edges[is_first], axis=0))
+        i, j = np.concatenate(owners).T
+        return len(bridges(i, j, np.ones(len(self.borders), dtype=bool)))
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
         """The same robots with other edges, of which they have told the borders.
@@ -113,9 +126,9 @@ class OpenedFiles:
         return replace(
             self,
             driver=driver,
+            borders=borders,
             sizes=sizes,
             num_rejected=num_rejected,
-            num_bridges=_num_bridges(borders),
         )
 
     def with_parts(self, parts: Sequence[ConsistentPart]) -> OpenedFiles:
@@ -161,6 +174,7 @@ def open_files(
             driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
             return OpenedFiles(
                 driver,
+                borders,
                 sizes,
                 folder,
                 weighting,
@@ -168,7 +182,6 @@ def open_files(
                 numbered.num_absent,
                 num_rejected,
                 threshold_scale(scale),
-                _num_bridges(borders),
             )
 
         if robust is None:
@@ -206,19 +219,6 @@ def _placed(
     if memory != 0:
         summaries = _chosen_elimination(network, summaries)
     return Driver(summaries, num_poses, lambda: network, memory), sizes
-
-
-def _num_bridges(borders: Sequence[Border]) -> int:
-    """Number of edges between robots that are bridges of the graph of robots.
-
-    Nothing checks these. A robot is one node, whatever gaps its own odometry has.
-    """
-    owners = []
-    for robot, border in enumerate(borders):
-        is_first = border.owners.min(axis=1) == robot
-        owners.append(np.repeat(border.owners[is_first], border.num_edges[is_first], axis=0))
-    i, j = np.concatenate(owners).T
-    return len(bridges(i, j, np.ones(len(borders), dtype=bool)))
 
 
 def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) -> float:

@@ -275,14 +275,19 @@ def _fit_every_edge(problem: PGOProblem, poses: Poses, factor: CholeskyFactor) -
     hides what light ones could still gain. A Newton step sees it all the same; one is enough, as a
     rule.
     """
-    layout = TangentLayout(problem.num_poses, problem.d)
     moved = poses
     for _ in range(MOST_FITTING_STEPS):
         if fit_of(problem, moved).is_closest:
             return moved
-        gradient = layout.join(*problem.riemannian_gradient(moved))
-        moved = moved.moved_along(*layout.split(-factor.solve(gradient)))
+        moved = moved_by(factor, problem.at(moved))
     return moved if fit_of(problem, moved).is_closest else poses
+
+
+def moved_by(factor: CholeskyFactor, here: EvaluatedPoses) -> Poses:
+    """Poses after one step -H^-1 g, with the factor of a matrix H that is there."""
+    layout = TangentLayout(here.problem.num_poses, here.problem.d)
+    gradient = layout.join(*here.riemannian_gradient)
+    return here.poses.moved_along(*layout.split(-factor.solve(gradient)))
 
 
 @door

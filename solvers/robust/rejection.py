@@ -273,15 +273,15 @@ class Rejection(Summarised):
         rejected = self.named(self.rejected)
         if self.rejected.any():
             rejected += "; written files are without them"
+        bridges = [("bridges", self.named(self.bridges))] if self.bridges.any() else []
         rows = [
             ("given", self.conditional),
             ("taken for right", self.named(self.known)),
             ("rejected", rejected),
             ("doubtful", self.named(self.doubtful)),
+            *bridges,
             ("found by", self.start),
         ]
-        if self.bridges.any():
-            rows.insert(-1, ("bridges", self.named(self.bridges)))
         if self.proof is not None:
             rows.append(("proven", f"{self.proof}"))
         if len(self.attempts) > 1:

@@ -20,7 +20,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.cholesky import CholeskyFactor
-from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import (
     FALSE_ALARM,
@@ -28,7 +27,7 @@ from pgo_models.problem.thresholds import (
     chi2_thresholds,
     edge_residuals,
 )
-from solvers.riemannian.polish import PolishState, polished
+from solvers.riemannian.polish import PolishState, moved_by, polished
 
 # Newton steps after one edge was dropped.
 _STEPS_AFTER_EDGE = 4
@@ -202,14 +201,10 @@ class _Suspect:
         step. The step takes the factor of Newton's matrix that still has the edge: it is too short,
         but its direction is about right.
         """
-        poses = self.fit.poses
-        here = self.inliers.at(poses)
+        here = self.inliers.at(self.fit.poses)
         least_cost = here.value
         if factor is not None:
-            layout = TangentLayout(self.inliers.num_poses, self.inliers.d)
-            step = -factor.solve(layout.join(*here.riemannian_gradient))
-            moved = poses.moved_along(*layout.split(step))
-            least_cost = min(least_cost, self.inliers.objective(moved))
+            least_cost = min(least_cost, self.inliers.objective(moved_by(factor, here)))
         return (self.fit.cost - least_cost) / self.threshold
 
 
