@@ -209,11 +209,6 @@ def test_a_wheel_has_all_that_is_no_code() -> None:
         assert others <= packed, f"{package}: {others - packed} would be left out"
 
 
-def test_code_is_ascii() -> None:
-    paths = [*FILES, *sorted((ROOT / "tests").glob("**/*.py"))]
-    assert [path for path in paths if not path.read_text(encoding="utf-8").isascii()] == []
-
-
 @pytest.mark.parametrize("package", ["pgo_models", "solvers"])
 def test_importing_prints_nothing_writes_nothing_and_needs_no_extra(
     package: str, tmp_path: Path

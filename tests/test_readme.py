@@ -1,21 +1,17 @@
 import re
 import shlex
 import shutil
-import subprocess
 import tomllib
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import pytest
 
-from pgo_models.graphs.published_results import published_rows
 from solvers.cli import app as cli
 
 ROOT = Path(__file__).parent.parent
 BENCHMARKS_PAGE = ROOT / "tests" / "benchmarks" / "README.md"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 ROOMS = (ROOT / "notebooks" / "site" / "guide" / "rooms.md").read_text(encoding="utf-8")
-MOST_LINES = 171
 BENCHMARKS = BENCHMARKS_PAGE.read_text(encoding="utf-8")
 
 
@@ -31,11 +27,6 @@ def rows_of(page: str, head: str) -> list[dict[str, str]]:
 def results(page: str) -> list[dict[str, str]]:
     """Rows of the table from file to certificate."""
     return rows_of(page, "| graph | poses / edges | F | gap ")
-
-
-def test_the_readme_is_short_and_begins_with_a_picture():
-    assert len(README.splitlines()) <= MOST_LINES
-    assert re.match(r"# [\w-]+\n\n!\[[^\]]+\]\(notebooks/pictures/[\w.-]+\)\n", README)
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(monkeypatch, capsys):
@@ -107,81 +98,11 @@ def check_line(line: dict[str, str], pgo_command) -> None:
         assert printed in out or printed in " ".join(out.split()), f"{typed(line)}\n{out}"
 
 
-@pytest.mark.parametrize("marker", ["ci:solve", "ci:tests"])
-def test_ci_finds_its_lines(marker):
-    assert re.search(rf"<!-- {marker} -->\n```sh\n.*\.venv/bin/.*\n```", README)
-
-
-def test_ci_has_an_environment_of_its_own():
-    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    assert ".venv" not in script.replace(".venv-ci", "")
-    assert "apt-get" not in script
-    venv = re.search(r"^venv=.*$", script, re.M)[0]
-    function = re.search(r"^line\(\) \{.*?^\}$", script, re.M | re.S)[0]
-    for marker in ("ci:solve", "ci:tests"):
-        shown = re.search(rf"<!-- {marker} -->\n```sh\n(.*)\n", README)[1]
-        run = ["bash", "-c", f"{venv}\n{function}\nline {marker}"]
-        done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True)
-        assert done.stdout == shown.replace(".venv", ".venv-ci") + "\n"
-
-
 def test_pictures_and_files_that_the_benchmarks_name_are_there():
     targets = re.findall(r"\]\(([^)]+)\)", BENCHMARKS)
     assert targets
     for target in targets:
         assert target.startswith("http") or (BENCHMARKS_PAGE.parent / target).exists(), target
-
-
-def test_the_readme_reads_the_same_where_no_other_file_is():
-    # It is the description of the package as well, where links to files of the repository lead
-    # nowhere. Its one picture is a file of the repository: no address is known where it lies.
-    for mark, target in re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", README):
-        if mark:
-            assert (ROOT / target).exists(), target
-        else:
-            assert target.startswith("https://"), target
-
-
-def test_the_readme_has_every_notebook_with_its_question_and_minutes():
-    rows = rows_of(README, "| notebook | question | minutes |")
-    sources = sorted(ROOT.glob("notebooks/[0-9][0-9]_*.py"))
-    assert [row["notebook"] for row in rows] == [f"`{source.stem}.ipynb`" for source in sources]
-    for row, source in zip(rows, sources, strict=True):
-        text = source.read_text(encoding="utf-8")
-        assert re.search(r"^# # \d+\. (.*)$", text, re.M)[1] == row["question"]
-        assert re.search(r"\*\*Time:\*\* (\d+) minutes", text)[1] == row["minutes"]
-
-
-ADDRESS = re.compile(r"https?://[^\s)>\]\"'`;]+")
-
-
-def test_addresses_outside_are_well_formed():
-    # Whether they answer takes a network: `python notebooks/site/build.py --links`.
-    kinds = (
-        "*.md",
-        "*.cff",
-        "*.toml",
-        "notebooks/**/*.md",
-        "notebooks/*.py",
-        "notebooks/*.ipynb",
-        "data/*.md",
-    )
-    pages = [
-        path
-        for kind in (*kinds, "tests/benchmarks/*.md", "pgo_models/**/*.py", "solvers/**/*.py")
-        for path in ROOT.glob(kind)
-        if "_build" not in path.parts
-    ]
-    found = {
-        address for path in pages for address in ADDRESS.findall(path.read_text(encoding="utf-8"))
-    }
-    assert found
-    for address in found:
-        parts = urlsplit(address)
-        assert parts.scheme == "https", address
-        assert re.fullmatch(r"[a-z0-9-]+(\.[a-z0-9-]+)+", parts.netloc), address
-        assert parts.netloc.rpartition(".")[2].isalpha(), address
-        assert not address.endswith((".", ",", ":")), address
 
 
 def test_the_release_is_the_same_everywhere():
@@ -216,10 +137,3 @@ def test_the_results_of_the_readme_are_those_of_the_benchmarks():
         assert first
         same = ("graph", "poses / edges", "F", "gap", "of SE-Sync's CPU")
         assert shown == {head: row[head] for head in same} | {"seconds": seconds}
-
-
-def test_the_papers_tables_stand_between_their_marks():
-    shown = re.search(r"<!-- pgo tables -->\n(.*)<!-- end of pgo tables -->", BENCHMARKS, re.S)[1]
-    rows = re.findall(r"^\| ([\w-]+) \| (\d+) \| (\d+) \|", shown, re.M)
-    assert rows == [(row.name, str(row.num_poses), str(row.num_edges)) for row in published_rows()]
-    assert "NOT on" not in shown

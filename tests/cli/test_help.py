@@ -1,6 +1,5 @@
 """Help of commands, what is said of misspelt words, and graphs on standard input and output."""
 
-import inspect
 import re
 import subprocess
 import sys
@@ -9,7 +8,6 @@ import pytest
 from commands import PGO, ROOT
 
 from solvers.cli.app import COMMANDS
-from solvers.cli.solve_command import solve_command
 
 
 def test_options_of_solve_are_in_groups_with_examples(pgo_command) -> None:
@@ -20,12 +18,6 @@ def test_options_of_solve_are_in_groups_with_examples(pgo_command) -> None:
     assert len(re.findall(r"^  pgo solve ", out, re.M)) == 3
     assert "range" not in out
     assert "<" not in out
-
-
-def test_every_option_of_solve_is_in_one_group() -> None:
-    grouped = [name for names in COMMANDS["solve"].groups.values() for name in names]
-    parameters = set(inspect.signature(solve_command).parameters) - {"graph", "information"}
-    assert sorted(grouped) == sorted({*parameters, "help"})
 
 
 def test_bare_pgo_shows_its_help(pgo_command) -> None:
