@@ -16,7 +16,7 @@ from solvers.convex.orthogonal import (
 )
 from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
 from solvers.given_poses import certify as certify
-from solvers.growing import GrowingSolution as GrowingSolution, extend as extend
+from solvers.growing import extend as extend
 from solvers.handedness.ascent import HandednessAscent as HandednessAscent
 from solvers.handedness.complex_relaxation import ComplexRelaxation as ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian as HullLagrangian
@@ -132,7 +132,6 @@ __all__ = [
 ]
 __all__ += [
     "FolderSolution",
-    "GrowingSolution",
     "Pipeline",
     "Robot",
     "Robots",

@@ -1,356 +1,70 @@
 """Graphs that grow: new poses start where their edges put them, and the solution goes on.
 
-With a certificate Newton comes next. An update ends where the gap that is asked for is proven, not
-at rounding level; it mostly takes one factorisation and the certificate. Without one an update
-changes what the new edges touch (`solvers.riemannian.growing_map`), and the certificate can be had
-at any later one.
+Newton comes next. An update ends where the gap that is asked for is proven, not at rounding level;
+it mostly takes one factorisation and the certificate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any, Literal, overload
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError, door
+from pgo_models.errors import GraphError, door
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, project_to_rotations, unstack_transposes
+from pgo_models.geometry.rotations import BoolArray, project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
-from pgo_models.problem.cholesky import CholeskyBackend, factorize
-from pgo_models.problem.edge_cost import EdgeCost
-from pgo_models.problem.growing_cost import GrowingCost
-from pgo_models.problem.local_world import LocalWorld, far_middle, seen_from_point
+from pgo_models.problem.cholesky import factorize
+from pgo_models.problem.local_world import LocalWorld, seen_from_point
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from pgo_models.summaries import Summarised
-from solvers.loop import run
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
 from solvers.place import Attempt, Place, Step
 from solvers.places import in_local_world, solution_by
 from solvers.plan import solve_at, unless_it_fails
 from solvers.request import Pipeline, SolveRequest
-from solvers.riemannian.growing_map import GrowingMap
-from solvers.riemannian.newton import Newton
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.revision import inlier_problem
 from solvers.robust.weighted_edges import held_together, known_inliers
 from solvers.robust_solves.robust_solve import go_on_robustly
-from solvers.soc.subgraph import PartProblem
 from solvers.solution import Solution
 
 # Share of the gap by which Newton may leave F above its minimum: the bound can be ten times as far
 # below it.
 _SHARE = 0.01
-# Relative decrement of Newton where an update without a certificate did not converge by itself.
-_AFRESH = 1e-9
-# Arrays with a row for every edge, by which two graphs are compared and joined.
 # Difference, in metres beside the length and in rotations, up to which two edges measure the same.
 _SAME = 1e-4
-_MEASURED = ("R_ij", "t_ij", "kappa", "tau", "information")
-
-
-@dataclass(frozen=True, eq=False)
-class GrowingSolution(Summarised):
-    """Poses near the optimum of a graph that grows, without a certificate.
-
-    `extend(.., certify=False)` returns one, and takes it again. `with_edges` adds new edges alone,
-    without a graph of all. The cost is F, or chi2 where it is quadratic.
-
-    Parameters
-    ----------
-    graphs : tuple of PoseGraph
-        The first graph, and what it has grown by: each has its edges and the poses of these.
-    numbers : dict
-        Number of every pose by its id.
-    map : GrowingMap
-        Poses, cost and factor.
-    weighting : Weighting
-        Which cost it is.
-    origin : Array, shape (d,)
-        Point that the positions in the map are relative to. It is not zero where the first solution
-        is far from zero: rounding of large coordinates would keep updates from converging.
-    backend : CholeskyBackend, optional
-        The sparse Cholesky of a certificate.
-
-    Examples
-    --------
-    A graph of 18 poses grows by one pose after the other:
-
-    >>> from pgo_models.graphs.scenes import grid
-    >>> from solvers import solve
-    >>> graph = grid(np.random.default_rng(0))
-    >>> growing = GrowingSolution.of(solve(graph.subgraph(np.arange(18))))
-    >>> for n in range(19, 28):
-    ...     growing = extend(growing, graph.subgraph(np.arange(n)), certify=False)
-    >>> growing
-    GrowingSolution('grid', poses=27, edges=108, F=97.01402)
-    >>> growing.certified().is_certified
-    True
-    """
-
-    graphs: tuple[PoseGraph, ...]
-    numbers: dict[int, int]
-    map: GrowingMap
-    weighting: Weighting
-    origin: Array
-    backend: CholeskyBackend | None = None
-
-    @classmethod
-    def of(cls, solution: Solution) -> GrowingSolution:
-        """Begin at a solution: one factorisation.
-
-        Parameters
-        ----------
-        solution : Solution
-            Of the graph before it grows.
-
-        Returns
-        -------
-        GrowingSolution
-            At the same poses.
-
-        Raises
-        ------
-        SettingError
-            When the cost is not quadratic, or the graph has landmarks or priors.
-        NotPositiveDefiniteError
-            When the weights are too far apart for doubles.
-        """
-        return cls._at(solution.problem, solution.poses)
-
-    @classmethod
-    def _at(cls, problem: PGOProblem, poses: Poses) -> GrowingSolution:
-        graph = problem.graph
-        weighting = problem.weighting
-        if weighting not in (Weighting.ISOTROPIC, Weighting.INFORMATION):
-            raise SettingError(f"certify=False is for F and chi2, not for {problem!r}")
-        assert isinstance(weighting, Weighting)
-        cost = GrowingCost.of(graph, _quadratic_cost(graph, weighting))
-        numbers = dict(zip(graph.pose_ids.tolist(), range(graph.num_poses), strict=True))
-        origin = far_middle(poses.t, graph)
-        started = GrowingMap.of(cost, poses.R, poses.t - origin)
-        return cls((graph,), numbers, started, weighting, origin, problem.backend)
-
-    @property
-    def poses(self) -> Poses:
-        """All poses, in the frame of the first solution."""
-        return Poses(self.map.R, self.map.t + self.origin)
-
-    @property
-    def objective(self) -> float:
-        """Cost of the poses, as computed: F, or chi2."""
-        return self.map.objective
-
-    @cached_property
-    def graph(self) -> PoseGraph:
-        """The whole graph: its poses and edges in the order in which they came.
-
-        Estimates, truth and time stamps are those of a whole graph alone, if one was given last.
-        """
-        first, *added = self.graphs
-        if not added:
-            return first
-        ids = np.array(list(self.numbers))
-        arrays: dict[str, Any] = {}
-        for name in _MEASURED:
-            rows = [getattr(graph, name) for graph in self.graphs]
-            arrays[name] = None if rows[0] is None else np.concatenate(rows)
-        ends_i = [self._numbers_of(graph)[graph.i] for graph in self.graphs]
-        ends_j = [self._numbers_of(graph)[graph.j] for graph in self.graphs]
-        i = np.concatenate(ends_i)
-        j = np.concatenate(ends_j)
-        return PoseGraph(
-            len(ids),
-            i,
-            j,
-            **arrays,
-            ids=ids,
-            fixed=first.fixed,
-            name=first.name,
-            written_error=_written_error(self.graphs),
-            weights_error=max(graph.weights_error for graph in self.graphs),
-        )
-
-    def with_edges(self, graph: PoseGraph) -> GrowingSolution:
-        """Return the solution after new edges.
-
-        Most updates take one or two products with an inverse that is factored anew only above the
-        poses of the new edges (Kaess et al. 2012). Where that does not converge, Newton solves
-        the whole graph.
-
-        Parameters
-        ----------
-        graph : PoseGraph
-            The new edges alone, with the poses that they join. Poses are recognised by their ids;
-            all others are new.
-
-        Returns
-        -------
-        GrowingSolution
-            At a minimum of the cost of all edges, near the poses before.
-
-        Raises
-        ------
-        GraphError
-            When a new pose is not joined with those before, or some edges have information
-            matrices and others have none.
-        SettingError
-            As for `of`.
-
-        References
-        ----------
-        M. Kaess, H. Johannsson, R. Roberts, V. Ila, J. Leonard and F. Dellaert, iSAM2: Incremental
-        smoothing and mapping using the Bayes tree, IJRR 2012.
-
-        Examples
-        --------
-        Two poses, and a third one that sees both:
-
-        >>> from pgo_models import PoseGraph
-        >>> from solvers import solve
-        >>> step = np.array([[1.0, 0.0]])
-        >>> turn = np.eye(2)[None]
-        >>> one = np.ones(1)
-        >>> pair = PoseGraph(2, np.array([0]), np.array([1]), turn, step, one, one)
-        >>> growing = GrowingSolution.of(solve(pair))
-        >>> seen = np.array([[1.0, 0.1], [2.0, 0.2]])
-        >>> turns = np.array([np.eye(2), np.eye(2)])
-        >>> third = PoseGraph(
-        ...     3, np.array([1, 0]), np.array([2, 2]), turns, seen, np.ones(2), np.ones(2)
-        ... )
-        >>> growing.with_edges(third)
-        GrowingSolution('graph', poses=3, edges=3, F=0.003000674)
-        """
-        first = self.graphs[0]
-        if (graph.information is None) != (first.information is None):
-            raise GraphError(
-                f"of {first.name} and {graph.name} one has information matrices and one has none; "
-                "give them to both"
-            )
-        cost = GrowingCost.of(graph, _quadratic_cost(graph, self.weighting))
-        numbers = dict(self.numbers)
-        for name in graph.pose_ids.tolist():
-            numbers.setdefault(name, len(numbers))
-        pose = _numbers_of(graph, numbers)
-        grown = replace(
-            self,
-            graphs=(*self.graphs, graph),
-            numbers=numbers,
-            map=self.map.with_edges(graph, cost, pose),
-        )
-        return grown if grown.map.has_converged else grown._solved_afresh()
-
-    def certified(self, pipeline: Pipeline | None = None) -> Solution:
-        """Return the solution with a certificate, as `extend` does.
-
-        Parameters
-        ----------
-        pipeline : Pipeline, optional
-            Settings of the stages; `Pipeline()` unless given.
-
-        Returns
-        -------
-        Solution
-            Of the whole graph. The growing solution can be extended all the same.
-        """
-        pipeline = pipeline if pipeline is not None else Pipeline()
-        return _solve_from(self.problem, pipeline, self.poses)
-
-    def __repr__(self) -> str:
-        name = "F" if self.weighting is Weighting.ISOTROPIC else "chi2"
-        size = f"poses={len(self.numbers)}, edges={self.map.cost.num_edges}"
-        title = self.graphs[0].name
-        return f"GrowingSolution({title!r}, {size}, {name}={self.objective:.7g})"
-
-    @cached_property
-    def problem(self) -> PGOProblem:
-        """The problem of the whole graph."""
-        return PGOProblem(self.graph, self.backend, self.weighting)
-
-    def _numbers_of(self, graph: PoseGraph) -> IntArray:
-        return _numbers_of(graph, self.numbers)
-
-    def _solved_afresh(self) -> GrowingSolution:
-        """The solution by Newton on the whole graph, from the present poses."""
-        start = Poses(self.map.R, self.map.t)
-        solved = run(Newton(tolerance=_AFRESH), self.problem, start)
-        poses = solved.poses
-        return replace(self, map=GrowingMap.of(self.map.cost, poses.R, poses.t))
-
-    def _with_whole(self, graph: PoseGraph) -> GrowingSolution:
-        """Return the solution of a whole graph that has grown out of this one."""
-        edges = _new_edges(self.graph, graph)
-        if edges is None:
-            _check_grown(self.graph, graph)
-            problem = PGOProblem(graph, self.backend, self.weighting)
-            start = extended_poses(problem, self.graph.pose_ids, self.poses)
-            return GrowingSolution._at(problem, start)._solved_afresh()
-        if not len(edges):
-            return self
-        added = graph.edge_subgraph(edges)
-        return replace(self.with_edges(added), graphs=(graph,))
-
-
-@overload
-def extend(
-    solution: Solution | GrowingSolution,
-    graph: PoseGraph,
-    pipeline: Pipeline | None = None,
-    *,
-    certify: Literal[True] = True,
-    robots: Robots | Partition | None = None,
-    robust: GNC | PCM | None = None,
-) -> Solution: ...
-
-
-@overload
-def extend(
-    solution: Solution | GrowingSolution,
-    graph: PoseGraph,
-    pipeline: Pipeline | None = None,
-    *,
-    certify: Literal[False],
-    robots: Robots | Partition | None = None,
-    robust: GNC | PCM | None = None,
-) -> GrowingSolution: ...
 
 
 @door
 def extend(
-    solution: Solution | GrowingSolution,
+    solution: Solution,
     graph: PoseGraph,
     pipeline: Pipeline | None = None,
     *,
-    certify: bool = True,
     robots: Robots | Partition | None = None,
     robust: GNC | PCM | None = None,
-) -> Solution | GrowingSolution:
+) -> Solution:
     """Solve a graph that has grown out of another one, from the solution of that.
 
-    With a certificate Newton alone comes first. Where its certificate is wider than asked for, the
-    whole pipeline follows, and the stages of the solution are those of both. A solution by robots
-    is extended by them.
+    Newton alone comes first. Where its certificate is wider than asked for, the whole pipeline
+    follows, and the stages of the solution are those of both. A solution by robots is extended by
+    them.
 
     Parameters
     ----------
-    solution : Solution or GrowingSolution
+    solution : Solution
         Of the graph before it has grown.
     graph : PoseGraph
         Poses of the solution, recognised by their ids, and new ones.
     pipeline : Pipeline, optional
         Settings of the stages; `Pipeline()` unless given.
-    certify : bool, optional
-        Whether the solution has a certificate. Without one, an update costs what the new edges
-        change, if the poses and edges of the solution come first in the graph, in their order; the
-        first update after a Solution factors the whole graph.
     robots : Robots or Partition, optional
         Robots that own the poses of the grown graph. Unless their owners are given, they are those
         of the solution. A new pose goes to the robot that the graph names, or where these are not
@@ -363,7 +77,7 @@ def extend(
 
     Returns
     -------
-    Solution or GrowingSolution
+    Solution
         Of the whole graph. The ledger of a solve by robots goes on from that of the solution.
 
     Raises
@@ -371,8 +85,7 @@ def extend(
     GraphError
         When the graph has no pose of the solution, or is not connected.
     SettingError
-        When no certificate is asked for, and there are robots, landmarks or priors, wrong edges are
-        sought, or the cost is not quadratic; when the robots are not those of the graph's poses.
+        When the robots are not those of the graph's poses.
 
     Examples
     --------
@@ -398,19 +111,9 @@ def extend(
     """
     shared = None if robots is None else Robots.of(robots)
     has_owners = shared is not None and shared.owners is not None
-    if not has_owners and isinstance(solution, Solution) and solution.robots is not None:
+    if not has_owners and solution.robots is not None:
         owners = extended_partition(solution.robots, solution.problem.graph.pose_ids, graph)
         shared = (shared or Robots()).with_owners(owners)
-    if not certify:
-        if shared is not None:
-            raise SettingError(
-                "certify=False is for updates in one place; robots go on with a certificate"
-            )
-        if robust is not None:
-            raise SettingError("robust updates have a certificate; leave certify=False out")
-        if isinstance(solution, Solution):
-            solution = GrowingSolution.of(solution)
-        return solution._with_whole(graph)
     _check_grown(solution.problem.graph, graph)
     pipeline = pipeline if pipeline is not None else Pipeline()
     weighting = solution.problem.weighting
@@ -429,15 +132,12 @@ def extend(
         start = extended_poses(inlier_problem(problem, kept), ids, solution.poses)
         request = SolveRequest(problem, pipeline, start, robots=shared)
         grown = in_local_world(partial(go_on_robustly, robust, kept, new), request)
-    before = solution.ledger if isinstance(solution, Solution) else None
-    return replace(grown, ledger=_joined(before, grown.ledger))
+    return replace(grown, ledger=_joined(solution.ledger, grown.ledger))
 
 
-def _decided_before(
-    solution: Solution | GrowingSolution, graph: PoseGraph
-) -> tuple[BoolArray, BoolArray]:
+def _decided_before(solution: Solution, graph: PoseGraph) -> tuple[BoolArray, BoolArray]:
     """Edges of a grown graph, (m,): those that the solution before has kept, and new ones."""
-    rejection = solution.robust if isinstance(solution, Solution) else None
+    rejection = solution.robust
     before = solution.problem.graph if rejection is None else rejection.problem.graph
     measured = _measurements(before)
     is_kept = np.ones(len(measured), dtype=bool) if rejection is None else rejection.kept
@@ -628,57 +328,3 @@ def _owners_by_name(owner: IntArray, num_robots: int, graph: PoseGraph) -> IntAr
         new_names = np.flatnonzero(owner_of_name < 0)
         owner_of_name[new_names] = num_robots + np.arange(len(new_names))
     return np.where(owner < 0, owner_of_name[graph.robot], owner)
-
-
-def _quadratic_cost(graph: PoseGraph, weighting: Weighting) -> EdgeCost:
-    """F or chi2 of a graph; a SettingError for what updates without a certificate cannot take."""
-    if len(graph.landmarks) or graph.world is not None:
-        raise SettingError(
-            f"{graph.name} has landmarks or priors; extend it with a certificate, certify=True"
-        )
-    cost = PartProblem(graph, weighting=weighting).weights
-    if not (cost.is_quadratic and cost.is_convex and cost.has_translations):
-        raise SettingError(
-            f"chi2 of {graph.name} is not quadratic and convex; take F (Weighting.ISOTROPIC), "
-            "or extend it with a certificate, certify=True"
-        )
-    return cost
-
-
-def _numbers_of(graph: PoseGraph, numbers: dict[int, int]) -> IntArray:
-    """Numbers, (n,), of the poses of a graph by their ids."""
-    return np.array([numbers[name] for name in graph.pose_ids.tolist()])
-
-
-def _written_error(graphs: Sequence[PoseGraph]) -> Array | None:
-    """`PoseGraph.written_error` of the edges of several graphs; None where none of them has one."""
-    if all(graph.written_error is None for graph in graphs):
-        return None
-    rows = []
-    for graph in graphs:
-        written = graph.written_error
-        rows.append(np.zeros((graph.num_edges, 2)) if written is None else written)
-    return np.concatenate(rows)
-
-
-def _new_edges(before: PoseGraph, graph: PoseGraph) -> IntArray | None:
-    """Edges of a graph that the one before does not have.
-
-    None unless its poses come first in the graph, and its edges come in the same order.
-    """
-    n = before.num_poses
-    m = before.num_edges
-    if not np.array_equal(graph.pose_ids[:n], before.pose_ids):
-        return None
-    between_known = np.flatnonzero((graph.i < n) & (graph.j < n))
-    old = between_known[:m]
-    for name in ("i", "j", *_MEASURED):
-        own = getattr(before, name)
-        other = getattr(graph, name)
-        if (own is None) != (other is None):
-            return None
-        if own is not None and not np.array_equal(own, other[old]):
-            return None
-    is_new = np.ones(graph.num_edges, dtype=bool)
-    is_new[old] = False
-    return np.flatnonzero(is_new)

@@ -280,14 +280,6 @@ REFUSED: list[tuple[Callable[[dict[str, Any]], object], str]] = [
         lambda it: solvers.extend(it["solution"], pgo.victoria_park(0, num_poses=40)),
         "in 2 dimensions and grid_world, which was solved, in 3; solve it on its own",
     ),
-    (
-        lambda it: solvers.extend(
-            solvers.extend(it["solution"], it["graph"], certify=False),
-            pgo.load("grid"),
-            certify=False,
-        ),
-        "grid has none of the measurements of grid_world",
-    ),
 ]
 
 

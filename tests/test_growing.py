@@ -7,23 +7,22 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 import pytest
-from graphs import COSTS, exact_graph, informed, varied_graph
+from graphs import COSTS, informed
 
 import solvers
 from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex.graph_subproblem import ModelChange
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error
 from pgo_models.graphs.datasets import load
-from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, grid, random_geometric
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers import growing as growing_solves
-from solvers.growing import GrowingSolution, extend, extended_partition, extended_poses
+from solvers.growing import extend, extended_partition, extended_poses
 from solvers.place import Attempt, Place
 from solvers.plan import solve_at
 from solvers.result import Status
@@ -149,235 +148,6 @@ def test_terms_of_an_extended_model_stay() -> None:
     assert grown.objective == pytest.approx(afresh.objective, rel=1e-6)
 
 
-def edges_of(graph: PoseGraph, pose: int) -> IntArray:
-    """Edges of a pose to earlier ones."""
-    return np.flatnonzero(np.maximum(graph.i, graph.j) == pose)
-
-
-def part_of(graph: PoseGraph, edges: IntArray) -> PoseGraph:
-    """Graph of some edges and their poses."""
-    poses = np.unique(np.concatenate([graph.i[edges], graph.j[edges]]))
-    is_left_out = np.ones(graph.num_edges, dtype=bool)
-    is_left_out[edges] = False
-    return replace(graph.without_edges(is_left_out).subgraph(poses), initial=None, truth=None)
-
-
-def world(d: int, seed: int) -> PoseGraph:
-    """One robot that walks on a lattice and closes loops."""
-    return grid_world(1, 80, np.random.default_rng(seed), d=d, loop_closure_probability=0.3)
-
-
-@pytest.mark.parametrize("as_wholes", [False, True])
-@pytest.mark.parametrize("d", [2, 3])
-def test_pose_by_pose_it_stays_at_the_optimum(d: int, as_wholes: bool) -> None:
-    graph = world(d, 0)
-    n = graph.num_poses
-    half = n // 2
-    growing = GrowingSolution.of(solvers.solve(first_poses(graph, half)))
-    for pose in range(half, n):
-        if as_wholes:
-            growing = extend(growing, first_poses(graph, pose + 1), certify=False)
-        else:
-            growing = growing.with_edges(part_of(graph, edges_of(graph, pose)))
-        if pose % 10 == 0 or pose == n - 1:
-            best = solvers.solve(first_poses(graph, pose + 1))
-            assert best.is_certified
-            assert growing.objective == pytest.approx(best.objective, rel=1e-6)
-            assert growing.objective >= best.lower_bound
-    assert growing.graph.num_edges == graph.num_edges
-    certified = growing.certified()
-    assert certified.is_certified
-    assert certified.problem.graph.num_poses == n
-    assert certified.objective == pytest.approx(best.objective, rel=1e-9)
-
-
-def test_a_state_is_left_alone_by_what_follows() -> None:
-    graph = world(2, 1)
-    n = graph.num_poses
-    before = GrowingSolution.of(solvers.solve(first_poses(graph, n - 8)))
-    poses = before.poses
-    left = before
-    right = before
-    for pose in range(n - 8, n):
-        left = left.with_edges(part_of(graph, edges_of(graph, pose)))
-    for pose in range(n - 8, n):
-        right = right.with_edges(part_of(graph, edges_of(graph, pose)))
-    np.testing.assert_array_equal(before.poses.t, poses.t)
-    assert before.graph.num_poses == n - 8
-    np.testing.assert_array_equal(left.poses.t, right.poses.t)
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_exact_edges_cost_nothing(d: int) -> None:
-    graph = exact_graph(0, 20, d)
-    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 12)))
-    for pose in range(12, 20):
-        growing = growing.with_edges(part_of(graph, edges_of(graph, pose)))
-    assert growing.objective < 1e-20 * graph.tau.sum()
-    assert graph.truth is not None
-    aligned = growing.poses.aligned_to(graph.truth)
-    np.testing.assert_allclose(aligned.t, graph.truth.t, rtol=0, atol=1e-9)
-
-
-def test_a_closure_that_moves_half_of_the_map_is_solved_as_well() -> None:
-    """A long chain with a bend, which the closure takes away."""
-    n = 120
-    rng = np.random.default_rng(3)
-    turns = exp_map(rng.normal(0.03, 0.05, (n, 1)))
-    steps = np.tile([1.0, 0.0], (n, 1)) + rng.normal(0.0, 0.05, (n, 2))
-    i = np.arange(n)
-    kappa = np.full(n, 100.0)
-    tau = np.full(n, 400.0)
-    ring = PoseGraph(n, i, (i + 1) % n, turns, steps, kappa, tau)
-    open_ring = ring.without_edges(i == n - 1)
-    growing = extend(solvers.solve(open_ring), ring, certify=False)
-    best = solvers.solve(ring)
-    assert growing.objective == pytest.approx(best.objective, rel=1e-6)
-
-
-def test_edges_in_another_order_are_another_graph_and_solved_all_the_same() -> None:
-    graph = grid(np.random.default_rng(3))
-    before = solvers.solve(first_poses(graph, 20))
-    shuffled = graph.subgraph(np.arange(27))
-    order = np.random.default_rng(0).permutation(graph.num_edges)
-    rows = {
-        name: getattr(graph, name)[order] for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau")
-    }
-    growing = extend(before, replace(shuffled, **rows), certify=False)
-    assert growing.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-6)
-    assert extend(growing, graph).is_certified
-    # nothing new
-    again = extend(growing, growing.graph, certify=False)
-    assert again.objective == growing.objective
-
-
-@pytest.mark.parametrize(
-    ("name", "weighting"),
-    [
-        ("i", Weighting.ISOTROPIC),
-        ("R_ij", Weighting.ISOTROPIC),
-        ("t_ij", Weighting.ISOTROPIC),
-        ("kappa", Weighting.ISOTROPIC),
-        ("tau", Weighting.ISOTROPIC),
-        ("information", Weighting.INFORMATION),
-    ],
-)
-def test_a_graph_with_other_measurements_of_old_edges_is_solved_with_these(
-    name: str, weighting: Weighting
-) -> None:
-    graph = varied_graph(4, 24, 2)
-    graph = replace(graph, information=isotropic_information(graph.kappa, graph.tau, 2))
-    before = solvers.solve(PGOProblem(first_poses(graph, 20), weighting=weighting))
-    growing = GrowingSolution.of(before)
-    rows = getattr(graph, name).copy()
-    rows[0] = {
-        "i": (graph.i[0] + 2) % 20,
-        "R_ij": graph.R_ij[0] @ exp_map(np.array([[0.1]]))[0],
-    }.get(name, 4 * rows[0])
-    changed = replace(graph, **{name: rows})
-    grown = extend(growing, changed, certify=False)
-    problem = PGOProblem(changed, weighting=weighting)
-    best = solvers.solve(problem)
-    assert best.is_certified
-    unchanged = solvers.solve(PGOProblem(graph, weighting=weighting))
-    assert best.objective > (1.0 + 1e-5) * unchanged.objective
-    assert grown.objective == pytest.approx(problem.objective(grown.poses), rel=1e-9)
-    assert grown.objective == pytest.approx(best.objective, rel=1e-6)
-
-
-def test_a_graph_with_fewer_poses_or_edges_is_solved_as_it_is() -> None:
-    graph = grid(np.random.default_rng(3))
-    growing = GrowingSolution.of(solvers.solve(graph))
-    is_last = np.arange(graph.num_edges) == graph.num_edges - 1
-    for smaller in (first_poses(graph, 20), graph.without_edges(is_last)):
-        found = extend(growing, smaller, certify=False)
-        assert found.graph is smaller
-        assert found.objective == pytest.approx(solvers.solve(smaller).objective, rel=1e-6)
-
-
-def test_poses_that_have_other_ids_now_are_told_by_these() -> None:
-    graph = grid(np.random.default_rng(3))
-    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 20)))
-    ids = graph.pose_ids.copy()
-    ids[[0, 19]] = ids[[19, 0]]
-    renamed = replace(graph, ids=ids)
-    found = extend(growing, renamed, certify=False)
-    assert found.graph is renamed
-    assert found.objective == pytest.approx(PGOProblem(renamed).objective(found.poses), rel=1e-9)
-    assert found.objective == pytest.approx(solvers.solve(graph).objective, rel=1e-6)
-
-
-@pytest.mark.parametrize("is_first_with", [False, True])
-def test_information_matrices_may_come_or_go_with_a_whole_graph(is_first_with: bool) -> None:
-    graph = varied_graph(4, 24, 2)
-    with_matrices = replace(graph, information=isotropic_information(graph.kappa, graph.tau, 2))
-    without = replace(graph, information=None)
-    before, after = (with_matrices, without) if is_first_with else (without, with_matrices)
-    F = Weighting.ISOTROPIC
-    growing = GrowingSolution.of(solvers.solve(PGOProblem(first_poses(before, 20), weighting=F)))
-    found = extend(growing, after, certify=False)
-    best = solvers.solve(PGOProblem(after, weighting=F))
-    assert found.graph is after
-    assert found.objective == pytest.approx(best.objective, rel=1e-6)
-
-
-def test_what_a_whole_graph_knows_beside_its_edges_stays() -> None:
-    graph = replace(grid(np.random.default_rng(3)), fixed=np.array([2]))
-    growing = GrowingSolution.of(solvers.solve(first_poses(graph, 20)))
-    assert extend(growing, graph, certify=False).graph is graph
-    pieced = growing
-    for pose in range(20, graph.num_poses):
-        pieced = pieced.with_edges(part_of(graph, edges_of(graph, pose)))
-    assert pieced.graph.fixed.tolist() == [2]
-
-
-def test_what_updates_without_a_certificate_cannot_take_is_named() -> None:
-    graph = informed(4, 30, 3, coupled=True, noise=NoiseModel(0.002, 0.002))
-    chi2 = solvers.solve(PGOProblem(graph, weighting=Weighting.INFORMATION))
-    with pytest.raises(SettingError, match="not quadratic and convex"):
-        GrowingSolution.of(chi2)
-    scene = grid(np.random.default_rng(0))
-    seen = scene.with_landmark(np.array([0, 1, 2]), np.eye(3), tau=1.0)
-    with pytest.raises(SettingError, match="landmarks or priors"):
-        GrowingSolution.of(solvers.solve(seen))
-    held = scene.with_position_prior([0, 1, 9, 20], np.eye(4)[:, :3], tau=1.0)
-    with pytest.raises(SettingError, match="landmarks or priors"):
-        GrowingSolution.of(solvers.solve(held))
-    rotations = solvers.solve(PGOProblem(scene, weighting=Weighting.ROTATIONS))
-    with pytest.raises(SettingError, match="for F and chi2"):
-        GrowingSolution.of(rotations)
-    growing = GrowingSolution.of(solvers.solve(first_poses(scene, 20)))
-    far = replace(first_poses(scene, 4), ids=np.arange(100, 104), truth=None)
-    with pytest.raises(GraphError, match="is not joined with the poses solved before"):
-        growing.with_edges(far)
-    with pytest.raises(GraphError, match="one has information matrices"):
-        growing.with_edges(part_of(graph, np.array([0])))
-
-
-def test_a_quadratic_chi2_that_is_not_convex_is_updated_with_a_certificate_alone() -> None:
-    """One axis of every turn is known far better than the others, so that W is indefinite."""
-    graph = varied_graph(4, 12, 3)
-    matrix = np.diag([25.0, 25.0, 25.0, 36.0, 1.0, 1.0])
-    stiff = replace(graph, information=np.tile(matrix, (graph.num_edges, 1, 1)))
-    problem = PGOProblem(stiff, weighting=Weighting.INFORMATION)
-    assert problem.weights.is_quadratic
-    assert not problem.weights.is_convex
-    with pytest.raises(SettingError, match="not quadratic and convex"):
-        GrowingSolution.of(solvers.solve(problem))
-
-
-def test_chi2_of_rotations_alone_is_updated_with_a_certificate_alone() -> None:
-    graph = varied_graph(4, 12, 3)
-    matrix = np.diag([0.0, 0.0, 0.0, 4.0, 4.0, 4.0])
-    silent = replace(
-        graph.with_weights(graph.kappa, np.zeros(graph.num_edges)),
-        information=np.tile(matrix, (graph.num_edges, 1, 1)),
-    )
-    before = solvers.solve(PGOProblem(silent, weighting=Weighting.INFORMATION))
-    with pytest.raises(SettingError, match="certify=True"):
-        GrowingSolution.of(before)
-
-
 # Robots
 
 
@@ -478,10 +248,3 @@ def test_robots_without_a_driver_go_on_without_one() -> None:
     assert grown.ledger is not None
     assert before.ledger is not None
     assert grown.ledger.rounds > before.ledger.rounds
-
-
-def test_robots_go_on_with_a_certificate_alone() -> None:
-    graph = grid(np.random.default_rng(0))
-    before = solvers.solve(first_poses(graph, 18), robots=2)
-    with pytest.raises(SettingError, match="in one place"):
-        extend(before, graph, certify=False)

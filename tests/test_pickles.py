@@ -137,7 +137,6 @@ MADE: dict[str, Make] = {
     "Run": lambda: run(solvers.SOC(), pgo.PGOProblem(GRAPH)),
     "Stage": lambda: solved().stages[0],
     "FolderSolution": lambda: solvers.solve_folder("robots"),
-    "GrowingSolution": lambda: solvers.GrowingSolution.of(solved()),
     "Pipeline": solvers.Pipeline,
     "Solution": solved,
     "SOC": lambda: solvers.SOC(robots=pgo.partition(GRAPH, 3)),

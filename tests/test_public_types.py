@@ -32,7 +32,6 @@ INSIDE = {
     "KKTResiduals": "figures of an OrthogonalSolution, which shows them",
     "RelaxationPlan": "choice of a RelaxationForm, which a RelaxationSolution shows",
     "RankReport": "figures of a RelaxationSolution, which shows them",
-    "GrowingMap": "poses and factor of a GrowingSolution, which shows what is to be known",
     "Attempt": "row of the attempts that a Rejection lists",
     "StepSettings": "settings of SOC as robots are sent them",
     "Solved": "base of Solution, whose fields Solution documents",

@@ -52,7 +52,6 @@ def of_pose_graphs() -> Iterator[object]:
     yield from (qp, qp.variables, qp.change, qp.qp)
     relaxed = pgo.solve_relaxation(graph)
     yield from (relaxed, relaxed.rank, relaxed.plan)
-    yield solvers.extend(solution, graph, certify=False)
     rejecting = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC()))
     yield from (rejecting.robust, rejecting.robust.proof)
     estimate = solvers.estimate_noise(graph)

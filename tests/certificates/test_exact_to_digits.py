@@ -116,13 +116,6 @@ DOORS: dict[str, Callable[[PoseGraph, Path], Certificate]] = {
             solvers.solve(graph.subgraph(np.arange(10)), progress=False), graph
         ).certificate
     ),
-    "grown": lambda graph, _: (
-        solvers.extend(
-            solvers.solve(graph.subgraph(np.arange(10)), progress=False), graph, certify=False
-        )
-        .certified()
-        .certificate
-    ),
     "own files": lambda graph, folder: (
         solvers.solve_folder(write_robot_files(graph, folder, "%.9f"), progress=False).certificate
     ),

@@ -10,7 +10,6 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray, exp_map
 from pgo_models.graphs.pose_graph import PoseGraph
 
@@ -126,10 +125,3 @@ def test_priors_are_suspects_of_a_stream_too() -> None:
     assert grown.robust is not None
     expected = np.flatnonzero(whole.is_prior)[[4]]
     np.testing.assert_array_equal(np.flatnonzero(grown.robust.rejected), expected)
-
-
-def test_updates_without_a_certificate_reject_nothing() -> None:
-    graph = pgo.load("grid")
-    solution = solvers.solve(graph.subgraph(np.arange(18)))
-    with pytest.raises(SettingError, match="robust updates have a certificate"):
-        solvers.extend(solution, graph, certify=False, robust=solvers.GNC())
