@@ -1,5 +1,7 @@
 """Graphs with wrong loop closures, for tests of robust estimation."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pgo_models.geometry.poses import Poses
@@ -93,3 +95,27 @@ def joined_by(num_between: int) -> PoseGraph:
     left_out = np.zeros(graph.num_edges, dtype=bool)
     left_out[between[num_between:]] = True
     return graph.without_edges(left_out)
+
+
+def slipped_loop(seed: int) -> PoseGraph:
+    """A loop of 8 to 19 poses and the beginning of a second one, with a slip of the odometry.
+
+    In half of the graphs an edge that may be a closure has slipped, too.
+    """
+    rng = np.random.default_rng(seed)
+    per_turn = int(rng.integers(5, 11))
+    n = int(rng.integers(per_turn + 3, 2 * per_turn))
+    angle = 2.0 * np.pi * np.arange(n) / per_turn
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    truth = Poses(R, np.stack([s, 1.0 - c], axis=1))
+    k = np.arange(n)
+    i = np.concatenate([k[:-1], k[: n - per_turn]])
+    j = np.concatenate([k[1:], k[per_turn:]])
+    noise = NoiseModel(0.01, 0.05)
+    graph = observe("slipped_loop", truth, i, j, noise, noise.kappa(2), noise.tau, rng)
+    t_ij = graph.t_ij.copy()
+    t_ij[rng.integers(0, n - 1)] += rng.normal(0.0, 0.5, 2)
+    if rng.random() < 0.5:
+        t_ij[rng.integers(n - 1, graph.num_edges)] += rng.normal(0.0, 0.5, 2)
+    return replace(graph, t_ij=t_ij)

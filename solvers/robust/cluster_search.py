@@ -95,21 +95,33 @@ class ClusterSearch:
     def improved(self, kept: BoolArray, poses: Poses) -> Fit:
         """Edges to keep, and their poses, from those of an estimate with the edges `kept`, (m,).
 
-        Clusters are added, removed and exchanged; then single edges are, as a cluster may have a
-        wrong one, unless edges come in a stream, whose updates have to be fast; then any edges, by
-        the linear theory. What that finds is improved in turn.
+        Clusters and single edges are exchanged until the map is at rest; then any edges are, by the
+        linear theory, and the map comes to rest anew.
         """
-        fit = self.sets.settled(kept, poses)
-        while True:
-            fit = self._at_rest(fit)
-            if not self.sets.has_time():
-                return fit
-            if self.new is None and (self.clusters.sizes > 1).any():
-                fit = min(fit, self.singly._at_rest(fit), key=self.sets.cost)
+        fit = self._refined(self.sets.settled(kept, poses))
+        while self.sets.has_time():
             exchanged = self.linear.exchanged(fit)
             if exchanged is None:
-                return fit
-            fit = exchanged
+                break
+            other = self._refined(exchanged)
+            # The loop ends, as the cost of maps at rest falls strictly. That of `exchanged` does
+            # not tell: a map can come to rest by the removal of the very edges that were exchanged
+            # for others.
+            if not self.sets.is_better(other, fit):
+                break
+            fit = other
+        return fit
+
+    def _refined(self, fit: Fit) -> Fit:
+        """The fit at rest, with regard to clusters and then to single edges.
+
+        A cluster may have a wrong edge. Edges that come in a stream are moved in clusters alone, as
+        its updates have to be fast.
+        """
+        fit = self._at_rest(fit)
+        if self.new is None and (self.clusters.sizes > 1).any() and self.sets.has_time():
+            fit = min(fit, self.singly._at_rest(fit), key=self.sets.cost)
+        return fit
 
     def _at_rest(self, fit: Fit) -> Fit:
         """The fit that no addition, removal or exchange of a cluster improves."""
@@ -119,6 +131,7 @@ class ClusterSearch:
             exchanged = self._exchanged(fit)
             if exchanged is None:
                 return fit
+            # The loop ends, as the cost of `best` falls strictly.
             if best is not None and not self.sets.is_better(exchanged, best):
                 return fit
             best = fit = exchanged
@@ -218,6 +231,7 @@ class ClusterSearch:
                 return fit
             added[candidates.groups[k]] = True
         larger = self.sets.settled(fit.kept | added, fit.poses)
+        # The loop ends, as `added` loses an edge in every round.
         while self.sets.has_time():
             costs = self.sets.problem.edge_costs(larger.poses)
             too_far = added & (costs > claimed * self.sets.allowed)
@@ -232,6 +246,7 @@ class ClusterSearch:
     def _with_clusters(self, fit: Fit) -> Fit:
         """The fit with the rejected clusters that it can follow, the one of least cost first."""
         trials = np.zeros(len(self.clusters), dtype=int)
+        # The loop ends, as the fit has more edges after every round.
         while self.sets.has_time():
             fit = self._with_fitting(fit)
             if not self.sets.has_time():
@@ -273,6 +288,7 @@ class ClusterSearch:
         names = candidates.groups.names
         waiting = candidates.order[trials[names[candidates.order]] < _MOST_TRIALS]
         all_near = candidates.near(waiting, _NEAR)
+        # The loop ends, as every round takes candidates of which there is a finite number.
         while num_left and num_failures < self._most_failures and self.sets.has_time():
             near = list(itertools.islice(all_near, num_left))
             if not near:
@@ -337,6 +353,7 @@ class ClusterSearch:
 
     def _without_misfits(self, fit: Fit) -> Fit:
         """The fit without the clusters that cost more than chance explains, the worst one first."""
+        # The loop ends, as the fit has fewer edges after every round.
         while self.sets.has_time():
             smaller = self._without_worst(fit)
             if smaller is None:

@@ -146,6 +146,7 @@ def drop_contradicted(
     fit = Fit.of(problem, kept, poses)
     suspect = _Suspect.of(problem, known, allowed, fit)
     removal = suspect.removed() if suspect is not None else None
+    # The loop ends, as the fit has fewer edges after every round.
     while removal is not None:
         following = _Suspect.of(problem, known, allowed, removal.fit)
         # If the edge does not stand out beside a lower bound of the next loss, the next removal

@@ -373,8 +373,12 @@ class _RobustSolve:
         are likely right although they are beyond the quantile, which may raise the truncated cost.
         An update of a graph that has grown goes without, as it has to be fast.
         """
+        kept_before: set[bytes] = set()
         try:
+            # The loop ends, as no set of edges comes again. Costs do not tell, as thresholds may
+            # change with the least error scale of all attempts.
             while self._has_time() and cheapest.status not in OUT_OF_TIME:
+                kept_before.add(cheapest.kept.tobytes())
                 search = self._search(self.choice)
                 fit = Fit.of(self.doubted.problem, cheapest.kept, cheapest.poses)
                 other = search.linear.without_one(fit)
@@ -382,6 +386,8 @@ class _RobustSolve:
                     return self._replaced(cheapest, search.with_likely(fit))
                 improved = search.improved(other.kept, other.poses)
                 better = min(improved, other, key=search.sets.cost)
+                if better.kept.tobytes() in kept_before:
+                    return cheapest
                 cheapest = self._replaced(cheapest, better)
         except FAILURES as error:
             self.failures.append(f"the last search failed ({error}); what it began with stands")
