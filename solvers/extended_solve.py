@@ -19,12 +19,9 @@ from pgo_models.errors import SettingError
 from pgo_models.figures import gap_above, scaled_above, scaled_below
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
-from solvers.convex.extended_newton import ExtendedNewton, kinks
-from solvers.convex.extended_soc import ExtendedSOC, with_priors
-from solvers.loop import RunMonitor
-from solvers.place import Attempt
+from solvers.convex.extended_soc import with_priors
 from solvers.request import SolveRequest
-from solvers.result import Stage
+from solvers.result import OUT_OF_TIME, Stage
 from solvers.solution import Solution, joined_notes, note_of_absence, note_of_coupling
 
 
@@ -36,16 +33,14 @@ def solve_extended(
     Terms that are priors go into the graph, which `solution_for` solves. With priors alone that is
     the solution, of the graph with them, whose last pose is the world.
 
-    Else the poses are those of ExtendedSOC and, where that leaves all terms smooth and there are no
-    constraints, of ExtendedNewton. The objective has all terms. The bound leaves out what the note
-    says: terms that are never negative, and constraints, which can only raise the optimum. Where
-    edges are replaced there is no bound.
+    Else the poses are those of ExtendedSOC. The objective has all terms. The bound leaves out what
+    the note says: terms that are never negative, and constraints, which can only raise the optimum.
+    Where edges are replaced there is no bound.
 
     A SettingError where a term may be negative, and where robots or a robust solve are asked for,
     which go with priors alone.
     """
     problem = request.problem
-    start = request.start
     monitor = request.monitor
     pipeline = request.pipeline
     soc: Any = pipeline.soc  # an ExtendedSOC
@@ -65,6 +60,7 @@ def solve_extended(
             "leave that out"
         )
     with_known_priors = PGOProblem(graph, problem.backend, problem.weighting)
+    start = request.start
     known_start = None if start is None else graph.completed(start)
     without_terms = replace(pipeline, soc=soc.soc)
     solution = solution_for(
@@ -73,21 +69,16 @@ def solve_extended(
     if not left_out:
         return solution
     stages = list(solution.stages)
-    answer = Attempt(solution.poses, solution.status, decrement=math.nan)
-    if not answer.is_out_of_time:
-        answer = _run_with_terms(problem, model, soc, start, monitor, stages)
-    rough = _atoms_with_kinks(model, answer.known_poses)
-    if rough:
-        left_out[-1] += (
-            "; SOC is the last stage, as Newton needs smooth terms alone, "
-            f"and there are {', '.join(rough)}"
-        )
-    elif not answer.is_out_of_time:
-        newton = pipeline.newton
-        second = ExtendedNewton(soc.changer, newton.tolerance, newton.max_iterations)
-        answer = _run_with_terms(problem, model, second, answer.poses, monitor, stages)
+    poses = solution.poses
+    status = solution.status
+    if status not in OUT_OF_TIME:
+        with_terms = monitor.run(soc, problem, start)
+        poses = with_terms.poses
+        stage = Stage.of(with_terms)
+        status = stage.status
+        stages.append(replace(stage, objective=model.cost(poses.stacked())))
     certificate = _certificate_with_terms(
-        solution.certificate, model, answer, with_known_priors, is_F=not other_terms
+        solution.certificate, model, poses, with_known_priors, is_F=not other_terms
     )
     note = joined_notes(
         note_of_absence(len(problem.graph.absent)),
@@ -97,39 +88,15 @@ def solve_extended(
     return replace(
         solution,
         problem=problem,
-        poses=answer.known_poses,
+        poses=poses,
         objective=certificate.objective,
         certificate=certificate,
-        status=answer.status,
+        status=status,
         stages=tuple(stages),
         seconds=time.perf_counter() - monitor.began,
         note=note,
         frame="that of the added terms",
     )
-
-
-def _run_with_terms(
-    problem: PGOProblem,
-    model: GraphQP,
-    method: ExtendedSOC | ExtendedNewton,
-    start: Poses | None,
-    monitor: RunMonitor,
-    stages: list[Stage],
-) -> Attempt:
-    """SOC or Newton with added terms, which the objective of its stage has, too."""
-    decrement = math.nan
-    if isinstance(method, ExtendedNewton):
-        second = monitor.run(method, problem, start)
-        stage = Stage.of(second)
-        poses = second.poses
-        decrement = second.state.decrement
-    else:
-        first = monitor.run(method, problem, start)
-        stage = Stage.of(first)
-        poses = first.poses
-    objective = model.cost(poses.stacked())
-    stages.append(replace(stage, objective=objective))
-    return Attempt(poses, stage.status, decrement)
 
 
 def _left_out(change: ModelChange, terms: list[cp.Expression]) -> list[str]:
@@ -143,24 +110,14 @@ def _left_out(change: ModelChange, terms: list[cp.Expression]) -> list[str]:
     return [f"{name} ({count})" for name, count in counts.items() if count]
 
 
-def _atoms_with_kinks(model: GraphQP, poses: Poses) -> list[str]:
-    """Names of what Newton cannot take at these poses: atoms that have a kink, and constraints."""
-    model.variables.X.value = poses.stacked()
-    names = {"constraints"} if model.change.constraints else set[str]()
-    for term in model.change.terms:
-        names |= kinks(term)
-    return sorted(names)
-
-
 def _certificate_with_terms(
-    certificate: Certificate, model: GraphQP, answer: Attempt, priors: PGOProblem, is_F: bool
+    certificate: Certificate, model: GraphQP, poses: Poses, priors: PGOProblem, is_F: bool
 ) -> Certificate:
     """Certificate of poses whose objective has all terms.
 
     `certificate` bounds the problem with the `priors` alone. `is_F` says whether there are no other
     terms. Nothing is known of the rounding error of terms of one's own.
     """
-    poses = answer.known_poses
     objective = model.cost(poses.stacked())
     has_replaced_edges = bool(model.change.replaced_edges)
     bound = NO_BOUND if has_replaced_edges else certificate.bound
@@ -177,5 +134,5 @@ def _certificate_with_terms(
         gap=relative_gap(at_most, at_least, fit is Fit.ROUNDING),
         verdict=verdict_of(fit, gap_above(at_most, at_least), bound, certificate.wanted_gap),
         fit=fit,
-        stationarity=answer.decrement,
+        stationarity=math.nan,
     )

@@ -258,25 +258,6 @@ class GraphQP(Summarised):
         squares = np.einsum("rc,rc->r", residuals, residuals)
         return float(self.w @ squares) + added
 
-    def gradient(self, X: Array) -> Array:
-        """Compute the gradient of `cost`.
-
-        Parameters
-        ----------
-        X : Array, (N_a, d)
-            A point where all added terms have a gradient.
-
-        Returns
-        -------
-        Array, (N_a, d)
-            The gradient in X.
-        """
-        self.variables.X.value = X
-        residuals = self.A @ X
-        weighted_residuals = 2.0 * self.w[:, None] * residuals
-        gradient_of_edges = np.asarray(self.A.T @ weighted_residuals)
-        return sum(map(self.gradient_of, self.change.terms), gradient_of_edges)
-
     def gradient_of(self, term: cp.Expression) -> Array:
         """Compute the gradient of a term at the value of X.
 

@@ -358,16 +358,6 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     return max(decrement, 2.0 * STATIONARY_DECREMENT)
 
 
-def factorize_gauss_newton(problem: PGOProblem, poses: Poses) -> CholeskyFactor:
-    """Factor the Gauss-Newton matrix, damped by as little as makes it positive definite.
-
-    A NotPositiveDefiniteError where `DAMPING_MAX` is not enough.
-    """
-    state = start_polish(problem, poses)
-    rules = StepRules(state.tolerance, second_order=False)
-    return factorize_definite(CentralAlgebra(problem, state, has_secants=False), rules).factor
-
-
 def _apply_inverse(factor: CholeskyFactor, secants: list[Secant], gradient: Array) -> Array:
     """Compute H^-1 g by the two loops of L-BFGS, from the factored matrix.
 

@@ -25,6 +25,7 @@ from solvers.loop import run
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import Run, Status
+from solvers.riemannian.newton import Newton
 from solvers.robust.gnc import GNC
 from solvers.soc.joint import SOCState
 from solvers.soc.penalty import MultiplierPenalty
@@ -289,7 +290,8 @@ def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(
     assert 0 < solution.lower_bound < solution.objective
     assert solution.certificate.verdict is Verdict.NOT_CERTIFIED
     assert solution.note.startswith("the bound leaves out terms other than tau ||t - p||^2")
-    assert "(1), constraints (1); SOC is the last stage" in solution.note
+    assert solution.note.endswith("(1), constraints (1)")
+    assert solution.stages[-1].name == "ExtendedSOC"
     assert solution.note in str(solution)
     solution.save(tmp_path / "x.json")
     assert json.loads((tmp_path / "x.json").read_text())["objective"] == solution.objective
@@ -308,6 +310,22 @@ def test_a_position_alone_costs_nothing_so_that_the_bound_without_it_is_tight() 
     assert solution.is_certified
     assert "(1)" in solution.note
     np.testing.assert_allclose(solution.poses.t[2], 3.0, rtol=0, atol=1e-3)
+
+
+def test_ctrl_c_before_the_terms_are_added_is_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken_off(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def tied(unknown: PoseVariables) -> ModelChange:
+        return ModelChange(terms=[cp.norm(unknown.t(2) - 3.0)])
+
+    monkeypatch.setattr(Newton, "step", broken_off)
+    solution = solve(problem(), Pipeline(soc=ExtendedSOC(tied, SETTINGS)))
+    assert solution.status is Status.INTERRUPTED
+    assert "ExtendedSOC" not in [stage.name for stage in solution.stages]
+    added = float(np.linalg.norm(solution.poses.t[2] - 3.0))
+    expected = problem().objective(solution.poses) + added
+    assert solution.objective == pytest.approx(expected, rel=1e-9)
 
 
 def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refused(
