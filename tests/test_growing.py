@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import cvxpy as cp
@@ -248,3 +250,16 @@ def test_robots_without_a_driver_go_on_without_one() -> None:
     assert grown.ledger is not None
     assert before.ledger is not None
     assert grown.ledger.rounds > before.ledger.rounds
+
+
+def test_what_an_update_leaves_behind_is_freed_at_once() -> None:
+    graph = grid(np.random.default_rng(0))
+    solution = solvers.solve(first_poses(graph, 20))
+    before = weakref.ref(solution.problem)
+    gc.collect()
+    gc.disable()
+    try:
+        solution = extend(solution, graph)
+        assert before() is None
+    finally:
+        gc.enable()

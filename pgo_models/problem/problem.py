@@ -160,14 +160,19 @@ class PGOProblem(ReadOnly):
         """Whether the cost is tr(X^T M X) of X alone."""
         return self.weights.is_quadratic
 
-    @cached_property
+    @property
     def convex_part(self) -> "PGOProblem":
         """The problem that SOC is run on: this one, if its cost is convex and quadratic in (R, t).
 
         Otherwise it is one with a convex quadratic cost near this one.
         """
+        # Not cached: a problem that refers to itself stays in memory until a late collection.
         if self.is_quadratic and self.weights.is_convex:
             return self
+        return self._convex_neighbour
+
+    @cached_property
+    def _convex_neighbour(self) -> "PGOProblem":
         cost = convex_cost(self.information, self.d)
         return _SharingProblem(self.graph, self.backend, cost, original=self)
 
