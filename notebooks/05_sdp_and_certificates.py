@@ -111,7 +111,7 @@ print(f"value of the dual {dual.value:.6f}")
 # The dual value that Clarabel has just returned is slightly *above* $F$ of poses that we know. So
 # it is not a bound: a solver stops slightly before or beyond feasibility.
 #
-# `solve_relaxation` chooses the form (primal, dual, or decomposed over cliques) and the solver by
+# `solve_relaxation` chooses the form (the dense primal or the sparse dual) and the solver by
 # size. Its `lower_bound` is proven in exact arithmetic from the multipliers that the solver
 # returned, as in notebook 1. It holds whatever the solver did: a worse $\Lambda$ gives a smaller
 # bound, never a wrong one.

@@ -97,8 +97,8 @@ from pgo_models.problem.thresholds import (
     edge_residuals as edge_residuals,
 )
 from pgo_models.problem.weighting import Weighting as Weighting
-from pgo_models.relaxations.plan import RelaxationForm as RelaxationForm
 from pgo_models.relaxations.solve_sdp import (
+    RelaxationForm as RelaxationForm,
     RelaxationSolution as RelaxationSolution,
     RelaxationStatus as RelaxationStatus,
     solve_relaxation as solve_relaxation,

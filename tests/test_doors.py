@@ -197,7 +197,7 @@ ALIKE: dict[str, Callable[[dict[str, Any]], tuple[Any, Any]]] = {
         solvers.SOC(r_step=solvers.RStep.CLARABEL),
     ),
     "a member with a hyphen": lambda it: (
-        pgo.solve_relaxation(it["graph"], "hull-dual").plan.form,
+        pgo.solve_relaxation(it["graph"], "hull-dual").form,
         pgo.RelaxationForm.HULL_DUAL,
     ),
     "a seed for a generator": lambda it: (

@@ -51,7 +51,7 @@ def of_pose_graphs() -> Iterator[object]:
     qp = pgo.graph_qp(graph, 12.0)
     yield from (qp, qp.variables, qp.change, qp.qp)
     relaxed = pgo.solve_relaxation(graph)
-    yield from (relaxed, relaxed.rank, relaxed.plan)
+    yield from (relaxed, relaxed.rank)
     rejecting = solvers.prove_outliers(solvers.solve(graph, robust=solvers.GNC()))
     yield from (rejecting.robust, rejecting.robust.proof)
     estimate = solvers.estimate_noise(graph)

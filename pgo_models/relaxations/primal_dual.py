@@ -5,8 +5,7 @@
 
 Their common value is a lower bound on F, the relaxation being exact where Z has rank d (Rosen et
 al. 2019; Carlone et al. 2015). `pgo_models.relaxations.solve_sdp` chooses a form, solves, rounds
-and proves the bound; `pgo_models.relaxations.clique_decomposition` has the form for large sparse
-graphs.
+and proves the bound.
 """
 
 from dataclasses import dataclass

@@ -3,28 +3,22 @@
 import enum
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import cvxpy as cp
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with
-from pgo_models.convex.convex_solver import ConvexSolver
+from pgo_models.convex.convex_solver import ConvexSolver, as_solver
 from pgo_models.errors import PGOError, SettingError, door
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.clique_decomposition import CliqueRelaxation, clique_relaxation
 from pgo_models.relaxations.hull_models import (
     DualHullRelaxation,
     PrimalHullRelaxation,
     dual_hull_relaxation,
     primal_hull_relaxation,
-)
-from pgo_models.relaxations.plan import (
-    DEFAULT_MEMORY_LIMIT,
-    RelaxationForm,
-    RelaxationPlan,
-    plan_relaxation,
 )
 from pgo_models.relaxations.primal_dual import (
     DualRelaxation,
@@ -37,9 +31,26 @@ from pgo_models.summaries import Summarised
 
 DEFAULT_RELAXATION_GAP = 1e-5
 TOLERANCE = 1e-10
+# Sides up to which the dense primal is solved by SCS, which decomposes its cone at every iteration:
+# sphere, with side 600, takes 1.1 s. Beyond, Clarabel decomposes the sparse dual over cliques.
+LARGEST_DENSE_CONE = 1000
 
-# The relaxations with hulls are subclasses of the first two.
-Relaxation = PrimalRelaxation | DualRelaxation | CliqueRelaxation
+# The relaxations with hulls are subclasses of these.
+Relaxation = PrimalRelaxation | DualRelaxation
+
+
+class RelaxationForm(enum.Enum):
+    """How the relaxation is posed."""
+
+    PRIMAL = "min tr(Q Z), Z_ii = I, Z PSD: one dense cone, translations marginalised out"
+    DUAL = "max tr(Lambda), M - blockdiag(0, Lambda) PSD: one sparse linear matrix inequality"
+    HULL = "PRIMAL, and Z_ij in the convex hull of SO(3) at every edge"
+    HULL_DUAL = "DUAL, with a multiplier of the convex hull of SO(3) at every edge"
+
+    @property
+    def has_hull(self) -> bool:
+        """Whether blocks are mixtures of rotations: a tighter relaxation, in space."""
+        return self in (RelaxationForm.HULL, RelaxationForm.HULL_DUAL)
 
 
 class RelaxationStatus(enum.Enum):
@@ -62,10 +73,12 @@ class RelaxationSolution(Summarised):
 
     Parameters
     ----------
-    relaxation : PrimalRelaxation, DualRelaxation or CliqueRelaxation
+    relaxation : PrimalRelaxation or DualRelaxation
         The model with its variables and duals as solved.
-    plan : RelaxationPlan
-        Form and solver.
+    form : RelaxationForm
+        How the relaxation was posed.
+    solver : ConvexSolver
+        What solved it.
     status : RelaxationStatus
         How the solver ended.
     value : float
@@ -82,7 +95,8 @@ class RelaxationSolution(Summarised):
     """
 
     relaxation: Relaxation
-    plan: RelaxationPlan
+    form: RelaxationForm
+    solver: ConvexSolver
     status: RelaxationStatus
     value: float
     certificate: Certificate
@@ -119,7 +133,7 @@ class RelaxationSolution(Summarised):
         certificate = self.certificate
         eta = rounded_up(certificate.eta, 3)
         lines = [
-            f"relaxation   {self.plan}",
+            f"relaxation   {self.form.name} with {self.solver.name}",
             f"status       {self.status.name}: {self.status.value}",
             f"effort       {self.iterations} iterations, {self.seconds:.3g} s",
             f"{f'{certificate.cost} rounded':<12} {certificate.cost_text}",
@@ -138,7 +152,6 @@ def solve_relaxation(
     solver: ConvexSolver | str | None = None,
     *,
     gap: float = DEFAULT_RELAXATION_GAP,
-    memory_limit: float = DEFAULT_MEMORY_LIMIT,
     time_limit: float = math.inf,
     verbose: bool = False,
 ) -> RelaxationSolution:
@@ -149,18 +162,18 @@ def solve_relaxation(
     problem : PGOProblem
         The problem; its cost must be quadratic in the poses.
     form : RelaxationForm or None
-        How the relaxation is posed; chosen by the sizes of its cones unless given.
+        How the relaxation is posed. Unless given, PRIMAL for a first-order method where its cone
+        has at most 1000 rows, and else DUAL.
     solver : ConvexSolver, str or None
-        A solver of cvxpy that takes semidefinite cones; chosen with the form unless given.
+        A solver of cvxpy that takes semidefinite cones. Unless given, SCS for PRIMAL and Clarabel
+        for the others. An interior point on the dense cone of PRIMAL takes about 14 (d n)^4 bytes.
     gap : float
         Relative gap for the verdict. Where the proof needs a shift eta, the smallest that is tried
         follows from it.
-    memory_limit : float, in bytes
-        An estimate above it is refused before anything is formed.
     time_limit : float, in seconds
         For the solver.
     verbose : bool
-        Whether the plan with its reason, the solver's table, and the result are printed.
+        Whether the solver's table and the result are printed.
 
     Returns
     -------
@@ -170,8 +183,7 @@ def solve_relaxation(
     Raises
     ------
     SettingError
-        If a limit or the gap is not positive, the cost is not quadratic, or the memory limit is
-        exceeded.
+        If the time limit or the gap is not positive, or the cost is not quadratic.
     PGOError
         If the solver gives no iterate.
 
@@ -192,36 +204,9 @@ def solve_relaxation(
         raise SettingError(f"time_limit is {time_limit}; it must be positive, the gap finite")
     problem.check_quadratic("the relaxation")
     began = time.perf_counter()
-    plan = plan_relaxation(problem, form, solver, memory_limit)
-    if verbose:
-        print(plan)
-    solution = _solve_posed(problem, plan, None, gap, time_limit, verbose)
-    if plan.form is RelaxationForm.CLIQUES and not solution.certificate.is_certified:
-        # Cliques lose digits where their centre is far from the optimum: once more around the poses
-        # that were found, in the time that is left.
-        seconds_left = time_limit - (time.perf_counter() - began)
-        if seconds_left > 0:
-            centre = solution.poses
-            again = _solve_posed(problem, plan, centre, gap, seconds_left, verbose)
-            solution = max(solution, again, key=lambda found: found.lower_bound)
-    solution = replace(solution, seconds=time.perf_counter() - began)
-    if verbose:
-        print(solution)
-    return solution
-
-
-def _solve_posed(
-    problem: PGOProblem,
-    plan: RelaxationPlan,
-    centre: Poses | None,
-    gap: float,
-    time_limit: float,
-    verbose: bool,
-) -> RelaxationSolution:
-    """Pose the relaxation, that over cliques around a centre, solve it, round it and prove it."""
-    began = time.perf_counter()
-    relaxation = _posed(problem, plan, centre)
-    status = _solve(relaxation.model, plan.solver, time_limit, verbose)
+    form, solver = _form_and_solver(problem, form, solver)
+    relaxation = _POSE[form](problem)
+    status = _solve(relaxation.model, solver, time_limit, verbose)
     poses, rank = relaxation.rounded()
     terms = None
     source = BoundSource.RELAXATION
@@ -241,21 +226,34 @@ def _solve_posed(
     value = float(relaxation.model.value) * relaxation.scale
     iterations = int(relaxation.model.solver_stats.num_iters or 0)
     seconds = time.perf_counter() - began
-    return RelaxationSolution(
-        relaxation, plan, status, value, certificate, rank, iterations, seconds
+    solution = RelaxationSolution(
+        relaxation, form, solver, status, value, certificate, rank, iterations, seconds
     )
+    if verbose:
+        print(solution)
+    return solution
 
 
-def _posed(problem: PGOProblem, plan: RelaxationPlan, centre: Poses | None) -> Relaxation:
-    if plan.form is RelaxationForm.CLIQUES:
-        return clique_relaxation(problem, centre, plan.tree)
-    if plan.form is RelaxationForm.PRIMAL:
-        return primal_relaxation(problem)
-    if plan.form is RelaxationForm.HULL:
-        return primal_hull_relaxation(problem)
-    if plan.form is RelaxationForm.HULL_DUAL:
-        return dual_hull_relaxation(problem)
-    return dual_relaxation(problem)
+def _form_and_solver(
+    problem: PGOProblem, form: RelaxationForm | None, solver: ConvexSolver | str | None
+) -> tuple[RelaxationForm, ConvexSolver]:
+    """Form and solver, where they are not given."""
+    chosen = None if solver is None else as_solver(solver)
+    if form is None:
+        is_small = problem.d * problem.num_poses <= LARGEST_DENSE_CONE
+        is_rough = chosen is None or chosen.is_first_order
+        form = RelaxationForm.PRIMAL if is_small and is_rough else RelaxationForm.DUAL
+    if chosen is None:
+        chosen = ConvexSolver("SCS" if form is RelaxationForm.PRIMAL else "CLARABEL")
+    return form, chosen
+
+
+_POSE: dict[RelaxationForm, Callable[[PGOProblem], Relaxation]] = {
+    RelaxationForm.PRIMAL: primal_relaxation,
+    RelaxationForm.DUAL: dual_relaxation,
+    RelaxationForm.HULL: primal_hull_relaxation,
+    RelaxationForm.HULL_DUAL: dual_hull_relaxation,
+}
 
 
 def _solve(

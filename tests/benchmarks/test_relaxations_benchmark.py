@@ -46,11 +46,3 @@ def test_tinyGrid3D(benchmark: BenchmarkFixture, benchmark_data) -> None:
         0.2,
         rounds=5,
     )
-
-
-@pytest.mark.parametrize(("first", "last"), [(2300, 3450), (0, 2000)])
-def test_a_long_trajectory_with_few_loops(
-    benchmark: BenchmarkFixture, benchmark_data, first: int, last: int
-) -> None:
-    graph = read_g2o(benchmark_data / "kitti_00.g2o").subgraph(np.arange(first, last))
-    check(benchmark, PGOProblem(graph), 60.0, rounds=1)

@@ -17,7 +17,6 @@ from pgo_models.geometry.stiefel import project_to_tangent, retract
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.plan import RelaxationForm
 from pgo_models.relaxations.rotation_hull import (
     PRODUCTS,
     hull_changes,
@@ -26,7 +25,7 @@ from pgo_models.relaxations.rotation_hull import (
     matrices_at,
     terms_of,
 )
-from pgo_models.relaxations.solve_sdp import solve_relaxation
+from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
 from solvers.handedness.hull_lagrangian import AugmentedLagrangian, HullLagrangian
 from solvers.loop import iterate, run
 from solvers.pipeline import solve

@@ -14,8 +14,7 @@ from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.plan import RelaxationForm
-from pgo_models.relaxations.solve_sdp import solve_relaxation
+from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
 from solvers.handedness import certificate_spectrum
 from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint

@@ -20,9 +20,8 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.hull_models import dual_hull_relaxation, primal_hull_relaxation
-from pgo_models.relaxations.plan import RelaxationForm
 from pgo_models.relaxations.rotation_hull import hull_matrices, terms_of
-from pgo_models.relaxations.solve_sdp import solve_relaxation
+from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
 from pgo_models.verification.verify import verify_proof
 from solvers.studies.tightness import SweptScene, noisy_scene
 

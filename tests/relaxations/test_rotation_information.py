@@ -14,8 +14,7 @@ from pgo_models.graphs.precisions import proper_information
 from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from pgo_models.relaxations.plan import RelaxationForm
-from pgo_models.relaxations.solve_sdp import solve_relaxation
+from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
 
 
 def rotations_informed(n: int) -> PGOProblem:
