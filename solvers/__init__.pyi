@@ -1,6 +1,5 @@
 from solvers.baselines.gauss_seidel import GaussSeidel as GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
-from solvers.baselines.mesa import Mesa as Mesa
 from solvers.baselines.sweep_order import Sweep as Sweep
 from solvers.convex.bregman import (
     AlternatingBregman as AlternatingBregman,
@@ -150,7 +149,7 @@ __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop",
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty", "PenaltyRule"]
 __all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent", "prove_outliers"]
-__all__ += ["GaussSeidel", "LevenbergMarquardt", "Mesa"]
+__all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
 __all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]
 __all__ += ["ExtendedSOC", "OrthogonalSOC", "solve_orthogonal"]

@@ -206,7 +206,6 @@ SETTINGS += (
     "PCM",
     "GaussSeidel",
     "LevenbergMarquardt",
-    "Mesa",
     "Faults",
     "Robots",
     "InProcess",

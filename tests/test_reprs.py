@@ -29,7 +29,6 @@ METHODS: list[Any] = [
     solvers.Staircase(),
     solvers.GaussSeidel(),
     solvers.LevenbergMarquardt(),
-    solvers.Mesa(),
     solvers.GNC(),
     solvers.IRLS(),
     solvers.ExtendedSOC(lambda unknown: pgo.ModelChange()),

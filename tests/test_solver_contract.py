@@ -28,7 +28,6 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import PGOProblem
 from solvers.baselines.gauss_seidel import GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
-from solvers.baselines.mesa import Mesa
 from solvers.baselines.sweep_order import Sweep
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.distributed.asynchronous import AsynchronousSOC
@@ -92,10 +91,6 @@ SOLVERS: dict[str, Make] = {
     "newton": lambda problem, **changes: Newton(**changes),
     "gauss_newton": lambda problem, **changes: dataclasses.replace(gauss_newton(), **changes),
     "levenberg_marquardt": lambda problem, **changes: LevenbergMarquardt(**changes),
-    "mesa": lambda problem, **changes: Mesa(
-        robots=partition(problem.graph, min(3, problem.num_poses)), **changes
-    ),
-    "mesa_singletons": lambda problem, **changes: Mesa(**changes),
     "staircase": lambda problem, **changes: Staircase(**changes),
     "growing_start": lambda problem, **changes: GrowingStart(first_size=2, growth=0.1, **changes),
     "gnc": lambda problem, **changes: GNC(spread=None, **changes),

@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.errors import NotPositiveDefiniteError, SettingError, check_settings
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, hat, log_map
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian, tangent_order
@@ -38,7 +38,6 @@ _DAMPING = 1e-5  # first one of Levenberg-Marquardt, relative to the diagonal
 _DAMPING_FACTOR = 10.0  # on it after a refused step; its inverse after one that was taken
 _MIN_DAMPING = 1e-9  # a robot that shares no pose may move its world freely
 _MAX_DAMPING = 1e12
-_MOST_RAISED = 1e6  # rho over its first value, at most
 _ROUNDING = 1e-14  # relative change of a robot's cost that counts as none
 _NUM_SUMS = 5  # numbers that all robots sum up to know whether a run has ended
 
@@ -107,12 +106,10 @@ class MesaState(Summarised):
         Damping of every robot's next step, relative to the diagonal.
     ledger : Ledger
         Rounds and messages so far.
-    raised : float
-        The penalties over their first values.
     disagreement : float
         Relative distance of copies from originals, as `primal_residual`.
     change : float
-        Relative change of the held poses in the last round, times `raised`; inf before the first.
+        Relative change of the held poses in the last round; inf before the first.
     """
 
     k: int
@@ -125,7 +122,6 @@ class MesaState(Summarised):
     rho_t: float
     damping: Array
     ledger: Ledger
-    raised: float = 1.0
     disagreement: float = 0.0
     change: float = np.inf
 
@@ -140,10 +136,9 @@ class Mesa:
     a round whether the run has ended. The poses of a state are those that their owners have.
 
     `primal_residual` is the distance of copies from originals, and `dual_residual` the change of
-    all held poses in the last round, times rho over its first value: a penalty that grows holds
-    poses where they are, whatever F is there. Both are the larger of the rotations' root mean
-    square, radians, and of the translations' norm over that of all translations. Where both are
-    zero the owners' poses are a stationary point of F.
+    all held poses in the last round. Both are the larger of the rotations' root mean square,
+    radians, and of the translations' norm over that of all translations. Where both are zero the
+    owners' poses are a stationary point of F.
 
     Four things differ from the paper. There, pairs communicate one at a time and in any order; here
     all do in each round. There, robots begin by minimising alone; here they begin at the common
@@ -154,20 +149,17 @@ class Mesa:
 
     With a penalty that is too small for the noise copies never agree: 0.3 is so on the scenes
     `grid` and `circle`, where 1 and 3 converge. Long chains with little noise converge many times
-    faster with 0.03 than with 1 (tests/benchmarks/README.md, "Peers in one table").
+    faster with 0.03 than with 1 (README.md beside this file, "Peers in one table").
 
     Parameters
     ----------
-    robots : Partition or None
-        Who owns which pose; one pose a robot unless given.
+    robots : Partition
+        Who owns which pose.
     penalty : float
-        First rho; over the curvature of an edge with the median weights where `is_scaled`.
+        rho; over the curvature of an edge with the median weights where `is_scaled`.
     is_scaled : bool
         Whether rho_R is `penalty` times twice the median kappa, and rho_t `penalty` times the
         median tau. Both medians are known before the first round, off the ledger.
-    growth : float, at least 1
-        Factor on rho after every round, up to a million times the first value. 1.05 is that of the
-        authors' code for this prior.
     multiplier_step : float in (0, 2)
         Factor on q in (c). In the authors' code q is the distance to the other robot's pose, which
         is the limit 2.
@@ -178,52 +170,25 @@ class Mesa:
     max_iterations : int
         Rounds at most.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     References
     ----------
     McGann, Lassak & Kaess, Asynchronous distributed smoothing and mapping via on-manifold consensus
     ADMM, ICRA 2024.
-
-    Examples
-    --------
-    >>> import pgo_models as pgo
-    >>> from solvers import run
-    >>> graph = pgo.load("grid")
-    >>> run(Mesa(pgo.partition(graph, 3)), pgo.PGOProblem(graph)).status.name
-    'CONVERGED'
     """
 
-    robots: Partition | None = None
-    penalty: float = 1.0
+    robots: Partition
+    penalty: float = 0.3
     is_scaled: bool = True
-    growth: float = 1.0
-    multiplier_step: float = 1.0
+    multiplier_step: float = 1.9
     local_steps: int = 2
     tolerance: float = 1e-6
     max_iterations: int = 1000
 
-    def __post_init__(self) -> None:
-        check_settings(self, positive=["penalty", "tolerance"], relaxation=["multiplier_step"])
-        check_settings(self, not_negative=["max_iterations"], at_least_one=["local_steps"])
-        if not 1.0 <= self.growth < math.inf:
-            raise SettingError(f"growth must be at least 1 and finite, got {self.growth}")
-
     def init(self, problem: PGOProblem, start: Poses | None) -> MesaState:
         """State 0: all copies at `start`, or at the chordal relaxation, and zero multipliers."""
-        problem.check_positions("MESA")
-        if problem.graph.is_world_loose or len(problem.graph.landmarks):
-            raise SettingError(
-                "MESA sends whole poses, and landmarks or the world of position priors have no "
-                "rotation that is determined; use another method"
-            )
         poses = start if start is not None else chordal_start(problem)
         problem.stacked(poses)  # raises unless the poses fit
-        robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
-        held = held_poses(problem, robots)
+        held = held_poses(problem, self.robots)
         x = poses[held.pose]
         num_pairs = len(held.copy)
         layout = TangentLayout(num_pairs, problem.d)
@@ -238,8 +203,8 @@ class Mesa:
             B_t=B_t,
             rho_R=self.penalty * (2.0 * kappa if self.is_scaled else 1.0),
             rho_t=self.penalty * (tau if self.is_scaled else 1.0),
-            damping=np.full(robots.num_robots, _DAMPING),
-            ledger=Ledger(robots.num_robots),
+            damping=np.full(self.robots.num_robots, _DAMPING),
+            ledger=Ledger(self.robots.num_robots),
         )
 
     def step(self, problem: PGOProblem, state: MesaState) -> MesaState:
@@ -256,19 +221,15 @@ class Mesa:
         ledger = state.ledger
         if len(held.traffic.sender):
             ledger = ledger.after_round(held.traffic)
-        growth = min(self.growth, _MOST_RAISED / state.raised)
         return replace(
             local,
             k=state.k + 1,
             z=z,
-            B_R=(state.B_R + self.multiplier_step * q_R) / growth,  # (c)
-            B_t=(state.B_t + self.multiplier_step * q_t) / growth,
-            rho_R=growth * state.rho_R,
-            rho_t=growth * state.rho_t,
-            raised=growth * state.raised,
+            B_R=state.B_R + self.multiplier_step * q_R,  # (c)
+            B_t=state.B_t + self.multiplier_step * q_t,
             ledger=ledger.after_all_reduce(_NUM_SUMS),
             disagreement=2.0 * max(norm(q_R) / math.sqrt(max(len(q_R), 1)), norm(q_t) / size),
-            change=state.raised * max(norm(w) / math.sqrt(len(w)), norm(v) / size),
+            change=max(norm(w) / math.sqrt(len(w)), norm(v) / size),
         )
 
     def measure(self, problem: PGOProblem, state: MesaState) -> Measurement:
@@ -293,10 +254,7 @@ class Mesa:
 
 
 def held_poses(problem: PGOProblem, robots: Partition) -> HeldPoses:
-    """Give every robot its edges, its poses, and copies of the poses at the far end of its edges.
-
-    A SettingError if the partition is of another number of poses.
-    """
+    """Give every robot its edges, its poses, and copies of the poses where its edges end."""
     graph = problem.graph
     n = graph.num_poses
     owner = robots.robot
