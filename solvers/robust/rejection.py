@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy  # and scipy.special when it is used
 
 from pgo_models.certificates.certificate import Verdict
 from pgo_models.certificates.fit import Fit
@@ -17,16 +19,16 @@ from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.summaries import Summarised
 from solvers.robust.bridges import unchecked_bridges
 from solvers.robust.outlier_record import OutlierProof
+from solvers.robust.slips import Slip
 
 # Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
 # half their threshold.
 NEAR = 4.0
 # Edges that are named in a row of the summary, at most.
 _MAX_NAMED = 5
-# An attempt is a rival where its truncated cost is above that of the answer by the thresholds of so
-# few edges, and it keeps so many that the answer rejects: more than one, and more than this share
-# of the closures kept. The same share of rejected edges may be near their thresholds.
-_RIVAL_EDGES = 2.0
+# Share of the closures kept on which the answer may be in doubt without saying so. An attempt is a
+# rival unless it is less likely than the answer by this factor, too: a truncated cost is minus
+# twice a log-likelihood, so that an attempt that costs c more is less likely by exp(-c / 2).
 _TOLERATED_SHARE = 0.05
 
 
@@ -93,6 +95,8 @@ class Rejection(Summarised):
     by_chance : float
         Number of wrong closures that are expected to fit the map by chance
         (`ClusterSearch.expected_by_chance`).
+    slip : Slip, optional
+        Known edge without which the truncated cost is lower (`slipped_step`).
     noise : float
         How many times their claim the squared errors are, where they are larger on all edges alike.
     places : tuple of str
@@ -115,6 +119,7 @@ class Rejection(Summarised):
     verdict: Verdict
     is_misfit: bool
     by_chance: float = 0.0
+    slip: Slip | None = None
     noise: float = 1.0
     places: tuple[str, ...] = ()
     fit: Fit = Fit.NONE
@@ -181,6 +186,14 @@ class Rejection(Summarised):
             doubts.append(text_of_bridges(num_bridges))
         if self.is_misfit:
             doubts.append("the edges kept do not fit together")
+        if self.slip is not None:
+            edge = self._label(self.slip.edge)
+            fit = f"{self.slip.others} more edges fit" if self.slip.others else "the others fit"
+            doubts.append(f"{edge} is taken for right, and without it {fit}")
+        num_fixes = int(self._suspected_fixes.sum())
+        num_lost = int((self._suspected_fixes & self.rejected).sum())
+        if 2 * num_lost > num_fixes:
+            doubts.append(f"{num_lost} of {num_fixes} fixes are rejected")
         if self.by_chance > _TOLERATED_SHARE * self.num_closures_kept:
             number = rounded_up(self.by_chance, 2)
             doubts.append(f"up to {number} wrong closures are expected to fit this map by chance")
@@ -214,8 +227,7 @@ class Rejection(Summarised):
     def held(self) -> str:
         """How many closures constrain the map, in words."""
         num_kept = self.num_closures_kept
-        has_suspected_fixes = bool((self.problem.graph.is_prior & ~self.known).any())
-        names = "closures and fixes" if has_suspected_fixes else "closures"
+        names = "closures and fixes" if self._suspected_fixes.any() else "closures"
         closures = f"{num_kept} of {self.num_closures} {names}"
         held = f"{closures} hold the map ({self.num_cycles} cycles)"
         keeps_most = 2 * num_kept >= self.num_closures
@@ -225,7 +237,9 @@ class Rejection(Summarised):
     def headline(self) -> str:
         """What is proven of the edges kept, and what supports them; doubts come first."""
         if self.support is Support.UNCHECKED:
-            return f"{self.support.name}, {self.support.value}; {self.held}"
+            return "; ".join(
+                [f"{self.support.name}, {self.support.value}", self.held, *self.doubts]
+            )
         edges = f"for all {len(self.kept)} edges"
         if self.rejected.any():
             edges = f"for the {int(self.kept.sum())} edges kept"
@@ -341,6 +355,7 @@ class Rejection(Summarised):
             "cycles": self.num_cycles,
             "truncated_cost": self.cost,
             "expected_by_chance": self.by_chance,
+            "slip": None if self.slip is None else dict(vars(self.slip)),
             "noise": self.noise,
             "threshold_scale": self.threshold_scale,
         }
@@ -354,13 +369,21 @@ class Rejection(Summarised):
         return max(1.0, _TOLERATED_SHARE * self.num_closures_kept)
 
     @property
+    def _suspected_fixes(self) -> BoolArray:
+        """Priors that are not known to be right, (m,)."""
+        return np.asarray(self.problem.graph.is_prior & ~self.known)
+
+    @property
     def _rival(self) -> Attempt | None:
-        """The cheapest attempt of nearly the same cost that keeps many rejected edges, if any."""
+        """The cheapest attempt that is about as likely and keeps many rejected edges, if any."""
         thresholds = chi2_thresholds(self.problem, self.quantile)[~self.known]
         if len(thresholds) == 0:
             return None
-        threshold = self.threshold_scale * float(np.median(thresholds))
-        max_cost = self.cost + _RIVAL_EDGES * threshold
+        # What the cost of one chi^2 is, whatever the weights of the problem.
+        dof = self.problem.d + tangent_dimension(self.problem.d)
+        of_whole_edges = float(scipy.special.chdtri(dof, 1.0 - self.quantile))
+        unit = self.threshold_scale * float(np.median(thresholds)) / of_whole_edges
+        max_cost = self.cost - 2.0 * math.log(_TOLERATED_SHARE) * unit
         rivals = [
             attempt
             for attempt in self.attempts

@@ -24,6 +24,7 @@ from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
 from solvers.robust.revision import Fit, drop_contradicted, error_scale, threshold_scale
+from solvers.robust.slips import Slip, slipped_step
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
@@ -344,6 +345,17 @@ class _RobustSolve:
         fit = Fit.of(self.doubted.problem, kept, solution.poses)
         return self._search(self.choice).expected_by_chance(fit)
 
+    def _slip(self, solution: Solution, kept: BoolArray) -> Slip | None:
+        """The known edge that closures contradict; not looked for where the solve was broken off.
+
+        Nor where every edge is kept and all fit together.
+        """
+        fits = kept.all() and not solution.edge_residuals.is_doubtful
+        if fits or solution.status in OUT_OF_TIME:
+            return None
+        fit = Fit.of(self.doubted.problem, kept, solution.poses)
+        return slipped_step(self._search(self.choice).sets, fit)
+
     def _has_time(self) -> bool:
         monitor = self.places.request.monitor
         return monitor.left >= _LAST_SHARE * monitor.time_limit
@@ -447,6 +459,7 @@ class _RobustSolve:
             is_misfit=noise == 1.0 and solution.edge_residuals.is_overall_misfit,
             noise=noise,
             by_chance=self._by_chance(solution, kept),
+            slip=self._slip(solution, kept),
             fit=solution.certificate.fit,
         )
         ledgers = self.places.ledgers

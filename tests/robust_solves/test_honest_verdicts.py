@@ -263,7 +263,7 @@ def test_what_speaks_against_the_edges_kept() -> None:
     misfit = replace(robust, is_misfit=True)
     assert misfit.headline.startswith("DOUBTFUL, the edges kept do not fit together: CERTIFIED")
     threshold = robust.threshold_scale * pgo.chi2_thresholds(robust.problem)[-1]
-    rival = Attempt("rival", robust.cost + threshold, 0, 0.0, True, 0.0, others=40)
+    rival = Attempt("rival", robust.cost + 0.5 * threshold, 0, 0.0, True, 0.0, others=40)
     disputed = replace(robust, attempts=(rival,))
     assert "kept by an attempt of nearly the same cost, rival" in disputed.headline
     dearer = replace(rival, cost=robust.cost + 3.0 * threshold)

@@ -1,0 +1,59 @@
+"""Each doubt of a robust solve: a small graph that it is said of, and one that it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from wrong_edges import ring_road
+
+import pgo_models as pgo
+import solvers
+from solvers.robust.rejection import Support
+
+
+def with_slip(graph: pgo.PoseGraph, edge: int, shift: float) -> pgo.PoseGraph:
+    t_ij = graph.t_ij.copy()
+    t_ij[edge] += shift
+    return replace(graph, t_ij=t_ij)
+
+
+def given(graph: pgo.PoseGraph) -> solvers.GNC:
+    """Settings that take odometry for right, whatever speaks against it."""
+    return solvers.GNC(known=np.arange(graph.num_edges) < graph.truth.num_poses - 1)
+
+
+def test_without_a_slipped_step_more_edges_fit() -> None:
+    graph = with_slip(ring_road(0, 45, 30), 38, 1.0)
+    solution = solvers.solve(graph, robust=given(graph))
+    robust = solution.robust
+    assert not solution.is_certified
+    doubt = f"DOUBTFUL, {graph.edge_label(38)} is taken for right, and without it 6 more edges fit"
+    assert robust.headline.startswith(doubt)
+    slip = solution.as_json()["robust"]["slip"]
+    assert slip["edge"] == 38
+    assert slip["others"] == robust.num_closures - robust.num_closures_kept
+    every_closure = solvers.solve(graph.without_edges(np.arange(graph.num_edges) == 38))
+    assert every_closure.objective < robust.cost - slip["gain"]
+
+
+def test_a_slip_that_costs_every_closure_is_said_of_a_tree() -> None:
+    graph = with_slip(ring_road(0, 45, 30), 20, 30.0)
+    solution = solvers.solve(graph, robust=given(graph))
+    assert solution.verdict is Support.UNCHECKED
+    assert solution.robust.slip.others == solution.robust.num_closures == 15
+    assert solution.robust.headline.endswith("and without it 15 more edges fit")
+
+
+@pytest.mark.parametrize("num_wrong", [2, 3])
+def test_more_than_half_of_the_fixes_rejected_is_doubted(num_wrong: int) -> None:
+    """Wrong fixes are far from each other, and the right ones agree."""
+    graph = ring_road(0, 24, 16)
+    poses = np.arange(0, 20, 4)
+    positions = graph.truth.t[poses]
+    positions[:num_wrong] += np.random.default_rng(0).uniform(50.0, 500.0, (num_wrong, 2))
+    graph = graph.with_position_prior(poses, positions, 4.0)
+    robust = solvers.solve(graph, robust=given(graph)).robust
+    assert robust.rejected.sum() == num_wrong
+    assert robust.doubts == (("3 of 5 fixes are rejected",) if num_wrong == 3 else ())
