@@ -125,22 +125,14 @@ def _printable_letter(letter: str) -> str:
 def extra_module(name: str, extra: str) -> ModuleType:
     """Module of a package that an extra brings, by its full name.
 
-    A MissingExtraError where it is not installed, and a MemoryError where there is not enough
-    memory to import it.
+    A MissingExtraError where it is not installed.
     """
     package = name.partition(".")[0]
     try:
         importlib.import_module(package)
         return importlib.import_module(name)
     except ImportError as error:
-        if is_out_of_memory(error):
-            raise MemoryError(f"{package} could not be imported: {error}") from error
         raise MissingExtraError(package, extra) from error
-
-
-def is_out_of_memory(error: ImportError) -> bool:
-    """Whether a module could not be imported because memory ran out."""
-    return any(sign in str(error).lower() for sign in _OUT_OF_MEMORY)
 
 
 def check_quantile(quantile: float) -> None:

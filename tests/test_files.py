@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 
 from pgo_models.errors import FileFormatError, PGOError
-from pgo_models.files import finite_number, read_table, read_text, replace_when_done
+from pgo_models.files import (
+    LONGEST_OF_ALL,
+    finite_number,
+    read_blocks,
+    read_table,
+    read_text,
+    replace_when_done,
+)
+from pgo_models.graphs.trajectories import read_times
 
 
 def test_text_is_read_without_the_byte_order_mark(tmp_path: Path) -> None:
@@ -143,3 +151,22 @@ def test_all_wrong_rows_of_a_table_are_named(tmp_path: Path) -> None:
     assert second.startswith(f"{place}:5: 'two' is no number")
     assert third.startswith(f"{place}:30: 3 numbers where 2 belong")
     assert last == "3 lines are wrong"
+
+
+@pytest.mark.parametrize("end", [b"\n", b"\r", b"\r\n"], ids=["lf", "cr", "crlf"])
+def test_lines_are_whole_wherever_blocks_end_and_errors_count_them(end, tmp_path):
+    lines = [f"line {k} \u00e9".encode() for k in range(200)]
+    path = tmp_path / "x"
+    path.write_bytes(end.join(lines) + end)
+    whole = "".join(line.decode() + "\n" for line in lines)
+    for size in (*range(1, 40), 1000):
+        blocks = list(read_blocks(path, size))
+        assert "".join(blocks) == read_text(path, size) == whole
+        assert all(block.endswith("\n") for block in blocks)
+    for wrong in (b"\xff", b"\0", b"x" * (LONGEST_OF_ALL + 1)):
+        path.write_bytes(end.join([*lines[:120], wrong, *lines]))
+        for size in (13, 1000, 2**24):
+            with pytest.raises(FileFormatError, match=r"x:121: "):
+                read_text(path, size)
+    path.write_bytes(end.join([b"#" * LONGEST_OF_ALL, b"1", b"2"]))
+    np.testing.assert_array_equal(read_times(path), [1.0, 2.0])

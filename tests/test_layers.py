@@ -20,7 +20,6 @@ ORDER = {
         "activity",
         "figures",
         "verification",
-        "memory",
         "html_tables",
         "summaries",
         "files",
@@ -70,8 +69,7 @@ ORDER = {
         "cli",
     ),
 }
-ORDER["command"] = ()  # the console script, which imports the rest when it runs
-LATER_PACKAGES = {"pgo_models": {"solvers"}, "solvers": set(), "command": {"pgo_models"}}
+LATER_PACKAGES = {"pgo_models": {"solvers"}, "solvers": set()}
 FILES = sorted(
     path for package in ("pgo_models", "solvers") for path in (ROOT / package).glob("**/*.py")
 )
@@ -118,8 +116,6 @@ def imports(path: Path) -> set[str]:
 def room_of(module: str) -> tuple[str, str]:
     """(package, room) of a module; the room of a file at the door is the file."""
     package, *rest = module.split(".")
-    if rest and rest[0] == "command":
-        return "command", ""
     if not rest:
         return package, ""
     rooms = [room for room in ORDER[package] if (".".join(rest) + ".").startswith(f"{room}.")]
@@ -183,7 +179,6 @@ def test_every_room_has_its_sentence_and_is_installed() -> None:
         "pgo_models.data",
         "pgo_models.data.robots",
         "solvers",
-        "pgo_command",
     }
 
 

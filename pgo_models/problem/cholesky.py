@@ -1,7 +1,7 @@
 """The one seam to sparse Cholesky: analyse a pattern once, factor and solve many times.
 
 SuperLU (scipy) is always there; CHOLMOD comes through CVXOPT with the extra `fast` and is found at
-run time, on the BLAS kernels of `pgo_models.problem.kernels`. Every factor knows how far it can be
+run time. Every factor knows how far it can be
 from exact (`pgo_models.problem.floating_point`), so that one that went through proves something in
 exact arithmetic.
 """

@@ -1,6 +1,5 @@
 """CHOLMOD and AMD of CVXOPT, with its matrices and its options."""
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -14,13 +13,8 @@ from scipy.sparse import csc_array
 from pgo_models.errors import extra_module
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.memory import check_room
-from pgo_models.problem.kernels import kernels_of_the_cpu
 
 _OPTIONS = RLock()
-_ROOM_TO_IMPORT = 2**28  # bytes of address space that the libraries and the buffer of OpenBLAS take
-# bytes that CVXOPT, which crashes where it gets none, takes to sort an entry into a matrix
-_ROOM_FOR_AN_ENTRY = 100
 
 
 def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
@@ -29,7 +23,6 @@ def lower_triangle(pattern: csc_array) -> tuple[Any, IntArray, BoolArray]:
     Returned as well are the positions of its entries in the pattern, and which are diagonal.
     """
     cvxopt, _ = import_cvxopt()
-    check_room(_ROOM_FOR_AN_ENTRY * len(pattern.indices))
     every_column = np.arange(pattern.shape[1], dtype=np.int32)
     columns = np.repeat(every_column, np.diff(pattern.indptr))
     lower = np.flatnonzero(pattern.indices >= columns)
@@ -69,22 +62,12 @@ def set_option(cholmod: ModuleType, name: str, value: int) -> Iterator[None]:
 @cache
 def import_cvxopt() -> tuple[ModuleType, ModuleType]:
     """CVXOPT and its CHOLMOD; a MissingExtraError without the extra `fast`."""
-    if "cvxopt.base" not in sys.modules:
-        check_room(_ROOM_TO_IMPORT)
-    with kernels_of_the_cpu():
-        cvxopt = extra_module("cvxopt", "fast")
-        cholmod = extra_module("cvxopt.cholmod", "fast")
-    # OpenBLAS crashes if it gets no memory for its buffer: a first call allocates it now, before
-    # large matrices take the memory.
-    extra_module("cvxopt.lapack", "fast").potrf(cvxopt.matrix(1.0))
-    return cvxopt, cholmod
+    return extra_module("cvxopt", "fast"), extra_module("cvxopt.cholmod", "fast")
 
 
 def amd_order(pattern: csc_array) -> IntArray:
     """Order of elimination by approximate minimum degree (Amestoy, Davis & Duff 2004), (N,)."""
-    import_cvxopt()  # on the kernels chosen
-    from cvxopt import amd
-
+    amd = extra_module("cvxopt.amd", "fast")
     matrix, _, _ = lower_triangle(pattern)
     order = np.array(amd.order(matrix)).ravel()
     return order.astype(np.int64)

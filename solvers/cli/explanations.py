@@ -6,7 +6,6 @@ file and line, and so are edges that do not fit.
 
 import functools
 import shlex
-import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,24 +17,19 @@ import numpy as np
 import typer
 
 from pgo_models.certificates.certificate import Certificate
-from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError, is_out_of_memory
+from pgo_models.errors import GraphWarning, NotPositiveDefiniteError, PGOError
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import name_of
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight
-from pgo_models.memory import check_memory
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.cli.inputs import Dropped, GraphOptions, indefinite_matrices, kept_edges, load_graph
 from solvers.cli.shell import command_to_type, wrapped
 from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
-from solvers.reporting.graph_facts import memory_note, memory_of_a_solve
 from solvers.solution import Solution, note_of_weights
 
-MORE_MEMORY = (
-    "raise the limit, or share it among machines: pgo solve --robots K --address HOST:PORT"
-)
 if TYPE_CHECKING:  # what commands that solve nothing do not need
     from solvers.readings import ReadingComparison
 
@@ -60,26 +54,8 @@ def explained_by_its_graph(command: Callable[P, T]) -> Callable[P, T]:
         except NotPositiveDefiniteError as error:
             place = place_of_weight(graph, dropped)
             raise NotPositiveDefiniteError(f"{place} ({error})") from error
-        except (MemoryError, ImportError) as error:
-            # A library that is imported when it is used fails with an ImportError.
-            if isinstance(error, ImportError) and not is_out_of_memory(error):
-                raise
-            raise PGOError(f"{graph} takes more memory than there is; {MORE_MEMORY}") from error
 
     return explained
-
-
-def say_memory_of_solve(name: str, graph: PoseGraph, is_shared: bool) -> None:
-    """Print on stderr how much memory a solve takes, if it is a lot.
-
-    Raises a PGOError if it is more than there is. If robots share the graph it does not, since they
-    may run on other machines.
-    """
-    if not is_shared:
-        check_memory(memory_of_a_solve(graph), f"{name}: a solve", MORE_MEMORY)
-    note = memory_note(graph)
-    if note:
-        print(f"pgo: {note}", file=sys.stderr)
 
 
 def warn_of_weights(

@@ -23,7 +23,6 @@ from pgo_models.graphs.scenes import (
     victoria_park,
 )
 from pgo_models.graphs.trajectories import write_tum
-from pgo_models.memory import check_memory
 from solvers.cli.options import Scene
 from solvers.cli.shell import (
     JsonOption,
@@ -148,9 +147,6 @@ def chosen_scene(
     if robots is None:
         robots = 4 if scene is Scene.GRID_WORLD else 1
     d = 3 if d is None else d
-    num_poses = poses * robots
-    memory = memory_of_scene(scene, num_poses, d)
-    check_memory(memory, f"a scene of {num_poses} poses", "ask for fewer")
     noise = _chosen_noise(translation_noise, rotation_noise)
     if scene is Scene.VICTORIA_PARK:
         return victoria_park(rng, num_poses=poses, noise=noise)
@@ -184,15 +180,3 @@ def _chosen_noise(translation_noise: float | None, rotation_noise: float | None)
     if rotation_noise is not None:
         rotation_std = float(np.deg2rad(rotation_noise))
     return NoiseModel(translation_std, rotation_std)
-
-
-def memory_of_scene(scene: Scene, num_poses: int, d: int) -> float:
-    """Bytes that a scene takes while it is made and written, beside those of the program.
-
-    As measured at 20,000 and 100,000 poses. In the park every tree is compared with every pose.
-    """
-    per_pose = 4000.0 if d == 3 else 2000.0
-    memory = per_pose * num_poses
-    if scene is Scene.VICTORIA_PARK:
-        memory += 12.0 * num_poses**2
-    return memory

@@ -24,9 +24,6 @@ from pgo_models.graphs.precisions import (
     without_indefinite_coupling,
 )
 from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum
-from pgo_models.problem.cholesky import CholeskyBackend, default_backend
-from pgo_models.problem.cholmod import import_cvxopt
-from pgo_models.problem.kernels import take_buffers
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.cli.options import Cost, Split
@@ -199,10 +196,6 @@ def load_graph(
     With `largest_component`, the poses and edges of other components are left out, too. The rest is
     as for `read_g2o`.
     """
-    # Both need memory, which the graph might leave none of.
-    take_buffers()
-    if default_backend() is CholeskyBackend.CHOLMOD:
-        import_cvxopt()
     loaded = load(
         graph,
         reading=reading,

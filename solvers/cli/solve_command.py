@@ -27,7 +27,6 @@ from solvers.cli.explanations import (
     edge_fit_of_solution,
     explained_by_its_graph,
     reading_that_is_meant,
-    say_memory_of_solve,
     show_advice,
     warn_of_weights,
     with_covariances,
@@ -269,7 +268,6 @@ def solve_command(
     outputs.check_drawable(problem)
     outputs.check_writable(problem.graph.num_robots)
     stages.check_robust()
-    say_memory_of_solve(graph, problem.graph, network.is_given)
     place = network.chosen_for(problem.graph, stages)
     solution = solve(
         problem,

@@ -11,7 +11,6 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.reporting.versions import installed_versions
 
-_WORTH_MENTIONING = 5e8  # bytes of memory
 _SHOWN_COMPONENTS = 5  # of which the sizes are listed
 
 
@@ -41,7 +40,7 @@ def describe_graph(graph: PoseGraph, indefinite: str = "") -> list[tuple[str, st
 
 
 def _cost_facts(graph: PoseGraph, has_chi2: bool) -> list[tuple[str, str]]:
-    """Costs of the estimate and of the starts, or the memory that a solve takes if it is a lot."""
+    """Costs of the estimate and of the starts."""
     problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
     name = problem.cost_name
     rows = []
@@ -53,36 +52,8 @@ def _cost_facts(graph: PoseGraph, has_chi2: bool) -> list[tuple[str, str]]:
                 cost = rounded_up(chi2(graph, estimate, convention), 8)
                 rows.append((f"chi2, {convention.name.lower()}", cost))
     rows.append((f"{name}, tree", rounded_up(problem.objective(spanning_tree_start(graph)), 8)))
-    note = memory_note(graph)
-    if note:
-        rows.append(("memory", note))
-    else:
-        rows.append((f"{name}, chordal", rounded_up(problem.objective(chordal_start(problem)), 8)))
+    rows.append((f"{name}, chordal", rounded_up(problem.objective(chordal_start(problem)), 8)))
     return rows
-
-
-def memory_note(graph: PoseGraph) -> str:
-    """How much memory a solve takes, in words; empty if it is little."""
-    needed = memory_of_a_solve(graph)
-    if needed <= _WORTH_MENTIONING:
-        return ""
-    return f"a solve takes about {1e-9 * needed:.2g} GB of memory"
-
-
-def memory_of_a_solve(graph: PoseGraph) -> float:
-    """Memory that a solve in one process takes, in bytes, beside the program and the graph.
-
-    It is about 600 (n + m) bytes, and the Cholesky factor: 390 k log2 k bytes in the plane,
-    850 k^(4/3) in space, as nested dissection fills lattices. Here k = min(n, 2 (m - n + 1)) is the
-    number of poses that are left after chains are eliminated. The estimate is right to 20 % on grid
-    worlds of 10,000 to a million poses in the plane, and to 30 % on those of 12,500 to 100,000 in
-    space. Narrow graphs take less, and lattices in space two to three times as much.
-    """
-    n = graph.num_poses
-    m = graph.num_edges
-    k = max(2, min(n, 2 * (m - n + 1)))
-    factor = 390.0 * k * np.log2(k) if graph.d == 2 else 850.0 * k ** (4 / 3)
-    return float(600.0 * (n + m) + factor)
 
 
 def _information_facts(graph: PoseGraph) -> list[tuple[str, str]]:

@@ -4,7 +4,6 @@ import os
 import platform
 
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
-from pgo_models.problem.kernels import chosen_kernels
 from solvers.distribution import DISTRIBUTION, installed_version, packages_of_extras
 
 
@@ -31,8 +30,5 @@ def installed_versions(backend: CholeskyBackend | None) -> dict[str, str]:
     for name in (DISTRIBUTION, "numpy", "scipy", "cvxpy", "clarabel"):
         versions[name] = installed_version(name)
     chosen = backend or default_backend()
-    kernels = chosen_kernels()
     versions["cholesky"] = chosen.value
-    if chosen is CholeskyBackend.CHOLMOD and kernels:
-        versions["cholesky"] += f", {kernels} kernels"
     return versions

@@ -26,8 +26,8 @@ MOST_PACKAGES = 15
 ROOT = Path(__file__).parents[2]
 BASE = "import numpy, scipy.sparse.linalg"
 DOORS = f"{BASE}; import pgo_models, solvers"
-# As the script that an installer writes; `solvers.command` is installed as `pgo_command`.
-ENTRY = "import sys; from pgo_command import main; sys.argv[0] = 'pgo'; sys.exit(main())"
+# As the script that an installer writes.
+ENTRY = "import sys; from solvers.cli.app import main; sys.argv[0] = 'pgo'; sys.exit(main())"
 STATEMENTS = {
     "`import numpy, scipy.sparse.linalg`": BASE,
     "... and `pgo_models, solvers`": DOORS,
@@ -47,7 +47,6 @@ LARGE = ("torus3D", "cubicle", "city10000")  # where PGO_DATA has them
 
 def environment(folder: str) -> dict[str, str]:
     """Variables of an interpreter with the packages of this copy, compiled into a folder."""
-    Path(folder, "pgo_command").symlink_to(ROOT / "solvers" / "command")
     variables = {
         **os.environ,
         "OMP_NUM_THREADS": "1",

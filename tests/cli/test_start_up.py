@@ -11,7 +11,6 @@ from commands import ROOT
 
 from solvers.cli import inputs
 from solvers.cli.app import COMMANDS, app
-from solvers.distribution import text_of_version
 
 PROGRAM = """
 import json, sys
@@ -96,21 +95,6 @@ def test_the_list_of_commands_has_the_help_of_every_command(pgo_command):
         assert f"{name} {COMMANDS[name].short_help}" in listed
         shown = " ".join(pgo_command(name, "--help")[1].split())
         assert " ".join(COMMANDS[name].help.split()) in shown
-
-
-def test_the_version_is_said_before_the_command_line_is_imported(pgo_command):
-    program = (
-        "import sys; from pgo_command import main; sys.argv = ['pgo', '--version']; main(); "
-        "assert 'typer' not in sys.modules"
-    )
-    printed = subprocess.run(
-        [sys.executable, "-c", program],
-        env={**os.environ},
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert printed == pgo_command("--version")[1] == f"{text_of_version()}\n"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a terminal is opened as Linux has it")
