@@ -96,14 +96,6 @@ from solvers.studies.comparison import (
     ComparisonSettings as ComparisonSettings,
     compare_methods as compare_methods,
 )
-from solvers.studies.forgetting import (
-    ErrorForgetting as ErrorForgetting,
-    error_forgetting as error_forgetting,
-)
-from solvers.studies.paper_figures import (
-    FigureSet as FigureSet,
-    draw_paper_figures as draw_paper_figures,
-)
 from solvers.studies.paper_tables import (
     Reproduction as Reproduction,
     ReproductionSettings as ReproductionSettings,
@@ -155,8 +147,6 @@ __all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBreg
 __all__ += ["ExtendedSOC", "OrthogonalSOC", "solve_orthogonal"]
 __all__ += [
     "compare_methods",
-    "draw_paper_figures",
-    "error_forgetting",
     "noise_sweep",
     "reproduce_tables",
 ]
@@ -167,5 +157,5 @@ __all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
 __all__ += ["OrthogonalSolution", "Sweep"]
 __all__ += ["Engine", "Recovery", "Traffic", "Worker", "WorkerPool"]
 __all__ += ["BenchmarkMethod", "BenchmarkSettings", "Comparison", "ComparisonSettings"]
-__all__ += ["ErrorForgetting", "FigureSet", "NoiseSweep", "SweptScene"]
+__all__ += ["NoiseSweep", "SweptScene"]
 __all__ += ["Reproduction", "ReproductionSettings"]

@@ -4,7 +4,7 @@
 RESULTS = {
     *("Certificate", "EdgeResiduals", "EvaluatedPoses", "GraphQP", "HandednessTerms", "LowerBound"),
     *("PoseVariables", "RelaxationSolution", "RotationQP", "Term", "Verification", "Marginals"),
-    *("Comparison", "EdgeFit", "ErrorForgetting", "FolderSolution"),
+    *("Comparison", "EdgeFit", "FolderSolution"),
     *("History", "Ledger", "Measurement", "NoiseSweep", "OrthogonalSolution"),
     *("Outcome", "RSubproblem", "Record", "Rejection", "Reproduction", "Run", "Solution", "Stage"),
     *("Traffic", "OutlierProof", "ReadingComparison", "ReadingFit", "NoiseEstimate", "NoiseLevel"),

@@ -31,7 +31,7 @@ WRONG: dict[str, Any] = {
     "a class": pgo.Poses,
 }
 # Their work is whole studies, or a file of another process.
-STUDIES = {"draw_paper_figures", "reproduce_tables", "compare_methods", "solve_folder"}
+STUDIES = {"reproduce_tables", "compare_methods", "solve_folder"}
 OTHERS = {"PGOError", "RayEngine", "Registry"}
 
 
@@ -94,7 +94,6 @@ def scene() -> dict[str, Any]:
 # Arguments that mean something else than elsewhere.
 OF_THEIR_OWN: dict[str, dict[str, str]] = {
     "solve_orthogonal": {"problem": "on_circle"},
-    "error_forgetting": {"problem": "constrained", "solution": "f"},
     "exp_map": {"w": "t"},
     "verify_proof": {"graph": "path"},
     "project_to_rotations": {"A": "R"},
@@ -109,7 +108,6 @@ CLASSES_WITH_MORE: dict[str, dict[str, Any]] = {
         "graphs": 1,
         "rng": 0,
     },
-    "error_forgetting": {"solution": np.array([2.5, 3.5])},
 }
 
 

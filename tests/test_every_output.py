@@ -77,8 +77,7 @@ def test_tables_and_curves_are_written_in_every_format(pgo_command, tmp_path):
     code, out, err = pgo_command("compare", "grid", "--methods", "newton,joint", *tables, *plots)
     assert (code, out.count("written: "), err) == (0, 7, "")
     tables = repeated("-o", tmp_path, ["y.md", "y.csv", "y.json"])
-    kept = ["--keep", tmp_path / "kept.json"]
-    code, out, err = pgo_command("tables", "--only", "circle", "--seeds", "1", *kept, *tables)
+    code, out, err = pgo_command("tables", "--only", "circle", "--seeds", "1", *tables)
     assert (code, out.count("written: ")) == (0, 3), err
     code, _, err = pgo_command("certify", "grid", "-o", tmp_path / "z.json")
     assert (code, err) == (3, "")

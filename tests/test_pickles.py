@@ -165,7 +165,6 @@ MADE: dict[str, Make] = {
     "RSubproblem": subproblem,
     "HandednessTerms": handedness_terms,
     "Traffic": lambda: solvers.Traffic(np.array([0]), np.array([1]), np.array([8])),
-    "ErrorForgetting": lambda: solvers.ErrorForgetting(np.ones(3), np.ones(3), np.ones(3), 1),
     "NoiseSweep": lambda: solvers.noise_sweep(
         solvers.SweptScene.GRID, np.array([0.1]), 1, np.random.default_rng(0)
     ),

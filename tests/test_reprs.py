@@ -74,7 +74,6 @@ def of_convex_problems() -> Iterator[object]:
     for method in (*(form() for form in forms), solvers.AlternatingBregman()):
         yield list(islice(solvers.iterate(method, constrained), 3))[-1]
         yield solvers.run(method, constrained)
-    yield solvers.error_forgetting(constrained, np.array([0.0, 1.0]), 0)
     best = solvers.solve_orthogonal(on_circle, 0)
     yield from (constrained, on_circle, on_circle.terms[0], best, best.kkt, best.outcome.state)
 

@@ -139,10 +139,6 @@ COMMANDS = {
         "The cost is F, with two precisions an edge, which all of these methods "
         "minimise.",
     ),
-    "figures": CommandOfModule(
-        "solvers.cli.study_commands:figures_command",
-        "Draw the paper's figures from new runs, as PNG and as interactive pages.",
-    ),
 }
 
 

@@ -1,38 +1,24 @@
-"""Commands of `pgo` that compare methods: tables, compare, figures."""
+"""Commands of `pgo` that compare methods: tables, compare."""
 
-import enum
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import typer
 
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.files import check_writable
 from solvers.cli.explanations import explained_by_its_graph
 from solvers.cli.inputs import check_outputs_differ, load_graph
 from solvers.cli.options import DropEdgeOption, TrustFolderOption, UnitWeightsOption
-from solvers.cli.shell import BROKEN_OFF, JsonOption, QuietOption, save_then_show, wrapped
+from solvers.cli.shell import BROKEN_OFF, JsonOption, QuietOption, save_then_show
 from solvers.reporting.result_table import check_table_format
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.comparison import ComparisonSettings, check_plot_format, compare_methods
-from solvers.studies.paper_figures import FigureSet, draw_paper_figures
 from solvers.studies.paper_tables import ReproductionSettings, reproduce_tables
 from solvers.studies.paper_tables_text import tables_as_text
 
-Choice = TypeVar("Choice", bound=enum.Enum)
-KEPT_FILE = Path("pgo-tables.json")
-JobsOption = Annotated[
-    int,
-    typer.Option(
-        "--jobs",
-        "-j",
-        min=1,
-        help="Runs side by side, each in a process of its own; they take wall time from each "
-        "other if there are fewer cores.",
-    ),
-]
 DownloadOption = Annotated[
     bool,
     typer.Option(
@@ -63,26 +49,15 @@ def tables_command(
         typer.Option(min=1, help="Robots that share a graph; SOC as in the paper has one a pose."),
     ] = ReproductionSettings.num_robots,
     out: TableOption = None,
-    keep: Annotated[
-        Path,
-        typer.Option(
-            help="File that keeps every finished figure; the same command continues from there."
-        ),
-    ] = KEPT_FILE,
-    fresh: Annotated[
-        bool, typer.Option("--fresh", help="Ignore the kept figures, and run everything again.")
-    ] = False,
     download: DownloadOption = False,
-    jobs: JobsOption = ReproductionSettings.num_jobs,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run `pgo tables`."""
-    check_outputs_differ({"--out": out, "--keep": keep})
+    check_outputs_differ({"--out": out})
     _check(out, check_table_format)
-    check_writable(keep)
-    settings = ReproductionSettings(_split(only), seeds, robots, download, jobs)
-    tables = reproduce_tables(settings, keep, is_fresh=fresh, progress=False if quiet else None)
+    settings = ReproductionSettings(_split(only), seeds, robots, download)
+    tables = reproduce_tables(settings, progress=False if quiet else None)
     table = tables_as_text(tables)
     save_then_show(
         [(path, table.save) for path in out or []],
@@ -123,7 +98,6 @@ def compare_command(
     unit_weights: UnitWeightsOption = False,
     drop_edge: DropEdgeOption = None,
     trust_folder: TrustFolderOption = False,
-    jobs: JobsOption = ComparisonSettings.num_jobs,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -132,9 +106,7 @@ def compare_command(
     _check(out, check_table_format)
     _check(plot, check_plot_format)
     settings = ComparisonSettings(
-        _chosen(BenchmarkMethod, methods, "method"),
-        BenchmarkSettings(robots, time_limit=time_limit),
-        jobs,
+        _methods(methods), BenchmarkSettings(robots, time_limit=time_limit)
     )
     loaded = load_graph(graph, unit_weights, dropped=drop_edge, trust_folder=trust_folder)
     comparison = compare_methods(loaded, settings, progress=False if quiet else None)
@@ -147,43 +119,13 @@ def compare_command(
         raise typer.Exit(BROKEN_OFF)
 
 
-def figures_command(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")] = Path(
-        "figures"
-    ),
-    only: Annotated[
-        str,
-        typer.Option(
-            help=f"With commas between: {', '.join(kind.value for kind in FigureSet)}. "
-            "All unless given."
-        ),
-    ] = "",
-    download: DownloadOption = False,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Run `pgo figures`."""
-    sets = _chosen(FigureSet, only, "figure")
-    progress = False if quiet else None
-    written, reasons = draw_paper_figures(out, sets, download=download, progress=progress)
-    record: dict[str, object] = {"written": list(map(str, written)), "left_out": reasons}
-    text = "\n".join(f"written: {path}" for path in written)
-    save_then_show(
-        [], lambda: typer.echo(wrapped(text)), (lambda: record) if as_json else None, quiet
-    )
-    for reason in reasons:
-        typer.echo(f"left out: {reason}", err=True)
-    if not written:
-        raise PGOError("no figure could be drawn: no graph is here")
-
-
-def _chosen(choices: type[Choice], names: str, kind: str) -> tuple[Choice, ...]:
-    """Members of an enum, of their names with commas between; a SettingError for other names."""
-    known = {member.value: member for member in choices}
+def _methods(names: str) -> tuple[BenchmarkMethod, ...]:
+    """Methods by their names with commas between; a SettingError for other names."""
+    known = {method.value: method for method in BenchmarkMethod}
     chosen = []
     for name in _split(names):
         if name not in known:
-            raise SettingError(f"there is no {kind} {name!r}; there are {', '.join(known)}")
+            raise SettingError(f"there is no method {name!r}; there are {', '.join(known)}")
         chosen.append(known[name])
     return tuple(chosen)
 

@@ -1,1 +1,1 @@
-"""Benchmarks, the paper's tables and figures, and studies of noise and error forgetting."""
+"""Methods side by side, the paper's tables, and a study of noise."""

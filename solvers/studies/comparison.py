@@ -2,11 +2,9 @@
 
 import importlib.util
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,6 @@ from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
-from solvers.studies.side_by_side import Trial, run_trials
 
 # Columns of figures: head, name in the record, and the function that formats a value.
 _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
@@ -53,21 +50,13 @@ class ComparisonSettings:
         Methods; all that can be run here unless given. GTSAM has to be installed.
     trial : BenchmarkSettings
         Common settings.
-    num_jobs : int
-        Number of methods that are run side by side, each in a process of its own if it is above 1.
-
-    Raises
-    ------
-    SettingError
-        If the number of jobs is not positive.
     """
 
     contenders: tuple[BenchmarkMethod, ...] = ()
     trial: BenchmarkSettings = field(default_factory=BenchmarkSettings)
-    num_jobs: int = 1
 
     def __post_init__(self) -> None:
-        check_settings(self, at_least_one=["num_jobs"])
+        check_settings(self)
 
     @property
     def chosen(self) -> tuple[BenchmarkMethod, ...]:
@@ -98,8 +87,6 @@ class Comparison(Summarised):
         Methods without figures, and why.
     is_complete : bool
         Whether all methods were run; after Ctrl-C they were not.
-    num_jobs : int
-        Number of methods that were run side by side.
     """
 
     problem: PGOProblem
@@ -108,7 +95,6 @@ class Comparison(Summarised):
     trials: tuple[BenchmarkRun, ...]
     reasons: tuple[tuple[BenchmarkMethod, str], ...]
     is_complete: bool = True
-    num_jobs: int = 1
 
     @property
     def curves(self) -> list[Curve]:
@@ -149,10 +135,6 @@ class Comparison(Summarised):
             "gaps are to the bound, over F",
             "rounds, all-reduces and MB: where they are counted; seconds a robot: side by side",
         ]
-        if self.num_jobs > 1:
-            notes.append(
-                f"seconds: of wall time, {self.num_jobs} methods having been run side by side"
-            )
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
         return tuple(notes)
@@ -224,23 +206,18 @@ def compare_methods(
     if isinstance(problem, PoseGraph):
         problem = PGOProblem(problem, weighting=Weighting.ISOTROPIC)
     solution = solve_whole(problem)
-    outcomes: dict[BenchmarkMethod, BenchmarkRun | str] = {}
-    is_complete = False
-    with JobBar(len(settings.chosen), progress) as bar, suppress(KeyboardInterrupt):
-        compared = deque(
-            _trial(contender, problem, settings.trial, outcomes, bar)
-            for contender in settings.chosen
-        )
-        run_trials(compared, settings.num_jobs)
-        is_complete = True
     trials: list[BenchmarkRun] = []
     reasons: list[tuple[BenchmarkMethod, str]] = []
-    for contender in settings.chosen:
-        outcome = outcomes.get(contender)
-        if isinstance(outcome, BenchmarkRun):
-            trials.append(outcome)
-        elif outcome is not None:
-            reasons.append((contender, outcome))
+    is_complete = False
+    with JobBar(len(settings.chosen), progress) as bar, suppress(KeyboardInterrupt):
+        for contender in settings.chosen:
+            bar.name_part(contender.label)
+            try:
+                trials.append(run_benchmark(contender, problem, settings.trial))
+            except FAILURES as error:
+                reasons.append((contender, reason_of(error)))
+            bar.end_part()
+        is_complete = True
     certificate = solution.certificate
     costs = [certificate.objective_at_most]
     costs.append(_cost_at_most(problem, certificate.poses, certificate.poses_objective))
@@ -252,7 +229,6 @@ def compare_methods(
         tuple(trials),
         tuple(reasons),
         is_complete,
-        settings.num_jobs,
     )
 
 
@@ -265,29 +241,6 @@ def check_plot_format(path: Path) -> None:
         problem = f"cannot write {path}: no plot has suffix {path.suffix!r}"
         raise SettingError(f"{problem}; use .html, .png, .svg or .pdf")
     check_installed(path)
-
-
-def _trial(
-    contender: BenchmarkMethod,
-    problem: PGOProblem,
-    settings: BenchmarkSettings,
-    outcomes: dict[BenchmarkMethod, BenchmarkRun | str],
-    bar: JobBar,
-) -> Trial:
-    """Trial of `run_trials`: run a method, and note its run or the reason why there is none."""
-    bar.name_part(contender.label)
-    outcomes[contender] = yield partial(_run_or_reason, contender, problem, settings)
-    bar.end_part()
-
-
-def _run_or_reason(
-    contender: BenchmarkMethod, problem: PGOProblem, settings: BenchmarkSettings
-) -> BenchmarkRun | str:
-    """Run of a method, or the reason for which it failed."""
-    try:
-        return run_benchmark(contender, problem, settings)
-    except FAILURES as error:
-        return reason_of(error)
 
 
 def _cost_at_most(problem: PGOProblem, poses: Poses, objective: float) -> float:

@@ -1,13 +1,9 @@
 """The paper's tables 1 to 4, row by row: its figures beside ours, with proven lower bounds."""
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,15 +19,12 @@ from pgo_models.summaries import Summarised
 from solvers.progress_bars import JobBar
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
-from solvers.studies.results_cache import Entry, KeptResults, graph_fingerprint
-from solvers.studies.side_by_side import Call, Trial, run_trials
 
 SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {
     "circle": circle,
     "grid": grid,
     "sphere": sphere,
 }
-Value = TypeVar("Value")
 TABLE_CONTENDERS = (
     BenchmarkMethod.STAIRCASE,
     BenchmarkMethod.GAUSS_SEIDEL,
@@ -54,8 +47,6 @@ class ReproductionSettings:
         Number of robots, as in `BenchmarkSettings`.
     download : bool
         Whether to download graphs that are not here. Otherwise their row says how to get them.
-    num_jobs : int
-        Number of runs that are done side by side, each in a process of its own if it is above 1.
 
     Raises
     ------
@@ -67,10 +58,9 @@ class ReproductionSettings:
     num_seeds: int = 20
     num_robots: int = BenchmarkSettings.num_robots
     download: bool = False
-    num_jobs: int = 1
 
     def __post_init__(self) -> None:
-        check_settings(self, at_least_one=["num_seeds", "num_robots", "num_jobs"])
+        check_settings(self, at_least_one=["num_seeds", "num_robots"])
         known = [row.name for row in published_rows()]
         for name in self.only:
             if name not in known:
@@ -114,10 +104,7 @@ class Optimum:
 
 @dataclass(frozen=True)
 class TableEntry:
-    """Figures of a method on one draw, see `BenchmarkRun`; `first_gap` is the gap after SOC.
-
-    Its seconds were measured while `num_jobs` runs were done side by side.
-    """
+    """Figures of a method on one draw, see `BenchmarkRun`; `first_gap` is the gap after SOC."""
 
     objective: float
     gap: float
@@ -128,7 +115,6 @@ class TableEntry:
     seconds: float
     seconds_per_robot: float
     remark: str
-    num_jobs: int = 1
 
 
 @dataclass(frozen=True)
@@ -192,9 +178,7 @@ class Reproduction(Summarised):
 @door
 def reproduce_tables(
     settings: ReproductionSettings | None = None,
-    keep: Path | None = None,
     *,
-    is_fresh: bool = False,
     progress: bool | None = None,
 ) -> Reproduction:
     """Run the methods of the paper's tables on its graphs.
@@ -208,18 +192,8 @@ def reproduce_tables(
     ----------
     settings : ReproductionSettings, optional
         Which rows, and how.
-    keep : Path, optional
-        JSON file that keeps every figure as soon as it is known; figures in it are not computed
-        again.
-    is_fresh : bool
-        Whether to ignore the figures in the file.
     progress : bool, optional
         Whether to show a bar on stderr; if not given, it is shown on a terminal.
-
-    Raises
-    ------
-    PGOError
-        If the file cannot be read or written.
 
     Examples
     --------
@@ -228,15 +202,13 @@ def reproduce_tables(
     [('staircase', True), ('gauss-seidel', False), ('paper', True), ('consensus', True)]
     """
     settings = settings if settings is not None else ReproductionSettings()
-    kept = KeptResults(keep, is_fresh)
     results = [_RowResults(row, settings) for row in settings.rows]
     is_complete = False
     num_parts = sum(len(row.seeds) for row in results) * len(TABLE_CONTENDERS)
-    trials: deque[Trial] = deque()
     with JobBar(num_parts, progress) as bar, suppress(KeyboardInterrupt):
         for row in results:
-            trials += [row.draw(seed, kept, bar, trials) for seed in row.seeds]
-        run_trials(trials, settings.num_jobs)
+            for seed in row.seeds:
+                row.draw(seed, bar)
         is_complete = True
     rows = chain.from_iterable(row.rows() for row in results)
     return Reproduction(settings, tuple(rows), is_complete)
@@ -261,19 +233,18 @@ def graph_of_row(row: PublishedRow, seed: int, download: bool) -> PoseGraph:
 
 
 class _RowResults:
-    """Results of one row of the paper's tables, over its draws."""
+    """Results of one row of the paper's tables, draw by draw."""
 
     def __init__(self, row: PublishedRow, settings: ReproductionSettings) -> None:
         self.row = row
         self.settings = settings
         self.seeds = settings.seeds(row.name)
-        # By seed, since draws that are run side by side end in any order.
-        self.optima: dict[int, Optimum] = {}
-        self.cells: dict[BenchmarkMethod, dict[int, TableEntry]] = {}
-        self.reasons: dict[BenchmarkMethod, dict[int, str]] = {}
+        self.optima: list[Optimum] = []
+        self.cells: dict[BenchmarkMethod, list[TableEntry]] = {}
+        self.reasons: dict[BenchmarkMethod, list[str]] = {}
         for contender in TABLE_CONTENDERS:
-            self.cells[contender] = {}
-            self.reasons[contender] = {}
+            self.cells[contender] = []
+            self.reasons[contender] = []
 
     def rows(self) -> Iterator[ReproducedRow]:
         """Row of every contender."""
@@ -282,91 +253,38 @@ class _RowResults:
                 self.row,
                 contender,
                 num_draws=len(self.seeds),
-                optima=_in_order(self.optima),
-                cells=_in_order(self.cells[contender]),
-                reasons=_in_order(self.reasons[contender]),
+                optima=tuple(self.optima),
+                cells=tuple(self.cells[contender]),
+                reasons=tuple(self.reasons[contender]),
             )
 
-    def draw(self, seed: int, kept: KeptResults, bar: JobBar, trials: deque[Trial]) -> Trial:
-        """Compute the optimum of one draw, unless it is kept, and queue the trials of its cells.
+    def draw(self, seed: int, bar: JobBar) -> None:
+        """Compute the optimum of one draw, and the figures of every method.
 
-        If it cannot be computed the reason is noted.
+        What cannot be computed leaves its reason.
         """
         bar.name_part(f"{self.row.name}: certified optimum")
         try:
             graph = graph_of_row(self.row, seed, self.settings.download)
+            problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
+            optimum = _optimum(problem)
         except FAILURES as error:
-            self._fail(seed, reason_of(error), bar)
+            for contender in TABLE_CONTENDERS:
+                self.reasons[contender].append(reason_of(error))
+                bar.end_part()
             return
-        problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
-        name = f"{self.row.name} {seed} {graph_fingerprint(graph)}"
-        entry = yield from _kept_or_computed(kept, f"{name} optimum", partial(_optimum, problem))
-        if isinstance(entry, str):
-            self._fail(seed, entry, bar)
-            return
-        optimum = Optimum(**entry)
-        self.optima[seed] = optimum
-        robots = BenchmarkSettings(self.settings.num_robots).robots(graph)
-        for contender in reversed(TABLE_CONTENDERS):  # the first one comes to the front
-            key = f"{name} {contender.value}, {robots.num_robots} robots {robots.method.name}"
-            compute = partial(
-                _compute_cell, contender, problem, self.row, self.settings, optimum.lower_bound
-            )
-            trials.appendleft(
-                self._cell(contender, seed, _kept_or_computed(kept, key, compute), bar)
-            )
-
-    def _cell(
-        self,
-        contender: BenchmarkMethod,
-        seed: int,
-        computation: Generator[Call, Any, Entry | str],
-        bar: JobBar,
-    ) -> Trial:
-        """Note the figures of a method on one draw, or the reason for which it fails."""
-        bar.name_part(f"{self.row.name}: {contender.label}")
-        entry = yield from computation
-        if isinstance(entry, str):
-            self.reasons[contender][seed] = entry
-        else:
-            entry = {**entry, "iterations": tuple(entry["iterations"])}
-            self.cells[contender][seed] = TableEntry(**entry)
-        bar.end_part()
-
-    def _fail(self, seed: int, reason: str, bar: JobBar) -> None:
-        """Note why a draw has no figures at all."""
+        self.optima.append(optimum)
         for contender in TABLE_CONTENDERS:
-            self.reasons[contender][seed] = reason
+            bar.name_part(f"{self.row.name}: {contender.label}")
+            try:
+                cell = _compute_cell(
+                    contender, problem, self.row, self.settings, optimum.lower_bound
+                )
+            except FAILURES as error:
+                self.reasons[contender].append(reason_of(error))
+            else:
+                self.cells[contender].append(cell)
             bar.end_part()
-
-
-def _in_order(by_seed: dict[int, Value]) -> tuple[Value, ...]:
-    """Values in order of their seeds."""
-    return tuple(by_seed[seed] for seed in sorted(by_seed))
-
-
-def _kept_or_computed(
-    kept: KeptResults, key: str, compute: Callable[[], Entry]
-) -> Generator[Call, Any, Entry | str]:
-    """Result that is kept under a key, or else is computed, by a call of a trial, and then kept.
-
-    If it cannot be computed the answer is the reason, which is not kept.
-    """
-    entry = kept.get(key)
-    if entry is not None:
-        return entry
-    entry_or_reason: Entry | str = yield partial(_entry_or_reason, compute)
-    if not isinstance(entry_or_reason, str):
-        kept.add(key, entry_or_reason)
-    return entry_or_reason
-
-
-def _entry_or_reason(compute: Callable[[], Entry]) -> Entry | str:
-    """Result, or the reason for which it cannot be computed."""
-    try:
-        return compute()
-    except FAILURES as error:
-        return reason_of(error)
 
 
 def _compute_cell(
@@ -375,8 +293,8 @@ def _compute_cell(
     row: PublishedRow,
     settings: ReproductionSettings,
     lower_bound: float,
-) -> Entry:
-    """Figures of a contender, as a record for the file; a PGOError if it has no result."""
+) -> TableEntry:
+    """Figures of a contender; a PGOError if it has no result."""
     start = None
     if contender is BenchmarkMethod.PAPER and row.name in SCENES:
         start = problem.graph.initial
@@ -387,7 +305,7 @@ def _compute_cell(
     first_gap = None
     if trial.first_objective is not None:
         first_gap = float(relative_gap(trial.first_objective, lower_bound))
-    entry = TableEntry(
+    return TableEntry(
         objective=float(trial.objective),
         gap=float(relative_gap(trial.objective, lower_bound)),
         first_gap=first_gap,
@@ -397,13 +315,11 @@ def _compute_cell(
         seconds=trial.seconds,
         seconds_per_robot=trial.seconds_per_robot,
         remark=trial.remark,
-        num_jobs=settings.num_jobs,
     )
-    return asdict(entry)
 
 
-def _optimum(problem: PGOProblem) -> Entry:
-    """Certified optimum of a graph, as a record for the file."""
+def _optimum(problem: PGOProblem) -> Optimum:
+    """Certified optimum of a graph."""
     solution = solve_whole(problem)
     best = min(solution.objective, solution.certificate.poses_objective)
-    return asdict(Optimum(float(best), float(solution.lower_bound)))
+    return Optimum(float(best), float(solution.lower_bound))

@@ -129,11 +129,8 @@ def _notes(tables: Reproduction) -> tuple[str, ...]:
             "so that gaps compare, and costs do not"
         )
     notes += _ALL_ROWS_NOTES
-    num_jobs = max((cell.num_jobs for row in tables.rows for cell in row.cells), default=1)
-    if num_jobs > 1:
-        notes.append(f"seconds: of wall time, up to {num_jobs} runs having been done side by side")
     if not tables.is_complete:
-        notes.append("interrupted: the same command goes on where it was")
+        notes.append("interrupted: the runs left out were not done")
     return tuple(notes)
 
 

@@ -27,11 +27,10 @@ FOR_READERS = [
     ("compare", "grid", "--robots", "2"),
     ("tables", "--only", "grid", "--seeds", "1"),
     ("generate", "random", "--out", "r.g2o"),
-    ("figures", "--only", "scenes"),
     ("verify", "--help"),
     *(
         (command, "--help")
-        for command in ("solve", "certify", "info", "generate", "tables", "compare", "figures")
+        for command in ("solve", "certify", "info", "generate", "tables", "compare")
     ),
 ]
 GRAPHS = (
@@ -109,7 +108,6 @@ def test_and_that_of_robust_solves_which_name_edges(columns: Call, tmp_path: Pat
         (("info", "sphere", "--robots", "5"), ("graph", "poses", "F, estimate", "partition")),
         (("generate", "grid", "--out", "g.g2o"), ("graph", "poses", "written")),
         (("tables", "--only", "grid", "--seeds", "1"), ("rows", "notes")),
-        (("figures", "--only", "scenes"), ("written", "left_out")),
         (("compare", "grid", "--methods", "newton"), ("rows", "notes")),
         (("solve", "grid"), ("objective", "lower_bound")),
         (("certify", "grid"), ("objective", "lower_bound")),

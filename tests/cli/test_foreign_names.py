@@ -126,7 +126,6 @@ def test_one_file_is_not_written_twice(pgo_command, tmp_path):
             "--resume and --cov",
         ),
         (["compare", "grid", "-o", tmp_path / "x.md", "-o", tmp_path / "x.md"], "--out twice"),
-        (["tables", "-o", tmp_path / "x.json", "--keep", tmp_path / "x.json"], "--out and --keep"),
     ]
     for arguments, said in twice:
         code, out, err = pgo_command(*arguments)

@@ -1,11 +1,7 @@
 import csv
 import inspect
 import json
-import os
-import signal
-import subprocess
 import sys
-import time
 
 import pytest
 import typer
@@ -37,7 +33,6 @@ def test_tables_prints_and_writes_every_format(pgo_command, tmp_path):
     rows = list(csv.DictReader((tmp_path / "t.csv").read_text().splitlines()))
     records = json.loads((tmp_path / "t.json").read_text())["rows"]
     assert [float(row["objective"]) for row in rows] == [record["objective"] for record in records]
-    assert len(json.loads(study_commands.KEPT_FILE.read_text())["results"]) == 5
 
 
 def test_a_missing_graph_is_a_row_and_no_failure(pgo_command, monkeypatch):
@@ -46,44 +41,6 @@ def test_a_missing_graph_is_a_row_and_no_failure(pgo_command, monkeypatch):
     code, out, err = pgo_command("tables", "--only", "rim")
     assert (code, err) == (0, "")
     assert "pgo info rim" in out
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX has them")
-@pytest.mark.parametrize("jobs", ["1", "2"])
-def test_ctrl_c_prints_what_is_done_and_the_same_command_goes_on(jobs, tmp_path):
-    command = [*PGO, "tables", "--only", "grid", "--seeds", "400", "--jobs", jobs]
-    process = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    kept = tmp_path / study_commands.KEPT_FILE
-    end = time.monotonic() + 60
-    while not (kept.exists() and len(json.loads(kept.read_text())["results"]) >= 11):
-        assert time.monotonic() < end
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes of the command
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, "pgo: interrupted before it was done\n")
-    assert "the same command goes on where it was" in out
-    assert "of 400 not run yet" in out
-    done = json.loads(kept.read_text())["results"]
-    finished = subprocess.run(
-        [*PGO, "tables", "--only", "grid", "--seeds", "1", "--jobs", jobs],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "not run yet" not in finished.stdout
-    results = json.loads(kept.read_text())["results"]
-    assert {name: results[name] for name in done} == done
-    if jobs == "1":  # else the first draw may have been under way
-        assert results == done
 
 
 def test_compare_prints_a_table_and_draws(pgo_command, tmp_path):
@@ -114,18 +71,6 @@ def test_compare_with_unit_weights_is_of_another_cost(pgo_command):
     assert f"best F {best:.6g}"[:12] in out
 
 
-def test_figures_are_written_into_a_folder(pgo_command, tmp_path):
-    pytest.importorskip("matplotlib")
-    pytest.importorskip("plotly")
-    code, out, err = pgo_command("figures", "--only", "scenes", "--out", "pictures")
-    assert (code, err) == (0, "")
-    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [
-        "scenes.html",
-        "scenes.png",
-    ]
-    assert "written: pictures/scenes.png" in out.replace(os.sep, "/")
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -140,7 +85,6 @@ def test_figures_are_written_into_a_folder(pgo_command, tmp_path):
         (("compare", "grid", "--plot", "plot.gif"), "use .html, .png"),
         (("compare", "nothing-here"), "no file and no data set"),
         (("compare", "grid", "--time-limit", "0"), "time_limit must be positive, got 0"),
-        (("figures", "--only", "scene"), "there is no figure 'scene'; there are scenes"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_run(arguments, message, pgo_command, tmp_path):
@@ -150,10 +94,6 @@ def test_bad_input_is_one_line_and_nothing_is_run(arguments, message, pgo_comman
     assert err.count("\n") == 1
     assert message in err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_names_between_commas_are_taken_once_and_blanks_do_not_count():
-    assert study_commands._split(" a, b,,a ") == ("a", "b")
 
 
 def test_defaults_are_those_of_the_settings():
@@ -166,7 +106,7 @@ def test_defaults_are_those_of_the_settings():
     assert compare["time_limit"].default == BenchmarkSettings.time_limit
 
 
-def test_help_names_the_three():
+def test_help_names_them():
     names = set(typer.main.get_command(cli.app).commands)
-    assert {"tables", "compare", "figures"} <= names
+    assert {"tables", "compare"} <= names
     assert isinstance(cli.app, typer.Typer)
