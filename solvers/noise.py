@@ -26,7 +26,7 @@ from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.graphs.residuals import edge_errors
-from pgo_models.problem.cholesky import factorize
+from pgo_models.problem.cholesky import lower_factor
 from pgo_models.problem.hessian import riemannian_hessian, unknowns_of
 from pgo_models.problem.matrices import entry_positions
 from pgo_models.problem.problem import PGOProblem, as_problem
@@ -230,7 +230,7 @@ def _redundancies(problem: PGOProblem, poses: Poses, components: Sequence[_Compo
     """
     graph = problem.graph
     A = _half_hessian(problem, poses)
-    L, order = factorize(A, problem.backend).take_apart()
+    L, order = lower_factor(A, problem.backend)
     place = np.argsort(order)
     inverse = selected_inverse(L)
     redundancies = []

@@ -17,7 +17,6 @@ from typing import TypeVar
 
 import numpy as np
 from scipy.sparse import csc_array
-from scipy.sparse.linalg import LinearOperator, cg
 
 from pgo_models.activity import Activity, doing
 from pgo_models.certificates.dual_variables import certificate_matrix
@@ -25,25 +24,23 @@ from pgo_models.certificates.rounding_errors import matrix_errors
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import CholeskyFactor, NonZeros, SymbolicCholesky
+from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
 
 T = TypeVar("T")
 
-# Shares of the diagonal: the first margin, and the least one, which is below the rounding of any
-# matrix with a few non-zeros in a row. A margin that rounding does not need sharpens the bound.
+# Share of the diagonal that is subtracted where that takes little of the softest energy: the loss
+# to G_r is divided by it, so that a margin above what rounding needs sharpens the bound.
 FIRST_MARGIN = 1e-9
-LEAST_MARGIN = 1e-15
-SHRINK = 1.0 / 32.0  # of a margin that was too large
-ROOM = 1.0 / 8.0  # share of the softest energy that may be subtracted at once
+SOFT_SHARE = 1.0 / 32.0  # share of the softest energy that such a margin may take
 # A margin is at least this multiple of the rounding that is expected: twice the rounding, and what
 # the estimate of it may be off by.
 ROUNDING_MULTIPLE = 2.125
+# The rounding of a SuperLU factor is known once it is there, and hardly changes with the margin.
+ATTEMPTS = 3
 ETA_GROWTH = 10.0
 ETA_BISECTIONS = 3
-_CG_TOLERANCE = 1e-4
-_CG_ITERATIONS = 50
 # of diagonal entries: nothing that counts underflows
 _SMALLEST = 1e-150
 _LARGEST = 1e150
@@ -51,61 +48,20 @@ _LARGEST = 1e150
 
 @dataclass(frozen=True, eq=False)
 class DefiniteProof:
-    """S + eta blockdiag(0, I), without some rows, factored less a share of its diagonal."""
+    """The exact S + eta blockdiag(0, I) is at least diag(slack), but for some rows left out."""
 
-    # the matrix in double precision, (N, N); only its diagonal in the rows left out
-    stored: csc_array
-    factor: CholeskyFactor  # of `stored` with the margin subtracted
-    diagonal: Array  # that it is a share of, (N,); 0 in the rows left out
-    margin: Array  # share that is subtracted, (N,)
-    entries: Array  # share that the rounding of the entries takes, (N,)
-    # whether a larger margin failed: the factor may be far from one of the matrix without a margin
-    is_marginal: bool
-    # share that the rounding of the factorisation takes, (N,), where the factor need not be asked
-    factor_error: Array | None = None
+    factor: CholeskyFactor  # of the stored matrix with a margin subtracted
+    slack: Array  # (N,): positive, and zero in the rows left out
 
     @property
     def free(self) -> BoolArray:
         """Rows that are not left out, (N,)."""
-        return np.asarray(self.diagonal > 0.0)
-
-    def slack(self) -> Array | None:
-        """Diagonal that can be subtracted from the exact matrix, (N,), positive in free rows.
-
-        The exact matrix less diag(slack) is positive semidefinite in the free rows. It is None if
-        rounding takes over half of the margin. What the factorisation takes of it depends on the
-        pattern alone then, and is counted from now on: the same proof, made once more, has a slack.
-
-        The stored matrix is at least (margin - factor's error) diag, and the exact one differs from
-        it by at most entries diag. The factor may be taken apart for it, so that solving first is
-        cheaper.
-        """
-        factor_error = self.factor_error
-        if factor_error is None:
-            factor_error = self.factor.backward_error()
-        error = OUTWARD * (self.entries + factor_error)
-        if (2.0 * error <= self.margin).all():
-            share_left = (self.margin - error) / OUTWARD
-            return share_left * self.diagonal
-        return None
+        return np.asarray(self.slack > 0.0)
 
     def solve(self, product: Array) -> Array:
-        """About S^-1 product, (N, k), in the rows that are not left out, and zero in those.
-
-        It is a solve with the factor. Where that is marginal, conjugate gradients on the matrix
-        without the margin follow, with the factor as preconditioner.
-        """
+        """About S^-1 product, (N, k), in the rows that are not left out, and zero in those."""
         free = self.free
-        right_hand_side = np.where(free[:, None], product, 0.0)
-        step = self.factor.solve(right_hand_side)
-        if self.is_marginal:
-            inverse = LinearOperator(self.stored.shape, matvec=self.factor.solve, dtype=float)
-            for column in range(step.shape[1]):
-                b = np.where(free, product[:, column], 0.0)
-                x0 = step[:, column]
-                step[:, column], _ = cg(
-                    self.stored, b, x0, rtol=_CG_TOLERANCE, maxiter=_CG_ITERATIONS, M=inverse
-                )
+        step = self.factor.solve(np.where(free[:, None], product, 0.0))
         step[~free] = 0.0
         return step
 
@@ -147,10 +103,11 @@ def prove_definite(
 ) -> DefiniteProof | None:
     """Proof that S + eta blockdiag(0, I) is definite without the rows `fixed`, or None.
 
-    The other arguments are those of `prove_stored`.
+    Rotations of landmarks get no eta (`etas_of_rotations`). The other arguments are those of
+    `prove_stored`.
     """
     shifts = np.zeros(problem.side)
-    shifts[problem.num_poses :] = eta
+    shifts[problem.num_poses :] = np.repeat(etas_of_rotations(problem, eta), problem.d)
     stored, diagonal = shifted_certificate(problem, Lambda, shifts)
     if not is_in_range(stored.data, diagonal):
         return None
@@ -161,74 +118,63 @@ def prove_definite(
     return prove_stored(matrix, first_margin, turned)
 
 
+def etas_of_rotations(problem: PGOProblem, eta: float) -> Array:
+    """The shift of every rotation, (n,): eta, but zero of landmarks.
+
+    A landmark has a rotation in one term alone, kappa ||R_l - R_i||^2, which holds it without eta
+    and is zero at every optimum. So nothing is lost to it, and a proof is the same without it.
+    """
+    etas = np.full(problem.num_poses, eta)
+    etas[problem.graph.landmarks] = 0.0
+    return etas
+
+
 def prove_stored(
     matrix: StoredMatrix, first_margin: float = FIRST_MARGIN, turned: Array | None = None
 ) -> DefiniteProof | None:
     """Proof that the exact matrix behind a stored one is definite, or None.
 
-    The share `first_margin` of the diagonal is subtracted first; less where the matrix is not
-    definite with it, more where rounding needs more. `turned`, (N, k), are moves that leave F
-    almost as it is, as a turn of all poses but those left out. S holds them only weakly: their
-    energy is small, and the margin has to take little of it. A bound on the rounding of the
-    factorisation may be known for any number of non-zeros in the factor, or for the most that there
-    can be; where the margin for that takes little enough, the non-zeros are not counted.
+    The share `first_margin` of the diagonal is subtracted, or more where rounding needs more; where
+    the matrix is not definite with it, what rounding needs and no more. `turned`, (N, k), are moves
+    that leave F almost as it is, as a turn of all poses but those left out. S holds them only
+    weakly: their energy is small, and a margin that rounding does not need is to take little of it.
     """
-    stored = matrix.stored
-    entries = matrix.entries
-    free_diagonal = matrix.free_diagonal
-    expected = matrix.analysis.backward_error(NonZeros.COUNTED)
-    is_counted = bool(np.isfinite(expected).all())
     if turned is not None:
-        softness = _softness(stored, free_diagonal, turned)
-        # A uniform margin takes margin * sum(weights) of each energy: little of the softest one.
-        weight_sums = softness.weights.sum(axis=0)
-        softest = float(np.min(SHRINK * softness.energies / weight_sums))
-        first_margin = min(first_margin, max(softest, LEAST_MARGIN))
-        if not is_counted:
-            uncounted = _factor_without_counts(matrix, first_margin, softness)
-            if uncounted is not None:
-                factor, margin, error = uncounted
-                return DefiniteProof(stored, factor, free_diagonal, margin, entries, False, error)
-    if not is_counted:
-        expected = np.zeros_like(entries)
-    chosen = search_margin(matrix.factor_less, entries, expected, first_margin)
-    if chosen is None:
-        return None
-    factor, margin, is_marginal = chosen
-    return DefiniteProof(stored, factor, free_diagonal, margin, entries, is_marginal)
+        softest = _soft_margin(matrix.stored, matrix.free_diagonal, turned)
+        first_margin = min(first_margin, softest)
+    proof = _prove_with_margin(matrix, first_margin)
+    return proof if proof is not None else _prove_with_margin(matrix, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Softness:
-    """How weakly a matrix S holds moves v, one a column: rows left out count as zero."""
+def _prove_with_margin(matrix: StoredMatrix, least_margin: float) -> DefiniteProof | None:
+    """Proof with at least this margin, and more where rounding needs it.
 
-    energies: Array  # (k,): v^T S v
-    weights: Array  # (N, k): margin @ weights is what a margin, (N,), takes of the energies
+    The stored matrix is at least (margin - factor's error) diag, and the exact one differs from it
+    by at most entries diag.
+    """
+    entries = matrix.entries
+    error = OUTWARD * (entries + matrix.analysis.expected_error())
+    for _ in range(ATTEMPTS):
+        margin = np.maximum(least_margin, ROUNDING_MULTIPLE * error)
+        factor = matrix.factor_less(margin)
+        if factor is None:
+            return None
+        error = OUTWARD * (entries + factor.backward_error())
+        if (2.0 * error <= margin).all():
+            share_left = (margin - error) / OUTWARD
+            return DefiniteProof(factor, share_left * matrix.free_diagonal)
+    return None
 
 
-def _softness(stored: csc_array, free_diagonal: Array, moves: Array) -> _Softness:
+def _soft_margin(stored: csc_array, free_diagonal: Array, moves: Array) -> float:
+    """Margin that takes a fixed share of the least energy v^T S v of moves v, one a column.
+
+    Rows left out count as zero. A margin takes margin v^T diag v of an energy.
+    """
     moves = np.where(free_diagonal[:, None] > 0.0, moves, 0.0)
     energies = np.einsum("rc,rc->c", moves, stored @ moves)
-    weights = free_diagonal[:, None] * moves**2
-    return _Softness(energies, weights)
-
-
-def _factor_without_counts(
-    matrix: StoredMatrix, first_margin: float, softness: _Softness
-) -> tuple[CholeskyFactor, Array, Array] | None:
-    """Factor, margin and bound on the factor's rounding that holds before non-zeros are counted.
-
-    None where the margin for such a bound takes too much of the softest energy, or does not factor.
-    """
-    room = ROOM * softness.energies
-    for non_zeros in (NonZeros.ALL, NonZeros.MOST):
-        error = matrix.analysis.backward_error(non_zeros)
-        margin = np.maximum(first_margin, ROUNDING_MULTIPLE * (matrix.entries + error))
-        is_small = np.isfinite(margin).all() and (margin @ softness.weights <= room).all()
-        factor = matrix.factor_less(margin) if is_small else None
-        if factor is not None:
-            return factor, margin, error
-    return None
+    weights = np.sum(free_diagonal[:, None] * moves**2, axis=0)
+    return float(np.min(SOFT_SHARE * energies / weights))
 
 
 def is_in_range(entries: Array, diagonal: Array) -> bool:
@@ -273,39 +219,6 @@ def shifted_certificate(
     stored = S.data[positions]
     diagonal = np.maximum(problem.M.data[positions], stored) + shifts
     return S, diagonal
-
-
-def search_margin(
-    attempt: Callable[[Array], CholeskyFactor | None],
-    entries: Array,
-    expected: Array,
-    first_margin: float,
-) -> tuple[CholeskyFactor, Array, bool] | None:
-    """First factor found for which rounding takes at most half of the margin, or None.
-
-    Returned with it are the margin, (N,), and whether a larger one failed.
-
-    A factor with the first margin that would have to be taken apart for its error (one that is not
-    `CholeskyFactor.is_counted`) is returned as it is. `attempt` factors with shares, (N,), of the
-    diagonal subtracted, or gives None when that does not go through; `entries` and `expected`,
-    (N,), are the shares that rounding the entries takes, and factoring may take.
-    """
-    uniform = first_margin
-    is_marginal = False
-    while uniform >= LEAST_MARGIN:
-        margin = np.maximum(uniform, ROUNDING_MULTIPLE * (entries + expected))
-        factor = attempt(margin)
-        if factor is None:
-            uniform = SHRINK * uniform
-            is_marginal = True
-            continue
-        if not (is_marginal or factor.is_counted):
-            return factor, margin, is_marginal
-        error = OUTWARD * (entries + factor.backward_error())
-        if (2.0 * error <= margin).all():
-            return factor, margin, is_marginal
-        expected = np.maximum(expected, error)
-    return None
 
 
 def smallest_eta(

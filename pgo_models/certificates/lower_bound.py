@@ -70,7 +70,12 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, smallest_eta
+from pgo_models.certificates.definiteness import (
+    DefiniteProof,
+    etas_of_rotations,
+    prove_definite,
+    smallest_eta,
+)
 from pgo_models.certificates.dual_variables import check_multipliers, scalar_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
@@ -222,17 +227,27 @@ def has_complex_form(problem: PGOProblem) -> bool:
 
 
 def prove_at(
-    problem: PGOProblem, Lambda: Array, poses: Poses, is_complex: bool = False
+    problem: PGOProblem,
+    Lambda: Array,
+    poses: Poses,
+    is_complex: bool = False,
+    eta: float = 0.0,
 ) -> LowerBound | None:
-    """Bound grounded at the poses as they are, with eta = 0; None where S_r is not proved definite.
+    """Bound grounded at the poses as they are; None where S_r is not proved definite with eta.
 
     The problem has to be quadratic: for chi2 the caller passes a tangent (`PGOProblem.tangent_at`),
-    whose bound is one on chi2. In complex numbers only the traces of Lambda count.
+    whose bound is one on chi2. In complex numbers only the traces of Lambda count. With an eta
+    above zero it is the better of both forms.
     """
     Lambda = _symmetric(problem, Lambda)
     if is_complex:
         Lambda = scalar_multipliers(Lambda)
-    return _prove(problem, Lambda, 0.0, _grounded_at(problem, poses, is_complex))
+    grounded = _prove(problem, Lambda, eta, _grounded_at(problem, poses, is_complex))
+    if is_complex or not eta > 0.0:
+        return grounded
+    bounds = [grounded, _prove(problem, Lambda, eta, None)]
+    proven = [bound for bound in bounds if bound is not None]
+    return max(proven, key=lambda bound: bound.value, default=None)
 
 
 def best_bound(
@@ -436,16 +451,11 @@ def _prove(
 def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBound | None:
     """Form with eta alone, the first translation left out; None where definiteness is not shown."""
     fixed = np.arange(1 if problem.has_translations else problem.num_poses)
-    proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
-    if proof is not None and proof.slack() is None:
-        # The margin was too small for the rounding of the factorisation, which nobody knew yet:
-        # the second proof begins with it and has a slack.
-        proof = prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN)
-    if proof is None:
+    if prove_definite(problem, Lambda, eta, fixed, UNGROUNDED_MARGIN) is None:
         return None
     trace = _trace(Lambda)
     constant, constant_error = problem.weights.constant
-    count = problem.num_poses * problem.d
+    count = (problem.num_poses - len(problem.graph.landmarks)) * problem.d
     return bound_with_eta([trace], eta, count, constant, constant_error)
 
 
@@ -456,7 +466,10 @@ def bound_with_eta(
     constant: float = 0.0,
     constant_error: float = 0.0,
 ) -> LowerBound:
-    """Bound tr(Lambda) + constant - eta n d, from parts of tr(Lambda); count = n d."""
+    """Bound tr(Lambda) + constant - eta n d, from parts of tr(Lambda); count = n d.
+
+    Here n counts rotations that eta is added to (`etas_of_rotations`).
+    """
     lost = eta * count
     sizes = sum(map(abs, traces)) + lost
     rounding = OUTWARD * 4.0 * UNIT_ROUNDOFF * sizes
@@ -477,11 +490,6 @@ def _prove_grounded(
         return _moved(unknowns, Lambda, proof, point)
 
     point = move_until_settled(_first_point(problem, Lambda, ground.X), move)
-    slack = proof.slack()
-    if slack is None:
-        # The margin was too small for the rounding of the factorisation, which nobody knew yet:
-        # every proof that is found from now on has a slack, so that this happens once.
-        return _prove_grounded(problem, Lambda, eta, ground)
     evaluation = point.evaluation
     if evaluation is None:
         evaluation = evaluate_certificate(problem, Lambda, point.X, point.low)
@@ -490,9 +498,10 @@ def _prove_grounded(
     # The bound is value - tr(G_r^T H^-1 G_r) - eta sum_i ||R_i^T - P_i V||_F^2 with G = S X' after
     # the last move (this file's opening). Both losses, and the error of the value, are replaced by
     # upper bounds: H - diag(slack) is positive semidefinite.
-    quadratic = quadratic_loss(product[free], product_error[free], slack[free])
+    quadratic = quadratic_loss(product[free], product_error[free], proof.slack[free])
     n = problem.num_poses
-    distances = squared_distances(point.X[n:], ground.X[n:])
+    has_eta = np.repeat(etas_of_rotations(problem, eta) > 0.0, problem.d)
+    distances = squared_distances(point.X[n:][has_eta], ground.X[n:][has_eta])
     bound = grounded_bound(evaluation.value, evaluation.value_error, quadratic, eta, distances)
     return replace(bound, is_complex=unknowns.is_complex)
 
@@ -566,7 +575,6 @@ class _Point:
     value: float = 0.0
     left: float = math.inf
     quadratic: float = 0.0
-    last_gain: float = math.inf
 
 
 def _first_point(problem: PGOProblem, Lambda: Array, X: Array) -> _Point:
@@ -589,13 +597,6 @@ def _moved(
     gradient, _ = unknowns.gradient(point.product, np.zeros_like(point.product))
     step = proof.solve(gradient)
     gain = inner(step, gradient)
-    if gain > point.last_gain:
-        # The factor is that of H less the margin. Gains that grow from move to move show that the
-        # smallest eigenvalues of H are about as small as the margin, so that its inverse is far
-        # from H^-1. A marginal proof solves with H itself, by conjugate gradients with the factor
-        # as preconditioner.
-        step = replace(proof, is_marginal=True).solve(gradient)
-        gain = inner(step, gradient)
     Z = unknowns.rows_of(step)
     X = point.X.copy()
     X[n:] -= Z[n:]
@@ -603,12 +604,9 @@ def _moved(
     evaluation = evaluate_certificate(problem, Lambda, X, low)
     free = proof.free
     product, product_error = unknowns.gradient(evaluation.product, evaluation.product_error)
-    # The margin stands in for the slack, which lies between about half of it and all of it. To know
-    # the slack the factor may have to be taken apart, and these two losses only decide whether X'
-    # is moved again.
-    cheap_slack = (proof.margin * proof.diagonal)[free]
-    left = quadratic_loss(product[free], 0.0, cheap_slack)
-    quadratic = quadratic_loss(product[free], product_error[free], cheap_slack)
+    slack = proof.slack[free]
+    left = quadratic_loss(product[free], 0.0, slack)
+    quadratic = quadratic_loss(product[free], product_error[free], slack)
     moved = _Point(
         X=X,
         low=low,
@@ -617,7 +615,6 @@ def _moved(
         value=evaluation.value,
         left=left,
         quadratic=quadratic,
-        last_gain=gain,
     )
     return moved, gain
 

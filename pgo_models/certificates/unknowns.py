@@ -38,6 +38,7 @@ from scipy.sparse import csc_array, diags_array, tril
 from pgo_models.certificates.definiteness import (
     DefiniteProof,
     StoredMatrix,
+    etas_of_rotations,
     is_definite_in_doubles,
     is_in_range,
     prove_definite,
@@ -250,11 +251,12 @@ class ComplexUnknowns(Unknowns):
         data = self.M.data.copy()
         positions = diagonal_positions(self.M)
         data[positions[of_r]] -= np.repeat(2.0 * Lambda[:, 0, 0], 2)
-        data[positions[of_r]] += 2.0 * eta
+        shifts = np.repeat(2.0 * etas_of_rotations(self.problem, eta), 2)
+        data[positions[of_r]] += shifts
         stored = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
         stored.has_canonical_format = True
         diagonal = np.maximum(M_diagonal, data[positions])
-        diagonal[of_r] += 2.0 * eta
+        diagonal[of_r] += shifts
         if not is_in_range(data, diagonal):
             return None
         row_diagonal = np.concatenate([diagonal[: 2 * n : 2], 0.5 * diagonal[of_r]])

@@ -104,12 +104,12 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
 def factor_of_M(problem: PGOProblem) -> tuple[csc_array, IntArray]:
     """Cholesky factor L of M with its diagonal doubled, and the order of a solve.
 
-    M itself is singular; the pattern of its factor is the same. See `take_apart`.
+    M itself is singular; the pattern of its factor is the same.
     """
     data = problem.M.data.copy()
     data[problem.diagonal_positions] *= 2.0
     definite = problem.with_pattern_of_M(data)
-    return problem.analysis.factorize(definite).take_apart()
+    return problem.analysis.lower_factor(definite)
 
 
 def plot_sparsity(problem: PGOProblem) -> Figure:

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -60,14 +61,6 @@ def default_backend() -> CholeskyBackend:
     return CholeskyBackend.CHOLMOD if installed else CholeskyBackend.SUPERLU
 
 
-class NonZeros(enum.Enum):
-    """Which non-zeros of R a bound on the rounding of a factorisation counts, cheapest first."""
-
-    ALL = "every entry, as if R were full"
-    MOST = "the most that there can be, as `analyze` was told"
-    COUNTED = "those of the pattern, counted in a factor that was made before"
-
-
 class CholeskyFactor(ABC):
     """A factorisation of one symmetric positive definite matrix."""
 
@@ -96,25 +89,12 @@ class CholeskyFactor(ABC):
         argument (`pgo_models.problem.floating_point`) holds for diagonals between 1e-150 and 1e150,
         where nothing that counts underflows. `beside`, an int or (N,), are non-zeros of further
         columns of R in its rows, as of `half_solve`: with them A is the leading block of a larger
-        matrix, their own columns' share of E is apart (`column_error`). As `take_apart`, it may
-        make the next solve factor again, unless the factor `is_counted`.
-        """
-
-    @property
-    def is_counted(self) -> bool:
-        """Whether `backward_error` leaves the factor as it is."""
-        return True
-
-    @abstractmethod
-    def take_apart(self) -> tuple[csc_array, np.ndarray]:
-        """L and the order with A[order][:, order] = L L^T, rows sorted, all of its pattern stored.
-
-        It may give up the numbers that solves are made with: the next solve factors A again.
+        matrix, their own columns' share of E is apart (`column_error`).
         """
 
     @abstractmethod
     def most_in_row(self, beside: Array | int = 0) -> float:
-        """Most non-zeros in a row of R; it costs what `backward_error` does."""
+        """Most non-zeros in a row of R."""
 
 
 class SymbolicCholesky(ABC):
@@ -124,11 +104,14 @@ class SymbolicCholesky(ABC):
     explicit zeros included. They are Hermitian where the analysed matrix has complex numbers.
     """
 
-    def __init__(self, pattern: csc_array) -> None:
+    def __init__(
+        self, pattern: csc_array, most_counts: Callable[[], FactorCounts] | None = None
+    ) -> None:
         self.dtype = np.result_type(pattern.dtype, np.float64)  # of factors and solutions
         self._indptr = pattern.indptr
         self._indices = pattern.indices
         self._shape = pattern.shape
+        self._most_counts = most_counts
         self._factorisation = Activity("factorisation", pattern.shape[0])
 
     @abstractmethod
@@ -150,13 +133,27 @@ class SymbolicCholesky(ABC):
         The next one costs another symbolic analysis.
         """
 
-    def backward_error(self, non_zeros: NonZeros, beside: Array | int = 0) -> Array:
-        """Bound on `CholeskyFactor.backward_error` of every factor of the pattern, (N,).
+    @abstractmethod
+    def lower_factor(self, matrix: csc_array) -> tuple[csc_array, IntArray]:
+        """L and the order with A[order][:, order] = L L^T, rows sorted, all of its pattern stored.
 
-        It is inf where these non-zeros are not known, and with a backend whose rounding depends on
-        the numbers.
+        A NotPositiveDefiniteError as of `factorize`.
         """
-        return np.full(self._shape[0], np.inf)
+
+    @cached_property
+    def counts(self) -> FactorCounts:
+        """Non-zeros of every factor of the pattern, or the most that there can be."""
+        if self._most_counts is not None:
+            return self._most_counts()
+        L, order = self.lower_factor(self.identity())
+        return FactorCounts.of(L.indptr, L.indices, order)
+
+    @abstractmethod
+    def expected_error(self, beside: Array | int = 0) -> Array:
+        """What is known of `CholeskyFactor.backward_error` before there is a factor, (N,).
+
+        Zero where it depends on the numbers.
+        """
 
     def _check(self, matrix: csc_array) -> None:
         has_same_pattern = (
@@ -235,6 +232,13 @@ def factorize_damped(analysis: SymbolicCholesky, matrix: csc_array) -> CholeskyF
     )
 
 
+def lower_factor(
+    A: csc_array, backend: CholeskyBackend | None = None
+) -> tuple[csc_array, IntArray]:
+    """L and the order with A[order][:, order] = L L^T, as `SymbolicCholesky.lower_factor`."""
+    return analyze(A, backend).lower_factor(A)
+
+
 def minimum_degree(pattern: csc_array) -> IntArray:
     """Order of elimination, (N,), of a lower triangle.
 
@@ -257,7 +261,8 @@ class _SuperLUFactor(CholeskyFactor):
     def __reduce__(self) -> tuple[Any, ...]:
         return _SuperLU.factorize, (self._analysis, self._matrix)
 
-    def take_apart(self) -> tuple[csc_array, np.ndarray]:
+    def lower_factor(self) -> tuple[csc_array, IntArray]:
+        """`SymbolicCholesky.lower_factor` of the matrix."""
         root_pivots = np.sqrt(self._lu.U.diagonal())
         L = self._lu.L @ diags_array(root_pivots)
         whole = L + self._analysis.tiny_factor()
@@ -369,7 +374,7 @@ class _SuperLU(SymbolicCholesky):
 
     def factorize(
         self, matrix: csc_array, overwrite: CholeskyFactor | None = None
-    ) -> CholeskyFactor:
+    ) -> "_SuperLUFactor":
         self._check(matrix)
         try:
             lu = self._lu(matrix)
@@ -381,6 +386,12 @@ class _SuperLU(SymbolicCholesky):
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive")
         check_pivots(lu.U.diagonal().real)
         return _SuperLUFactor(lu, self, matrix)
+
+    def lower_factor(self, matrix: csc_array) -> tuple[csc_array, IntArray]:
+        return self.factorize(matrix).lower_factor()
+
+    def expected_error(self, beside: Array | int = 0) -> Array:
+        return np.zeros(self._shape[0])
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _SuperLU, (self._pattern(), self.order)
@@ -396,16 +407,13 @@ class _CholmodFactor(CholeskyFactor):
     """A factor of CVXOPT, which factors in place, symbolic part included.
 
     The symbolic part of a factor out of use is taken over by the next one.
-
-    Reading the entries of a factor, or counting them, uses up what CVXOPT solves with. The triangle
-    of the matrix stays, so that a later solve factors it again.
     """
 
     def __init__(self, numeric: _Capsule | None, analysis: "_Cholmod", lower: Array | None) -> None:
-        self._numeric = numeric  # None: given up
+        self._numeric = numeric
         self._analysis = analysis
-        # Triangle of the matrix: what a copy, what comes out of a pickle, or a factor that was
-        # given up is factored from. None: the caller had the factor overwritten.
+        # Triangle of the matrix, from which a copy, or what comes out of a pickle, is factored.
+        # None, as the numeric part: the caller had the factor overwritten.
         self._lower = lower
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -414,7 +422,7 @@ class _CholmodFactor(CholeskyFactor):
         return _Cholmod.factorize_triangle, (self._analysis, self._lower)
 
     @property
-    def is_given_up(self) -> bool:
+    def is_overwritten(self) -> bool:
         """Whether another factor may take over the symbolic part."""
         return self._numeric is None
 
@@ -422,21 +430,6 @@ class _CholmodFactor(CholeskyFactor):
         """Leave the memory to a later factor, for good."""
         self._numeric = None
         self._lower = None
-
-    def _give_up(self) -> _Capsule:
-        """The numeric factor, for a use that it does not outlast."""
-        numeric = self._current()
-        self._numeric = None
-        return numeric
-
-    def _current(self) -> _Capsule:
-        """The numeric factor, factored again if it was given up."""
-        if self._lower is None:
-            raise ValueError("this factor was overwritten by a later one")
-        if self._numeric is None:
-            self._numeric = self._analysis.fill(self._lower)
-            self._analysis.take(self._numeric, self)
-        return self._numeric
 
     def solve(self, right_hand_side: Array) -> Array:
         return self._solved(right_hand_side, _WHOLE)
@@ -449,34 +442,19 @@ class _CholmodFactor(CholeskyFactor):
         return self._solved(rows, _PERMUTE).real.astype(np.int64)
 
     def _solved(self, right_hand_side: Array, *systems: int) -> Array:
+        if self._numeric is None:
+            raise ValueError("this factor was overwritten by a later one")
         cvxopt, cholmod = import_cvxopt()
-        numeric = self._current()
         solution = cvxopt.matrix(np.asfortranarray(right_hand_side, dtype=self._analysis.dtype))
         for system in systems:
-            cholmod.solve(numeric, solution, sys=system)
+            cholmod.solve(self._numeric, solution, sys=system)
         return np.array(solution).reshape(right_hand_side.shape)
 
-    def take_apart(self) -> tuple[csc_array, np.ndarray]:
-        parts, order = self._analysis.take_apart(self._give_up())
-        pointers, rows, values = (np.array(part).ravel() for part in parts)
-        side = len(order)
-        L = csc_array((values, rows, pointers), shape=(side, side))
-        return L, order
-
-    @property
-    def is_counted(self) -> bool:
-        return self._analysis.is_counted
-
     def most_in_row(self, beside: Array | int = 0) -> float:
-        return self._counts().most_in_row(beside)
+        return self._analysis.counts.most_in_row(beside)
 
     def backward_error(self, beside: Array | int = 0) -> Array:
-        return self._counts().error(beside)
-
-    def _counts(self) -> FactorCounts:
-        if self._numeric is not None and not self.is_counted:
-            return self._analysis.count(self._give_up())
-        return self._analysis.counts()
+        return self._analysis.expected_error(beside)
 
 
 class _Cholmod(SymbolicCholesky):
@@ -485,10 +463,8 @@ class _Cholmod(SymbolicCholesky):
     def __init__(
         self, pattern: csc_array, order: IntArray | None, most: Callable[[], FactorCounts] | None
     ) -> None:
-        super().__init__(pattern)
+        super().__init__(pattern, most)
         self._order = order
-        self._most_counts = most
-        self._known: dict[NonZeros, FactorCounts] = {}
         self._matrix, self._lower, self._is_diagonal = lower_triangle(pattern)
         # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one
         # would be lost.
@@ -501,50 +477,19 @@ class _Cholmod(SymbolicCholesky):
         """Number of rows."""
         return int(self._shape[0])
 
-    @property
-    def is_counted(self) -> bool:
-        """Whether the non-zeros of a factor were counted."""
-        return NonZeros.COUNTED in self._known
+    def expected_error(self, beside: Array | int = 0) -> Array:
+        return self.counts.error(beside)
 
-    def backward_error(self, non_zeros: NonZeros, beside: Array | int = 0) -> Array:
-        if non_zeros is NonZeros.ALL:
-            return FactorCounts.of_full_factor(self.side).error(beside)
-        is_first_time = non_zeros not in self._known
-        if is_first_time and non_zeros is NonZeros.MOST and self._most_counts is not None:
-            self._known[non_zeros] = self._most_counts()
-        counts = self._known.get(non_zeros)
-        return super().backward_error(non_zeros) if counts is None else counts.error(beside)
-
-    def counts(self) -> FactorCounts:
-        """Counts of every factor with this pattern, if need be of one that is out of use."""
-        if self.is_counted:
-            return self._known[NonZeros.COUNTED]
-        return self.count(self._spare())
-
-    def count(self, capsule: _Capsule) -> FactorCounts:
-        """Find the counts of a numeric factor, which is used up for it."""
-        try:
-            parts, order = self.take_apart(capsule)
-        except (ValueError, ArithmeticError):
-            # It is symbolic, or of a matrix that was not positive definite: factor the identity.
-            identity = np.where(self._is_diagonal, 1.0, 0.0)
-            self._fill(identity, capsule)
-            parts, order = self.take_apart(capsule)
-        pointers, rows, _ = parts
-        counts = FactorCounts.of(np.array(pointers).ravel(), np.array(rows).ravel(), order)
-        self._known[NonZeros.COUNTED] = counts
-        return counts
-
-    def take_apart(self, capsule: _Capsule) -> tuple[tuple[object, object, object], np.ndarray]:
-        """Pointers, rows and values of L, and its order.
-
-        CVXOPT uses the factor up for it: the next one in it would be L D L^T.
-        """
-        self._taken = [(user, other) for user, other in self._taken if other is not capsule]
+    def lower_factor(self, matrix: csc_array) -> tuple[csc_array, IntArray]:
+        self._check(matrix)
+        # CVXOPT uses a factor up when it shows the entries: it is in no list of those to reuse.
+        capsule = self.fill(matrix.data[self._lower])
         cvxopt, cholmod = import_cvxopt()
-        order = cvxopt.matrix(np.arange(self._shape[0], dtype=self.dtype))
+        order = cvxopt.matrix(np.arange(self.side, dtype=self.dtype))
         cholmod.solve(capsule, order, sys=_PERMUTE)
-        return cholmod.getfactor(capsule).CCS, np.array(order).ravel().real.astype(np.int64)
+        pointers, rows, values = (np.array(part).ravel() for part in cholmod.getfactor(capsule).CCS)
+        L = csc_array((values, rows, pointers), shape=self._shape)
+        return L, np.array(order).ravel().real.astype(np.int64)
 
     def _analyze(self) -> _Capsule:
         analysis = replace(self._factorisation, name="analysis")
@@ -572,12 +517,9 @@ class _Cholmod(SymbolicCholesky):
         """
         capsule = self.fill(lower)
         factor = _CholmodFactor(capsule, self, lower)
-        self.take(capsule, factor)
-        return factor
-
-    def take(self, capsule: _Capsule, factor: _CholmodFactor) -> None:
-        """Note which factor uses a capsule; when it is gone, or gives it up, the next one may."""
+        # when it is gone, or overwritten, the next one may use the capsule
         self._taken.append((weakref.ref(factor), capsule))
+        return factor
 
     def fill(self, lower: Array) -> _Capsule:
         """A capsule with the factor of these values of the lower triangle.
@@ -610,7 +552,7 @@ class _Cholmod(SymbolicCholesky):
         idle = []
         for user, numeric in self._taken:
             factor = None if user is None else user()
-            if factor is None or factor.is_given_up:
+            if factor is None or factor.is_overwritten:
                 idle.append(numeric)
             else:
                 used.append((user, numeric))
@@ -630,5 +572,4 @@ class _Cholmod(SymbolicCholesky):
         return np.array(cholmod.diag(capsule)).ravel().real
 
     def __reduce__(self) -> tuple[Any, ...]:
-        state = {"_known": self._known}
-        return _Cholmod, (self._pattern(), self._order, self._most_counts), state
+        return _Cholmod, (self._pattern(), self._order, self._most_counts)

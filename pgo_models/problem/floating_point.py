@@ -119,12 +119,6 @@ class FactorCounts:
         np.maximum.at(widest, rows, np.repeat(in_row, lengths))
         return cls(in_column, in_row, widest, order)
 
-    @classmethod
-    def of_full_factor(cls, side: int) -> "FactorCounts":
-        """Counts of an R that counts as if it had no zeros at all, in any order."""
-        every = np.full(side, float(side))
-        return cls(every, every, every, np.arange(side))
-
     def most_in_row(self, beside: Array | int) -> float:
         """Most non-zeros in a row, with `beside` more of them in further columns."""
         in_row = self.in_row + beside

@@ -8,6 +8,8 @@ F / 2)^-1. Here tau is the information of a coordinate and 2 kappa that of an an
 I_theta with `RotationWeight.GAUSSIAN`, and 2 I_theta with the kappa of SE-Sync in the plane.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +22,7 @@ from pgo_models.files import replace_when_done
 from pgo_models.geometry.arrays import ReadOnly, whole_number
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, factorize
+from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, factorize, lower_factor
 from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.matrices import block_entries, entry_positions
 from pgo_models.problem.selected_inversion import selected_inverse
@@ -132,7 +134,8 @@ class Marginals(ReadOnly):
     def _blocks(self, i: IntArray, j: IntArray) -> Array:
         """Blocks (i, j) of the inverse, (k, p, p), between poses without the anchor."""
         # A factor of its own, whose memory is freed at the end.
-        L, order = self._factorize(self._with_room(i, j)).take_apart()
+        with _at_a_strict_minimum():
+            L, order = lower_factor(self._with_room(i, j), self.backend)
         # Rows of L that belong to every pose.
         pose_rows = np.argsort(order).reshape(self.layout.num_poses - 1, -1)
         rows, columns = block_entries(pose_rows[i], pose_rows[j])
@@ -174,16 +177,8 @@ class Marginals(ReadOnly):
     @cached_property
     def _factor(self) -> CholeskyFactor:
         """Factor that `joint` solves with, kept between calls."""
-        return self._factorize(self._information)
-
-    def _factorize(self, information: csc_array) -> CholeskyFactor:
-        try:
-            return factorize(information, self.backend)
-        except NotPositiveDefiniteError as error:
-            raise NotPositiveDefiniteError(
-                "no covariances, the poses are at no strict minimum; "
-                "solve to the end first, or polish() the poses"
-            ) from error
+        with _at_a_strict_minimum():
+            return factorize(self._information, self.backend)
 
     def _check(self, *poses: int) -> None:
         last = self.layout.num_poses - 1
@@ -191,6 +186,18 @@ class Marginals(ReadOnly):
             whole_number(pose, "a pose", SettingError)
             if not 0 <= pose <= last:
                 raise SettingError(f"there is no pose {pose}; give one of 0 to {last}")
+
+
+@contextmanager
+def _at_a_strict_minimum() -> Iterator[None]:
+    """Say what a Hessian that is not positive definite means for covariances."""
+    try:
+        yield
+    except NotPositiveDefiniteError as error:
+        raise NotPositiveDefiniteError(
+            "no covariances, the poses are at no strict minimum; "
+            "solve to the end first, or polish() the poses"
+        ) from error
 
 
 def write_covariances(

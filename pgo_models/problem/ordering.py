@@ -14,7 +14,6 @@ from scipy.sparse import csc_array, csr_array, tril
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
-    CholeskyFactor,
     SymbolicCholesky,
     analyze,
     minimum_degree,
@@ -79,27 +78,20 @@ def row_order(poses: IntArray, *widths: int) -> IntArray:
 
 
 def most_counts(poses: SymbolicCholesky, *widths: int) -> FactorCounts:
-    """`counts_of_blocks` for the analysis of a matrix with one entry for each of the blocks."""
-    return counts_of_blocks(poses.factorize(poses.identity()), *widths)
-
-
-def counts_of_blocks(of_poses: CholeskyFactor, *widths: int) -> FactorCounts:
     """Most non-zeros that factors in the order `row_order(poses, *widths)` can have.
 
-    The factor is one of a matrix with one entry for each of the blocks, in that order of the poses;
-    it is taken apart (`CholeskyFactor.take_apart`). All entries of every block that fills in are
-    counted. CHOLMOD stores further zeros to have wider supernodes; they are exact and add no
-    rounding.
+    The analysis is that of a matrix with one entry for each of the blocks, in that order of the
+    poses. All entries of every block that fills in are counted. CHOLMOD stores further zeros to
+    have wider supernodes; they are exact and add no rounding.
     """
     width = sum(widths)
-    L, order = of_poses.take_apart()
-    counts = FactorCounts.of(L.indptr, L.indices, order)
+    counts = poses.counts
     # A block that fills in has `width` rows and columns, all of which count as non-zeros.
     return FactorCounts(
         in_column=np.repeat(width * counts.in_column, width),
         in_row=np.repeat(width * counts.in_row, width),
         widest=np.repeat(width * counts.widest, width),
-        order=row_order(order, *widths),
+        order=row_order(counts.order, *widths),
     )
 
 

@@ -25,7 +25,7 @@ from pgo_models.problem.cholesky import (
 )
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.incidence import Incidence
-from pgo_models.problem.ordering import counts_of_blocks, pose_order, row_order
+from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.right_costs import RightCosts
 from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.problem.weighting import (
@@ -313,8 +313,7 @@ class PGOProblem(ReadOnly):
         if self.convex_part is not self:
             return self.convex_part.analysis
         order = row_order(self.pose_order, 1, self.d)
-        # The factor is hardly used any more where the counts are asked for, in a proof.
-        counts = partial(counts_of_blocks, self._translation_factor, 1, self.d)
+        counts = partial(most_counts, self._pose_analysis, 1, self.d)
         return analyze(self.M, self.backend, order, counts)
 
     @cached_property

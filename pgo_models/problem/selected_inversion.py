@@ -23,7 +23,7 @@ from pgo_models.graphs.pose_graph import IntArray
 def selected_inverse(L: csc_array) -> Array:
     """Values of (L L^T)^-1 at the stored entries of L, in their order.
 
-    L is as of `CholeskyFactor.take_apart`: lower triangular, rows sorted, all of its pattern
+    L is as of `SymbolicCholesky.lower_factor`: lower triangular, rows sorted, all of its pattern
     stored, zeros included.
     """
     data = L.data

@@ -14,9 +14,7 @@ import numpy as np
 from pgo_models.certificates import lower_bound as central
 from pgo_models.certificates.definiteness import (
     FIRST_MARGIN,
-    LEAST_MARGIN,
     ROUNDING_MULTIPLE,
-    SHRINK,
     is_in_range,
 )
 from pgo_models.certificates.handedness import HandednessTerms
@@ -33,6 +31,13 @@ from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.robots.records import ProofAnswer, ProofOrder, ProofStep, TermsAnswer
 from solvers.network.counted_pool import Count
+
+# Robots do not know the softest energy of S, which a margin has to take little of
+# (`definiteness.prove_stored`). So margins are tried from the first one on, each a share of the one
+# before: the loss to G_r is within that share of the least. The last one is below the rounding of
+# any matrix with a few non-zeros in a row.
+_SHRINK = 1.0 / 32.0
+_LEAST_MARGIN = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,12 +163,12 @@ def prove_grounded(
     position = driver.grounded_position
     X = _grounded_point(driver)
     proof = None
-    share = FIRST_MARGIN
+    margin = FIRST_MARGIN
     while proof is None:
-        if share < LEAST_MARGIN:
+        if margin < _LEAST_MARGIN:
             return None
-        proof = eliminate_S(driver, position, eta, share, X, less_terms)
-        share *= SHRINK
+        proof = eliminate_S(driver, position, eta, margin, X, less_terms)
+        margin *= _SHRINK
     free = np.ones(len(X), dtype=bool)
     free[driver.rows_left_out(position)] = False
     steps = [answer.step for answer in proof.answers if answer.step is not None]

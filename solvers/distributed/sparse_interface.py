@@ -22,7 +22,6 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
     CholeskyFactor,
-    NonZeros,
     SymbolicCholesky,
     analyze,
 )
@@ -80,8 +79,7 @@ class CoverPattern:
     @cached_property
     def counts(self) -> IntArray:
         """Poses in every column of the factor, (g,)."""
-        L, _ = self.analysis.factorize(self.analysis.identity()).take_apart()
-        return np.diff(L.indptr).astype(np.int64)
+        return self.analysis.counts.in_row.astype(np.int64)
 
     def flops(self, width: int) -> float:
         """Operations of a factorisation with so many unknowns per pose."""
@@ -170,7 +168,7 @@ class SparseInterface(Interface):
         """
         num_terms = float(len(sizes) + len(own))
         of_sums = gamma(num_terms + 8.0)
-        of_factor = self.unknowns.analysis.backward_error(NonZeros.MOST)
+        of_factor = self.unknowns.analysis.expected_error()
         sums = self._row_sums(sizes, own, diagonal)
         error: Array = of_sums * sums + of_factor / (1.0 - of_sums) * diagonal
         return OUTWARD * error

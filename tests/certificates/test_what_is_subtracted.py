@@ -12,7 +12,7 @@ from robots import contiguous, driver_at
 
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.certificate import certify_at, judge
-from pgo_models.certificates.definiteness import DefiniteProof, prove_definite, shifted_certificate
+from pgo_models.certificates.definiteness import FIRST_MARGIN, prove_definite, shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_bound
@@ -20,8 +20,7 @@ from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.errors import ProofError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, random_rotations
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
@@ -51,76 +50,6 @@ def test_a_shift_costs_what_rotations_half_a_turn_apart_cost(share: float) -> No
     assert problem.objective(opposite) == pytest.approx(8.0 * kappa)
     bound = prove_bound(problem, Lambda, share * kappa, opposite)
     assert bound is None or bound == 0.0
-
-
-class FactorOfKnownError(CholeskyFactor):
-    """A factor whose backward error is given."""
-
-    def __init__(self, error: Array) -> None:
-        self.error = error
-
-    def solve(self, right_hand_side: Array) -> Array:
-        return right_hand_side
-
-    def half_solve(self, right_hand_side: Array) -> Array:
-        return right_hand_side
-
-    def row_order(self) -> IntArray:
-        return np.arange(len(self.error))
-
-    def backward_error(self, beside: Array | int = 0) -> Array:
-        return self.error
-
-    def take_apart(self) -> tuple[object, np.ndarray]:  # type: ignore[override]
-        raise NotImplementedError
-
-    def most_in_row(self, beside: Array | int = 0) -> float:
-        return 1.0
-
-
-@pytest.mark.parametrize("backend", CholeskyBackend)
-def test_slack_and_solve_may_be_asked_for_in_either_order(backend: CholeskyBackend) -> None:
-    graph = varied_graph(0, 8, 3)
-    product = np.random.default_rng(0).standard_normal((32, 3))
-    steps = []
-    slacks = []
-    for is_slack_first in (True, False):
-        problem = PGOProblem(graph, backend)
-        proof = prove_definite(problem, np.zeros((8, 3, 3)), 1.0, np.zeros(1, dtype=np.int64))
-        assert proof is not None
-        if is_slack_first:
-            slacks.append(proof.slack())
-        steps.append(proof.solve(product))
-        slacks.append(proof.slack())
-        np.testing.assert_array_equal(proof.solve(product), steps[-1])
-    np.testing.assert_array_equal(*steps)
-    for other in slacks[1:]:
-        np.testing.assert_array_equal(other, slacks[0])
-
-
-@pytest.mark.parametrize("is_known", [False, True])
-@pytest.mark.parametrize(
-    ("of_entries", "of_factor"), [(0.3, 0.1), (0.1, 0.3), (0.6, 0.0), (0.0, 0.6), (1.5, 1.5)]
-)
-def test_slack_is_the_margin_less_both_errors_or_none(
-    of_entries: float, of_factor: float, is_known: bool
-) -> None:
-    problem = PGOProblem(varied_graph(0, 5, 3))
-    margin = np.full(problem.side, 1e-9)
-    diagonal = np.linspace(1.0, 2.0, problem.side)
-    entries = of_entries * margin
-    error = of_factor * margin
-    factor = FactorOfKnownError(np.full(problem.side, math.nan) if is_known else error)
-    proof = DefiniteProof(
-        problem.M, factor, diagonal, margin, entries, False, error if is_known else None
-    )
-    slack = proof.slack()
-    if of_entries + of_factor > 0.5:
-        assert slack is None
-    else:
-        assert slack is not None
-        assert (slack > 0.0).all()
-        assert (slack <= (margin - entries - error) * diagonal).all()
 
 
 @given(seed=SEEDS, d=DIMENSIONS)
@@ -153,12 +82,10 @@ def test_a_proof_counts_the_rounding_of_the_entries(seed: int, d: int) -> None:
     fixed = lower_bound.pose_rows(0, 6, d)
     proof = prove_definite(problem, Lambda, 0.0, fixed)
     assume(proof is not None)
-    slack = proof.slack()
-    assume(slack is not None)
     _, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     entries = matrix_errors(problem, diagonal)
     assert (entries > 0.0).all()
-    assert (slack <= (proof.margin - entries) * proof.diagonal).all()
+    assert (proof.slack <= (FIRST_MARGIN - entries) * diagonal).all()
 
 
 @pytest.mark.parametrize("d", [2, 3])

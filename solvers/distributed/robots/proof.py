@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.certificates.definiteness import ROUNDING_MULTIPLE, is_in_range, shifted_certificate
+from pgo_models.certificates.definiteness import (
+    ATTEMPTS,
+    ROUNDING_MULTIPLE,
+    is_in_range,
+    shifted_certificate,
+)
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import quadratic_loss, squared_distances
 from pgo_models.certificates.rounding_errors import (
@@ -22,13 +27,11 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.cholesky import CholeskyBackend, NonZeros
+from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
 from solvers.soc.subgraph import Part
-
-_ATTEMPTS = 3  # the error of a factor is known when it is there, and hardly changes with the shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +166,7 @@ def verify_interior(
     data[problem.diagonal_positions[cut.boundary]] -= OUTWARD * of_separators
     positions = problem.diagonal_positions[inside]
     error = entries + _expected_error(cut)
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
         shift = np.maximum(share, ROUNDING_MULTIPLE * error)
         data[positions] = S.data[positions] - shift * diagonal[inside]
         matrix = problem.with_pattern_of_M(data.copy())
@@ -195,5 +198,4 @@ def _expected_error(cut: Cut) -> Array:
     """Return the share of the diagonal that factoring may take, 0 where it is not known before."""
     if cut.analysis is None:
         return np.zeros(len(cut.interior))
-    expected = cut.analysis.backward_error(NonZeros.COUNTED, len(cut.boundary))
-    return np.where(np.isfinite(expected), expected, 0.0)
+    return cut.analysis.expected_error(len(cut.boundary))

@@ -30,16 +30,14 @@ from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
     CholeskyFactor,
-    NonZeros,
     SymbolicCholesky,
     _Cholmod,
     _CholmodFactor,
     _SuperLUFactor,
     analyze,
 )
-from pgo_models.problem.floating_point import FactorCounts, gamma
 from pgo_models.problem.matrices import columns_of
-from pgo_models.problem.ordering import analyze_poses, most_counts, row_order
+from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import TreeFactor
@@ -71,7 +69,7 @@ def square_of(factor: CholeskyFactor, analysis: SymbolicCholesky) -> Exact:
     else:
         assert isinstance(factor, _CholmodFactor)
         assert isinstance(analysis, _Cholmod)
-        order = analysis.counts().order
+        order = analysis.counts.order
         columns = cholmod.getfactor(factor._numeric)
         L = exact(np.array(cvxopt.matrix(columns)))
         product = L @ L.T
@@ -109,77 +107,25 @@ def test_a_factor_is_within_its_backward_error(
     assert largest_share(difference - np.diag(exact(epsilon * A.diagonal())), A.diagonal()) < 0.0
 
 
-def test_counts_of_a_pattern_do_not_depend_on_numbers() -> None:
-    """CVXOPT shows the non-zeros of a numeric factor: zeros in it must count, too."""
-    M = PGOProblem(road(0, 300, 5.0, 3)).M
-    found = []
-    for values in (M.data, np.zeros(M.nnz)):
-        analysis = analyze(M, CholeskyBackend.CHOLMOD)
-        assert isinstance(analysis, _Cholmod)
-        matrix = csc_array((values.copy(), M.indices, M.indptr), shape=M.shape)
-        matrix.setdiag(1.0 + 2.0 * M.diagonal())
-        analysis.factorize(matrix)  # and let go, so that it is the one that is looked into
-        found.append(analysis.counts())
-    untouched = analyze(M, CholeskyBackend.CHOLMOD)
-    assert isinstance(untouched, _Cholmod)
-    for counts in found:
-        np.testing.assert_array_equal(counts.in_column, untouched.counts().in_column)
-        np.testing.assert_array_equal(counts.in_row, untouched.counts().in_row)
-        np.testing.assert_array_equal(counts.order, untouched.counts().order)
-    counted = untouched.backward_error(NonZeros.COUNTED)
-    np.testing.assert_array_equal(counted, untouched.counts().error(0))
-    of_full_factor = untouched.backward_error(NonZeros.ALL)
-    assert of_full_factor.min() >= counted.max() > 0
-    side = float(M.shape[0])
-    assert of_full_factor.min() >= side * gamma(side)
-
-
 @BACKENDS
-def test_what_the_rounding_of_a_factor_is_not_known_from_says_inf(backend: CholeskyBackend) -> None:
+def test_what_is_expected_of_a_factor_s_rounding_is_known_from_the_pattern_or_zero(
+    backend: CholeskyBackend,
+) -> None:
     M = stored_matrix(well_conditioned(0, 4, 2))
     analysis = analyze(M, backend)
-    for non_zeros in (NonZeros.MOST, NonZeros.COUNTED):
-        assert np.isinf(analysis.backward_error(non_zeros)).all()
-    factor = analysis.factorize(M)
-    epsilon = factor.backward_error()
-    assert factor.is_counted
-    assert np.isfinite(epsilon).all()
-    counted = analysis.backward_error(NonZeros.COUNTED)
+    epsilon = analysis.factorize(M).backward_error()
+    expected = analysis.expected_error()
+    assert (epsilon > 0.0).all()
     if backend is CholeskyBackend.CHOLMOD:
-        np.testing.assert_array_equal(counted, epsilon)
+        np.testing.assert_array_equal(expected, epsilon)
     else:
-        assert np.isinf(counted).all()
+        assert not expected.any()
 
 
-def test_the_most_non_zeros_are_found_once_and_bound_those_that_are_counted() -> None:
+def test_the_most_non_zeros_bound_those_that_are_counted() -> None:
     problem = PGOProblem(road(0, 40, 5.0, 3))
-    calls = []
-
-    def most() -> FactorCounts:
-        calls.append(1)
-        return most_counts(analyze_poses(problem.graph, problem.pose_order), 1, 3)
-
-    order = row_order(problem.pose_order, 1, 3)
-    analysis = analyze(problem.M, CholeskyBackend.CHOLMOD, order, most)
-    bound = analysis.backward_error(NonZeros.MOST)
-    np.testing.assert_array_equal(analysis.backward_error(NonZeros.MOST), bound)
-    assert len(calls) == 1
-    matrix = problem.M.copy()
-    matrix.setdiag(1.0 + 2.0 * matrix.diagonal())
-    assert (bound >= analysis.factorize(matrix).backward_error()).all()
-
-
-def test_a_factor_is_counted_in_place_and_solves_as_before() -> None:
-    M = stored_matrix(well_conditioned(1, 4, 2))
-    analysis = analyze(M, CholeskyBackend.CHOLMOD)
-    factor = analysis.factorize(M)
-    b = np.arange(float(M.shape[0]))
-    x = factor.solve(b)
-    assert not factor.is_counted
-    factor.backward_error()
-    assert isinstance(factor, _CholmodFactor)
-    assert factor.is_given_up
-    np.testing.assert_array_equal(factor.solve(b), x)
+    counted = analyze(problem.M, CholeskyBackend.CHOLMOD, row_order(problem.pose_order, 1, 3))
+    assert (problem.analysis.expected_error() >= counted.expected_error()).all()
 
 
 def bordered(seed: int, coupling: float) -> tuple[Array, Cut]:
@@ -402,7 +348,10 @@ def test_the_drivers_sparse_factor_is_within_its_rounding(cancelling: float) -> 
         diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
         sizes = [row_sums(C, diagonal[at]) for C, at in zip(parts, space.columns, strict=True)]
         lost = space.rounding(sizes, [(columns, values)], diagonal)
-        L, order = space.factorize(contributions, [(columns, values)]).factor.take_apart()
+        factor = space.factorize(contributions, [(columns, values)]).factor
+        assert isinstance(factor, _CholmodFactor)
+        order = factor.row_order()
+        L = csc_array(np.array(cvxopt.matrix(cholmod.getfactor(factor._numeric))))
         product = np.full((space.side, space.side), MP.mpf(0), dtype=object)
         exact_L = exact(L.toarray())
         product[np.ix_(order, order)] = exact_L @ exact_L.T
@@ -448,7 +397,7 @@ def test_a_long_column_takes_as_many_roundings_as_it_has_entries(backend: Choles
     else:
         assert isinstance(factor, _CholmodFactor)
         assert isinstance(analysis, _Cholmod)
-        row = int(np.flatnonzero(analysis.counts().order == side - 1)[0])
+        row = int(np.flatnonzero(analysis.counts.order == side - 1)[0])
         squares = exact(np.array(cvxopt.matrix(cholmod.getfactor(factor._numeric)))[row]) ** 2
     deviation = abs(total(squares) - exact(corner))
     allowed = factor.backward_error()[side - 1] * corner
