@@ -136,6 +136,22 @@ def landmarks(rng: np.random.Generator) -> PoseGraph:
     return graph
 
 
+def coupled_points(rng: np.random.Generator) -> PoseGraph:
+    """Loud coupled matrices beside landmarks or positions: most bounds are far from the cost."""
+    n = int(rng.integers(3, 7))
+    d = (2, 2, 3)[int(rng.integers(3))]
+    graph = varied_graph(seed_of(rng), n, d, LOUD_NOISE)
+    decades = rng.uniform(0.3, 1.0)
+    k = d + tangent_dimension(d)
+    graph = replace(graph, information=spread_matrices(rng, graph.num_edges, k, decades))
+    chosen = rng.permutation(n)[:3]
+    points = 3.0 * rng.standard_normal((len(chosen), d))
+    tau = float(rng.uniform(0.1, 3.0))
+    if rng.integers(2):
+        return graph.with_landmark(chosen, points, tau=tau)
+    return graph.with_position_prior(chosen, points, tau=tau)
+
+
 def handed(rng: np.random.Generator) -> PoseGraph:
     """Rotations so noisy that the relaxation is loose without handedness terms."""
     scene = (SweptScene.CIRCLE, SweptScene.GRID)[int(rng.integers(2))]
@@ -198,6 +214,7 @@ GRAPHS: tuple[Draw, ...] = (
     priors,
     positions,
     landmarks,
+    coupled_points,
     handed,
     few_and_coupled,
     noise_free,

@@ -17,8 +17,8 @@ from pgo_models.figures import scaled_below
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.arrays import block_norms, inner_products
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information, middle_pose
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.problem.excess import CoupledExcess
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
@@ -108,7 +108,6 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     transposed = np.swapaxes(proven.Lambda, 1, 2)
     Lambda = 0.5 * (proven.Lambda + transposed)
     upper_triangle = np.triu_indices(d)
-    has_multipliers = _has_form_of_verifier(problem)
     rows: list[dict[str, object]] = []
     for pose in range(graph.num_poses):
         row: dict[str, object] = {"id": _name(graph, pose)}
@@ -116,8 +115,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
             row["t"] = poses.t[pose].tolist()
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
-            if has_multipliers:
-                row["Lambda"] = Lambda[pose][upper_triangle].tolist()
+            row["Lambda"] = Lambda[pose][upper_triangle].tolist()
         rows.append(row)
     eta = None if math.isnan(certificate.eta) else certificate.eta
     record: dict[str, object] = {
@@ -149,21 +147,38 @@ def _entries_of_some_proofs(
     return entries
 
 
-def _terms_of_poses(graph: PoseGraph, terms: HandednessTerms | None) -> HandednessTerms | None:
-    """The terms of pairs of poses with rotations, None without any.
+def _holders(graph: PoseGraph) -> IntArray:
+    """Every pose itself, (n,), and for a landmark the pose that its rotation is held by.
 
-    Robots, who do not tell landmarks from poses, may have terms of landmarks, too. Those are true,
-    as a landmark has a rotation in the solver, but a proof has none.
+    A proof has no rotations of landmarks. In the solver a landmark has one, in the term
+    kappa ||R_l - R_i||^2 alone, which is zero at every optimum. With R_l = R_i the proof of the
+    solver is one without R_l, whose multipliers and terms are those of pose i.
+    """
+    holders = np.arange(graph.num_poses)
+    holds = np.isin(graph.j, graph.landmarks) & (graph.kappa > 0.0)
+    holders[graph.j[holds]] = graph.i[holds]
+    return holders
+
+
+def _terms_of_poses(graph: PoseGraph, terms: HandednessTerms | None) -> HandednessTerms | None:
+    """The terms as those of pairs of poses with rotations, None without any.
+
+    Robots, who do not tell landmarks from poses, may have terms of landmarks, too (`_holders`).
     """
     if terms is None:
         return None
-    ends = np.stack([terms.i, terms.j])
-    is_kept = ~np.isin(ends, graph.landmarks).any(axis=0)
+    i, j = _holders(graph)[np.stack([terms.i, terms.j])]
+    is_kept = i != j
     if not is_kept.any():
         return None
-    return replace(
-        terms, i=terms.i[is_kept], j=terms.j[is_kept], T=terms.T[is_kept], P=terms.P[is_kept]
-    )
+    return HandednessTerms(i[is_kept], j[is_kept], terms.T[is_kept], terms.P[is_kept])
+
+
+def _share_edges(graph: PoseGraph, terms: HandednessTerms) -> bool:
+    """Whether every term is of two poses that share an edge."""
+    pairs = set(zip(graph.i.tolist(), graph.j.tolist(), strict=True))
+    of_terms = zip(terms.i.tolist(), terms.j.tolist(), strict=True)
+    return all((i, j) in pairs or (j, i) in pairs for i, j in of_terms)
 
 
 def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, object]]:
@@ -190,7 +205,6 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
     J_ss = cost.excess.J_ss if isinstance(cost.excess, CoupledExcess) else None
     if J_ss is not None and graph.d == 3:
         J_ss = np.swapaxes(graph.R_ij, 1, 2) @ J_ss @ graph.R_ij
-    is_point = _measures_position(graph)
     rows: list[dict[str, object]] = []
     for e in range(graph.num_edges):
         row: dict[str, object] = {
@@ -198,28 +212,10 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
             "j": _name(graph, int(graph.j[e])),
             "tau": float(cost.tau[e]),
         }
-        if J_ss is not None and not is_point[e]:
+        if J_ss is not None and J_ss[e].any():
             row["J_ss"] = J_ss[e][upper_triangle].tolist()
         rows.append(row)
     return rows
-
-
-def _measures_position(graph: PoseGraph) -> BoolArray:
-    """Whether an edge measures a position alone, (m,)."""
-    is_position_prior = graph.is_prior & (graph.kappa == 0.0)
-    return np.asarray(np.isin(graph.j, graph.landmarks) | is_position_prior)
-
-
-def _has_form_of_verifier(problem: PGOProblem) -> bool:
-    """Whether the verifier has the same quadratic form, to which the multipliers belong.
-
-    In a coupled chi2 the solver gives edges that measure a position alone a small J_ss, too, and
-    the verifier none. The multipliers are then left to the verifier, which takes those of its own
-    form at the poses.
-    """
-    cost = problem.weights
-    is_coupled = isinstance(cost, ExcessCost) and isinstance(cost.excess, CoupledExcess)
-    return not (is_coupled and _measures_position(problem.graph).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,31 +228,43 @@ class _Proven:
 
 
 def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
-    """What proves the bound of a certificate.
+    """Poses and multipliers that prove the bound of a certificate, or nearly so.
 
-    The poses have their own translations, or the best ones. For given multipliers the bound of a
-    quadratic cost does not depend on them. That of chi2 does, as the tangent is taken there: where
-    M hardly holds a direction that chi2 holds, a tangent elsewhere proves much less. So the best of
-    a few is chosen.
+    The bound is proven once more from what is written; a SettingError where that fails. For given
+    multipliers the bound of a quadratic cost does not depend on the translations, and the best ones
+    are written. That of chi2 does, as the tangent is taken there: where M hardly holds a direction
+    that chi2 holds, a tangent elsewhere proves much less. So the best of a few is chosen.
     """
     best = problem.at_best_translations(certificate.poses)
-    of_certificate = _Proven(best, certificate.Lambda, certificate.bound.value)
-    if problem.is_quadratic or certificate.eta != 0.0:
-        return of_certificate
+    landmarks = problem.graph.landmarks
+    Lambda_of_poses = certificate.Lambda.copy()
+    Lambda_of_poses[landmarks] = 0.0
+    holders = _holders(problem.graph)[landmarks]
+    np.add.at(Lambda_of_poses, holders, certificate.Lambda[landmarks])
+    points = [(best, Lambda_of_poses)]
     terms = _terms_of_poses(problem.graph, certificate.bound.terms)
-    points = [(poses, multipliers(problem, poses)) for poses in (best, certificate.poses)]
-    if _has_form_of_verifier(problem):
-        points.append((best, certificate.Lambda))
+    if math.isnan(certificate.eta):
+        return _Proven(best, Lambda_of_poses, 0.0)
+    if terms is not None and not _share_edges(problem.graph, terms):
+        # M has no blocks for them. The bound is proven with the landmarks between the poses.
+        return _Proven(best, Lambda_of_poses, certificate.bound.value)
+    if not problem.is_quadratic:
+        points.append((certificate.poses, Lambda_of_poses))
+        points += [(poses, multipliers(problem, poses)) for poses in (best, certificate.poses)]
     candidates = []
     for poses, Lambda in points:
         tangent = problem.tangent_at(poses)
         if terms is not None:
             tangent = terms.taken_off(tangent)
-        bound = prove_at(tangent, Lambda, poses, certificate.bound.is_complex)
+        is_complex = certificate.bound.is_complex
+        bound = prove_at(tangent, Lambda, poses, is_complex, certificate.eta)
         if bound is not None:
             lost = 0.0 if terms is None else terms.loss()
             candidates.append(_Proven(poses, Lambda, bound.value - lost))
-    return max(candidates, key=lambda proven: proven.bound, default=of_certificate)
+    if not candidates:
+        what = "the bound could not be proven from poses and multipliers as they would be written"
+        raise SettingError(f"no proof to write: {what}; leave out --proof")
+    return max(candidates, key=lambda proven: proven.bound)
 
 
 def _claimed_bound(

@@ -195,18 +195,26 @@ def _uncoupled_cost(graph: PoseGraph, blocks: _Information) -> ExcessCost:
 
 
 def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) -> ExcessCost:
-    """chi2 with the excess u^T J u + tr(H J_ss H), u = (r, s)."""
+    """chi2 with the excess u^T J u + tr(H J_ss H), u = (r, s).
+
+    An edge without coupling has J_ss = 0 and the excess r^T (I_tt - tau I) r of `_uncoupled_cost`.
+    """
     d = graph.d
     p = tangent_dimension(d)
     tau = _coupled_tau(information, blocks)
     J_tt = blocks.I_tt - tau[:, None, None] * np.eye(d)
     margin_t = np.repeat(blocks.margin[:, None], d, axis=1)
-    margin_R = _rotation_margin(blocks)
+    is_coupled = blocks.is_coupled
+    # Half of what J_ss exceeds the Schur complement by, a small share of the least eigenvalue of
+    # I_rr. Blocks of zeros have no rounding that it would have to make up for.
+    margin_R = _MARGIN * blocks.smallest_R + _ROUNDED * blocks.trace_R
+    margin_R[~is_coupled] = 1.0
     # J_ss is above the Schur complement I_tr^T J_tt^-1 I_tr, so that J is positive definite.
     schur = eliminated_products(J_tt, blocks.I_tr)
     share = 0.5 + 4.0 * margin_t[:, 0] / blocks.smallest + _MARGIN
     J_ss = share[:, None, None] * (schur + np.swapaxes(schur, 1, 2))
     J_ss = J_ss + 2.0 * margin_R[:, None, None] * np.eye(p)
+    J_ss[~is_coupled] = 0.0
     upper = np.concatenate([J_tt, blocks.I_tr], axis=2)
     lower = np.concatenate([np.swapaxes(blocks.I_tr, 1, 2), J_ss], axis=2)
     in_frame_j = np.concatenate([upper, lower], axis=1)
@@ -216,24 +224,13 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     to_frame_i[:, d:, d:] = graph.R_ij if d == 3 else 1.0
     J = to_frame_i @ in_frame_j @ np.swapaxes(to_frame_i, 1, 2)
     margin = np.concatenate([margin_t, np.repeat(margin_R[:, None], p, axis=1)], axis=1)
-    _check_excess(graph, tau, J, margin)
+    _check_excess(graph, tau, J[:, :d, :d], margin_t)
+    least = margin[:, :, None] * np.eye(d + p)
+    _check(graph, ~is_coupled | are_definite(J - least, 0.0))
     trace_of_sizes = blocks.trace + d * tau
     size = _block_sizes(d, trace_of_sizes, np.einsum("mkk->m", J_ss))
-    least = 0.5 * margin[:, [0, -1]]
-    excess = CoupledExcess(graph.R_ij, J, size, least, J[:, d:, d:])
+    excess = CoupledExcess(graph.R_ij, J, size, 0.5 * margin[:, [0, -1]], J[:, d:, d:])
     return ExcessCost(tau, _rotation_weights(blocks.I_rr, J_ss), excess)
-
-
-def _rotation_margin(blocks: _Information) -> Array:
-    """Half of what J_ss exceeds the Schur complement by, (m,).
-
-    It is a small share of the smallest eigenvalue of I_rr. Where I_rr is zero, the median over the
-    other edges takes the place of that eigenvalue, and W' is that of -J_ss.
-    """
-    is_zero = blocks.trace_R == 0.0
-    median = np.median(blocks.smallest_R[~is_zero])
-    smallest_R = np.where(is_zero, median, blocks.smallest_R)
-    return np.asarray(_MARGIN * smallest_R + _ROUNDED * blocks.trace_R)
 
 
 def _coupled_tau(information: Array, blocks: _Information) -> Array:

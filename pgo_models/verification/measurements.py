@@ -6,7 +6,10 @@ information is in the frame measured, of a position prior in the world's, of a l
 pose's.
 """
 
+import gzip
+import io
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -89,6 +92,7 @@ WRITTEN_FILE = "verify the proof of the file that pgo solve --out one.g2o writes
 WORLD = 2**63  # the pose that priors are measured from; ids have 64 bits, with a sign
 NUMBER = re.compile(r"([+-]?)(\d*)\.?(\d*)(?:[eE]([+-]?\d{1,3}))?", re.ASCII)
 LONGEST_WORD = 1000
+GZIP = b"\x1f\x8b"  # first bytes of a file that is compressed by gzip
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,12 +359,18 @@ def exact_number(path: Path, line: int, word: str) -> fmpq:
 
 
 def read_text(path: Path) -> str:
-    """Text of a UTF-8 file; a FileFormatError where there is none."""
+    """Text of a UTF-8 file, which gzip may have compressed; else a FileFormatError."""
     if path.is_dir():
         problem = "a folder; verify the file that pgo solve --out one.g2o writes of it"
         raise FileFormatError(path, None, problem)
     try:
-        return path.read_text(encoding="utf-8-sig")
+        content = path.read_bytes()
+        if content.startswith(GZIP):
+            content = gzip.decompress(content)
+        return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig").read()
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        problem = "gzip cannot unpack it, as it is cut off or damaged; compress it again"
+        raise FileFormatError(path, None, problem) from error
     except OSError as error:
         problem = f"cannot be read: {error.strerror}; give a readable file"
         raise FileFormatError(path, None, problem) from error

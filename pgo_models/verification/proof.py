@@ -138,9 +138,9 @@ def read_splits(path: Path, record: dict[str, Any], d: int) -> dict[tuple[int, i
     for row in rows:
         i = name_of(path, entry(path, row, "i"))
         j = name_of(path, entry(path, row, "j"))
-        J_ss = row.get("J_ss", [])
-        if J_ss:
-            J_ss = numbers(path, J_ss, "J_ss of a split", size_of_triangle)
+        J_ss: list[float] = []
+        if "J_ss" in row:
+            J_ss = numbers(path, row["J_ss"], "J_ss of a split", size_of_triangle)
         split = Split(number_entry(path, row, "tau"), tuple(J_ss))
         splits.setdefault((i, j), []).append(split)
     return splits

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from proofs import PLANE, SPACE, edited, proof_of, written
 import solvers
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.proof_file import proof_json, save_proof
-from pgo_models.errors import SettingError
+from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.precisions import RotationWeight
@@ -28,6 +30,7 @@ from solvers.given_poses import certify
 
 Call = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]
+CASES = Path(__file__).parent / "cases"
 
 
 # Input that is no proof, or no graph.
@@ -171,6 +174,52 @@ def test_unknown_tags_are_left_out_when_asked(tmp_path: Path, pgo_command: Call)
     assert pgo_command("solve", path, "--skip-unknown", "--proof", proof)[0] == 0
     assert pgo_command("verify", path, proof)[0] == 1
     assert pgo_command("verify", path, proof, "--skip-unknown")[0] == 0
+
+
+def places_of(record: object) -> Iterator[tuple[Any, Any]]:
+    """Every entry of a proof, as what holds it and where; of lists the first one."""
+    if isinstance(record, dict):
+        for name, value in record.items():
+            yield record, name
+            yield from places_of(value)
+    elif isinstance(record, list) and record:
+        yield record, 0
+        yield from places_of(record[0])
+
+
+@pytest.mark.filterwarnings("ignore::pgo_models.errors.GraphWarning")
+def test_any_entry_that_is_something_else_is_one_line_or_a_verdict(tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_bytes((CASES / "coupled_landmark.g2o").read_bytes())
+    _, proof = proof_of(path, Weighting.INFORMATION)
+    text = proof.read_text()
+    assert {"splits", "complex"} <= json.loads(text).keys()
+    num_refused = 0
+    for place in range(len(list(places_of(json.loads(text))))):
+        for value in (None, {}, -1):
+            record = json.loads(text)
+            holder, name = list(places_of(record))[place]
+            holder[name] = value
+            proof.write_text(json.dumps(record))
+            try:
+                verify_proof(path, proof)
+            except FileFormatError as error:
+                num_refused += "\n" not in str(error)
+    assert num_refused > 50
+
+
+def test_files_compressed_by_gzip_are_read(tmp_path: Path, pgo_command: Call) -> None:
+    path = written(tmp_path, varied_graph(0, 4, 3))
+    _, proof = proof_of(path)
+    compressed = []
+    for plain in (path, proof):
+        compressed.append(plain.with_name(f"{plain.name}.gz"))
+        compressed[-1].write_bytes(gzip.compress(plain.read_bytes()))
+    assert verify_proof(*compressed).bound == verify_proof(path, proof).bound
+    compressed[0].write_bytes(compressed[0].read_bytes()[:-20])
+    code, out, err = pgo_command("verify", *compressed)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "gzip cannot unpack it" in err
 
 
 # What is written, and by whom.

@@ -334,6 +334,23 @@ def test_bounds_in_complex_numbers_are_those_of_balls(
     assert found.bound <= solution.objective * (1 + 1e-12) + certificate.rounding_level
 
 
+@pytest.mark.parametrize("eta", [0.0, 1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("is_complex", [False, True])
+def test_no_shift_proves_more_than_the_least_cost_from_poses_that_are_not_best(
+    eta: float, is_complex: bool, tmp_path: Path
+) -> None:
+    path = written(tmp_path, informed(3, 5, 2, True, 0.5, NoiseModel(0.3, 0.8)))
+    certificate, proof = proof_of(path, Weighting.ISOTROPIC)
+    record = json.loads(proof.read_text())
+    for k, pose in enumerate(record["poses"]):
+        pose["R"] = (np.array(pose["R"]) @ exp_map(np.array([0.3 * k]))).tolist()
+    changed = edited(proof, poses=record["poses"], eta=eta, complex=is_complex)
+    found = verify_proof(path, changed)
+    assert found.failure  # of the cost that is claimed for the poses, if not before
+    if found.bound is not None:
+        assert found.bound.lower() <= certificate.poses_objective
+
+
 # What is changed in a proof or a file is either harmless or noticed.
 
 
