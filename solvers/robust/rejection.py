@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 import enum
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy  # and scipy.special when it is used
 
 from pgo_models.certificates.certificate import Verdict
 from pgo_models.certificates.fit import Fit
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.summaries import Summarised
 from solvers.robust.bridges import unchecked_bridges
 from solvers.robust.outlier_record import OutlierProof
-from solvers.robust.slips import Slip
+from solvers.robust.rivals import Rival
 
 # Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
 # half their threshold.
 NEAR = 4.0
 # Edges that are named in a row of the summary, at most.
 _MAX_NAMED = 5
-# Share of the closures kept on which the answer may be in doubt without saying so. An attempt is a
-# rival unless it is less likely than the answer by this factor, too: a truncated cost is minus
-# twice a log-likelihood, so that an attempt that costs c more is less likely by exp(-c / 2).
+# Share of the closures kept on which the answer may be in doubt without saying so.
 _TOLERATED_SHARE = 0.05
 
 
@@ -95,8 +90,8 @@ class Rejection(Summarised):
     by_chance : float
         Number of wrong closures that are expected to fit the map by chance
         (`ClusterSearch.expected_by_chance`).
-    slip : Slip, optional
-        Known edge without which the truncated cost is lower (`slipped_step`).
+    rival : Rival, optional
+        Another map that explains the measurements about as well (`rival_of`).
     noise : float
         How many times their claim the squared errors are, where they are larger on all edges alike.
     places : tuple of str
@@ -119,7 +114,7 @@ class Rejection(Summarised):
     verdict: Verdict
     is_misfit: bool
     by_chance: float = 0.0
-    slip: Slip | None = None
+    rival: Rival | None = None
     noise: float = 1.0
     places: tuple[str, ...] = ()
     fit: Fit = Fit.NONE
@@ -186,25 +181,19 @@ class Rejection(Summarised):
             doubts.append(text_of_bridges(num_bridges))
         if self.is_misfit:
             doubts.append("the edges kept do not fit together")
-        if self.slip is not None:
-            edge = self._label(self.slip.edge)
-            fit = f"{self.slip.others} more edges fit" if self.slip.others else "the others fit"
-            doubts.append(f"{edge} is taken for right, and without it {fit}")
+        if self.rival is not None:
+            doubts.append(self._text_of_rival(self.rival))
         num_fixes = int(self._suspected_fixes.sum())
         num_lost = int((self._suspected_fixes & self.rejected).sum())
         if 2 * num_lost > num_fixes:
             doubts.append(f"{num_lost} of {num_fixes} fixes are rejected")
-        if self.by_chance > _TOLERATED_SHARE * self.num_closures_kept:
+        if self.by_chance > self._num_tolerated:
             number = rounded_up(self.by_chance, 2)
             doubts.append(f"up to {number} wrong closures are expected to fit this map by chance")
         num_near = self.num_rejected_near
         if num_near > self._num_tolerated:
             among = "are expected among the edges rejected near their thresholds"
             doubts.append(f"about {num_near:.0f} right ones {among}")
-        rival = self._rival
-        if rival is not None:
-            kept_by = f"kept by an attempt of nearly the same cost, {rival.name}"
-            doubts.append(f"{rival.others} rejected edges are {kept_by}")
         return tuple(doubts)
 
     @property
@@ -355,7 +344,7 @@ class Rejection(Summarised):
             "cycles": self.num_cycles,
             "truncated_cost": self.cost,
             "expected_by_chance": self.by_chance,
-            "slip": None if self.slip is None else dict(vars(self.slip)),
+            "rival": None if self.rival is None else dict(vars(self.rival)),
             "noise": self.noise,
             "threshold_scale": self.threshold_scale,
         }
@@ -373,23 +362,12 @@ class Rejection(Summarised):
         """Priors that are not known to be right, (m,)."""
         return np.asarray(self.problem.graph.is_prior & ~self.known)
 
-    @property
-    def _rival(self) -> Attempt | None:
-        """The cheapest attempt that is about as likely and keeps many rejected edges, if any."""
-        thresholds = chi2_thresholds(self.problem, self.quantile)[~self.known]
-        if len(thresholds) == 0:
-            return None
-        # What the cost of one chi^2 is, whatever the weights of the problem.
-        dof = self.problem.d + tangent_dimension(self.problem.d)
-        of_whole_edges = float(scipy.special.chdtri(dof, 1.0 - self.quantile))
-        unit = self.threshold_scale * float(np.median(thresholds)) / of_whole_edges
-        max_cost = self.cost - 2.0 * math.log(_TOLERATED_SHARE) * unit
-        rivals = [
-            attempt
-            for attempt in self.attempts
-            if attempt.cost <= max_cost and attempt.others > self._num_tolerated
-        ]
-        return min(rivals, key=lambda attempt: attempt.cost, default=None)
+    def _text_of_rival(self, rival: Rival) -> str:
+        """What is said of a rival."""
+        if rival.edge is None:
+            return f"another map, with {rival.others} edges rejected here, fits about as well"
+        fit = f"{rival.others} more edges fit" if rival.others else "the others fit"
+        return f"{self._label(rival.edge)} is taken for right, and without it {fit}"
 
     def _label(self, e: int) -> str:
         """Name of an edge, with file and line where they are known."""

@@ -24,7 +24,7 @@ from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.gnc import GNC
 from solvers.robust.rejection import Rejection
 from solvers.robust.revision import Fit, drop_contradicted, error_scale, threshold_scale
-from solvers.robust.slips import Slip, slipped_step
+from solvers.robust.rivals import Rival, rival_of
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
@@ -345,8 +345,8 @@ class _RobustSolve:
         fit = Fit.of(self.doubted.problem, kept, solution.poses)
         return self._search(self.choice).expected_by_chance(fit)
 
-    def _slip(self, solution: Solution, kept: BoolArray) -> Slip | None:
-        """The known edge that closures contradict; not looked for where the solve was broken off.
+    def _rival(self, solution: Solution, kept: BoolArray) -> Rival | None:
+        """Another map that is about as likely; not looked for where the solve was broken off.
 
         Nor where every edge is kept and all fit together.
         """
@@ -354,7 +354,8 @@ class _RobustSolve:
         if fits or solution.status in OUT_OF_TIME:
             return None
         fit = Fit.of(self.doubted.problem, kept, solution.poses)
-        return slipped_step(self._search(self.choice).sets, fit)
+        attempts = [(estimate.kept, estimate.poses) for estimate in self.estimates]
+        return rival_of(self._search(self.choice).sets, fit, attempts)
 
     def _has_time(self) -> bool:
         monitor = self.places.request.monitor
@@ -459,7 +460,7 @@ class _RobustSolve:
             is_misfit=noise == 1.0 and solution.edge_residuals.is_overall_misfit,
             noise=noise,
             by_chance=self._by_chance(solution, kept),
-            slip=self._slip(solution, kept),
+            rival=self._rival(solution, kept),
             fit=solution.certificate.fit,
         )
         ledgers = self.places.ledgers

@@ -17,8 +17,9 @@ from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
-from solvers.robust.rejection import Attempt, Support
+from solvers.robust.rejection import Support
 from solvers.robust.revision import truncated_cost
+from solvers.robust.rivals import Rival
 from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves import attempts as robust_attempts, robust_solve
 from solvers.robust_solves.attempts import Plan
@@ -262,12 +263,8 @@ def test_what_speaks_against_the_edges_kept() -> None:
     assert replace(robust, ratio=by_chance).support is Support.CHECKED
     misfit = replace(robust, is_misfit=True)
     assert misfit.headline.startswith("DOUBTFUL, the edges kept do not fit together: CERTIFIED")
-    threshold = robust.threshold_scale * pgo.chi2_thresholds(robust.problem)[-1]
-    rival = Attempt("rival", robust.cost + 0.5 * threshold, 0, 0.0, True, 0.0, others=40)
-    disputed = replace(robust, attempts=(rival,))
-    assert "kept by an attempt of nearly the same cost, rival" in disputed.headline
-    dearer = replace(rival, cost=robust.cost + 3.0 * threshold)
-    assert replace(robust, attempts=(dearer,)).support is Support.CHECKED
+    disputed = replace(robust, rival=Rival(None, -1.0, 40))
+    assert "another map, with 40 edges rejected here, fits about as well" in disputed.headline
     uncertified = replace(misfit, verdict=Verdict.NOT_CERTIFIED)
     assert uncertified.headline.startswith("NOT_CERTIFIED for the ")
     assert uncertified.headline.endswith("; the edges kept do not fit together")
