@@ -86,9 +86,10 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     ('POLISHED', True)
     """
     problem = as_problem(problem)
+    check_poses(problem.graph, poses)
+    poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
     local = LocalWorld.of(problem)
     if local is not None:
-        check_poses(problem.graph, poses)
         local_certificate = certify(local.problem, local.local_poses(poses), gap)
         return certificate_of_whole(local, poses, local_certificate)
     stationarity = relative_decrement(problem, poses)

@@ -386,6 +386,7 @@ def certify_at(
     True
     """
     check_poses(problem.graph, poses)
+    poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
     local = LocalWorld.of(problem)
     if local is not None:
         local_certificate = certify_at(local.problem, local.local_poses(poses), gap, stationarity)

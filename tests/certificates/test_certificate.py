@@ -44,6 +44,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting
+from solvers import solve
 from solvers.given_poses import certify
 from solvers.riemannian.polish import polish, relative_decrement
 
@@ -492,3 +493,19 @@ def test_stationary_poses_are_not_called_others(seed: int, d: int) -> None:
         assert "which were not stationary" not in text or not is_stationary
         assert "which were stationary" not in text or is_stationary
     assert certificate.source in (BoundSource.REFINED, BoundSource.CHORDAL, BoundSource.SOFTENED)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("judge_poses", [certify, certify_at])
+def test_a_landmark_has_no_rotation_that_counts(judge_poses, d):
+    rng = np.random.default_rng(0)
+    graph = varied_graph(1, 8, d).with_landmark(np.array([0, 3, 5]), rng.normal(size=(3, d)), 4.0)
+    problem = PGOProblem(graph)
+    poses = solve(problem).poses
+    R = poses.R.copy()
+    R[graph.landmarks] = exp_map(np.ones((1, 1 if d == 2 else 3)))
+    expected = judge_poses(problem, poses)
+    turned = judge_poses(problem, Poses(R, poses.t))
+    assert expected.is_certified
+    assert turned.is_certified
+    np.testing.assert_allclose(turned.objective, expected.objective, rtol=1e-12, atol=0)
