@@ -12,7 +12,7 @@ from typing import Any
 import cvxpy as cp
 
 from pgo_models.certificates.certificate import Certificate, relative_gap, verdict_of
-from pgo_models.certificates.fit import Fit, fit_of
+from pgo_models.certificates.fit import NO_FIT, fit_of
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.convex.graph_subproblem import GraphQP, ModelChange
 from pgo_models.errors import SettingError
@@ -121,7 +121,7 @@ def _certificate_with_terms(
     objective = model.cost(poses.stacked())
     has_replaced_edges = bool(model.change.replaced_edges)
     bound = NO_BOUND if has_replaced_edges else certificate.bound
-    fit = Fit.NONE
+    fit = NO_FIT
     if is_F and not has_replaced_edges:
         fit = fit_of(priors, priors.graph.completed(poses))
     at_most = scaled_above(objective, certificate.weights_error)
@@ -131,7 +131,7 @@ def _certificate_with_terms(
         objective=objective,
         objective_error=math.nan,
         bound=bound,
-        gap=relative_gap(at_most, at_least, fit is Fit.ROUNDING),
+        gap=relative_gap(at_most, at_least, fit.is_to_rounding),
         verdict=verdict_of(fit, gap_above(at_most, at_least), bound, certificate.wanted_gap),
         fit=fit,
         stationarity=math.nan,

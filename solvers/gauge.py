@@ -1,5 +1,7 @@
 """The frame of the answer: the cost is the same in all, so that one has to be chosen."""
 
+import numpy as np
+
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 
@@ -13,7 +15,12 @@ def choose_gauge(poses: Poses, graph: PoseGraph, anchor: int | None) -> tuple[Po
     reference = graph.initial
     if graph.world is not None:
         ignored = "; FIX lines are ignored beside them" if len(graph.fixed) else ""
-        return poses.with_gauge_at(graph.world), f"that of the priors{ignored}", graph.world
+        frame = f"that of the priors{ignored}"
+        moved = graph.in_frame_of_priors(poses)
+        if graph.has_far_priors:
+            half_a_digit = np.spacing(np.abs(moved.t).max()) / 2.0
+            frame += f"; doubles have coordinates so far from zero to {half_a_digit:.1e} m"
+        return moved, frame, graph.world
     held = anchor
     why = "as asked for"
     if anchor is None and len(graph.fixed):

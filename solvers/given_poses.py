@@ -14,7 +14,6 @@ from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
     BoundSource,
     Certificate,
-    certificate_of_whole,
     certify_at,
     judge,
     with_terms,
@@ -25,7 +24,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.handedness.complex_relaxation import (
@@ -88,10 +86,14 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     problem = as_problem(problem)
     check_poses(problem.graph, poses)
     poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
-    local = LocalWorld.of(problem)
-    if local is not None:
-        local_certificate = certify(local.problem, local.local_poses(poses), gap)
-        return certificate_of_whole(local, poses, local_certificate)
+    if problem.graph.has_far_priors:
+        near = problem.graph.near_zero(poses)
+        return judge(problem, poses, _certificate_near(problem, near, gap))
+    return _certificate_near(problem, poses, gap)
+
+
+def _certificate_near(problem: PGOProblem, poses: Poses, gap: float) -> Certificate:
+    """`certify` for poses that are not far from zero."""
     stationarity = relative_decrement(problem, poses)
     is_stationary = stationarity <= STATIONARY_DECREMENT
     if is_stationary and problem.is_quadratic:

@@ -7,7 +7,6 @@ it mostly takes one factorisation and the certificate.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -17,14 +16,13 @@ from pgo_models.geometry.rotations import BoolArray, project_to_rotations, unsta
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.problem.cholesky import factorize
-from pgo_models.problem.local_world import LocalWorld, seen_from_point
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
 from solvers.place import Attempt, Place, Step
-from solvers.places import in_local_world, solution_by
+from solvers.places import solution_by
 from solvers.plan import solve_at, unless_it_fails
 from solvers.request import Pipeline, SolveRequest
 from solvers.robots import Robots
@@ -131,7 +129,7 @@ def extend(
         )
         start = extended_poses(inlier_problem(problem, kept), ids, solution.poses)
         request = SolveRequest(problem, pipeline, start, robots=shared)
-        grown = in_local_world(partial(go_on_robustly, robust, kept, new), request)
+        grown = go_on_robustly(robust, kept, new, request)
     return replace(grown, ledger=_joined(solution.ledger, grown.ledger))
 
 
@@ -242,10 +240,6 @@ def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
     rotations are projected. Then all translations are the best for the rotations. A GraphError when
     no pose of the problem has one of the ids.
     """
-    local = LocalWorld.of(problem)
-    if local is not None:
-        start = extended_poses(local.problem, ids, _seen_locally(local, ids, poses))
-        return local.unrounded_poses(start)
     n = problem.num_poses
     d = problem.d
     M = problem.convex_part.M
@@ -259,6 +253,11 @@ def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
     t = np.zeros((n, d))
     R[known] = poses.R[place]
     t[known] = poses.t[place]
+    graph = problem.graph
+    if graph.has_far_priors and WORLD_ID in ids:
+        # The poses before are in the frame of their file, their world pose at an origin of its own.
+        t[known] -= graph.world_point
+        t[graph.world] = 0.0
     new = np.setdiff1d(np.arange(n), known)
     if len(new):
         # M_new,new X_new = -M_new,known X_known
@@ -271,14 +270,6 @@ def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
         R[new] = project_to_rotations(unstack_transposes(X[n:])[new])
         t[new] = X[new]
     return problem.at_best_translations(Poses(R, t))
-
-
-def _seen_locally(local: LocalWorld, ids: IntArray, poses: Poses) -> Poses:
-    """Poses with these ids as the local problem has them; as they are if they are of no world."""
-    world = np.flatnonzero(ids == WORLD_ID)
-    if not len(world):
-        return poses
-    return seen_from_point(poses, int(world[0]), local.point)
 
 
 def extended_partition(robots: Partition, ids: IntArray, graph: PoseGraph) -> Partition:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.weighting import Weighting
 from solvers.loop import RunMonitor
-from solvers.places import in_local_world, solution_by
+from solvers.places import solution_by
 from solvers.plan import solve_at
 from solvers.request import Pipeline, SolveRequest
 from solvers.result import Record
@@ -189,7 +188,7 @@ def solution_for(request: SolveRequest) -> Solution:
     if request.robust is not None:
         from solvers.robust_solves.robust_solve import solve_robustly
 
-        return in_local_world(partial(solve_robustly, request.robust), request)
+        return solve_robustly(request.robust, request)
     return solution_by(solve_at, request)
 
 

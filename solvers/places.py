@@ -9,13 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from pgo_models.geometry.poses import Poses
-from pgo_models.problem.local_world import LocalWorld
 from solvers.here import Here
-from solvers.local_solution import local_request, solution_of_whole
 from solvers.place import Attempt, Place
 from solvers.request import Pipeline, SolveRequest, solution_of
 from solvers.result import Stage
@@ -28,21 +25,12 @@ Page = Callable[[Place, Pipeline, Poses | None], Attempt]
 
 
 def solution_by(page: Page, request: SolveRequest) -> Solution:
-    """Solution of a request by the steps of a page, at the place where it is to be solved.
-
-    A graph whose priors are far from zero is solved in its local world (`LocalWorld`).
-    """
-    return in_local_world(partial(_solution_at_place, page), request)
-
-
-def in_local_world(
-    solve_request: Callable[[SolveRequest], Solution], request: SolveRequest
-) -> Solution:
-    """Solution of a request, or of that of its local world where its priors are far from zero."""
-    local = LocalWorld.of(request.problem)
-    if local is None:
-        return solve_request(request)
-    return solution_of_whole(local, solve_request(local_request(local, request)))
+    """Solution of a request by the steps of a page, at the place where it is to be solved."""
+    request = with_partition(request)
+    with open_place(request) as place:
+        best = page(place, request.pipeline, request.start)
+        place.finish(best)
+    return solution_of(request, place, best)
 
 
 def with_partition(request: SolveRequest) -> SolveRequest:
@@ -54,14 +42,6 @@ def with_partition(request: SolveRequest) -> SolveRequest:
     graph = request.problem.graph
     owners = robots_of_solve(request.pipeline.soc, request.robots.owners, graph)
     return replace(request, robots=request.robots.with_owners(owners))
-
-
-def _solution_at_place(page: Page, request: SolveRequest) -> Solution:
-    request = with_partition(request)
-    with open_place(request) as place:
-        best = page(place, request.pipeline, request.start)
-        place.finish(best)
-    return solution_of(request, place, best)
 
 
 def open_place(request: SolveRequest, gnc: GNC | None = None) -> AbstractContextManager[Place]:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.certificates.fit import Fit
 from pgo_models.errors import FAILURES, FileFormatError, door
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate
@@ -221,7 +220,7 @@ def compare_readings(
     with warnings.catch_warnings(action="ignore"):  # of the reader, once more
         fits = [trial.fit(reading) for reading in Reading if reading is not Reading.AS_WRITTEN]
     others = tuple(fit for fit in fits if fit is not None)
-    has_noise = residuals.overall > 0.0 and solution.certificate.fit is Fit.NONE
+    has_noise = residuals.overall > 0.0 and not solution.certificate.fit.is_exact
     proposed = _proposed(others, written) if has_noise else ()
     return ReadingComparison(problem.cost_name, written, others, proposed)
 

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 
 from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
-    Verdict,
-    exact_to_coordinates,
     judge,
 )
 from pgo_models.errors import SettingError, check_settings
@@ -183,6 +181,9 @@ class SolveRequest:
             )
         if self.robots is not None:
             self._check_robots(self.robots)
+        if self.start is not None and self.problem.graph.has_far_priors:
+            self.problem.stacked(self.start)  # raises unless the poses fit
+            object.__setattr__(self, "start", self.problem.graph.near_zero(self.start))
 
     def _check_anchor(self, anchor: int) -> None:
         """Raise a SettingError unless the anchor is a pose with a rotation.
@@ -247,10 +248,7 @@ def solution_of(request: SolveRequest, place: Place, best: Attempt) -> Solution:
     poses, frame, held = choose_gauge(current, problem.graph, request.anchor)
     poses = problem.seen_poses(poses)  # a frame has an origin, too
     # A frame far away rounds the poses: the certificate is of those that are returned.
-    found = best.proof
-    certificate = judge(problem, poses, found)
-    if found.verdict is Verdict.EXACT:
-        certificate = exact_to_coordinates(problem, poses, certificate)
+    certificate = judge(problem, poses, best.proof)
     return Solution(
         problem=problem,
         poses=poses,

@@ -17,7 +17,6 @@ from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.hessian import riemannian_hessian, unknowns_of
 from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
@@ -190,11 +189,7 @@ class Solution:
             p = d(d-1)/2 for rotations.
         """
         problem = self.problem
-        at = self.poses
-        local = LocalWorld.of(problem)
-        if local is not None:
-            problem = local.problem
-            at = local.local_poses(at)
+        at = problem.graph.near_zero(self.poses)
         hessian = riemannian_hessian(problem.at(at), multipliers(problem, at))
         hessian, layout = unknowns_of(problem, hessian)
         anchor = self.anchor if anchor is None else anchor

@@ -55,7 +55,6 @@ ORDER = {
         "solution",
         "request",
         "plan",
-        "local_solution",
         "places",
         "robust_solves",
         "extended_solve",

@@ -183,6 +183,7 @@ MADE["Verification"] = verification
 MADE["NoiseEstimate"] = lambda: solvers.estimate_noise(GRAPH)
 MADE["NoiseLevel"] = lambda: solvers.estimate_noise(GRAPH).levels[0]
 MADE["ReadingComparison"] = lambda: solvers.compare_readings("grid")
+MADE["Fit"] = lambda: solvers.solve(GRAPH).certificate.fit
 MADE["ReadingFit"] = lambda: solvers.compare_readings("grid").written
 SETTINGS = (
     "Anderson",

@@ -47,7 +47,8 @@ def test_a_square_written_in_nine_digits_is_exact_to_them(
 ) -> None:
     proof = tmp_path / "proof.json"
     record = solved(pgo_command, "square_9_digits", "--proof", proof)
-    assert (record["verdict"], record["exact_to"]) == ("EXACT", "DIGITS")
+    assert record["verdict"] == "EXACT"
+    assert 0.0 < record["exact_to"] < 1e-9
     assert pgo_command("verify", CASES / "square_9_digits.g2o", proof)[0] == 0
 
 

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 
 from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
-from pgo_models.certificates.fit import Fit, fits_to_coordinates
+from pgo_models.certificates.fit import NO_FIT, Fit
 from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
 from pgo_models.certificates.lower_bound import (
     NO_BOUND,
@@ -41,7 +41,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.html_tables import facts_table
-from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting, name_of_cost
@@ -136,7 +135,7 @@ class Certificate(ReadOnly):
     has_translations : bool
         Whether this is said of poses; otherwise of rotations alone.
     fit : Fit
-        How closely the poses fit every edge; the verdict is EXACT unless that is NONE.
+        How closely the poses fit every edge; the verdict is EXACT where that `is_exact`.
     weights_error : float
         The cost of the file is between 1 - weights_error and 1 + weights_error times that of the
         weights as they are stored (`PoseGraph.weights_error`), of which `objective` and `bound`
@@ -157,7 +156,7 @@ class Certificate(ReadOnly):
     weighting: Weighting = Weighting.ISOTROPIC
     objective_error: float = math.nan
     has_translations: bool = True
-    fit: Fit = Fit.NONE
+    fit: Fit = NO_FIT
     weights_error: float = 0.0
 
     def __post_init__(self) -> None:
@@ -231,7 +230,7 @@ class Certificate(ReadOnly):
     @property
     def printed_gap(self) -> float:
         """The proven gap as tables show it: 0 of poses that fit to rounding, whose cost is none."""
-        return 0.0 if self.fit is Fit.ROUNDING else self.proven_gap
+        return 0.0 if self.fit.is_to_rounding else self.proven_gap
 
     @property
     def cost_text(self) -> str:
@@ -249,15 +248,11 @@ class Certificate(ReadOnly):
 
         From four digits on, it says how many are proven.
         """
-        if self.fit is Fit.ROUNDING:
+        if self.fit.is_to_rounding:
             return "0: every edge fits to its rounding"
         text = rounded_up(self.proven_gap, 3)
-        if self.fit is Fit.DIGITS:
-            return f"{text}, of a cost below the digits of the file"
-        if self.fit is Fit.COORDINATES:
-            return f"{text}, of a cost below the last bits of the coordinates"
-        if self.fit is Fit.BILLIONTH:
-            return f"{text}, of a cost below a billionth of what the edges measure"
+        if self.fit.is_exact:
+            return f"{text}, of a cost that the last digits of the edges explain"
         return f"{text}, proven to {self.digits} digits" if self.digits > 3 else text
 
     @property
@@ -309,8 +304,8 @@ class Certificate(ReadOnly):
     @property
     def _verdict_sentence(self) -> str:
         """What the verdict says, with how closely exact poses fit and what hides a gap."""
-        if self.verdict is Verdict.EXACT and self.fit is not Fit.NONE:
-            return f"globally optimal, {self.fit.value}"
+        if self.verdict is Verdict.EXACT and self.fit.is_exact:
+            return f"globally optimal: {self.fit.text}"
         if self.verdict is Verdict.NOT_CERTIFIED and self.is_hidden_by_rounding:
             return f"{self.verdict.value}, and rounding in doubles leaves no smaller one"
         return self.verdict.value
@@ -387,10 +382,16 @@ def certify_at(
     """
     check_poses(problem.graph, poses)
     poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
-    local = LocalWorld.of(problem)
-    if local is not None:
-        local_certificate = certify_at(local.problem, local.local_poses(poses), gap, stationarity)
-        return certificate_of_whole(local, poses, local_certificate)
+    if problem.graph.has_far_priors:
+        near = problem.graph.near_zero(poses)
+        return judge(problem, poses, _certificate_at(problem, near, gap, stationarity))
+    return _certificate_at(problem, poses, gap, stationarity)
+
+
+def _certificate_at(
+    problem: PGOProblem, poses: Poses, gap: float, stationarity: float
+) -> Certificate:
+    """`certify_at` for poses that are not far from zero."""
     best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
     certificate = certify_with(
         problem,
@@ -407,28 +408,6 @@ def certify_at(
         return with_complex_numbers(problem, certificate, best)
     terms = closed_form_terms(problem.tangent_at(best), best)
     return certificate if terms is None else with_terms(problem, certificate, terms, best)
-
-
-def certificate_of_whole(local: LocalWorld, poses: Poses, certificate: Certificate) -> Certificate:
-    """Certificate of poses of the file, from that of the same poses in the local problem.
-
-    The bound is the same, as the cost is. So is all that is said of the poses, where they are local
-    poses without any rounding; others are judged with the rounding of their coordinates.
-    """
-    certificate = replace(certificate, poses=local.unrounded_poses(certificate.poses))
-    if not local.keeps_exactly(poses):
-        return judge(local.whole, poses, certificate)
-    return exact_to_coordinates(local.whole, poses, certificate)
-
-
-def exact_to_coordinates(
-    problem: PGOProblem, poses: Poses, certificate: Certificate
-) -> Certificate:
-    """The certificate, EXACT where its poses fit as the last bits of far coordinates allow."""
-    could_fit = certificate.fit is Fit.BILLIONTH or not certificate.is_certified
-    if not (could_fit and fits_to_coordinates(problem, poses)):
-        return certificate
-    return replace(certificate, fit=Fit.COORDINATES, verdict=Verdict.EXACT)
 
 
 def with_terms(
@@ -498,7 +477,7 @@ def certify_with(
     if bound is None:
         ground = ground if ground is not None else problem.at_best_translations(poses)
         tangent = problem.tangent_at(ground)
-        if rounding.fit is Fit.ROUNDING:
+        if rounding.fit.is_to_rounding:
             bound = NO_BOUND
         elif terms is None:
             bound = best_bound(tangent, Lambda, ground, gap, objective)
@@ -587,7 +566,7 @@ def judge_cost(
     gap = relative_gap(
         scaled_above(F, weights_error),
         scaled_below(known, weights_error),
-        rounding.fit is Fit.ROUNDING,
+        rounding.fit.is_to_rounding,
     )
     # chi2, which is never negative, may come out below zero.
     bound = replace(bound, value=min(bound.value, max(F, 0.0)))
@@ -603,7 +582,7 @@ def verdict_of(fit: Fit, proven_gap: float, bound: LowerBound, wanted_gap: float
 
     What was asked for has to be proven.
     """
-    if fit is not Fit.NONE:
+    if fit.is_exact:
         return Verdict.EXACT
     if math.isnan(bound.eta):
         return Verdict.TRIVIAL

@@ -1,11 +1,11 @@
 """Fit: whether poses fit every edge as closely as its numbers can tell.
 
-Two things limit that: the rounding of doubles, and the last digit with which a file writes its
-measurements (`PoseGraph.written_error`). Both are known edge by edge, from the numbers of that edge
-alone: a heavy edge, a long one or a pose far away says nothing of the others.
+Three things limit that: the rounding of doubles, 1e-9 of what an edge measures, and the last digit
+with which a file writes its measurements (`PoseGraph.written_error`). All are known edge by edge,
+from the numbers of that edge alone: a heavy edge, a long one or a pose far away says nothing of the
+others.
 """
 
-import enum
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,31 +15,61 @@ import numpy as np
 from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF, gamma
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 _SHARE_OF_ONE = 8.0  # times sqrt(m) its own error: what an edge may be off by beside m - 1 that fit
 _BILLIONTH = 1e-9  # of what an edge measures
-_SHARE_OF_NOISE = 1e-6  # of a standard deviation
-_NEARLY = 2.0  # times its level: above that there is no need to look at every edge
+_COST_OF_BILLIONTHS = 1e-12  # squared, a millionth of a standard deviation
+# An edge may be off by so many halves of the unit of its last digit. The true poses are off by one.
+# The best ones share the errors e of all edges: their residuals are (I - H) e with the hat matrix
+# H, whose rows have norms of at most 1. So beside its own error an edge has a mean of errors, each
+# spread evenly over at most a half, with a deviation of at most 1 / sqrt(3): three halves are more
+# than five deviations.
+_HALF_UNITS = 4.0
+# What the coordinates of a far frame leave open of an edge is no excuse beyond a millionth of it.
+_MOST_OF_FRAME = 1e-6
+_NEARLY = 2.0  # times what is allowed: above that there is no need to look at every edge
 
 
-class Fit(enum.Enum):
-    """How closely poses fit all edges, the closest fit first."""
+@dataclass(frozen=True)
+class Fit:
+    """How closely poses fit all edges (`fit_of`).
 
-    ROUNDING = "exact to rounding: every edge fits to its last bits"
-    COORDINATES = "exact to its coordinates: every edge fits to their last bits, so far from zero"
-    DIGITS = "exact to the digits of the file: every edge fits to the last digits written"
-    BILLIONTH = (
-        "exact to a billionth: every edge fits to 1e-9 of what it measures, and all of them "
-        "together to 1e-6 of a standard deviation"
-    )
-    NONE = "some edges do not fit"
+    Parameters
+    ----------
+    is_exact : bool
+        Whether every edge fits as closely as its numbers can tell.
+    is_to_rounding : bool
+        Whether it does so to its last bits: the cost cannot be told from zero then.
+    share : float
+        The largest residual of an edge over what it measures: its length, or a radian.
+    units : float
+        The largest residual of an edge in units of its last written digit; inf where no digits of a
+        file are known.
+    """
+
+    is_exact: bool = False
+    is_to_rounding: bool = False
+    share: float = math.inf
+    units: float = math.inf
 
     @property
     def is_closest(self) -> bool:
         """Whether no poses in doubles, or none that the file can tell apart, fit more closely."""
-        return self not in (Fit.BILLIONTH, Fit.NONE)
+        return self.is_to_rounding or (self.is_exact and self.units <= 0.5 * _HALF_UNITS)
+
+    @property
+    def text(self) -> str:
+        """How closely every edge fits, in words and with the number."""
+        if not self.is_exact:
+            return "some edges do not fit"
+        if self.is_to_rounding:
+            return "every edge fits to its last bits"
+        if self.share > _BILLIONTH and self.units < math.inf:
+            return f"every edge fits to {self.units:.2g} units of the last digit that its file has"
+        return f"every edge fits to {self.share:.2g} of what it measures"
 
     @classmethod
     def of_all(cls, fits: Iterable["Fit"]) -> "Fit":
@@ -55,8 +85,19 @@ class Fit(enum.Enum):
         Fit
             The fit of all.
         """
-        closest_first = list(cls)
-        return max(fits, key=closest_first.index, default=cls.ROUNDING)
+        parts = list(fits)
+        if not parts:
+            return FITS_WITHOUT_EDGES
+        return cls(
+            is_exact=all(part.is_exact for part in parts),
+            is_to_rounding=all(part.is_to_rounding for part in parts),
+            share=max(part.share for part in parts),
+            units=max(part.units for part in parts),
+        )
+
+
+NO_FIT = Fit()
+FITS_WITHOUT_EDGES = Fit(is_exact=True, is_to_rounding=True, share=0.0, units=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +120,23 @@ class EdgeErrors:
         """Errors of every edge, and at least those of half of the edges."""
         return EdgeErrors(_not_below_median(self.translation), _not_below_median(self.rotation))
 
+    def at_least(self, other: "EdgeErrors") -> "EdgeErrors":
+        """The larger of both errors of every edge."""
+        translation = np.maximum(self.translation, other.translation)
+        return EdgeErrors(translation, np.maximum(self.rotation, other.rotation))
+
+    def less(self, other: "EdgeErrors") -> "EdgeErrors":
+        """The errors less others, and not below zero."""
+        translation = np.maximum(self.translation - other.translation, 0.0)
+        return EdgeErrors(translation, np.maximum(self.rotation - other.rotation, 0.0))
+
+    def largest_share(self, problem: PGOProblem, allowed: "EdgeErrors") -> float:
+        """The largest error over the one allowed, of all residuals that have a weight."""
+        is_seen_t, is_seen_R = problem.weights.is_seen()
+        of_t = _shares(self.translation, allowed.translation)[is_seen_t]
+        of_R = _shares(self.rotation, allowed.rotation)[is_seen_R]
+        return float(max(of_t.max(initial=0.0), of_R.max(initial=0.0)))
+
     def times(self, factor: float) -> "EdgeErrors":
         """Errors that are larger by a factor."""
         return EdgeErrors(factor * self.translation, factor * self.rotation)
@@ -88,53 +146,35 @@ class EdgeErrors:
         return problem.weights.bound_of_norms(self.translation, self.rotation)
 
 
-@dataclass(frozen=True, eq=False)
-class Allowance:
-    """Errors that a fit allows edges."""
-
-    together: EdgeErrors  # the cost of all residuals is at most that of these
-    alone: EdgeErrors  # and no residual is more than a share of these
-
-
 def fit_of(problem: PGOProblem, poses: Poses) -> Fit:
-    """How closely poses fit all edges: to rounding, to the digits of a file, or not.
+    """How closely poses fit all edges, and whether that is as closely as their numbers can tell.
 
-    With errors e_t and e_R of every edge, and m edges, two things are wanted for a fit:
+    Let r_t and r_R be the residuals of an edge, e_t and e_R their rounding (`edge_roundings`), and
+    h_t and h_R half a unit of the last digit that its file has (`written_errors`), 0 where that is
+    not known. Poses are exact where every edge fits,
 
-        sum tau ||r_t||^2 + kappa ||r_R||_F^2 <= sum tau e_t^2 + kappa e_R^2,
-        ||r_t|| <= 8 sqrt(m) e_t  and  ||r_R||_F <= 8 sqrt(m) e_R  of every edge,
+        ||r_t|| <= f + max(1e-9 ||t_ij|| - e_t, 4 h_t'),   ||r_R||_F <= max(1e-9 - e_R, 4 h_R'),
 
-    the latter whatever its weight is. The errors are those of `edge_roundings` for a fit to
-    rounding; for one to the digits `written_errors` are added. In the second condition e_t has the
-    lever e_R ||t_ij|| of rotations that are known to e_R, and both are at least the median of all
-    edges: the best poses share the errors of the file among edges, and an edge whose numbers are
-    short has none of its own.
+    whatever its weight is, and the cost is one that these numbers explain, with c_t = e_t + h_t + f
+    and c_R = e_R + h_R:
 
-    The first alone says nothing of light edges where there is a heavy one, whose error outweighs
-    all that they cost; by the second no edge takes much more than the errors of m edges like
-    itself, 8 being for what a solve adds to the rounding of one residual. A residual without weight
-    does not count. In chi2 kappa is the largest |eigenvalue| of W, and (size_t ||r_t|| + size_R
-    ||r_R||)^2 is added on either side for the excess. Where robots share the edges, each asks this
-    of its own. Neither condition changes with the unit of the weights.
+        sum tau ||r_t||^2 + kappa ||r_R||_F^2 <= 1e-12 + sum tau c_t^2 + kappa c_R^2.
 
-    A fit to rounding. The rounding of a computed residual together with the distance of the stored
-    R from rotations is at most e_t and e_R: that of r_t is (2 + d^1.5) u, and (2 d + 3) u is in
-    e_t; that of r_R is (d + 1) (d + d^0.5) u, and 2 d^0.5 (2 d + 3) u is in e_R. So at the exact
-    rotations nearest to the poses every residual is at most (8 sqrt(m) + 1) e_t and (8 sqrt(m) + 1)
-    e_R. And F, or chi2, is at most 4 times the cost of these errors there, by the triangle
-    inequality in the norm whose square the sum is. As neither is ever negative, no poses cost less
-    by more than that.
+    Here f is what the coordinates of a far frame leave open (`frame_error`), at most 1e-6 ||t_ij||.
+    h' has the lever h_R ||t_ij|| of the rotation, and both are at least the median of all edges,
+    for the numbers of an edge may be short by chance, and the best poses share errors among edges.
+    Priors, which measure a position and not a length, and edges that measure no translation have
+    the shortest ||t_ij|| of all. A residual without weight does not count. In chi2 kappa is the
+    largest |eigenvalue| of W, and (size_t ||r_t|| + size_R ||r_R||)^2 is added on either side for
+    the excess. Where robots share the edges, each asks this of its own.
 
-    A fit to the digits. Where the file rounds measurements without noise, the true poses have
-    residuals of at most the written errors, and so the least cost is at most that of these errors.
-    The poses that fit cost no more. Others may cost less, but by no more than the file leaves open:
-    which of the measurements that it rounds were meant cannot be told.
+    Why this is said to be globally optimal: the cost is never negative, and the true poses of
+    measurements that are rounded without noise cost up to sum tau h_t^2 + kappa h_R^2. Other poses
+    may cost less than those that fit, but by no more than the file leaves open. As 1e-12 is a
+    millionth of a standard deviation, the errors of an optimiser that has not come to the last bits
+    are of no account beside the noise which the weights state.
 
-    A fit to a billionth. Measurements without noise have a least cost of zero, which an optimiser
-    comes close to and does not reach. Of every edge ||r_t|| <= 1e-9 ||t_ij|| and ||r_R|| <= 1e-9,
-    after rounding; priors and edges that measure no translation have the shortest ||t_ij|| of all.
-    And the cost of all is at most 1e-12, so that errors are of no account beside the noise which
-    the matrices state. This alone depends on the unit of the weights, and can only be lost by it.
+    Poses fit to rounding (`fits_to_rounding`) are exact as well.
 
     Parameters
     ----------
@@ -146,7 +186,7 @@ def fit_of(problem: PGOProblem, poses: Poses) -> Fit:
     Returns
     -------
     Fit
-        NONE says nothing of how good the poses are.
+        `NO_FIT` says nothing of how good the poses are.
     """
     at = problem.at(poses)
     return fit_at(at, edge_roundings(problem, problem.seen_poses(poses)))
@@ -155,47 +195,78 @@ def fit_of(problem: PGOProblem, poses: Poses) -> Fit:
 def fit_at(at: EvaluatedPoses, rounding: EdgeErrors) -> Fit:
     """`fit_of` poses that are evaluated already, with their `edge_roundings`."""
     problem = at.problem
-    allowances = {Fit.ROUNDING: Allowance(rounding, rounding)}
+    poses = problem.seen_poses(at.poses)
     written = written_errors(problem)
+    sizes = _measured_sizes(problem)
+    of_frame = np.minimum(frame_error(problem.graph), _MOST_OF_FRAME * sizes.translation)
+    explained = EdgeErrors(rounding.translation + of_frame, rounding.rotation)
     if written is not None:
-        together = rounding.plus(written)
-        alone = rounding.plus(written.with_levers(problem).not_below_median())
-        allowances[Fit.DIGITS] = Allowance(together, alone)
-    allowances[Fit.BILLIONTH] = _billionths(problem, rounding)
-    return _closest_fit(at, allowances)
+        explained = explained.plus(written)
+    most = _COST_OF_BILLIONTHS + explained.cost(problem)
+    # The cost as a whole is cheap to compute, and mostly settles it.
+    if not at.value <= _NEARLY * most:
+        return NO_FIT
+    residuals = _residual_norms(problem, poses)
+    is_to_rounding = _is_to_rounding(problem, residuals, rounding)
+    of_digits = None if written is None else written.with_levers(problem).not_below_median()
+    allowed = sizes.times(_BILLIONTH).less(rounding)
+    if of_digits is not None:
+        allowed = allowed.at_least(of_digits.times(_HALF_UNITS))
+    allowed = EdgeErrors(allowed.translation + of_frame, allowed.rotation)
+    fits = residuals.largest_share(problem, allowed) <= 1.0 and residuals.cost(problem) <= most
+    if not (fits or is_to_rounding):
+        return NO_FIT
+    share = residuals.plus(rounding).largest_share(problem, sizes)
+    units = math.inf
+    if of_digits is not None:
+        units = residuals.largest_share(problem, of_digits.times(2.0))
+    return Fit(True, is_to_rounding, share, units)
 
 
 def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
-    """Whether rounding alone can make every residual as large as it is (`fit_of`).
+    """Whether rounding alone can make every residual as large as it is.
 
-    The cost cannot be told from zero then.
+    With the errors e_t and e_R of `edge_roundings`, and m edges, that is
+
+        sum tau ||r_t||^2 + kappa ||r_R||_F^2 <= sum tau e_t^2 + kappa e_R^2,
+        ||r_t|| <= 8 sqrt(m) e_t  and  ||r_R||_F <= 8 sqrt(m) e_R  of every edge.
+
+    The first alone says nothing of light edges where there is a heavy one, whose error outweighs
+    all that they cost; by the second no edge takes much more than the errors of m edges like
+    itself, 8 being for what a solve adds to the rounding of one residual. Neither condition changes
+    with the unit of the weights.
+
+    The error of a computed residual together with the distance of the stored R from rotations is at
+    most e_t and e_R: that of r_t is (2 + d^1.5) u, and (2 d + 3) u is in e_t; that of r_R is
+    (d + 1) (d + d^0.5) u, and 2 d^0.5 (2 d + 3) u is in e_R. So at the exact rotations nearest to
+    the poses F, or chi2, is at most 4 times the cost of these errors, by the triangle inequality in
+    the norm whose square the sum is. As neither is ever negative, no poses cost less by more than
+    that: the cost cannot be told from zero.
     """
     poses = problem.seen_poses(poses)
     rounding = edge_roundings(problem, poses)
-    allowances = {Fit.ROUNDING: Allowance(rounding, rounding)}
-    return _closest_fit(problem.at(poses), allowances) is Fit.ROUNDING
+    return _is_to_rounding(problem, _residual_norms(problem, poses), rounding)
 
 
-def fits_to_coordinates(problem: PGOProblem, poses: Poses) -> bool:
-    """Whether every edge fits as the last bits of its coordinates allow (`fit_of`).
+def _is_to_rounding(problem: PGOProblem, residuals: EdgeErrors, rounding: EdgeErrors) -> bool:
+    """Both conditions of `fits_to_rounding`."""
+    allowed = rounding.times(_SHARE_OF_ONE * math.sqrt(problem.graph.num_edges))
+    fits = residuals.largest_share(problem, allowed) <= 1.0
+    return fits and residuals.cost(problem) <= rounding.cost(problem)
 
-    Doubles have a coordinate t to u |t|. So r_t = t_j - t_i - R_i t_ij of coordinates that fit
-    exactly may be as large as u (||t_i|| + ||t_j|| + ||t_ij||), once these are rounded. In UTM
-    coordinates that is more than the rounding of residuals, and doubles have no better poses. Ends
-    that are known to so much leave the direction of their edge open by that over its length, which
-    a rotation may be off by.
+
+def frame_error(graph: PoseGraph) -> float:
+    """What the last bits of coordinates leave open of residuals: 2 u times how far the frame is.
+
+    The frame is that of the priors, or of the estimate of a graph without priors. In UTM
+    coordinates doubles have no better poses. A frame that somebody moves poses to does not count.
     """
-    poses = problem.seen_poses(poses)
-    graph = problem.graph
-    size = block_norms(poses.t)
-    rounding = edge_roundings(problem, poses)
-    lengths = block_norms(problem.weights.seen_offsets(graph.t_ij))
-    coordinates = UNIT_ROUNDOFF * (size[graph.i] + size[graph.j] + lengths)
-    together = EdgeErrors(rounding.translation + coordinates, rounding.rotation)
-    directions = coordinates / np.where(lengths > 0.0, lengths, np.inf)
-    alone = EdgeErrors(together.translation, together.rotation + directions)
-    allowances = {Fit.COORDINATES: Allowance(together, alone)}
-    return _closest_fit(problem.at(poses), allowances) is Fit.COORDINATES
+    far = np.zeros(graph.d)
+    if graph.has_far_priors:
+        far = graph.world_point
+    elif graph.initial is not None:
+        far = _lower_median(graph.initial.t)
+    return float(2.0 * UNIT_ROUNDOFF * np.linalg.norm(far))
 
 
 def edge_roundings(problem: PGOProblem, poses: Poses) -> EdgeErrors:
@@ -245,38 +316,14 @@ def written_errors(problem: PGOProblem) -> EdgeErrors | None:
     return EdgeErrors(written[:, 0], written[:, 1])
 
 
-def _billionths(problem: PGOProblem, rounding: EdgeErrors) -> Allowance:
-    """What a fit to a billionth allows edges, less the rounding of their residuals."""
+def _measured_sizes(problem: PGOProblem) -> EdgeErrors:
+    """What edges measure: lengths of translations, and a radian of rotations."""
     graph = problem.graph
     lengths = block_norms(problem.weights.seen_offsets(graph.t_ij))
     lengths[graph.is_prior] = 0.0  # a position, not a length
     shortest = lengths[lengths > 0.0].min(initial=math.inf)
     lengths[lengths == 0.0] = shortest if shortest < math.inf else 0.0
-    of_t = np.maximum(_BILLIONTH * lengths - rounding.translation, 0.0)
-    of_R = np.maximum(_BILLIONTH - rounding.rotation, 0.0)
-    largest = EdgeErrors(of_t, of_R)
-    most = largest.cost(problem)
-    of_noise = min(1.0, _SHARE_OF_NOISE / math.sqrt(most)) if most > 0.0 else 1.0
-    each = 1.0 / (_SHARE_OF_ONE * math.sqrt(graph.num_edges))
-    return Allowance(largest.times(of_noise), largest.times(each))
-
-
-def _closest_fit(at: EvaluatedPoses, allowances: dict[Fit, Allowance]) -> Fit:
-    """The closest fit that allows the residuals of the poses."""
-    problem = at.problem
-    # The cost as a whole is cheap to compute, and mostly settles it.
-    objective = at.value
-    possible = {}
-    for fit, allowance in allowances.items():
-        if objective <= _NEARLY * allowance.together.cost(problem):
-            possible[fit] = allowance
-    if not possible:
-        return Fit.NONE
-    residuals = _residual_norms(problem, problem.seen_poses(at.poses))
-    for fit, allowance in possible.items():
-        if _allows(problem, allowance, residuals):
-            return fit
-    return Fit.NONE
+    return EdgeErrors(lengths, np.ones_like(lengths))
 
 
 def _residual_norms(problem: PGOProblem, poses: Poses) -> EdgeErrors:
@@ -292,15 +339,10 @@ def _residual_norms(problem: PGOProblem, poses: Poses) -> EdgeErrors:
     return EdgeErrors(block_norms(residuals_t), block_norms(residuals_R))
 
 
-def _allows(problem: PGOProblem, allowance: Allowance, residuals: EdgeErrors) -> bool:
-    """Both conditions of `fit_of`."""
-    is_seen_t, is_seen_R = problem.weights.is_seen()
-    share = _SHARE_OF_ONE * math.sqrt(problem.graph.num_edges)
-    fits_t = residuals.translation <= share * allowance.alone.translation
-    fits_R = residuals.rotation <= share * allowance.alone.rotation
-    if not ((fits_t | ~is_seen_t).all() and (fits_R | ~is_seen_R).all()):
-        return False
-    return residuals.cost(problem) <= allowance.together.cost(problem)
+def _shares(errors: Array, allowed: Array) -> Array:
+    """Errors over those allowed; 0 of none, and inf where none is allowed."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(errors == 0.0, 0.0, errors / allowed)
 
 
 def _not_below_median(errors: Array) -> Array:

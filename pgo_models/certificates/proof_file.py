@@ -15,15 +15,13 @@ from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError, door
 from pgo_models.figures import scaled_below
 from pgo_models.files import replace_when_done
-from pgo_models.geometry.arrays import block_norms, inner_products
+from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.problem.excess import CoupledExcess
-from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.information_costs import ExcessCost
-from pgo_models.problem.local_world import LocalWorld
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 
@@ -97,14 +95,14 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         what = "the bound is that of smaller information matrices, not the file's"
         way_out = "leave out --proof, or add --cost isotropic to prove F"
         raise SettingError(f"no proof to write: {what}; {way_out}")
-    at_bound = certificate
-    local = LocalWorld.of(problem)
-    if local is not None:
-        # The poses stay with their small coordinates, unrounded, and the world pose far from them.
-        at_bound = replace(certificate, poses=local.local_poses(certificate.poses))
-    of_bound = problem if local is None else local.problem
-    proven = _proven_at(of_bound, at_bound)
-    poses = proven.poses if local is None else local.unrounded_poses(proven.poses)
+    at_bound = replace(certificate, poses=graph.near_zero(certificate.poses))
+    proven = _proven_at(problem, at_bound)
+    poses = graph.near_zero(proven.poses)
+    positions = poses.t.copy()
+    if graph.has_far_priors:
+        # The others keep their small coordinates, unrounded: this is where their frame has the
+        # zero of the priors.
+        positions[graph.world] = -graph.world_point
     transposed = np.swapaxes(proven.Lambda, 1, 2)
     Lambda = 0.5 * (proven.Lambda + transposed)
     upper_triangle = np.triu_indices(d)
@@ -112,7 +110,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     for pose in range(graph.num_poses):
         row: dict[str, object] = {"id": _name(graph, pose)}
         if problem.weighting is not Weighting.ROTATIONS:
-            row["t"] = poses.t[pose].tolist()
+            row["t"] = positions[pose].tolist()
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
             row["Lambda"] = Lambda[pose][upper_triangle].tolist()
@@ -123,13 +121,13 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         "cost": cost,
         "d": d,
         # chi2 may come out below zero
-        "objective": max(of_bound.objective(proven.poses), 0.0),
-        "lower_bound": _claimed_bound(of_bound, at_bound, proven, graph),
+        "objective": max(problem.objective(proven.poses), 0.0),
+        "lower_bound": _claimed_bound(problem, at_bound, proven),
         "eta": eta,
         "ground": _name(graph, _ground(graph)),
         "poses": rows,
     }
-    return record | _entries_of_some_proofs(of_bound, certificate.bound, graph)
+    return record | _entries_of_some_proofs(problem, certificate.bound, graph)
 
 
 def _entries_of_some_proofs(
@@ -267,17 +265,14 @@ def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
     return max(candidates, key=lambda proven: proven.bound)
 
 
-def _claimed_bound(
-    problem: PGOProblem, certificate: Certificate, proven: _Proven, of_file: PoseGraph
-) -> float:
+def _claimed_bound(problem: PGOProblem, certificate: Certificate, proven: _Proven) -> float:
     """The bound of the certificate, less what the rounding of the numbers of the file can take.
 
     To first order the least cost changes by what the cost of the best poses does. Its residuals
     are known to `objective_rounding`. A relative error of the entries of information matrices
     changes chi2 by that share of the sizes sum_a I_aa z_a^2 of the residuals z, and so it changes F
     (`pgo_models.verification.doubles`). The loss of second order is as large as what the
-    certificate subtracts for rounding, which is subtracted once more. Priors, which the problem may
-    have with smaller coordinates, were rounded as the file has them (`_loss_of_priors`).
+    certificate subtracts for rounding, which is subtracted once more.
     """
     stored_bound = min(certificate.bound.value, proven.bound)
     bound = scaled_below(stored_bound, certificate.weights_error)
@@ -285,24 +280,8 @@ def _claimed_bound(
         return 0.0
     of_residuals = objective_rounding(problem, proven.poses).error
     of_weights = WEIGHT_ERROR * _sizes_of_weights(problem, proven.poses)
-    of_priors = _loss_of_priors(problem, proven.poses, of_file)
-    claimed = bound - of_residuals - of_weights - of_priors - certificate.bound.rounding
+    claimed = bound - of_residuals - of_weights - certificate.bound.rounding
     return max(claimed, 0.0)
-
-
-def _loss_of_priors(problem: PGOProblem, poses: Poses, of_file: PoseGraph) -> float:
-    """What the rounding of positions p in the decimals of a file can make of the cost.
-
-    It is up to u ||p||, and with I_tt and the cost c of its edge sum 2 sqrt(c tr(I_tt)) u ||p|| +
-    tr(I_tt) (u ||p||)^2.
-    """
-    of_priors = of_file.is_prior
-    error = UNIT_ROUNDOFF * block_norms(of_file.t_ij[of_priors])
-    weight = np.einsum(
-        "mkk->m", _information_of(problem.graph)[of_priors, : of_file.d, : of_file.d]
-    )
-    cost = np.maximum(problem.edge_costs(poses)[of_priors], 0.0)
-    return float(np.sum(2.0 * np.sqrt(cost * weight) * error + weight * error**2))
 
 
 def _information_of(graph: PoseGraph) -> Array:

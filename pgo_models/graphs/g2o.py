@@ -36,6 +36,7 @@ from pgo_models.graphs.g2o_rows import (
 )
 from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.missing_poses import with_missing_poses
+from pgo_models.graphs.origin import far_middle, shifted_exactly
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
 from pgo_models.graphs.precisions import RotationWeight, edge_precisions
 from pgo_models.graphs.written_digits import most_digits, written_errors
@@ -210,7 +211,13 @@ def graph_of_files(
     edges = np.searchsorted(ids, edge_ids)
     robot = _robots(file_ids, files, letters)
     estimate, is_known = _estimate(file_ids, robot, files)
+    information = information_of(d, rows)
+    kappa, tau = edge_precisions(information, weights)
     R_ij, t_ij = poses_of(d, rows)
+    is_prior = edge_ids[:, 0] == WORLD_ID
+    origin = far_middle(t_ij[is_prior & (tau > 0)], t_ij[~is_prior])
+    if origin.any():
+        t_ij[is_prior] = shifted_exactly(t_ij[is_prior], _remainders(files)[is_prior], origin)
     landmark_ids = np.concatenate([file.landmarks for file in files])
     is_landmark = np.isin(ids, landmark_ids)
     world = None
@@ -222,8 +229,6 @@ def graph_of_files(
             first_prior = np.argmax(edges[:, 0] == world)
             measured_pose = edges[first_prior, 1]
             robot = np.append(robot, robot[measured_pose])
-    information = information_of(d, rows)
-    kappa, tau = edge_precisions(information, weights)
     digits = most_digits(file.digits for file in files)
     graph = PoseGraph(
         len(ids),
@@ -243,6 +248,7 @@ def graph_of_files(
         landmarks=np.flatnonzero(is_landmark),
         written_error=written_errors(measurements_of(d, rows), digits),
         weights_error=max(file.weights_error for file in files),
+        origin=origin,
     )
     if not path.is_dir() and len(files) == 1 and is_known.any() and not is_known.all():
         return with_missing_poses(graph, estimate, is_known, printable(str(path)))
@@ -632,6 +638,17 @@ def _joined_edges(files: list[G2OLines]) -> tuple[IntArray, Array]:
     return np.concatenate(edge_ids), np.concatenate(edges)
 
 
+def _remainders(files: list[G2OLines]) -> Array:
+    """What the decimals of the edges of `_joined_edges` have beyond their doubles, (m, d)."""
+    remainders = []
+    for file, kept in zip(files, _rows_to_keep(files), strict=True):
+        of_file = file.remainders
+        if of_file is None:
+            of_file = np.zeros((len(file.edges), file.d))
+        remainders.append(of_file[kept])
+    return np.concatenate(remainders)
+
+
 def edge_rows_to_keep(files: Sequence[tuple[IntArray, Array]]) -> list[IntArray | slice]:
     """Rows of every file to keep, so that an edge that is in two files counts once.
 
@@ -747,6 +764,8 @@ def _poses_to_write(graph: PoseGraph, poses: Poses | None) -> Poses | None:
         raise GraphError(
             f"poses are {written}; {graph.name} needs {graph.num_poses} of them in {graph.d}D"
         )
+    if written is not None and graph.has_far_priors:
+        return graph.in_frame_of_priors(written)
     return written
 
 
@@ -826,7 +845,8 @@ def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
         # The line of a prior names the measured pose alone, which is the second end of the edge.
         ids = end_ids[chosen, -kind.num_ids :]
         offset = "0 " * kind.num_offsets
-        yield from lines_of(tag, ids, numbers, offset)
+        origin = graph.origin if kind.num_ids == 1 else None
+        yield from lines_of(tag, ids, numbers, offset, origin)
 
 
 def _numbers(poses: Poses, kind: Tag) -> Array:

@@ -82,6 +82,8 @@ class G2OLines:
     landmarks: IntArray  # (l,): ids of points
     digits: WrittenDigits  # of the measurements as they are written
     weights_error: float = 0.0  # the largest of the edges, see `weight_errors`
+    # (m, d): what the positions of priors have in decimals beyond `edges`; None of none.
+    remainders: Array | None = None
     landmark_shift: int = 0  # what was added to the ids of landmarks, which the file has for poses
 
 
@@ -275,10 +277,21 @@ class _Assembly:
             landmarks=np.zeros(0, dtype=np.int64),
             digits=digits,
             weights_error=self.weights_error,
+            remainders=self._remainders(edges),
         )
         if vertices.is_point.any() or edges.is_point.any():
             return self._with_landmarks(file, vertices.is_point, edges.is_point)
         return file
+
+    def _remainders(self, edges: _Rows) -> Array | None:
+        """What the positions of priors have in decimals beyond the numbers of the edges, (m, d)."""
+        of_lines = self._source.remainders
+        if not of_lines:
+            return None
+        remainders = np.zeros((len(edges.lines), self._d))
+        for row in np.flatnonzero(edges.ids[:, 0] == WORLD_ID):
+            remainders[row] = of_lines[int(edges.lines[row])]
+        return remainders
 
     def _settle_complete(self) -> None:
         """Put the upper triangles of complete matrices in their place."""

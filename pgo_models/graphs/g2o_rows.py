@@ -12,6 +12,7 @@ from pgo_models.geometry.rotations import (
     quaternions_from_rotations,
     rotations_from_quaternions,
 )
+from pgo_models.graphs.origin import decimal_sums
 from pgo_models.graphs.pose_graph import IntArray
 
 _ROWS_AT_A_TIME = 2**14  # rows of numbers that are turned into text at a time
@@ -48,15 +49,22 @@ def numbers_of(R: Array, t: Array) -> Array:
     return np.concatenate([t, rotations], axis=1)
 
 
-def lines_of(tag: str, ids: IntArray, numbers: Array, offset: str = "") -> Iterator[str]:
-    """Lines `tag ids offset numbers`; `repr` of a double gives the digits that bring it back."""
+def lines_of(
+    tag: str, ids: IntArray, numbers: Array, offset: str = "", origin: Array | None = None
+) -> Iterator[str]:
+    """Lines `tag ids offset numbers`; `repr` of a double gives the digits that bring it back.
+
+    An origin, (d,), is added to the first numbers, in decimals.
+    """
+    far = [] if origin is None else origin.tolist()
     for first in range(0, len(ids), _ROWS_AT_A_TIME):
         rows = slice(first, first + _ROWS_AT_A_TIME)
         ids_of_rows = ids[rows].tolist()
         numbers_of_rows = numbers[rows].tolist()
         for row_ids, row in zip(ids_of_rows, numbers_of_rows, strict=True):
             words_of_ids = " ".join(map(str, row_ids))
-            words = " ".join(map(repr, row))
+            sums = decimal_sums(row[: len(far)], far)
+            words = " ".join([*sums, *map(repr, row[len(far) :])])
             yield f"{tag} {words_of_ids} {offset}{words}\n"
 
 

@@ -27,6 +27,7 @@ from pgo_models.graphs.g2o_tags import (
     WITH_ANGLES,
     Tag,
 )
+from pgo_models.graphs.origin import remainder_of
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 
 _LONG_RUN = 16  # lines of one tag in a row, from which on they need not be sorted by tag
@@ -67,6 +68,8 @@ class Source:
         self.unknown: dict[str, tuple[int, int]] = {}  # tag: how many lines, and the first
         self.skipped: dict[str, int] = {}  # tags that are skipped by their nature: how many lines
         self.num_kernels = 0
+        # Lines of priors to what their decimals have beyond the doubles that they are read as.
+        self.remainders: dict[int, list[float]] = {}
         # Poses of sensors: dimension and id, as it is written, to lines and words behind the id.
         self.offsets: dict[tuple[int, str], list[tuple[int, list[str]]]] = {}
 
@@ -234,7 +237,17 @@ class Source:
         parsed = ParsedLines(numbers, ids.copy(), values)
         self.parsed[tag].append(parsed)
         self.written_tags.add(written_tag)
+        if kind.is_edge and kind.num_ids == 1:
+            self._note_remainders(kind, parsed, lines)
         return True
+
+    def _note_remainders(self, kind: Tag, parsed: ParsedLines, lines: list[str]) -> None:
+        """Note what the positions of priors have beyond their doubles, as far ones are shifted."""
+        first = 1 + kind.num_ids + kind.num_other_ids
+        values = parsed.numbers[:, : kind.d].tolist()
+        for number, line, row in zip(parsed.lines.tolist(), lines, values, strict=True):
+            words = line.split(None, first + kind.d)[first : first + kind.d]
+            self.remainders[number] = list(map(remainder_of, words, row))
 
     def _check_line(self, tag: str, number: int, line: str) -> None:
         """Raise a FileFormatError when a word of a line is wrong, or there are not enough."""

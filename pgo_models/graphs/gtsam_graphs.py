@@ -189,7 +189,8 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
         raise GraphError(f"{edge}: its information matrix is singular; GTSAM needs definite ones")
     factors = gtsam.NonlinearFactorGraph()
     ids = graph.pose_ids
-    measured = poses_in_gtsam(gtsam, Poses(graph.R_ij, graph.t_ij))
+    t_ij = graph.t_ij + np.where(graph.is_prior[:, None], graph.world_point, 0.0)
+    measured = poses_in_gtsam(gtsam, Poses(graph.R_ij, t_ij))
     in_order = np.roll(information, 3, axis=(1, 2)) if d == 3 else information
     full_noise = gtsam.noiseModel.Gaussian.Information
     between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
@@ -199,7 +200,7 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
         j = int(ids[graph.j[e]])
         if is_position[e]:
             noise = full_noise(information[e, :d, :d])
-            factors.add(position(j, graph.t_ij[e], noise))
+            factors.add(position(j, t_ij[e], noise))
         elif graph.is_prior[e]:
             factors.add(prior(j, measured[e], full_noise(in_order[e])))
         else:

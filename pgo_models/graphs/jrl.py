@@ -24,6 +24,7 @@ from pgo_models.graphs.g2o_parser import (
     problems_of,
 )
 from pgo_models.graphs.g2o_tags import Noise, Tag
+from pgo_models.graphs.origin import remainder_of
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.weight_errors import MOST
@@ -265,6 +266,7 @@ def lines_of_measurements(
     width = 9 if d == 2 else 28
     ids = [np.zeros((0, 2), dtype=np.int64)]
     rows = [np.zeros((0, width))]
+    remainders = [np.zeros((0, d))]
     places = [np.zeros(0, dtype=np.int64)]
     landmarks = [np.zeros(0, dtype=np.int64)]
     measured = [np.zeros(0)]
@@ -289,6 +291,7 @@ def lines_of_measurements(
         places_of_kind = of_kind[~is_wrong]
         problems += far_information(places_of_kind[~is_right])
         rows.append(rows_of_kind[is_right])
+        remainders.append(_remainders(kind, rows[-1]))
         measured.append(numbers[:, : kind.num_measured].ravel())
         ids.append(ids_of_kind[is_right])
         places.append(places_of_kind[is_right])
@@ -311,7 +314,20 @@ def lines_of_measurements(
         landmarks=np.unique(np.concatenate(landmarks)),
         digits=digits_of(np.concatenate(measured)),
         weights_error=weights_error,
+        remainders=np.concatenate(remainders)[order],
     )
+
+
+def _remainders(kind: Tag, rows: Array) -> Array:
+    """What the positions of priors have in decimals beyond the numbers of rows, (k, d).
+
+    JSON is written with the fewest digits that bring a double back, which are those of `repr`.
+    """
+    positions = rows[:, : kind.d]
+    if kind.num_ids != 1:
+        return np.zeros_like(positions)
+    beyond = [remainder_of(repr(x), x) for x in positions.ravel().tolist()]
+    return np.reshape(beyond, positions.shape)
 
 
 def _take(of_type: Measurements, measurement: Mapping[str, Any]) -> None:

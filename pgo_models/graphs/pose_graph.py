@@ -20,6 +20,7 @@ from pgo_models.errors import GraphError, check_settings, door
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array, whole_array, whole_number
 from pgo_models.geometry.poses import Poses, rotations_to_rounding
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.origin import far_middle, is_exact_difference
 from pgo_models.html_tables import facts_table
 
 # Numbers of poses and edges; those that come from sparse matrices have 32 bits.
@@ -36,8 +37,8 @@ _NAMED_COMPONENTS = 5  # components that an error names
 
 _WHOLE_NUMBERS = ("num_poses", "world")
 _WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks", "absent")
-_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times", "written_error")
-_OPTIONAL = ("world", "ids", "robot", "information", "times", "written_error")
+_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times", "written_error", "origin")
+_OPTIONAL = ("world", "ids", "robot", "information", "times", "written_error", "origin")
 _EDGE_FIELDS = (
     "i",
     "j",
@@ -127,6 +128,12 @@ class PoseGraph(ReadOnly):
         the file are between 1 - weights_error and 1 + weights_error times these. Certificates count
         it. 0 where the file has the weights itself, and of weights that are given.
 
+    origin : Array, (d,), optional
+        Where the world pose stands in the frame of the file: a point near priors that are far from
+        zero, as in UTM coordinates, else zero. The t_ij of priors are measured from it, and poses
+        in the frame of the file have the world pose there. Unless given it is found, and the t_ij
+        given are seen from it if that takes no rounding.
+
     Raises
     ------
     GraphError
@@ -166,6 +173,7 @@ class PoseGraph(ReadOnly):
     absent: IntArray = field(default_factory=_no_poses)
     written_error: Array | None = None
     weights_error: float = 0.0
+    origin: Array | None = None
 
     _way_out = "pgo_models.load(..) reads a graph, and `.graph` of a problem is one"
 
@@ -190,6 +198,7 @@ class PoseGraph(ReadOnly):
         self._check_not_empty()
         self._settle_landmarks()
         self._check_not_empty()
+        self._settle_origin()
         for name in ("initial", "truth"):
             poses = getattr(self, name)
             if poses is not None:
@@ -375,7 +384,7 @@ class PoseGraph(ReadOnly):
         Returns
         -------
         Poses
-            All n poses. The world pose is the identity where it was left out. A landmark has the
+            All n poses. The world pose is at the `origin` where it was left out. A landmark has the
             rotation of the pose that saw it first.
         """
         first = self.first_sights
@@ -387,13 +396,81 @@ class PoseGraph(ReadOnly):
         if self.world is not None and num_given == self.num_poses - 1:
             identity = np.eye(poses.d)
             R = np.insert(R, self.world, identity, axis=0)
-            t = np.insert(t, self.world, 0.0, axis=0)
+            t = np.insert(t, self.world, self.world_point, axis=0)
         if len(first) and len(t) == self.num_poses:
             landmarks = self.j[first]
             seen_from = self.i[first]
             R = R.copy()
             R[landmarks] = R[seen_from]
         return Poses(R, t)
+
+    @property
+    def world_point(self) -> Array:
+        """Where the world pose stands in the frame of the file, (d,): the `origin`."""
+        assert self.origin is not None
+        return self.origin
+
+    @property
+    def has_far_priors(self) -> bool:
+        """Whether priors are seen from a point among them that is far from zero."""
+        return self.world is not None and bool(self.world_point.any())
+
+    def near_zero(self, poses: Poses) -> Poses:
+        """Return poses of a graph with far priors in the frame of the world pose; others as given.
+
+        Parameters
+        ----------
+        poses : Poses
+            All poses of the graph, in any frame.
+
+        Returns
+        -------
+        Poses
+            With the world pose at the identity. Poses in the frame of the file lose nothing.
+        """
+        if not self.has_far_priors:
+            return poses
+        world = self.world
+        assert world is not None
+        moved = poses.with_gauge_at(world)
+        R = moved.R.copy()
+        R[world] = np.eye(self.d)
+        return Poses(R, moved.t)
+
+    def in_frame_of_priors(self, poses: Poses) -> Poses:
+        """Return poses of a graph with priors in the frame of its file.
+
+        Parameters
+        ----------
+        poses : Poses
+            All poses of the graph, in any frame.
+
+        Returns
+        -------
+        Poses
+            With the world pose unturned at the `origin`. Far from zero each coordinate is rounded.
+        """
+        assert self.world is not None
+        if not self.has_far_priors:
+            return poses.with_gauge_at(self.world)
+        near = self.near_zero(poses)
+        return near.with_translations(near.t + self.world_point)
+
+    def _settle_origin(self) -> None:
+        """Find the origin of far priors, and measure them from there, unless it is given."""
+        if self.origin is not None:
+            return
+        origin = np.zeros(self.d)
+        if self.world is not None:
+            is_prior = self.is_prior
+            origin = far_middle(self.t_ij[is_prior & (self.tau > 0)], self.t_ij[~is_prior])
+            is_exact = is_exact_difference(self.t_ij[is_prior], origin).all(axis=0)
+            origin = np.where(is_exact, origin, 0.0)
+            if origin.any():
+                t_ij = self.t_ij.copy()
+                t_ij[is_prior] -= origin
+                self._set("t_ij", read_only(t_ij))
+        self._set("origin", read_only(origin))
 
     def _settle_landmarks(self) -> None:
         """Set kappa and information of the edges to landmarks, see the docstring of the class."""
@@ -469,6 +546,7 @@ class PoseGraph(ReadOnly):
             "robot": (n,),
             "fixed": (len(self.fixed),),
             "times": (len(self.bodies),),
+            "origin": (d,),
         }
 
     def _fits(self, poses: Poses) -> bool:
@@ -824,6 +902,7 @@ class PoseGraph(ReadOnly):
             ids=self.pose_ids[poses],
             name=self.name,
             weights_error=self.weights_error,
+            origin=self.origin,
         )
 
     def unit_weights(self) -> PoseGraph:
@@ -937,13 +1016,14 @@ class PoseGraph(ReadOnly):
             raise GraphError(
                 f"{measured} for {len(i)} edges in {self.d}D; give one measured pose for every edge"
             )
+        offsets = measured.t - np.where((i == self.world)[:, None], self.world_point, 0.0)
         kappa_rows = _rows_of_weights(kappa, len(i), "kappa")
         tau_rows = _rows_of_weights(tau, len(i), "tau")
         new_rows = {
             "i": i,
             "j": j,
             "R_ij": measured.R,
-            "t_ij": measured.t,
+            "t_ij": offsets,
             "kappa": kappa_rows,
             "tau": tau_rows,
             "information": isotropic_information(kappa_rows, tau_rows, self.d),
@@ -955,7 +1035,9 @@ class PoseGraph(ReadOnly):
         extended: dict[str, Any] = {}
         for name, rows in own_rows.items():
             extended[name] = np.concatenate([rows, new_rows[name]])
-        return replace(self, **extended)
+        # Where nothing was far before, the origin is found anew.
+        origin = self.origin if self.world_point.any() else None
+        return replace(self, **extended, origin=origin)
 
     def with_prior(
         self, poses: IntArray, measured: Poses, kappa: Weights, tau: Weights

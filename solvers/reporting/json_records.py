@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 from pgo_models.certificates.certificate import Certificate
-from pgo_models.certificates.fit import Fit
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.partitioning import Partition
 from solvers.network.ledger import Ledger
@@ -16,8 +15,8 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
     """What `.json` files hold of a certificate; None stands for what is not known.
 
     That is eta where none was proved, the error of the objective where no bound on it is known, and
-    the stationarity where it was not measured. `exact_to` is a name of `Fit` where the verdict is
-    EXACT.
+    the stationarity where it was not measured. `exact_to` is the largest residual of an edge over
+    what it measures, where the verdict is EXACT.
     """
     return {
         "lower_bound": certificate.lower_bound,
@@ -32,7 +31,7 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
         "digits": certificate.digits,
         "stationarity": finite_or_none(certificate.stationarity),
         "verdict": certificate.verdict.name,
-        "exact_to": None if certificate.fit is Fit.NONE else certificate.fit.name,
+        "exact_to": finite_or_none(certificate.fit.share),
     }
 
 

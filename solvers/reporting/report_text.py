@@ -9,7 +9,6 @@ from decimal import Decimal
 from typing import Protocol
 
 from pgo_models.certificates.certificate import Certificate, Verdict
-from pgo_models.certificates.fit import Fit
 from pgo_models.figures import in_percent, rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -92,15 +91,10 @@ class Solved(Protocol):
 def headline(certificate: Certificate) -> str:
     """Return the verdict in one sentence."""
     verdict = certificate.verdict
-    if verdict is Verdict.EXACT and certificate.fit is Fit.BILLIONTH:
-        return "Certified: the poses fit every measurement to a billionth of what it says."
     if verdict is Verdict.EXACT:
-        digits = "double precision"
-        if certificate.fit is Fit.DIGITS:
-            digits = "their file"
         return (
-            f"Certified: the measurements agree to the last digits of {digits}, and the poses fit "
-            "them all."
+            "Certified: the poses fit every measurement as closely as its numbers can tell "
+            f"({certificate.fit.text})."
         )
     if verdict is Verdict.TRIVIAL:
         nothing = f"nothing better than {certificate.cost} >= 0 is proven"
@@ -125,25 +119,12 @@ def meaning(certificate: Certificate) -> list[str]:
         f"The poses cost {certificate.cost} = {certificate.cost_text}: the sum, over all "
         "measurements, of squared errors times precisions."
     )
-    if certificate.fit is Fit.DIGITS:
+    if certificate.fit.is_exact and not certificate.fit.is_to_rounding:
         return [
             cost,
-            "That is no more than what rounding the measurements to the last digits of their file "
-            f"makes of it, and {certificate.cost} is never below zero: no other poses fit better, "
-            "as far as the file can tell.",
-        ]
-    if certificate.fit is Fit.COORDINATES:
-        return [
-            cost,
-            "That is no more than what the last bits of the coordinates make of it, as doubles "
-            f"have them so far from zero, and {certificate.cost} is never below zero.",
-        ]
-    if certificate.fit is Fit.BILLIONTH:
-        return [
-            cost,
-            "No measurement is missed by more than a billionth of what it says, and all of them "
-            "together by less than a millionth of a standard deviation. "
-            f"{certificate.cost} is never below zero, so no other poses fit noticeably better.",
+            f"That is no more than what the last digits of the measurements make of it: "
+            f"{certificate.fit.text}. {certificate.cost} is never below zero, so no other poses "
+            "fit noticeably better.",
         ]
     if certificate.verdict is Verdict.EXACT:
         rounding = rounded_up(certificate.rounding_level, 2)

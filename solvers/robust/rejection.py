@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from pgo_models.certificates.certificate import Verdict
-from pgo_models.certificates.fit import Fit
+from pgo_models.certificates.fit import NO_FIT, Fit
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.problem.problem import PGOProblem
@@ -117,7 +117,7 @@ class Rejection(Summarised):
     rival: Rival | None = None
     noise: float = 1.0
     places: tuple[str, ...] = ()
-    fit: Fit = Fit.NONE
+    fit: Fit = NO_FIT
     proof: OutlierProof | None = None
 
     @property
@@ -234,8 +234,7 @@ class Rejection(Summarised):
             edges = f"for the {int(self.kept.sum())} edges kept"
         if self.noise > 1.0:
             edges += f", whose squared errors are {rounded_up(self.noise, 2)} times those claimed"
-        digits = " to the digits of the file" if self.fit is Fit.DIGITS else ""
-        proven = f"{self.verdict.name}{digits} {edges}; {self.held}"
+        proven = f"{self.verdict.name} {edges}; {self.held}"
         if not self.doubts:
             return proven
         doubts = "; ".join(self.doubts)

@@ -31,7 +31,7 @@ from pgo_models.certificates.certificate import (
     judge,
 )
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.fit import Fit, fits_to_rounding
+from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, Fit, fits_to_rounding
 from pgo_models.certificates.lower_bound import best_bound, prove_bound
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import GraphError, SettingError
@@ -192,12 +192,12 @@ def test_graphs_without_noise_are_certified(seed: int, n: int, d: int) -> None:
     certificate = certify(problem, graph.truth)
     assert certificate.verdict is Verdict.EXACT
     assert (certificate.gap, certificate.lower_bound) == (0.0, 0.0)
-    assert "exact to rounding" in str(certificate)
+    assert "fits to its last bits" in str(certificate)
     # A linear solve may leave a little more than the rounding of residuals.
     certificate = certify(problem, chordal_start(problem))
     assert certificate.verdict is Verdict.EXACT
     assert certificate.lower_bound == 0.0
-    assert "exact to rounding" in str(certificate) or certificate.objective_at_most < 1e-12
+    assert "fits to its last bits" in str(certificate) or certificate.objective_at_most < 1e-12
     # Poses elsewhere have no bound but zero.
     certificate = certify(problem, random_poses(n, d, seed))
     assert (certificate.verdict, certificate.lower_bound) == (Verdict.TRIVIAL, 0.0)
@@ -410,11 +410,12 @@ def test_a_gap_is_written_with_the_digits_that_it_proves() -> None:
     assert near.gap_text == "9.1e-13, proven to 12 digits"
     far = replace(whole, bound=replace(found.bound, value=0.75 * 2.0**60))
     assert (far.gap_text, far.digits) == ("0.25", 0)
-    to_rounding = replace(near, verdict=Verdict.EXACT, fit=Fit.ROUNDING)
+    to_rounding = replace(near, verdict=Verdict.EXACT, fit=FITS_WITHOUT_EDGES)
     assert to_rounding.gap_text == "0: every edge fits to its rounding"
-    assert to_rounding.verdict_text.endswith("exact to rounding: every edge fits to its last bits")
-    to_digits = replace(near, verdict=Verdict.EXACT, fit=Fit.DIGITS)
-    assert to_digits.gap_text == "9.1e-13, of a cost below the digits of the file"
+    assert to_rounding.verdict_text.endswith("globally optimal: every edge fits to its last bits")
+    to_digits = replace(near, verdict=Verdict.EXACT, fit=Fit(is_exact=True, share=2e-9, units=0.7))
+    assert to_digits.gap_text == "9.1e-13, of a cost that the last digits of the edges explain"
+    assert "to 0.7 units of the last digit" in to_digits.verdict_text
     # Of exact poses, too, no more is said to be proven than is.
     for exact in (to_rounding, to_digits):
         assert (exact.digits, exact.proven_gap) == (near.digits, near.proven_gap)

@@ -20,7 +20,7 @@ from written import write_robot_files, written_text
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import Certificate, Verdict
-from pgo_models.certificates.fit import Fit
+from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, NO_FIT, Fit
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
@@ -31,10 +31,6 @@ SQUARE = "".join(
     f"EDGE_SE2 {i} {j} 1 0 1.570796327 1 0 0 1 0 1\n" for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))
 )
 FORMATS = [f"%.{digits}{kind}" for digits in (8, 9, 10, 12) for kind in "fg"]
-SENTENCE = (
-    "EXACT: globally optimal, exact to the digits of the file: "
-    "every edge fits to the last digits written"
-)
 
 
 def read(graph: PoseGraph, form: str, folder: Path) -> PoseGraph:
@@ -55,13 +51,15 @@ def without_noise(pattern: PoseGraph) -> PoseGraph:
 
 def assert_exact_to_digits(certificate: Certificate) -> None:
     """The verdict, its sentence, and a gap of which no more is said than is proven."""
-    assert (certificate.verdict, certificate.fit) == (Verdict.EXACT, Fit.DIGITS)
-    assert certificate.verdict_text.replace("rotations ", "") == SENTENCE
+    assert certificate.verdict is Verdict.EXACT
+    assert certificate.fit.is_exact
+    assert certificate.fit.units <= 2.0
+    assert "globally optimal: every edge fits to " in certificate.verdict_text
     assert certificate.is_certified
     assert not certificate.can_improve
     cost = exact(certificate.objective_at_most)
     assert (1 - exact(certificate.proven_gap)) * cost <= exact(certificate.lower_bound)
-    assert certificate.gap_text.endswith("of a cost below the digits of the file")
+    assert certificate.gap_text.endswith("of a cost that the last digits of the edges explain")
 
 
 @settings(max_examples=examples(25))
@@ -89,7 +87,7 @@ def test_graphs_without_noise_are_exact_to_the_digits_of_their_file(
     problem = PGOProblem(read(graph, form, tmp_path_factory.mktemp("digits")))
     solution = solvers.solve(problem, progress=False)
     certificate = solution.certificate
-    if certificate.fit is not Fit.ROUNDING:  # all numbers of a small graph may be that of a double
+    if not certificate.fit.is_to_rounding:  # all numbers of a small graph may be that of a double
         assert_exact_to_digits(certificate)
     judged = solvers.certify(problem, solution.poses)
     assert (judged.verdict, judged.fit) == (certificate.verdict, certificate.fit)
@@ -175,9 +173,10 @@ def test_a_student_s_first_square_is_exact(
         with pytest.raises(SystemExit) as ended:
             main(["solve", str(path), *options])
         assert ended.value.code == 0
-        assert "exact to the digits of the file" in " ".join(capsys.readouterr().out.split())
+        assert "globally optimal: every edge fits to " in capsys.readouterr().out
     record = solvers.solve(pgo.read_g2o(path), progress=False).as_json()
-    assert (record["verdict"], record["exact_to"]) == ("EXACT", "DIGITS")
+    assert record["verdict"] == "EXACT"
+    assert 0.0 < record["exact_to"] < 1e-9
     assert record["proven_gap"] > 1e-6
 
 
@@ -185,14 +184,14 @@ def test_a_student_s_first_square_is_exact(
 def test_few_digits_and_those_of_doubles_are_no_reason_to_say_so(form: str, tmp_path: Path) -> None:
     for seed in range(4):
         graph = read(exact_graph(seed, 12, 2 + seed % 2), form, tmp_path)
-        assert solvers.solve(graph, progress=False).certificate.fit is not Fit.DIGITS
+        assert np.isinf(solvers.solve(graph, progress=False).certificate.fit.units)
 
 
 def test_the_same_numbers_without_a_file_are_not_exact(tmp_path: Path) -> None:
     graph = read(exact_graph(0, 12, 2), "%.9f", tmp_path)
     unknown = replace(graph, written_error=None)
-    assert solvers.solve(graph, progress=False).certificate.fit is Fit.DIGITS
-    assert solvers.solve(unknown, progress=False).certificate.fit is Fit.NONE
+    assert solvers.solve(graph, progress=False).certificate.fit.is_exact
+    assert not solvers.solve(unknown, progress=False).certificate.fit.is_exact
 
 
 @settings(max_examples=examples(15))
@@ -204,7 +203,7 @@ def test_noise_above_the_last_digit_is_not_exact(
     graph = exact_graph(seed, 12, d)
     noise = 1e-9 * units * np.random.default_rng(seed).standard_normal(graph.t_ij.shape)
     noisy = read(replace(graph, t_ij=graph.t_ij + noise), "%.9f", tmp_path_factory.mktemp("noise"))
-    assert solvers.solve(noisy, progress=False).certificate.fit is Fit.NONE
+    assert not solvers.solve(noisy, progress=False).certificate.fit.is_exact
 
 
 @settings(max_examples=examples(15))
@@ -216,10 +215,10 @@ def test_weights_have_no_say(
     graph = read(exact_graph(seed, 12, d), "%.9f", tmp_path_factory.mktemp("weights"))
     scaled = replace(graph, kappa=weight * graph.kappa, tau=weight * graph.tau, information=None)
     problem = PGOProblem(scaled)
-    assert solvers.solve(problem, progress=False).certificate.fit is not Fit.NONE
+    assert solvers.solve(problem, progress=False).certificate.fit.is_exact
     for poses in (random_poses(12, d, seed), Poses.identity(12, d)):
         certificate = solvers.certify(problem, poses)
-        assert certificate.fit is Fit.NONE
+        assert not certificate.fit.is_exact
         assert not certificate.is_certified
 
 
@@ -236,10 +235,10 @@ def test_digits_of_a_long_edge_excuse_no_other(far: int, tmp_path: Path) -> None
     t = np.zeros((4, 2))
     t[[b, c, far]] = [[1.0, 0.0], [1.0, 1.0], [1e9, 0.0]]
     straight = np.tile(np.eye(2), (4, 1, 1))
-    assert solvers.certify(graph, Poses(straight, t)).fit is Fit.DIGITS
+    assert solvers.certify(graph, Poses(straight, t)).fit.is_exact
     t[c, 0] += 1e-5
     off = solvers.certify(graph, Poses(straight, t))
-    assert (off.fit, off.is_certified) == (Fit.NONE, False)
+    assert not off.is_certified
 
 
 def test_a_heavy_edge_does_not_hide_light_ones(tmp_path: Path) -> None:
@@ -247,22 +246,39 @@ def test_a_heavy_edge_does_not_hide_light_ones(tmp_path: Path) -> None:
     assert graph.truth is not None
     first = np.arange(graph.num_edges) == 0
     heavy = read(replace(graph, tau=np.where(first, 1e30, 1.0), information=None), "%.9f", tmp_path)
-    assert solvers.certify(heavy, graph.truth).fit is Fit.DIGITS
+    assert solvers.certify(heavy, graph.truth).fit.is_exact
     t = graph.truth.t.copy()
     free = np.setdiff1d(np.arange(10), [graph.i[0], graph.j[0]])[0]
     t[free, 0] += 1e-6
     assert PGOProblem(heavy).objective(Poses(graph.truth.R, t)) < 1e12
-    assert solvers.certify(heavy, Poses(graph.truth.R, t)).fit is Fit.NONE
+    assert not solvers.certify(heavy, Poses(graph.truth.R, t)).fit.is_exact
 
 
 def test_a_robust_solve_says_to_what_it_is_exact(tmp_path: Path) -> None:
     graph = read(exact_graph(3, 14, 2), "%.12g", tmp_path)
     robust = solvers.solve(graph, robust=solvers.GNC(), progress=False).robust
     assert robust is not None
-    assert "EXACT to the digits of the file for " in robust.headline
+    assert "EXACT for " in robust.headline
 
 
 def test_the_loosest_of_several_fits_is_that_of_all() -> None:
-    assert Fit.of_all([]) is Fit.ROUNDING
-    assert Fit.of_all([Fit.ROUNDING, Fit.DIGITS]) is Fit.DIGITS
-    assert Fit.of_all([Fit.NONE, Fit.ROUNDING]) is Fit.NONE
+    exact = Fit(is_exact=True, share=1e-10, units=0.5)
+    assert Fit.of_all([]) == FITS_WITHOUT_EDGES
+    assert Fit.of_all([FITS_WITHOUT_EDGES, exact]) == exact
+    assert not Fit.of_all([NO_FIT, FITS_WITHOUT_EDGES]).is_exact
+
+
+CASES = Path(__file__).parent.parent / "cases"
+
+
+def test_a_fix_that_is_off_by_three_of_its_units_is_not_exact() -> None:
+    """Its last digit is a metre, and it is 3.3 m off among a hundred fixes."""
+    certificate = solvers.solve(
+        pgo.read_g2o(CASES / "exact_wrong_fix.g2o"), progress=False
+    ).certificate
+    assert certificate.objective > 1000.0
+    assert certificate.verdict is not Verdict.EXACT
+    square = solvers.solve(
+        pgo.read_g2o(CASES / "q1_noise_free_square.g2o"), progress=False
+    ).certificate
+    assert square.verdict is Verdict.EXACT

@@ -24,7 +24,7 @@ from pgo_models.certificates.certificate import (
     Verdict,
     certify_with,
 )
-from pgo_models.certificates.fit import Fit, fits_to_rounding
+from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.certificates.rounding_errors import objective_rounding, rounding_level
 from pgo_models.geometry.poses import Poses
@@ -85,7 +85,7 @@ def allowed_residuals(problem: PGOProblem, poses: Poses) -> tuple[Exact, Exact]:
 def assert_exact_is_true(problem: PGOProblem, poses: Poses) -> bool:
     """Whether it is said that poses are exact to rounding, and if so that it is so."""
     certificate = judged(problem, poses)
-    if certificate.fit is not Fit.ROUNDING:
+    if not certificate.fit.is_to_rounding:
         assert certificate.gap > 0.0
         return False
     assert certificate.gap == 0.0
@@ -149,9 +149,9 @@ def test_a_heavy_edge_does_not_hide_light_ones(
     away = Poses(graph.truth.R, graph.truth.t + shift)
     assert weight < 1e30 or problem.objective(away) <= rounding_level(problem, away)
     for certificate in (judged(problem, away), certify(problem, away)):
-        assert certificate.fit in (Fit.BILLIONTH, Fit.NONE)
+        assert not certificate.fit.is_to_rounding
         # A shift of 1e-9 m is of no account beside these edges, unless the heavy one is in its way.
-        assert certificate.fit is Fit.NONE or (weight < 1e30 and size < -8.0)
+        assert not certificate.fit.is_exact or (weight < 1e30 and size < -8.0)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -211,7 +211,7 @@ def test_chi2_that_is_said_to_be_exact_is(
     off = Poses(R, t + 10.0**away * rng.standard_normal((n, d)))
     for poses in (pattern.truth, off):
         certificate = judged(problem, poses)
-        if certificate.fit is Fit.ROUNDING:
+        if certificate.fit.is_to_rounding:
             (square_t, square_R), (e_t, e_R) = (
                 exact_residuals(graph, poses),
                 allowed_residuals(problem, poses),
@@ -251,13 +251,13 @@ def test_the_sum_of_all_edges_is_held_against_the_level(monkeypatch: pytest.Monk
     sizes = 2.0 ** np.arange(-56.0, -40.0)
     moves = rng.standard_normal(graph.truth.t.shape)
     found = [Poses(graph.truth.R, graph.truth.t + size * moves) for size in sizes]
-    said = [objective_rounding(problem, poses).fit is Fit.ROUNDING for poses in found]
+    said = [objective_rounding(problem, poses).fit.is_to_rounding for poses in found]
     assert said == sorted(said, reverse=True)
     assert 0 < sum(said) < len(said)
     for poses in found:
         assert_exact_is_true(problem, poses)
     monkeypatch.setattr(fit, "_NEARLY", math.inf)
-    assert [objective_rounding(problem, poses).fit is Fit.ROUNDING for poses in found] == said
+    assert [objective_rounding(problem, poses).fit.is_to_rounding for poses in found] == said
 
 
 @settings(max_examples=examples(40))

@@ -19,7 +19,7 @@ from robots import PARTITIONERS, Partitioner, Recording, arrays_in
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import BoundSource, Verdict, certify_at
-from pgo_models.certificates.fit import Fit
+from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, NO_FIT, Fit
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -306,13 +306,13 @@ def test_what_no_edge_between_robots_ties_together_is_named(what: str, tmp_path:
         solve_folder(tmp_path)
 
 
-@pytest.mark.parametrize("fits", [(Fit.ROUNDING, Fit.NONE), (Fit.NONE, Fit.ROUNDING)])
+@pytest.mark.parametrize("fits", [(FITS_WITHOUT_EDGES, NO_FIT), (NO_FIT, FITS_WITHOUT_EDGES)])
 def test_the_cost_is_exact_where_the_part_of_every_robot_is(fits: tuple[Fit, Fit]) -> None:
     first, second = fits
     parts = [ObjectiveRounding(1.0, 0.25, first), ObjectiveRounding(2.0, 0.5, second)]
-    assert robots_with_files._sum_of_roundings(parts) == ObjectiveRounding(3.0, 0.75, Fit.NONE)
-    same = [replace(part, fit=Fit.ROUNDING) for part in parts]
-    assert robots_with_files._sum_of_roundings(same).fit is Fit.ROUNDING
+    assert robots_with_files._sum_of_roundings(parts) == ObjectiveRounding(3.0, 0.75, NO_FIT)
+    same = [replace(part, fit=FITS_WITHOUT_EDGES) for part in parts]
+    assert robots_with_files._sum_of_roundings(same).fit.is_to_rounding
 
 
 # What crosses.

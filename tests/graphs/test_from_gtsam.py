@@ -69,7 +69,8 @@ def test_the_answer_of_pose2_slam_as_it_is_without_noise_is_certified() -> None:
     graph = pgo.from_gtsam(factors, optimised(factors, values))
     certificate = solvers.certify(graph, graph.initial)
     assert certificate.is_certified
-    assert (certificate.verdict, certificate.fit) == (pgo.Verdict.EXACT, pgo.Fit.BILLIONTH)
+    assert certificate.verdict is pgo.Verdict.EXACT
+    assert certificate.fit.share <= 1e-9
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pages import Page, own_part
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.certificate import BoundSource
-from pgo_models.certificates.fit import Fit
+from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, Fit
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
@@ -214,7 +214,7 @@ def cases(solution, uncertain):
     certificate = solution.certificate
     yield graph, certificate, solvers.Status.CONVERGED
     yield graph, replace(certificate, wanted_gap=1e-9), solvers.Status.CONVERGED
-    for fit in (Fit.ROUNDING, Fit.DIGITS):
+    for fit in (FITS_WITHOUT_EDGES, Fit(is_exact=True, share=1e-10)):
         exact = replace(certificate, verdict=pgo.Verdict.EXACT, fit=fit)
         yield graph, exact, solvers.Status.CONVERGED
     for status in solvers.Status:
@@ -322,9 +322,8 @@ def test_what_is_exact_to_the_digits_of_a_file_is_reported_as_that(tmp_path):
     edges = [f"EDGE_SE2 {i} {(i + 1) % 4} 1 0 1.570796327 1 0 0 1 0 1" for i in range(4)]
     (tmp_path / "square.g2o").write_text("\n".join(edges))
     page = Page(report_page(solvers.solve(pgo.read_g2o(tmp_path / "square.g2o"))))
-    assert "Certified: the measurements agree to the last digits of their file" in page.text
-    assert "rounding the measurements to the last digits of their file makes of it" in page.text
-    assert "double precision" not in page.text
+    assert "Certified: the poses fit every measurement as closely as its numbers" in page.text
+    assert "no more than what the last digits of the measurements make of it" in page.text
     assert "Ask for a tighter proof" not in page.text
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.certificates.fit import Fit
+from pgo_models.certificates.fit import FITS_WITHOUT_EDGES
 from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
 from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
@@ -128,7 +128,7 @@ class Border:
     has_indefinite: bool  # whether the share of an edge in chi2 can be negative
 
 
-NO_ROUNDING = ObjectiveRounding(0.0, 0.0, Fit.ROUNDING)  # of no edges
+NO_ROUNDING = ObjectiveRounding(0.0, 0.0, FITS_WITHOUT_EDGES)  # of no edges
 
 
 @dataclass(frozen=True, eq=False)
