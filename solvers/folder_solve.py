@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pgo_models.certificates.certificate import Certificate
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
@@ -162,7 +162,6 @@ class FolderSolution(Summarised):
         return [("F", f"{F} with two precisions an edge; the bound is on chi2 alone")]
 
 
-@door
 def solve_folder(
     folder: Path | str,
     pipeline: Pipeline | None = None,

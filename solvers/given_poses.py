@@ -19,7 +19,7 @@ from pgo_models.certificates.certificate import (
     with_terms,
 )
 from pgo_models.certificates.lower_bound import has_complex_form
-from pgo_models.errors import FAILURES, GraphWarning, door
+from pgo_models.errors import FAILURES, GraphWarning
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
@@ -38,7 +38,6 @@ from solvers.riemannian.polish import polish, relative_decrement
 from solvers.riemannian.shrunk_bound import bound_is_tight, with_shrunk_information
 
 
-@door
 def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
     """Judge anybody's poses by a proven lower bound on the global optimum.
 

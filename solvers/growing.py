@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pgo_models.errors import GraphError, door
+from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray, project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
@@ -40,7 +40,6 @@ _SHARE = 0.01
 _SAME = 1e-4
 
 
-@door
 def extend(
     solution: Solution,
     graph: PoseGraph,

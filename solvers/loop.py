@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
-from pgo_models.errors import NotPositiveDefiniteError, SettingError, door, fitted_arguments
+from pgo_models.errors import NotPositiveDefiniteError, SettingError, fitted_arguments
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
@@ -110,7 +110,6 @@ def iterate(
 ) -> Iterator[S]: ...
 @overload
 def iterate(method: Method[P, X, S], problem: P, start: X | None = None) -> Iterator[S]: ...
-@door
 def iterate(method: Method[Any, Any, S], problem: Any, start: Any = None) -> Iterator[S]:
     """Yield state 0, state 1, .. without end.
 
@@ -182,7 +181,6 @@ def run(
     verbose: bool = False,
     progress: bool | None = None,
 ) -> Outcome[S]: ...
-@door
 def run(
     method: Method[Any, Any, S],
     problem: Any,

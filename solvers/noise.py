@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.errors import GraphError, door
+from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -93,7 +93,6 @@ class NoiseEstimate(Summarised):
         return "; ".join(map(str, self.levels))
 
 
-@door
 def estimate_noise(graph: PoseGraph | PGOProblem) -> NoiseEstimate:
     """Estimate the noise of odometry and closures from how well they fit each other.
 

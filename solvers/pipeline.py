@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pgo_models.errors import GraphWarning, door
+from pgo_models.errors import GraphWarning
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -34,7 +34,6 @@ if TYPE_CHECKING:  # what a solve in one place does not need
 _NUM_NAMED = 5  # landmarks that a warning names
 
 
-@door
 def solve(
     problem: PGOProblem | PoseGraph,
     pipeline: Pipeline | None = None,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FAILURES, FileFormatError, door
+from pgo_models.errors import FAILURES, FileFormatError
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import g2o_files
@@ -163,7 +163,6 @@ class ReadingComparison(Summarised):
         return "\n".join(lines)
 
 
-@door
 def compare_readings(
     name_or_path: str | Path,
     *,

@@ -3,6 +3,7 @@
 A browser opens and searches it from the disk.
 """
 
+import inspect
 import json
 import os
 import re
@@ -126,7 +127,7 @@ def test_the_reference_has_every_public_name_and_every_notebook_is_there(pages, 
     anchors = set().union(*(page.anchors for page in pages.values()))
     for package in (pgo_models, solvers):
         for name in package.__all__:
-            thing = getattr(package, name)
+            thing = inspect.unwrap(getattr(package, name))
             assert f"{thing.__module__}.{thing.__qualname__}" in anchors, name
     for notebook in (ROOT / "notebooks").glob("[0-9][0-9]_*.py"):
         assert site / "notebooks" / f"{notebook.stem}.html" in pages

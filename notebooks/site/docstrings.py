@@ -54,7 +54,8 @@ def public_names() -> dict[str, str]:
     for package, short in ((pgo_models, "pgo"), (solvers, "solvers")):
         for name in package.__all__:
             thing = getattr(package, name)
-            full = f"{thing.__module__}.{thing.__qualname__}"
+            inside = inspect.unwrap(thing)
+            full = f"{inside.__module__}.{inside.__qualname__}"
             spellings = (name, f"{short}.{name}", f"{package.__name__}.{name}")
             full_names |= dict.fromkeys(spellings, full)
     return full_names

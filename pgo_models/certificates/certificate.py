@@ -26,7 +26,7 @@ from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
     rounding_of,
 )
-from pgo_models.errors import ProofError, SettingError, door
+from pgo_models.errors import ProofError, SettingError
 from pgo_models.figures import (
     gap_above,
     proven_digits,
@@ -337,7 +337,6 @@ class Certificate(ReadOnly):
         return "" if terms is None else f", with handedness terms of {terms.num_pairs} pairs"
 
 
-@door
 def certify_at(
     problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP, stationarity: float = math.nan
 ) -> Certificate:

@@ -3,14 +3,13 @@
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 
-@door
 def multipliers(problem: PGOProblem, poses: Poses) -> Array:
     """Return the multipliers of R_i R_i^T = I at poses, Lambda_i = sym((M X)_i R_i).
 
@@ -73,7 +72,6 @@ def multiplier_norms(Lambda: Array) -> Array:
     return np.asarray(sizes.max(axis=1, initial=0.0))
 
 
-@door
 def certificate_matrix(problem: PGOProblem, Lambda: Array, eta: float = 0.0) -> csc_array:
     """Return S + eta blockdiag(0, I), with S = M - blockdiag(0, Lambda).
 

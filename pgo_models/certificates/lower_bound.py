@@ -80,7 +80,7 @@ from pgo_models.certificates.dual_variables import check_multipliers, scalar_mul
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import Evaluation, evaluate_certificate, has_safe_scale
 from pgo_models.certificates.unknowns import ComplexUnknowns, RowUnknowns, Unknowns
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, orthogonality_error
@@ -147,7 +147,6 @@ class LowerBound(Summarised):
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
 
 
-@door
 def prove_bound(
     problem: PGOProblem,
     Lambda: Array,

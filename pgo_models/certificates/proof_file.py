@@ -12,7 +12,7 @@ from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import LowerBound, prove_at
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.figures import scaled_below
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.arrays import inner_products
@@ -32,7 +32,6 @@ FORMAT = "pgo-splitting proof 1"
 WEIGHT_ERROR = 2.0**-44
 
 
-@door
 def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) -> None:
     """Write what proves the bound of a certificate, as JSON; `verify_proof` checks it.
 

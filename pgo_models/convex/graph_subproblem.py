@@ -18,7 +18,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from pgo_models.convex.convex_solver import ConvexSolver, HoldsModel, check_terms
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
-from pgo_models.errors import SettingError, check_settings, door
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.matrices import residual_matrix, rotation_columns
@@ -278,7 +278,6 @@ class GraphQP(Summarised):
         return np.asarray(stacked_columns.reshape(X.shape, order="F"))
 
 
-@door
 def graph_qp(
     graph: PoseGraph | PGOProblem,
     rho: Array | float,

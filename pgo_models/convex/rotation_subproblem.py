@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from pgo_models.convex.convex_solver import ConvexSolver, HoldsModel, as_solver, solve_compiled
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.rotations import Array
 
@@ -84,7 +84,6 @@ class RotationQP(HoldsModel):
         return self.last[key].copy()
 
 
-@door
 def rotation_qp(
     A: csr_array,
     w: Array,

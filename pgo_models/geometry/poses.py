@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pgo_models.errors import GraphError, door
+from pgo_models.errors import GraphError
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array
 from pgo_models.geometry.rotations import (
     Array,
@@ -322,7 +322,6 @@ def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> tuple[Array, 
     return R, float(error.max(initial=0.0))
 
 
-@door
 def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
     """Compute the ATE: the root mean square of ||t_i - t_i'||, after the estimate is aligned.
 
@@ -396,7 +395,6 @@ def absolute_rotation_error(estimate: Poses, truth: Poses) -> float:
     return float(np.sqrt(np.mean(squared_angle)))
 
 
-@door
 def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[float, float]:
     """Compute the RPE over all pairs (i, i + step), without alignment.
 

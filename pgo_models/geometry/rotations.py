@@ -6,7 +6,7 @@ The projection is step (b) of the paper's Algorithm 1, with det = +1 enforced.
 import numpy as np
 from numpy.typing import NDArray
 
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -38,7 +38,6 @@ _NEXT_AFTER = _entries(1, 2)
 _AFTER_NEXT = _entries(2, 1)
 
 
-@door
 def project_to_rotations(A: Array) -> Array:
     """Project matrices to the nearest rotations: argmin over omega in SO(d) of ||omega - A_i||_F.
 
@@ -211,7 +210,6 @@ def vee(W: Array) -> Array:
     return 0.5 * np.stack([x, y, z], -1)
 
 
-@door
 def exp_map(w: Array) -> Array:
     """Compute the rotations Exp(hat(w)) of tangent vectors.
 
@@ -247,7 +245,6 @@ def exp_map(w: Array) -> Array:
     return np.asarray(np.cos(angle) * np.eye(3) + first_order * hat(w) + second_order * outer)
 
 
-@door
 def log_map(R: Array) -> Array:
     """Compute the tangent vectors w of rotations, with Exp(hat(w)) = R and ||w|| <= pi.
 
@@ -304,7 +301,6 @@ def as_generator(rng: np.random.Generator | int) -> np.random.Generator:
     return np.random.default_rng(rng)
 
 
-@door
 def random_rotations(count: int, d: int, rng: np.random.Generator | int) -> Array:
     """Draw rotations uniformly (by the Haar measure) from SO(d).
 

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pgo_models.errors import DatasetError, FileFormatError, SettingError, door
+from pgo_models.errors import DatasetError, FileFormatError, SettingError
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.g2o import COMPRESSED, edge_places, name_of, read_g2o
 from pgo_models.graphs.g2o_readings import Reading
@@ -65,7 +65,6 @@ SE_SYNC = Registry(
 )
 
 
-@door
 def load(
     name_or_path: str | Path,
     registry: Registry = SE_SYNC,
@@ -213,7 +212,6 @@ def _unknown(name: str, registry: Registry) -> DatasetError:
     )
 
 
-@door
 def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
     """Return the names that `load` takes.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError, door, extra_module, printable
+from pgo_models.errors import GraphError, SettingError, extra_module, printable
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_rows import numbers_of, poses_of
@@ -19,7 +19,6 @@ from pgo_models.graphs.residuals import check_poses
 _COLUMNS = {2: ["x", "y", "theta"], 3: ["x", "y", "z", "qx", "qy", "qz", "qw"]}
 
 
-@door
 def from_networkx(network: Any) -> PoseGraph:  # noqa: ANN401 - networkx has no types
     """Make a PoseGraph of a directed networkx graph with a pose on every edge.
 
@@ -87,7 +86,6 @@ def from_networkx(network: Any) -> PoseGraph:  # noqa: ANN401 - networkx has no 
     )
 
 
-@door
 def to_networkx(graph: PoseGraph, poses: Poses | None = None) -> Any:  # noqa: ANN401
     """Make a networkx graph of a PoseGraph, with the measured poses on its edges.
 
@@ -134,7 +132,6 @@ def to_networkx(graph: PoseGraph, poses: Poses | None = None) -> Any:  # noqa: A
     return network
 
 
-@door
 def from_pandas(edges: Any, poses: Any = None) -> PoseGraph:  # noqa: ANN401 - may be absent
     """Make a PoseGraph of a frame of pandas with a row for every edge.
 
@@ -195,7 +192,6 @@ def from_pandas(edges: Any, poses: Any = None) -> PoseGraph:  # noqa: ANN401 - m
     )
 
 
-@door
 def to_pandas(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
     """Make frames of pandas of a PoseGraph: its edges, and poses.
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, door, printable
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, printable
 from pgo_models.files import check_lines, check_writable, replace_when_done
 from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.poses import Poses
@@ -47,7 +47,6 @@ COMPRESSED = ".gz"  # suffix of a file that is compressed by gzip
 _SAME_ROTATION = 1e-9
 
 
-@door
 def read_g2o(
     path: Path | str,
     weights: RotationWeight = RotationWeight.SE_SYNC,
@@ -354,7 +353,6 @@ def _check_same_poses(file: G2OLines, graph: PoseGraph) -> None:
         raise FileFormatError(file.path, line, problem)
 
 
-@door
 def write_g2o(
     graph: PoseGraph, path: Path | str, poses: Poses | None = None, mine: BoolArray | None = None
 ) -> None:

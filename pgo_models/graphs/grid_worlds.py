@@ -10,7 +10,7 @@ import scipy  # and scipy.spatial when it is used
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, as_generator, exp_map
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -28,7 +28,6 @@ _STRAIGHT = 0.6  # probability of going straight on where nothing is in the way
 _REACH = 1.1  # metres: poses in the same cell or in cells side by side see each other
 
 
-@door
 def grid_world(
     num_robots: int,
     poses_per_robot: int,

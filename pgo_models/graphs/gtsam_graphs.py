@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pgo_models.errors import GraphError, GraphWarning, SettingError, door, extra_module, printable
+from pgo_models.errors import GraphError, GraphWarning, SettingError, extra_module, printable
 from pgo_models.files import Problem, check_lines
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, log_map, project_to_rotations
@@ -59,7 +59,6 @@ class _UnreadableFactorError(Exception):
     """A factor that is no edge; the text says why."""
 
 
-@door
 def from_gtsam(
     factors: Any,  # noqa: ANN401 - GTSAM has no types
     values: Any = None,  # noqa: ANN401
@@ -139,7 +138,6 @@ def from_gtsam(
     return replace(graph, initial=_poses_of_values(gtsam, values, graph))
 
 
-@door
 def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
     """Make a factor graph of GTSAM of a PoseGraph: between factors, priors and positions of poses.
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphWarning, door, printable
+from pgo_models.errors import FileFormatError, GraphWarning, printable
 from pgo_models.files import LARGEST, Problem, check_lines, far_lines, zero_quaternion_lines
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import edge_rows_to_keep, graph_of_files
@@ -64,7 +64,6 @@ class Measurements:
     numbers: list[list[float]] = field(default_factory=list)
 
 
-@door
 def read_jrl(
     path: Path | str,
     weights: RotationWeight = RotationWeight.SE_SYNC,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import MissingExtraError, SettingError, door, extra_module
+from pgo_models.errors import MissingExtraError, SettingError, extra_module
 from pgo_models.geometry.arrays import ReadOnly, whole_array, whole_number
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, has_no_gap
@@ -109,7 +109,6 @@ class Partition(ReadOnly):
         return f"Partition({self.num_robots} robots, {sizes}, {self.method.value})"
 
 
-@door
 def partition(
     graph: PoseGraph, num_robots: int | None = None, method: PartitionMethod | None = None
 ) -> Partition:

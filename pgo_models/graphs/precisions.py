@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError, door
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges, isotropic_information
 
@@ -95,7 +95,6 @@ def gaussian_information(graph: PoseGraph) -> Array:
     return _without_coupling(raised, is_indefinite, graph.d)
 
 
-@door
 def indefinite_edges(graph: PoseGraph) -> BoolArray:
     """Return which edges have a coupling block that makes their information matrix indefinite.
 
@@ -132,7 +131,6 @@ def indefinite_edges(graph: PoseGraph) -> BoolArray:
     return is_indefinite
 
 
-@door
 def without_indefinite_coupling(graph: PoseGraph) -> PoseGraph:
     """Return the graph without the coupling blocks that make information matrices indefinite.
 

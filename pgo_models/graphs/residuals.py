@@ -7,7 +7,7 @@ import enum
 
 import numpy as np
 
-from pgo_models.errors import GraphError, door
+from pgo_models.errors import GraphError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -77,7 +77,6 @@ class Chi2Convention(enum.Enum):
     GTSAM = "the program GTSAM: the logarithm in SE(d), which turns r_t too"
 
 
-@door
 def chi2(
     graph: PoseGraph, poses: Poses, convention: Chi2Convention = Chi2Convention.CHORDAL
 ) -> float:

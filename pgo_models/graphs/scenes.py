@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # and scipy.spatial when it is used
 from numpy.typing import NDArray
 
-from pgo_models.errors import SettingError, check_settings, door
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -83,7 +83,6 @@ class NoiseModel:
 MILD_NOISE = NoiseModel(translation_std=0.1, rotation_std=np.pi / 60)
 
 
-@door
 def circle(rng: np.random.Generator | int) -> PoseGraph:
     """Generate the paper's circle: 25 poses at a radius of 2.6 m in the x-y plane.
 
@@ -118,7 +117,6 @@ def circle(rng: np.random.Generator | int) -> PoseGraph:
     return _network("circle", t, radius=4.0, rng=rng)
 
 
-@door
 def grid(rng: np.random.Generator | int) -> PoseGraph:
     """Generate the paper's grid: 27 poses on a 3 x 3 x 3 lattice with a spacing of 1.66 m.
 
@@ -149,7 +147,6 @@ def grid(rng: np.random.Generator | int) -> PoseGraph:
     return _network("grid", 1.66 * lattice, radius=1.66, rng=rng)
 
 
-@door
 def sphere(rng: np.random.Generator | int) -> PoseGraph:
     """Generate the paper's sphere: 50 poses by Deserno's equal-area rule at a radius of 3 m.
 
@@ -185,7 +182,6 @@ def sphere(rng: np.random.Generator | int) -> PoseGraph:
     return _network("sphere", t, radius=3.0, rng=rng, left_out=_SPHERE_PAIR_LEFT_OUT)
 
 
-@door
 def random_geometric(
     num_poses: int,
     rng: np.random.Generator | int,
@@ -260,7 +256,6 @@ def _nearest_earlier(t: Array, pose: int) -> int:
     return int(np.argmin(squared_distance))
 
 
-@door
 def victoria_park(
     rng: np.random.Generator | int,
     *,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphError, door
+from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.files import (
     check_lines,
     far_lines,
@@ -28,7 +28,6 @@ _PLANE_TOLERANCE = 1e-6
 _MATRIX_TOLERANCE = 1e-3
 
 
-@door
 def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -> None:
     """Write a TUM file: a line `timestamp tx ty tz qx qy qz qw` for each pose.
 
@@ -73,7 +72,6 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
     _write_rows(rows, path)
 
 
-@door
 def read_tum(path: Path | str, d: int = 3) -> Poses:
     """Return the poses of a TUM file, in the order of its lines.
 
@@ -147,7 +145,6 @@ def write_kitti(poses: Poses, path: Path | str) -> None:
     _write_rows(rows, path)
 
 
-@door
 def read_kitti(path: Path | str, d: int = 3) -> Poses:
     r"""Return the poses of a KITTI odometry file, in the order of its lines.
 

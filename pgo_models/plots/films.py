@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError, door
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -34,7 +34,6 @@ _FRAME_MILLISECONDS = 250
 _POINTS_ACROSS = 1000  # coordinates are rounded to this part of the extent
 
 
-@door
 def animate(
     frames: Sequence[Sequence[Trace]],
     labels: Sequence[str],
@@ -128,7 +127,6 @@ def _check_frames(frames: Sequence[Sequence[Trace]], labels: Sequence[str]) -> N
         )
 
 
-@door
 def animate_poses(
     graph: PoseGraph, iterates: Sequence[Poses], labels: Sequence[str] | None = None
 ) -> Figure:

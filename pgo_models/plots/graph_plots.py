@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pgo_models.errors import GraphError, door
+from pgo_models.errors import GraphError
 from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.poses import Poses, absolute_trajectory_error
 from pgo_models.geometry.rotations import Array, BoolArray, log_map
@@ -195,7 +195,6 @@ def draw_graph(
     _frame(axes, poses.t[graph.in_files])
 
 
-@door
 def plot_graph(
     graph: PoseGraph,
     poses: Poses,
@@ -265,7 +264,6 @@ def plot_graph(
     return figure
 
 
-@door
 def compare_poses(
     graph: PoseGraph,
     panels: Sequence[tuple[str, Poses]] | Poses,

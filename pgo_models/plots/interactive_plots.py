@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pgo_models.errors import door
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
@@ -44,7 +43,6 @@ _LINES_OF_KINDS = {
 }
 
 
-@door
 def explore_graph(
     graph: PoseGraph,
     poses: Poses,

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from pgo_models.errors import GraphError, SettingError, door
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
@@ -26,7 +26,6 @@ from pgo_models.problem.problem import PGOProblem
 _SHARED = 10_000
 
 
-@door
 def odometry_start(graph: PoseGraph) -> Poses:
     """Compose the measurements i -> i + 1 from pose 0 on; of repeated ones the first is used.
 
@@ -69,7 +68,6 @@ def odometry_start(graph: PoseGraph) -> Poses:
     return compose_along_tree(graph, order, parent, edge, is_forward)
 
 
-@door
 def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     """Compose measurements along a breadth-first spanning tree, as the paper does for SLAM.
 
@@ -128,7 +126,6 @@ def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntA
     return order, parent, usable[first_edge[places]]
 
 
-@door
 def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
     """Solve for rotations without their constraints, project, and take the best translations.
 

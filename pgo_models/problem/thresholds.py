@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # and scipy.special when it is used
 
-from pgo_models.errors import check_quantile, door
+from pgo_models.errors import check_quantile
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -87,7 +87,6 @@ class EdgeResiduals(Summarised):
         return bool(self.is_misfit.any()) or self.is_overall_misfit
 
 
-@door
 def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResiduals:
     """Compute and test the residuals and the cost of every edge at poses.
 
@@ -176,7 +175,6 @@ def _redundancy(graph: PoseGraph, rank: int, has_translations: bool) -> float:
     return 1.0 - unknowns / max(rank, 1)
 
 
-@door
 def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     """Compute thresholds that edge costs at the true poses exceed with probability 1 - quantile.
 

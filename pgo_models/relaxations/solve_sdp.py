@@ -10,7 +10,7 @@ import cvxpy as cp
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict, certify_with
 from pgo_models.convex.convex_solver import ConvexSolver, as_solver
-from pgo_models.errors import PGOError, SettingError, door
+from pgo_models.errors import PGOError, SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
@@ -145,7 +145,6 @@ class RelaxationSolution(Summarised):
         return "\n".join(lines)
 
 
-@door
 def solve_relaxation(
     problem: PGOProblem,
     form: RelaxationForm | None = None,

@@ -25,7 +25,7 @@ from pgo_models.convex.orthogonality import (
     SplitProblem,
     norm_of_all,
 )
-from pgo_models.errors import SettingError, check_settings, door
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
 from solvers.loop import run
@@ -331,7 +331,6 @@ class OrthogonalSolution(Summarised):
         return "\n".join(lines)
 
 
-@door
 def solve_orthogonal(
     problem: OrthogonalProblem,
     rng: np.random.Generator | int = 0,

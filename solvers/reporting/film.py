@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from pgo_models.certificates.certificate import certify_at
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -45,7 +45,6 @@ class FilmedIterate:
     lower_bound: float
 
 
-@door
 def film(
     problem: PGOProblem | PoseGraph,
     methods: Sequence[Solver[Any]] | None = None,

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.errors import SettingError, door, extra_module
+from pgo_models.errors import SettingError, extra_module
 from pgo_models.figures import rounded_up
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import absolute_trajectory_error
@@ -46,7 +46,6 @@ _MOST_ROBOTS = 200
 _PAGE_SUFFIXES = (".html", ".htm")
 
 
-@door
 def write_report(
     solution: Solved, path: Path | str, *, source: str | None = None, fit: EdgeFit | None = None
 ) -> None:

@@ -5,7 +5,7 @@ F never rises but by rounding.
 
 from dataclasses import dataclass
 
-from pgo_models.errors import check_settings, door
+from pgo_models.errors import check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
@@ -122,7 +122,6 @@ def newton_status(figures: NewtonFigures) -> Status | None:
     return None if figures.moved else Status.STALLED
 
 
-@door
 def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
     """Return Newton with the Gauss-Newton matrix instead of the Hessian.
 

@@ -14,7 +14,7 @@ from scipy.sparse import csc_array
 from pgo_models.certificates.dual_variables import multipliers_at
 from pgo_models.certificates.fit import fit_of
 from pgo_models.certificates.rounding_errors import rounding_level
-from pgo_models.errors import NotPositiveDefiniteError, door
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, vee
 from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
@@ -290,7 +290,6 @@ def moved_by(factor: CholeskyFactor, here: EvaluatedPoses) -> Poses:
     return here.poses.moved_along(*layout.split(-factor.solve(gradient)))
 
 
-@door
 def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
     """Move poses to the stationary point nearby, where F is no higher (damped Riemannian Newton).
 

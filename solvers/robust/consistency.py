@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # and scipy.special when it is used
 
-from pgo_models.errors import check_quantile, check_settings, door
+from pgo_models.errors import check_quantile, check_settings
 from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
@@ -65,7 +65,6 @@ class PCM(ValueEquality):
         check_quantile(self.quantile)
 
 
-@door
 def pairwise_consistent(
     graph: PoseGraph, known: BoolArray | None = None, quantile: float = 0.99
 ) -> BoolArray:

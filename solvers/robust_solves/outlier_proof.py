@@ -42,7 +42,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
@@ -86,7 +86,6 @@ _OUTWARD = 1.0 + 1e-12  # for sums of up to a million positive terms
 _LEAST = float(np.finfo(float).tiny)
 
 
-@door
 def prove_outliers(solution: Solution, time_limit: float = math.inf) -> Solution:
     """Prove closures wrong, for all maps that are as good as that of a robust solve.
 

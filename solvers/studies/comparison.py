@@ -11,7 +11,7 @@ from typing import Any
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.errors import SettingError, check_settings, door
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -162,7 +162,6 @@ class Comparison(Summarised):
             save_figure(plot_efforts(self.curves), path)
 
 
-@door
 def compare_methods(
     problem: PGOProblem | PoseGraph,
     settings: ComparisonSettings | None = None,

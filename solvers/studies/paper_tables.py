@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import PGOError, SettingError, check_settings, door
+from pgo_models.errors import PGOError, SettingError, check_settings
 from pgo_models.graphs.datasets import load
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.published_results import PublishedFigures, PublishedRow, published_rows
@@ -175,7 +175,6 @@ class Reproduction(Summarised):
     is_complete: bool
 
 
-@door
 def reproduce_tables(
     settings: ReproductionSettings | None = None,
     *,

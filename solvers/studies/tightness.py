@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, as_generator, random_rotations
@@ -116,7 +116,6 @@ def noisy_lattice(
     return observe("lattice", truth, i, j, noise, kappa, 100.0, rng)
 
 
-@door
 def noise_sweep(
     scene: SweptScene, rotation_std: Array, graphs: int, rng: np.random.Generator | int
 ) -> NoiseSweep:

@@ -13,6 +13,7 @@ from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.sparse import issparse
 
+from pgo_models import partition
 from pgo_models.convex.bregman import BregmanPoint, BregmanProblem
 from pgo_models.convex.orthogonality import OrthogonalPoint
 from pgo_models.errors import GraphError, PGOError, SettingError
@@ -25,7 +26,7 @@ from pgo_models.geometry.arrays import (
     whole_number,
 )
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.problem import PGOProblem
