@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
+from pgo_models import Partition, PartitionMethod
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
@@ -245,3 +246,11 @@ def chain_with_closures(seed: int, n: int, d: int, num_closures: int) -> PoseGra
     t = rng.choice([0.1, 1.0, 10.0]) * rng.standard_normal((m, d))
     kappa, tau = np.exp(rng.uniform(-3.0, 6.0, (2, m)))
     return PoseGraph(n, i, j, R, t, kappa, tau)
+
+
+def scattered(graph: PoseGraph, num_robots: int, seed: int) -> Partition:
+    """Poses to robots at random, so that a robot's poses fall into pieces."""
+    num_free = graph.num_poses - num_robots
+    drawn_robots = np.random.default_rng(seed).integers(0, num_robots, num_free)
+    robot = np.concatenate([np.arange(num_robots), drawn_robots])
+    return Partition(np.random.default_rng(seed).permutation(robot), PartitionMethod.GIVEN)

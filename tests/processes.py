@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+import pgo_models as pgo
+import solvers
 from pgo_models.errors import PGOError
 from pgo_models.graphs.scenes import grid
 from solvers.network.messages import Idle
@@ -117,3 +119,16 @@ def _serve(link: Connection, megabytes: float, make: Callable[[Any], Any], share
         except (PGOError, MemoryError) as error:  # whoever asked gets it
             answer = error
         link.send(answer)
+
+
+def long_run() -> tuple[pgo.PoseGraph, solvers.Pipeline, pgo.Partition]:
+    """Graph, settings and robots of a run with 150 iterations of SOC."""
+    graph = pgo.load("circle")
+    robots = pgo.partition(graph, 3)
+    soc = solvers.SOC(
+        coupling=solvers.Coupling.SUBSTRUCTURED,
+        robots=robots,
+        tolerance=1e-300,
+        max_iterations=150,
+    )
+    return graph, solvers.Pipeline(soc=soc), robots

@@ -21,9 +21,9 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 import pytest
+from every_solver import SOLVERS
 from orthogonal_models import smallest_eigenvectors
 from signals import sparse_signal
-from test_solver_contract import SOLVERS
 
 import pgo_models as pgo
 import solvers

@@ -1,20 +1,15 @@
 import sys
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from types import ModuleType, TracebackType
 
-import numpy as np
 import pytest
-from rich.progress import Progress
 
 import solvers
 from pgo_models.activity import Activity, doing
-from pgo_models.graphs import scenes
 from pgo_models.graphs.datasets import load
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers import loop
 from solvers.progress import Pace, StageLine, Table, is_shown
 from solvers.result import Measurement, Record, Status
 from solvers.riemannian.newton import Newton
@@ -164,17 +159,6 @@ def test_a_short_run_shows_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
-def test_the_table_takes_the_place_of_the_bar(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    graph = scenes.grid(np.random.default_rng(0))
-    monkeypatch.setattr(loop, "StageLine", partial(StageLine, pace=Pace(large_side=1)))
-    solvers.run(Newton(), graph, verbose=True, progress=True)
-    out, err = capsys.readouterr()
-    assert out.startswith("Newton\n")
-    assert err == ""
-
-
 class Notebook:
     """Stands for IPython in a notebook: remembers what its outputs show."""
 
@@ -232,34 +216,6 @@ def test_no_bar_is_shown_by_default_outside_notebooks(capsys: pytest.CaptureFixt
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("error", [None, KeyboardInterrupt, ValueError])
-def test_the_bar_is_stopped_whatever_happens(
-    error: type[BaseException] | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stopped: list[bool] = []
-    its_own = Progress.stop
-
-    def stop(bar: Progress) -> None:
-        stopped.append(True)
-        its_own(bar)
-
-    monkeypatch.setattr(Progress, "stop", stop)
-
-    def interrupted() -> None:
-        with Table("SOC", False, line_of("SOC", 10.0)) as table:
-            table.row(RECORDS[1])
-            assert not stopped
-            if error is not None:
-                raise error
-
-    if error is None:
-        interrupted()
-    else:
-        with pytest.raises(error):
-            interrupted()
-    assert stopped == [True]
-
-
 def test_it_swallows_no_exception() -> None:
     table = Table("SOC", verbose=False)
     nothing: tuple[type[BaseException] | None, BaseException | None, TracebackType | None] = (
@@ -268,27 +224,6 @@ def test_it_swallows_no_exception() -> None:
         None,
     )
     assert table.__exit__(*nothing) is None
-
-
-def test_stages_without_iterations_are_shown_on_large_graphs_with_what_is_still_to_come(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "100")
-    graph = scenes.grid(np.random.default_rng(0))
-    solvers.solve(graph, progress=True)
-    assert "chordal start" not in capsys.readouterr().err
-    monkeypatch.setattr(loop, "StageLine", partial(StageLine, pace=Pace(large_side=1)))
-    solvers.solve(graph, progress=True)
-    err = capsys.readouterr().err
-    start, _, others = err.partition("Newton, then certificate")
-    assert "chordal start, then Newton, certificate" in start
-    assert "analysis" in start
-    newton, _, certificate = others.rpartition("Newton, then certificate")
-    assert "factorisation" in newton
-    assert "certificate  " in certificate
 
 
 OF_M = Activity("factorisation", 4 * 1000)

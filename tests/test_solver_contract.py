@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from budget import examples
+from every_solver import SOLVERS
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings, strategies as st
 from robots import metis, share, sparse_elimination
@@ -22,13 +23,10 @@ import solvers
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import orthogonality_error
-from pgo_models.graphs.partitioning import PartitionMethod, partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import PGOProblem
-from solvers.baselines.gauss_seidel import GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
-from solvers.baselines.sweep_order import Sweep
 from solvers.convex.extended_soc import ExtendedSOC
 from solvers.distributed.asynchronous import AsynchronousSOC
 from solvers.distributed.consensus import ConsensusSOC
@@ -45,59 +43,19 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
 from solvers.result import Record, Status
-from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.newton import Newton
 from solvers.riemannian.newton_step import ModelOrder
-from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
 from solvers.robots import Checkpoint
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC, GNCState
-from solvers.robust.losses import RobustLoss
 from solvers.soc.anderson import Anderson
-from solvers.soc.paper import PaperSOC
 from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.soc import SOC
 
 Make = Callable[..., Any]
 
 
-def three_robots(problem: PGOProblem, **changes: Any) -> SOC:
-    return SOC(robots=partition(problem.graph, min(3, problem.num_poses)), **changes)
-
-
-def singletons(problem: PGOProblem, **changes: Any) -> SOC:
-    return SOC(robots=partition(problem.graph, method=PartitionMethod.SINGLETONS), **changes)
-
-
-SOLVERS: dict[str, Make] = {
-    "soc_joint": lambda problem, **changes: SOC(**changes),
-    "soc_joint_plain": lambda problem, **changes: SOC(acceleration=None, alpha=1.5, **changes),
-    "soc_joint_balanced": lambda problem, **changes: SOC(penalty=BalancedPenalty(), **changes),
-    "soc_consensus": three_robots,
-    "soc_consensus_singletons": singletons,
-    "soc_paper": lambda problem, **changes: PaperSOC(**changes),
-    "soc_paper_one_robot": lambda problem, **changes: PaperSOC(
-        robots=partition(problem.graph, 1), **changes
-    ),
-    "gauss_seidel": lambda problem, **changes: GaussSeidel(
-        robots=partition(problem.graph, min(3, problem.num_poses)), **changes
-    ),
-    "gauss_seidel_singletons": lambda problem, **changes: GaussSeidel(
-        sweep=Sweep.ROBOTS, alpha=1.2, **changes
-    ),
-    "jacobi": lambda problem, **changes: GaussSeidel(
-        sweep=Sweep.JACOBI, gauss_newton_steps=3, **changes
-    ),
-    "newton": lambda problem, **changes: Newton(**changes),
-    "gauss_newton": lambda problem, **changes: dataclasses.replace(gauss_newton(), **changes),
-    "levenberg_marquardt": lambda problem, **changes: LevenbergMarquardt(**changes),
-    "staircase": lambda problem, **changes: Staircase(**changes),
-    "growing_start": lambda problem, **changes: GrowingStart(first_size=2, growth=0.1, **changes),
-    "gnc": lambda problem, **changes: GNC(spread=None, **changes),
-    "gnc_geman_mcclure": lambda problem, **changes: GNC(
-        RobustLoss.GEMAN_MCCLURE, spread=None, **changes
-    ),
-}
 EVERY = pytest.mark.parametrize("make", SOLVERS.values(), ids=SOLVERS)
 SIZES = st.integers(3, 10)
 
@@ -319,24 +277,6 @@ def test_control_c_in_a_callback_is_reported(make: Make, problem: PGOProblem, st
             raise KeyboardInterrupt
 
     result = run(make(problem), problem, start, callback=interrupt)
-    assert (result.status, result.iterations, len(result.history)) == (Status.INTERRUPTED, 2, 3)
-    assert_best(result)
-
-
-@EVERY
-def test_control_c_in_a_step_is_reported(
-    make: Make, problem: PGOProblem, start: Poses, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    solver = make(problem)
-    step = type(solver).step
-
-    def interrupted(self: Any, problem: PGOProblem, state: Any) -> Any:
-        if state.k == 2:
-            raise KeyboardInterrupt
-        return step(self, problem, state)
-
-    monkeypatch.setattr(type(solver), "step", interrupted)
-    result = run(solver, problem, start)
     assert (result.status, result.iterations, len(result.history)) == (Status.INTERRUPTED, 2, 3)
     assert_best(result)
 
@@ -597,42 +537,3 @@ def test_robots_forget_the_moments_of_states_that_are_gone() -> None:
         # Those of the last state and of the one that it came from, whose step forgot all others.
         robots = driver.network.ledger.num_robots
         assert driver.network.ask(count, [None] * robots, Count.OFF) == [1] * robots
-
-
-@BY_ROBOTS
-def test_a_step_by_robots_that_was_interrupted_can_be_taken_again(
-    begin: Begin, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Ctrl-C reaches the second of four robots, order by order.
-    with driver_in(fronts_with_robots) as driver:
-        method, problem = begin(driver)
-        state = method.step(problem, method.init(problem, None))
-        expected = figures(method, problem, method.step(problem, state))
-        workers = driver.network.workers
-        ask = workers.ask
-        for last in range(1, 12):
-            orders = 0
-
-            def interrupted(order: Any, requests: Any, last: int = last) -> Any:
-                nonlocal orders
-                orders += 1
-                if orders < last:
-                    return ask(order, requests)
-
-                def fails(agent: Any, request: Any) -> Any:
-                    if agent.subgraph.robot == 1:
-                        raise KeyboardInterrupt
-                    return order(agent, request)
-
-                return ask(fails, requests)
-
-            with monkeypatch.context() as patch:
-                patch.setattr(workers, "ask", interrupted)
-                try:
-                    method.step(problem, state)
-                except KeyboardInterrupt:
-                    pass
-                else:
-                    break
-            following = method.step(problem, state)
-            assert_same(figures(method, problem, following), expected)

@@ -16,12 +16,12 @@ from graphs import (
     SEEDS,
     exact_graph,
     random_poses,
+    scattered,
     varied_graph,
     varied_problem,
 )
 from hypothesis import given, settings, strategies as st
 from scipy.sparse.linalg import spsolve
-from test_sweep_order import scattered
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses

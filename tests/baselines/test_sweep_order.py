@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, SEEDS, varied_graph
+from graphs import DIMENSIONS, SEEDS, scattered, varied_graph
 from hypothesis import given, settings, strategies as st
 
 from pgo_models.errors import SettingError
@@ -12,14 +12,6 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from solvers.baselines.sweep_order import Schedule, Sweep, schedule
 
 NUM_POSES = st.integers(2, 25)
-
-
-def scattered(graph: PoseGraph, num_robots: int, seed: int) -> Partition:
-    """Poses to robots at random, so that a robot's poses fall into pieces."""
-    num_free = graph.num_poses - num_robots
-    drawn_robots = np.random.default_rng(seed).integers(0, num_robots, num_free)
-    robot = np.concatenate([np.arange(num_robots), drawn_robots])
-    return Partition(np.random.default_rng(seed).permutation(robot), PartitionMethod.GIVEN)
 
 
 def drawn(seed: int, n: int, d: int, sweep: Sweep) -> tuple[PoseGraph, Partition, Schedule]:

@@ -14,6 +14,7 @@ from exact_arithmetic import (
     ExactGraph,
     Rows,
     exact,
+    exact_chi2,
     is_positive_definite,
     largest_share,
     less_diagonal,
@@ -31,7 +32,6 @@ from graphs import (
 from hypothesis import given, settings, strategies as st
 from proofs import PLANE
 from roads import Shape, road
-from test_tangent import exact_chi2
 
 import solvers
 from pgo_models.certificates.certificate import certify_at

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from test_shell import ended, one_line, started
+from commands import ended, one_line, started
 
 from pgo_models.errors import printable
 from solvers.cli.shell import shown

@@ -19,14 +19,12 @@ from pgo_models.geometry.rotations import Array, exp_map, log_map
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.convex.extended_soc import ExtendedSOC, ExtendedStep, with_priors
 from solvers.loop import run
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import Run, Status
 from solvers.riemannian.newton import Newton
-from solvers.robust.gnc import GNC
 from solvers.soc.joint import SOCState
 from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.r_step import RStep
@@ -326,37 +324,6 @@ def test_ctrl_c_before_the_terms_are_added_is_the_end(monkeypatch: pytest.Monkey
     added = float(np.linalg.norm(solution.poses.t[2] - 3.0))
     expected = problem().objective(solution.poses) + added
     assert solution.objective == pytest.approx(expected, rel=1e-9)
-
-
-def test_replaced_edges_leave_no_bound_and_terms_that_may_be_negative_are_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def absolute(unknown: PoseVariables) -> ModelChange:
-        return ModelChange(
-            terms=[cp.sum(cp.abs(unknown.translation_residual[:2]))], replaced_edges=range(2)
-        )
-
-    solution = solve(problem(), Pipeline(soc=ExtendedSOC(absolute, SETTINGS)))
-    assert (solution.lower_bound, solution.certificate.verdict) == (0.0, Verdict.TRIVIAL)
-    assert "replaced edges (2)" in solution.note
-    linear = ExtendedSOC(lambda unknown: ModelChange(terms=[cp.sum(unknown.t(0))]))
-    with pytest.raises(SettingError, match="a term may be negative"):
-        solve(problem(), Pipeline(soc=linear))
-    for begun in (
-        "distributed.robots_of_graph.open_driver",
-        "robust_solves.robust_solve.solve_robustly",
-    ):
-        monkeypatch.setattr(
-            f"solvers.{begun}", lambda *_: pytest.fail("solved before it was refused")
-        )
-    for setting in ({"robots": 2}, {"robust": GNC()}):
-        name = next(iter(setting))
-        refused = rf"^{name} go with priors alone, and there are terms other .* \(1\)"
-        with pytest.raises(SettingError, match=refused):
-            solve(problem(), Pipeline(soc=ExtendedSOC(absolute, SETTINGS)), **setting)
-    information = PGOProblem(varied_problem(4, N, D).graph, weighting=Weighting.INFORMATION)
-    with pytest.raises(SettingError, match="terms are added to F"):
-        run(linear, information)
 
 
 @pytest.mark.parametrize(

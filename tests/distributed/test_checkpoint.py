@@ -10,15 +10,13 @@ import pytest
 from budget import examples
 from graphs import varied_graph
 from hypothesis import HealthCheck, given, settings as hypothesis_settings, strategies as st
+from processes import long_run
 from robots import Killed
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import FileFormatError, PGOError, SettingError
+from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.graphs.partitioning import partition
-from solvers.cli.choices import chosen_pipeline
-from solvers.cli.inputs import chosen_partition
-from solvers.cli.options import BackEndName, FirstStage
 from solvers.distributed import checkpoint
 from solvers.distributed.checkpoint import Journal
 from solvers.network.engine import InProcess
@@ -176,33 +174,6 @@ def test_the_file_stays_when_the_run_was_stopped_and_goes_when_it_converged(tmp_
     assert not path.exists()
 
 
-def test_a_checkpoint_is_due_after_so_many_rounds(tmp_path, monkeypatch):
-    graph = varied_graph(8, 40, 2)
-    write = checkpoint._write
-    written = []
-
-    def recording(path, run_fingerprint, saved, snapshots):
-        written.append((saved.method, saved.driver.ledger.rounds))
-        write(path, run_fingerprint, saved, snapshots)
-
-    def writes(rounds):
-        written.clear()
-        finer = solvers.Pipeline(soc=solvers.SOC(tolerance=2e-3))
-        solvers.solve(
-            graph,
-            finer,
-            robots=solvers.Robots(2, checkpoint=Checkpoint(tmp_path / "run.ckpt", rounds)),
-        )
-        return [rounds for method, rounds in written if method == "SubstructuredSOC"]
-
-    monkeypatch.setattr(checkpoint, "_write", recording)
-    every_state = writes(1)
-    assert len(every_state) > 5
-    (rounds_a_step,) = set(np.diff(every_state[1:]))
-    assert writes(int(rounds_a_step)) == every_state
-    assert writes(int(3 * rounds_a_step))[1:] == every_state[3::3]
-
-
 @pytest.fixture
 def broken_off(tmp_path):
     """Graph, and path of the checkpoint of a solve of it by three robots."""
@@ -337,28 +308,6 @@ def test_a_checkpoint_holds_no_pickle(broken_off):
         assert {file[name].dtype.kind for name in file.files} <= set("fiUb")
 
 
-def test_room_on_the_disk_again_means_checkpoints_again(tmp_path, monkeypatch, caplog):
-    graph = varied_graph(6, 30, 3)
-    path = tmp_path / "run.ckpt"
-    written = []
-    write = checkpoint._write
-
-    def failing(*arguments):
-        written.append(path.exists())
-        if len(written) in (2, 3, 5):
-            raise PGOError(
-                f"cannot write {path}: No space left on device; choose a place that can be written"
-            )
-        write(*arguments)
-
-    monkeypatch.setattr(checkpoint, "_write", failing)
-    found = solvers.solve(graph, robots=solvers.Robots(3, checkpoint=Checkpoint(path, rounds=1)))
-    assert len(written) > 6
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert_same(found, solvers.solve(graph, robots=3))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path, caplog):
     graph = varied_graph(6, 30, 2)
     path = tmp_path / "run.ckpt"
@@ -413,7 +362,7 @@ def test_rounds_are_positive():
 WAITING_RUN = """
 import sys
 import solvers
-from test_checkpoint import long_run
+from processes import long_run
 
 def wait_in_the_middle(state, record):
     if record.k == 60:
@@ -425,16 +374,6 @@ checkpoint = solvers.Checkpoint(sys.argv[1])
 robots = solvers.Robots(robots, checkpoint=checkpoint)
 solvers.solve(graph, settings, robots=robots, callback=wait_in_the_middle)
 """
-
-
-def long_run():
-    """Graph, settings and robots of a run with 150 iterations of SOC."""
-    graph = pgo.load("circle")
-    robots = chosen_partition(graph, 3, None)
-    settings = chosen_pipeline(
-        FirstStage.SUBSTRUCTURED, robots, BackEndName.FACTORIZED, 1e-6, 150, 1e-300
-    )
-    return graph, settings, robots
 
 
 def test_a_killed_process_goes_on_where_it_was(tmp_path):

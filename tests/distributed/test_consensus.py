@@ -13,13 +13,10 @@ from robots import (
     PARTITIONERS,
     Partitioner,
     Recording,
-    contiguous,
     corner_cases,
     driver_at,
     metis,
     one_robot,
-    scattered,
-    singletons,
     spoil,
 )
 
@@ -31,7 +28,6 @@ from pgo_models.graphs.scenes import NoiseModel, grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.stationarity import rotation_scale
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots import recursion
@@ -40,11 +36,10 @@ from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.robots import Robots
-from solvers.soc import safeguard, separator_stiffness as stiffness
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus import ConsensusState, LocalConsensus
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
+from solvers.soc.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule
 from solvers.soc.r_step import RStep
 from solvers.soc.recursion_block import RecursionBlock
 from solvers.soc.settings import Coupling
@@ -157,43 +152,6 @@ def test_the_iterates_are_those_of_one_place(
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
 def test_the_iterates_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
     check(PGOProblem(graph), parts, SOC(robots=parts), 8)
-
-
-@pytest.mark.parametrize("partitioner", [contiguous, metis, scattered, singletons, one_robot])
-@pytest.mark.parametrize("d", [2, 3])
-def test_every_change_of_the_penalty_is_the_central_one(
-    d: int, partitioner: Partitioner, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    problem = varied_problem(5, 14, d, LOUD_NOISE)
-    parts = partitioner(problem.graph, 5)
-    soc = SOC(coupling=Coupling.CONSENSUS, robots=parts)
-    assert check(problem, parts, replace(soc, penalty=STALLED), 8).refreshes == 1
-    assert (
-        check(problem, parts, replace(soc, penalty=BalancedPenalty(scale=100.0)), 8).refreshes >= 1
-    )
-    monkeypatch.setattr(safeguard, "_DIVERGED", 1.0)  # any step back counts as divergence
-    weak = FixedPenalty(0.1 * float(np.median(rotation_scale(problem))))
-    assert (
-        check(problem, parts, replace(soc, penalty=weak, acceleration=None, alpha=1.9), 14).raises
-        >= 1
-    )
-
-
-def test_the_recheck_of_the_translation_penalty_is_the_central_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(stiffness, "_RECHECK_STEPS", 2)
-    monkeypatch.setattr(stiffness, "_RECHECK_RESIDUAL", 0.0)
-    monkeypatch.setattr(stiffness, "_SMALLEST_FACTOR", 0.999)
-    monkeypatch.setattr(stiffness, "_WORTHWHILE_FACTOR", np.inf)  # any fall is taken
-    problem = varied_problem(5, 14, 3, LOUD_NOISE)
-    parts = metis(problem.graph, 5)
-    assert (
-        check(
-            problem, parts, SOC(coupling=Coupling.CONSENSUS, robots=parts, penalty=STALLED), 12
-        ).refreshes
-        >= 2
-    )
 
 
 @pytest.mark.parametrize("seed", [3, 5])

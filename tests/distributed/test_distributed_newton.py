@@ -32,7 +32,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.relaxations.low_rank import LiftedPoses, append_dimension
-from solvers.distributed.driver import Driver, collect
+from solvers.distributed.driver import collect
 from solvers.distributed.newton import SubstructuredNewton, model_at
 from solvers.loop import iterate, run
 from solvers.result import Status
@@ -208,48 +208,3 @@ def test_where_the_hessian_is_not_positive_definite_gauss_newton_takes_over(d: i
     assert model_at(driver, ModelOrder(True, 0.0)) is None
     assert model_at(driver, ModelOrder(False, 0.0)) is not None
     check(problem, parts, start, Newton(), 4)
-
-
-def test_damping_grows_until_the_matrix_is_positive_definite(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # As if rounding spoiled every factorisation with less damping than 1e-3.
-    problem = varied_problem(0, 12, 3)
-    driver = driver_at(problem, metis(problem.graph, 2), near(problem, 0, 0.2))
-    tried = []
-
-    def spoiled(driver: Driver, order: ModelOrder) -> object:
-        tried.append((order.second_order, order.damping))
-        return model_at(driver, order) if order.damping >= 1e-3 else None
-
-    monkeypatch.setattr("solvers.distributed.newton.model_at", spoiled)
-    before = driver.current.objective
-    state = next(islice(iterate(SubstructuredNewton(), driver), 1, None))
-    assert [second_order for second_order, _ in tried] == [True] + [False] * (len(tried) - 1)
-    dampings = [damping for _, damping in tried[1:]]
-    np.testing.assert_allclose(
-        dampings, [0.0, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3], rtol=1e-12, atol=0
-    )
-    assert state.moved
-    assert driver.current.objective < before
-
-
-def test_a_shift_grows_until_the_matrix_is_positive_definite(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # As if every factorisation failed with a shift below a thousand times the first one.
-    problem = varied_problem(0, 12, 3)
-    driver = driver_at(problem, metis(problem.graph, 2), near(problem, 0, 0.2))
-    first = 1e-3 * driver.current.objective / (driver.num_poses * driver.d)
-    tried: list[float] = []
-
-    def spoiled(driver: Driver, order: ModelOrder) -> object:
-        tried.append(order.eta)
-        return model_at(driver, order) if order.eta >= 1e3 * first else None
-
-    monkeypatch.setattr("solvers.distributed.newton.model_at", spoiled)
-    state = next(islice(iterate(SubstructuredNewton(is_shifted=True), driver), 1, None))
-    expected = [0.0, *(first * 4.0**k for k in range(6))]
-    np.testing.assert_allclose(tried, expected, rtol=1e-12, atol=0)
-    assert state.eta == tried[-1]
-    assert not state.is_convex

@@ -30,7 +30,7 @@ from robots import (
 )
 
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.partitioning import Partition, partition
@@ -40,7 +40,6 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import collect
-from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.robots import current_poses, descent, recursion, start, translations
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.robots_of_graph import open_driver
@@ -85,27 +84,6 @@ def test_the_chordal_start_is_the_central_one(
 ) -> None:
     graph = varied_graph(seed, n, d, noise)
     check_start(PGOProblem(graph, backend), partitioner(graph, seed))
-
-
-def test_the_translations_are_asked_for_again_when_their_first_factorisation_failed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    eliminate_all(monkeypatch)
-    problem = varied_problem(4, 15, 3)
-    driver = open_driver(problem, metis(problem.graph, 3), InProcess(), 4e9)
-    start = random_poses(15, 3, 0)
-    driver.set_poses(start)
-
-    def failing(*_: object) -> InterfaceFactor:
-        raise NotPositiveDefiniteError("once")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Interface, "factorize", failing)
-        with pytest.raises(NotPositiveDefiniteError, match="once"):
-            driver.adopt(driver.current.R)
-    driver.adopt(driver.current.R)
-    expected = problem.objective(problem.with_best_translations(start.R))
-    assert driver.current.objective == pytest.approx(expected, rel=1e-9)
 
 
 @settings(max_examples=examples(20))

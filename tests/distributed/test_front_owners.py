@@ -8,16 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from graphs import varied_graph
-from robots import Killed, Recording, arrays_in, eliminate_all, share
+from robots import Killed, share
 
-from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed import multifrontal
-from solvers.distributed.multifrontal import FrontOwners
-from solvers.distributed.robots.elimination import HeldFront
-from solvers.distributed.robots.records import ALONG_TREE
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.network.engine import Engine, InProcess
 from solvers.network.ledger import DRIVER
@@ -75,69 +70,6 @@ def test_the_numbers_are_those_of_a_driver_that_holds_all(seed: int, d: int, rob
     assert found.ledger.all_reduces == expected.ledger.all_reduces
 
 
-@pytest.mark.parametrize(("seed", "d", "robots"), [(0, 2, 3), (1, 3, 4), (2, 2, 9), (3, 3, 6)])
-def test_the_ledger_counts_what_every_robot_sent_and_received(
-    seed: int, d: int, robots: int
-) -> None:
-    graph, parts = world(seed, d, robots)
-    engine = Recording()
-    asked = FrontOwners.ask
-    roots: list[Any] = []
-    down: list[tuple[int, Any]] = []
-
-    def noted(self: FrontOwners, order: Any, requests: Any) -> Any:
-        roots.append(requests.get(len(self.tree) - 1))
-        answers = asked(self, order, requests)
-        for number, answer in answers.items() if order is HeldFront.substitute else ():
-            robots = zip(self.tree[number].robots, answer[1], strict=False)
-            down.extend((robot, part) for robot, part in robots if self.owner[number] != robot)
-        return answers
-
-    with pytest.MonkeyPatch.context() as patch:
-        share(patch)
-        patch.setattr(FrontOwners, "ask", noted)
-        ledger = solved(graph, parts, engine).ledger
-    assert ledger is not None
-    sent, received = np.zeros((2, robots), dtype=int)
-    counted = [one for one in engine.log if one[0] not in OFF]
-    for robot, agent in enumerate(engine.agents):
-        others = [
-            request
-            for _, requests, _ in counted
-            for to, request in enumerate(requests)
-            if to != robot
-        ]
-        told = {id(value) for request in (*others, *roots) for _, value in arrays_in(request)}
-        own = {id(value) for _, _, answers in counted for _, value in arrays_in(answers[robot])}
-        own |= {id(part) for _, part in down}
-        received[robot] = sum(part.size for one, part in down if one == robot)
-        for order, requests, answers in counted:
-            answer = answers[robot]
-            if order == "HeldFront.substitute" and answer is not None:
-                assert agent.front is not None
-                # without what is the holder's own
-                answer = answer[0], answer[1][min(agent.front.num_robots, 1) :]
-            for name, value in arrays_in(answer):
-                if name == "measured":
-                    continue
-                # What goes up the tree is sent where somebody else takes it.
-                goes_up = name in ALONG_TREE or (
-                    order in ("HeldFront.eliminate", "HeldFront.reduce") and value.ndim
-                )
-                sent[robot] += 0 if goes_up and id(value) not in told else value.size
-            named = [
-                (name, value) for name, value in arrays_in(requests[robot]) if name != "measured_at"
-            ]
-            numbers = [value for _, value in named if value.ndim or "HeldFront" not in order]
-            received[robot] += sum(
-                value.size for value in numbers if not value.ndim or id(value) not in own
-            )
-    np.testing.assert_array_equal(ledger.bytes_sent, 8 * sent)
-    np.testing.assert_array_equal(ledger.bytes_received, 8 * received)
-    assert ledger.bytes_by_level.sum() == ledger.num_bytes
-    assert len(ledger.bytes_by_level) > 1
-
-
 def test_every_front_but_the_root_has_a_robot_of_its_group(shared: None) -> None:
     for robots in (1, 2, 7, 12):
         graph, parts = world(robots, 2, robots)
@@ -151,20 +83,6 @@ def test_every_front_but_the_root_has_a_robot_of_its_group(shared: None) -> None
             assert fronts.owner[number] in ({DRIVER} if is_root else below[number])
         assert sorted(fronts.held) == [len(fronts.tree) - 1]
         assert len(set(fronts.owner)) == len(fronts.tree)
-
-
-def test_large_fronts_are_robots_and_few_or_small_ones_the_driver_s(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    eliminate_all(monkeypatch)
-    graph = grid_world(16, 60, np.random.default_rng(0), d=2)
-    parts = partition(graph, 16, PartitionMethod.METIS)
-    for least, few, expected in ((30, 3, True), (30, 100, False), (10**6, 3, False)):
-        monkeypatch.setattr(multifrontal, "LEAST_SEPARATORS", least)
-        monkeypatch.setattr(multifrontal, "LEAST_FRONTS", few)
-        driver = open_driver(PGOProblem(graph), parts, InProcess())
-        fronts = driver.interface(1).fronts
-        assert (set(fronts.owner) != {DRIVER}) == expected
 
 
 def test_a_run_that_was_broken_off_goes_on_with_fronts_on_robots(

@@ -1,6 +1,5 @@
 """CONSENSUS without a driver: the optimum to SOC's tolerance, and no certificate."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -62,37 +61,6 @@ ALONE = ("in_cover", "force", "schur", "b")  # fields that are sent to a driver 
 def alone(parts: Partition, **settings: Any) -> Robots:
     """Robots without a driver."""
     return Robots(parts, driver_memory=0, **settings)
-
-
-@pytest.mark.parametrize(
-    ("interrupted_step", "status"), [(3, Status.INTERRUPTED), (None, Status.TIME_LIMIT)]
-)
-def test_a_start_that_is_cut_short_is_the_end(
-    interrupted_step: int | None, status: Status, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    graph = varied_graph(3, 30, 3)
-    steps = list[int]()
-    step = ConsensusSOC.step
-    parts = metis(graph, 4)
-
-    def counted(self: ConsensusSOC, *args: Any) -> Any:
-        steps.append(len(steps))
-        if len(steps) == interrupted_step:
-            raise KeyboardInterrupt
-        return step(self, *args)
-
-    monkeypatch.setattr(ConsensusSOC, "step", counted)
-    limit = math.inf if interrupted_step is not None else 1e-6
-    solution = solve(
-        graph,
-        Pipeline(soc=SOC(coupling=Coupling.CONSENSUS, robots=parts)),
-        robots=alone(parts),
-        time_limit=limit,
-    )
-    assert [stage.name for stage in solution.stages] == ["spanning tree"]
-    assert solution.status is status
-    assert len(steps) == (interrupted_step or 0)
-    assert solution.objective == pytest.approx(solution.stages[0].objective, rel=1e-9)
 
 
 @settings(max_examples=examples(15))

@@ -159,19 +159,6 @@ def test_robots_on_a_ring_need_only_small_fronts() -> None:
     assert interface_of(touched, each * number, (6,)).num_bytes < 0.2 * 8 * (6 * each * number) ** 2
 
 
-@pytest.mark.parametrize("most", [0, 5])
-def test_teams_too_large_for_the_spectral_cut_are_halved_in_order(
-    most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rooms, "_MOST_SPECTRAL", most)
-    for seed in range(5):
-        touched = random_team(seed, 23, 17)
-        check_system(seed, touched, 17, 3)
-        shared = np.random.default_rng(seed).random((23, 23))
-        one, other = rooms._halves(np.arange(23), shared + shared.T)
-        assert (one.tolist(), other.tolist()) == (list(range(11)), list(range(11, 23)))
-
-
 def test_more_robots_than_the_spectral_cut_takes() -> None:
     number = rooms._MOST_SPECTRAL + 25
     touched = tuple(np.array([a, (a + 1) % number]) for a in range(number))

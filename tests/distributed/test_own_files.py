@@ -1,11 +1,9 @@
 """Robots with files of their own: the solution of the whole graph, and what the driver learns."""
 
-import math
 import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from drawn_graphs import covariances, drawn_file, write_covariances
 from graphs import DIMENSIONS, SEEDS, exact_graph, informed, varied_graph
 from hypothesis import given, settings, strategies as st
 from processes import LimitedProcesses, under_limit
-from robots import PARTITIONERS, Partitioner, Recording, arrays_in
+from robots import PARTITIONERS, Partitioner
 
 import pgo_models as pgo
 import solvers
@@ -23,25 +21,16 @@ from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, NO_FIT, Fit
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import exp_map, project_to_rotations
+from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
 from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers.distributed import (
-    elimination_choice,
-    own_files,
     robots_with_files,
-    staircase,
-    substructured,
 )
-from solvers.distributed.driver_place import DriverPlace
-from solvers.distributed.robots import climbing, current_poses
 from solvers.folder_solve import FolderSolution, solve_folder
-from solvers.place import Attempt
-from solvers.result import Status
 from solvers.robots import Robots
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import WARM_START
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 LIMIT = 27.0  # MB beside the program itself
@@ -318,67 +307,6 @@ def test_the_cost_is_exact_where_the_part_of_every_robot_is(fits: tuple[Fit, Fit
 # What crosses.
 
 
-@pytest.mark.parametrize("is_interleaved", [False, True])
-def test_robots_leave_poses_where_their_areas_interleave(
-    is_interleaved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("cvxopt")
-    monkeypatch.setattr(elimination_choice, "ENOUGH_FLOPS", 0.0)
-    graph = pgo.grid_world(4, 300, np.random.default_rng(0), d=2)
-    robots = pgo.partition(graph, 4, pgo.PartitionMethod.METIS).robot.copy()
-    if is_interleaved:
-        swapped = np.random.default_rng(1).random(graph.num_poses) < 0.5
-        robots[swapped] = np.random.default_rng(2).permutation(robots[swapped])
-    graph = graph.with_robots(robots)
-    write_g2o_folder(graph, tmp_path / "in")
-    engine = Recording()
-    solution = solve_folder(tmp_path / "in", robots=Robots(engine=engine), out=tmp_path / "out")
-    check_same(solution, graph, tmp_path / "out")
-    assert engine.times(own_files.propose_poses) == 1
-    assert engine.times(own_files.take_larger_cover) == int(is_interleaved)
-    assert all(agent.subgraph.is_sparse == is_interleaved for agent in engine.agents)
-
-
-@pytest.mark.slow  # graphs of thousands of poses
-@pytest.mark.parametrize("climbs", [False, True])
-def test_messages_do_not_grow_with_the_interiors(
-    climbs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nor do requests and answers that are off the ledger, in the staircase or before."""
-    monkeypatch.setattr(substructured, "ENOUGH_NORMS", 60)
-    pipeline = solvers.Pipeline()
-    largest = []
-    width = 6
-    # no bound is good enough for it, and so it goes up a dimension, where it finds no way down
-    if climbs:
-        monkeypatch.setattr(staircase, "smallest_shift", lambda *_: 1e-30)
-        pipeline = replace(pipeline, newton=solvers.Newton(max_iterations=0), second_try=False)
-        width = 10
-    for poses_each in (100, 800):
-        graph = tower(3, poses_each)
-        engine = Recording()
-        folder = tmp_path / str(poses_each)
-        write_g2o_folder(graph, folder)
-        solution = solve_folder(folder, pipeline, robots=Robots(engine=engine), out=folder / "out")
-        assert solution.certificate.is_certified
-        assert (engine.times(climbing.climb) > 0) == climbs
-        assert max(agent.subgraph.graph.num_edges for agent in engine.agents) >= 2 * poses_each - 10
-        on_ledger = max(
-            int(traffic.num_bytes.max(initial=0)) for traffic, _ in solution.ledger.counted
-        )
-        sizes = [
-            np.size(value)
-            for _, *both in engine.log
-            for messages in both
-            for _, value in arrays_in(tuple(messages))
-        ]
-        largest.append((on_ledger, max(sizes)))
-    # Of 12 poses in the cover, 6 at most with one robot twice: a triangle of 72 rows. Norms are at
-    # most 60 + 3.
-    assert largest[0] == largest[1]
-    assert largest[1][1] <= 12 * width * (12 * width + 1) // 2
-
-
 @pytest.mark.slow  # 16 processes, each under a limit
 @pytest.mark.skipif(
     sys.platform != "linux", reason="RLIMIT_DATA counts private memory on Linux alone"
@@ -520,76 +448,6 @@ def test_the_staircase_follows_where_newton_has_had_no_step() -> None:
     without = solve_folder(ROBOTS, replace(unfinished, staircase=None))
     assert not without.certificate.is_certified
     assert solution.certificate.gap < without.certificate.gap
-
-
-@pytest.mark.slow  # a staircase by robots
-def test_the_staircase_climbs_from_the_best(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    graph = varied_graph(1, 30, 2, NoiseModel(translation_std=1.0, rotation_std=1.5))
-    graph = graph.with_robots(pgo.partition(graph, 4).robot)
-    write_g2o_folder(graph, tmp_path / "in")
-    began: list[float] = []
-    climb = DriverPlace.climb_from_current
-    soc = DriverPlace.run_soc
-    newton = DriverPlace.run_newton
-    tolerances: list[float] = []
-    away = np.random.default_rng(0).standard_normal((2, 2))
-
-    def noted(place: DriverPlace, staircase: solvers.Staircase) -> Attempt:
-        driver = place.driver
-        began.extend(
-            [
-                driver.current.objective,
-                math.fsum(part.objective for part in driver.ask(current_poses.evaluate, None)),
-            ]
-        )
-        return climb(place, staircase)
-
-    def remembered(place: DriverPlace, attempt: Attempt, settings: solvers.SOC) -> Attempt:
-        tolerances.append(settings.tolerance)
-        return soc(place, attempt, settings)
-
-    def worse(place: DriverPlace, attempt: Attempt, settings: solvers.Newton) -> Attempt:
-        refined = newton(place, attempt, settings)
-        driver = place.driver
-        # Of the second try, which alone runs SOC in the plane.
-        if not began and tolerances and tolerances[-1] < WARM_START.tolerance:
-            driver.adopt(np.broadcast_to(project_to_rotations(away), driver.current.R.shape))
-        return refined
-
-    monkeypatch.setattr(DriverPlace, "climb_from_current", noted)
-    monkeypatch.setattr(DriverPlace, "run_soc", remembered)
-    monkeypatch.setattr(DriverPlace, "run_newton", worse)
-    solution = solve_folder(tmp_path / "in")
-    best = min(stage.objective for stage in solution.stages if stage.name == "Newton")
-    assert began == pytest.approx([best, best], rel=1e-9)
-
-
-@pytest.mark.slow  # a second try by robots
-def test_ctrl_c_between_the_loops_keeps_what_was_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    graph = varied_graph(1, 30, 2, NoiseModel(translation_std=1.0, rotation_std=1.5))
-    write_g2o_folder(graph.with_robots(pgo.partition(graph, 4).robot), tmp_path / "in")
-    bound = robots_with_files.best_bound_distributed
-    calls = list[int]()
-
-    def interrupted(*args: Any) -> Any:
-        calls.append(len(calls))
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return bound(*args)
-
-    monkeypatch.setattr(robots_with_files, "best_bound_distributed", interrupted)
-    solution = solve_folder(tmp_path / "in", out=tmp_path / "out")
-    assert solution.status is Status.INTERRUPTED
-    written = read_g2o(tmp_path / "out")
-    assert written.initial is not None
-    cost = pgo.PGOProblem(written, weighting=solution.certificate.weighting)
-    assert cost.objective(written.initial) == pytest.approx(
-        solution.certificate.objective, rel=1e-9
-    )
 
 
 def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,8 +12,6 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import Certificate
-from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
@@ -74,41 +72,6 @@ def test_right_edges_that_it_begins_without_come_back(tmp_path: Path) -> None:
     assert solution.certificate.objective == pytest.approx(agreeing.certificate.objective)
 
 
-def test_edges_that_leave_poses_apart_are_not_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world_in_files(tmp_path / "in", 0, 2, "random", 0.3)
-    agreeing = solvers.solve_folder(tmp_path / "in", robust=solvers.PCM(), trust_folder=True)
-    with_edges = own_revision.OpenedFiles.with_edges
-
-    def apart(opened, borders, num_rejected):
-        if num_rejected != agreeing.num_rejected and num_rejected > 0:
-            raise GraphError("apart")
-        return with_edges(opened, borders, num_rejected)
-
-    monkeypatch.setattr(own_revision.OpenedFiles, "with_edges", apart)
-    solution = solvers.solve_folder(tmp_path / "in", robust=solvers.GNC(), trust_folder=True)
-    assert solution.num_rejected == agreeing.num_rejected
-    assert solution.certificate.objective == pytest.approx(agreeing.certificate.objective)
-
-
-def test_a_run_that_fails_leaves_the_answer_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world_in_files(tmp_path / "in", 0, 2, "random", 0.3)
-    agreeing = solvers.solve_folder(tmp_path / "in", robust=solvers.PCM(), trust_folder=True)
-
-    def fails(*_: object) -> None:
-        raise SettingError("the interface takes too much memory")
-
-    monkeypatch.setattr(own_revision.SharedGNC, "of_files", fails)
-    solution = solvers.solve_folder(tmp_path / "in", robust=solvers.GNC(), trust_folder=True)
-    assert solution.num_rejected == agreeing.num_rejected
-    assert solution.certificate.objective == pytest.approx(agreeing.certificate.objective)
-    assert solution.certificate.is_certified
-    assert [stage.status.name for stage in solution.stages if stage.name == "GNC"] == ["FAILED"]
-
-
 def test_a_solve_that_is_out_of_time_has_the_best_bound(tmp_path: Path) -> None:
     noise = NoiseModel(0.2, 0.2)
     rng = np.random.default_rng(1)
@@ -119,26 +82,6 @@ def test_a_solve_that_is_out_of_time_has_the_best_bound(tmp_path: Path) -> None:
     assert solution.status is solvers.Status.TIME_LIMIT
     assert not solution.certificate.is_certified
     assert solution.certificate.lower_bound > 0.3 * solution.certificate.objective
-
-
-@pytest.mark.parametrize("kind", ["random", "aliased"])
-@pytest.mark.parametrize("is_certified", [True, False])
-def test_four_closures_of_five_may_be_wrong(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, is_certified: bool
-) -> None:
-    """Between robots that have no right closures wrong ones agree, each with itself at least."""
-    graph, is_wrong = world_in_files(tmp_path / "in", 0, 2, kind, 0.8)
-    if not is_certified:  # then all edges come back, in several passes
-        monkeypatch.setattr(Certificate, "is_certified", property(lambda _: False))
-    solution = solvers.solve_folder(
-        tmp_path / "in", robust=solvers.GNC(), trust_folder=True, out=tmp_path / "out"
-    )
-    kept = edges_of(read_g2o(tmp_path / "out", trust_folder=True))
-    num_mistaken = len(kept ^ edges_of(graph.without_edges(is_wrong)))
-    assert num_mistaken <= (0 if is_certified else 4)
-    if is_certified:  # with all edges back it is 120 MB
-        assert solution.ledger.rounds < 130
-        assert solution.ledger.num_bytes < 6e6
 
 
 def test_thresholds_follow_errors_that_are_smaller_than_the_matrices_claim(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed import elimination_choice
 from solvers.distributed.elimination_choice import CoverSystem, choose_elimination, leave_poses
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.robots_of_graph import open_driver
@@ -83,26 +82,6 @@ def numbers_in(answers: list[Any]) -> list[tuple[str, Any]]:
     return [found for answer in answers for found in arrays_in(answer)]
 
 
-def test_robots_leave_poses_where_their_areas_interleave(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(elimination_choice, "ENOUGH_FLOPS", 0.0)
-    graph = grid_world(4, 400, np.random.default_rng(0), d=2)
-    rng = np.random.default_rng(1)
-    interleaved = partition(graph, 4).robot.copy()
-    swapped = rng.random(graph.num_poses) < 0.5
-    interleaved[swapped] = rng.permutation(interleaved[swapped])
-    for robots, is_sparse in (
-        (partition(graph, 4, PartitionMethod.METIS), False),
-        (Partition(interleaved, PartitionMethod.GIVEN), True),
-    ):
-        shares = split_graph(PGOProblem(graph), robots)
-        chosen = choose_elimination(shares)
-        assert all(share.is_sparse is is_sparse for share in chosen)
-        flops = [CoverSystem.of([s.summary for s in some]).flops for some in (shares, chosen)]
-        assert (flops[1] < flops[0]) is is_sparse
-        driver = open_driver(PGOProblem(graph), robots, InProcess())
-        assert isinstance(driver.interface(1), SparseInterface) is is_sparse
-
-
 def test_robots_leave_poses_where_their_messages_become_shorter() -> None:
     graph = grid_world(8, 30, np.random.default_rng(0), d=2)
     shares = split_graph(PGOProblem(graph), partition(graph, 4))
@@ -114,15 +93,6 @@ def test_robots_leave_poses_where_their_messages_become_shorter() -> None:
     assert not isinstance(driver.interface(1), SparseInterface)
     driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
     assert isinstance(driver.interface(1), SparseInterface)
-
-
-def test_nothing_is_left_where_all_messages_are_shorter_than_the_edges(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    graph = grid_world(4, 400, np.random.default_rng(0), d=2)
-    shares = split_graph(PGOProblem(graph), partition(graph, 4, PartitionMethod.METIS))
-    monkeypatch.setattr(elimination_choice, "leave_poses", None)  # is not called
-    assert choose_elimination(shares) == tuple(shares)
 
 
 def test_memory_is_known_before_it_is_spent() -> None:

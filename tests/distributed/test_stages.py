@@ -30,8 +30,6 @@ from pgo_models.graphs.scenes import NoiseModel, grid, victoria_park
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed.robots import current_poses
-from solvers.distributed.robots.interior import Interior
 from solvers.network.engine import InProcess
 from solvers.network.faults import Faults
 from solvers.pipeline import solve
@@ -193,29 +191,6 @@ def test_a_start_or_a_partition_of_another_graph_is_refused() -> None:
         solve(graph, start=Poses(np.eye(3)[None], np.zeros((1, 3))), robots=3)
     with pytest.raises(SettingError, match="give one robot for every pose"):
         solve(graph, robots=Partition(np.array([0, 1]), partition(graph, 3).method))
-
-
-@pytest.mark.parametrize("robot", [0, 2])
-def test_ctrl_c_while_robots_go_to_a_trial_leaves_none_behind(
-    robot: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    accept = current_poses.accept
-    calls = list[int]()
-
-    def interrupted(interior: Interior, request: None) -> tuple[Interior, None]:
-        calls.append(len(calls))
-        if len(calls) == 4 + robot:  # of the second trial of four robots
-            raise KeyboardInterrupt
-        return accept(interior, request)
-
-    problem = varied_problem(6, 25, 3, LOUD_NOISE)
-    parts = metis(problem.graph, 4)
-    monkeypatch.setattr(current_poses, "accept", interrupted)
-    solution = solve(problem, replace(SHORT, soc=None), robots=parts)
-    newton = solution.stages[-1]
-    assert newton.status is Status.INTERRUPTED
-    assert solution.objective == pytest.approx(problem.objective(solution.poses), rel=1e-12)
-    assert solution.objective <= newton.history.objective[-1] * (1 + 1e-12)
 
 
 def stop_at(k: int) -> Callable[[object, Record], bool]:

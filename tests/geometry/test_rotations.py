@@ -109,22 +109,6 @@ def test_projection_of_degenerate_matrices_is_a_rotation(d: int) -> None:
     np.testing.assert_allclose(omega[-1], np.eye(d), rtol=0, atol=4 * EPS)
 
 
-def test_well_conditioned_matrices_take_the_fast_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    # An iteration that is wrong does not settle, and the SVD then hides it: what it hands on is
-    # counted.
-    rng = np.random.default_rng(0)
-    A = random_rotations(1000, 3, rng) + 0.1 * rng.standard_normal((1000, 3, 3))
-    expected = project_by_svd(A)
-    handed_on = []
-    monkeypatch.setattr(
-        rotations, "project_by_svd", lambda bad: handed_on.append(bad) or project_by_svd(bad)
-    )
-    np.testing.assert_allclose(project_to_rotations(A), expected, rtol=0, atol=1e-13)
-    assert handed_on == []
-    project_to_rotations(-A)
-    assert [len(bad) for bad in handed_on] == [1000]
-
-
 def test_many_matrices_are_projected_some_at_a_time() -> None:
     rng = np.random.default_rng(0)
     count = 5 * rotations._BATCH // 2

@@ -1,4 +1,3 @@
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +5,6 @@ import pytest
 from graphs import assert_says
 
 from pgo_models.errors import FileFormatError
-from pgo_models.files import read_blocks
 from pgo_models.graphs.g2o_parser import read_lines
 from pgo_models.graphs.g2o_rows import information_of, poses_of
 
@@ -141,23 +139,6 @@ def test_numbers_that_all_lines_end_with_are_read_like_others(tmp_path: Path) ->
     ):
         with pytest.raises(FileFormatError, match=words):
             read_lines(write(tmp_path, *(line.replace("4 0 9", end) for line in lines)))
-
-
-def test_a_block_of_a_file_knows_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    in_small_blocks = partial(read_blocks, block=100)
-    monkeypatch.setattr("pgo_models.graphs.g2o_parser.read_blocks", in_small_blocks)
-    lines = [f"VERTEX_SE2 {k} {k} 0 0" for k in range(20)] + [
-        f"EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1" for k in range(19)
-    ]
-    found = read_lines(write(tmp_path, *lines))
-    np.testing.assert_array_equal(found.vertices[:, 0], np.arange(20))
-    np.testing.assert_array_equal(found.edge_lines, np.arange(21, 40))
-    with pytest.raises(FileFormatError, match=r":40: 'x' is no number"):
-        read_lines(write(tmp_path, *lines, "EDGE_SE2 0 1 x 0 0 1 0 0 1 0 1"))
-    path = write(tmp_path, *lines)
-    path.write_bytes(path.read_bytes() + b"# \xff\n")
-    with pytest.raises(FileFormatError, match=r":40: bytes that are no text"):
-        read_lines(path)
 
 
 def test_blank_lines_count(tmp_path: Path) -> None:

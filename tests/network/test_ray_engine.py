@@ -218,27 +218,6 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
         pool.close()
 
 
-def test_a_slow_answer_is_waited_for_while_the_cluster_lives(graph, actors, monkeypatch):
-    pool = RayEngine().open(
-        partial(Agent, backend=None), split_graph(graph, pgo.partition(graph, 1))
-    )
-    monkeypatch.setattr(ray_engine, "_SECONDS_TO_ANSWER", 0.1)
-    slow = pickle.dumps(["slow"])
-    try:
-        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(1) or slow)
-        assert actors[0].receive(0, ticket) == ["slow"]
-        monkeypatch.setattr(ray_engine, "_SECONDS_TO_COME_BACK", 0.5)
-        monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": False}])
-        ticket = actors[0].actors[0].__ray_call__.remote(lambda holder: time.sleep(5) or {})
-        with pytest.raises(
-            EngineError, match=r"has died \(none of its machines is left\); solve again"
-        ):
-            actors[0].receive(0, ticket)
-        assert actors[0].actors == {}
-    finally:
-        pool.close()
-
-
 @pytest.mark.parametrize(
     "error", [MissingExtraError("cvxopt", "fast"), FileFormatError("x.g2o", 3, "bad")]
 )

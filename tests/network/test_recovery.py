@@ -11,7 +11,6 @@ import solvers
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.partitioning import PartitionMethod, partition
 from pgo_models.problem.problem import PGOProblem
-from solvers.distributed import multifrontal
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
@@ -108,49 +107,6 @@ def test_lost_robots_return_to_the_moments_of_old_states(method, orders):
         assert following.dual_residual == undisturbed.dual_residual
     (pool,) = engine.opened
     assert pool.place.lost > 1
-
-
-@pytest.mark.parametrize(
-    ("coupling", "orders"),
-    [
-        (solvers.Coupling.SUBSTRUCTURED, 1),
-        (solvers.Coupling.SUBSTRUCTURED, 7),
-        (solvers.Coupling.SUBSTRUCTURED, 1000),
-        (solvers.Coupling.CONSENSUS, 7),
-    ],
-)
-@pytest.mark.parametrize(
-    ("is_before", "least", "groups"),
-    [
-        (True, 200, ()),
-        (False, 200, ()),
-        (True, 0, ()),
-        (True, 200, ((0, 2, 3), (1,))),
-        (False, 0, ((0, 2), (1, 3))),
-    ],
-)
-def test_lost_robots_change_nothing(coupling, orders, is_before, least, groups, monkeypatch):
-    monkeypatch.setattr(
-        multifrontal, "LEAST_SEPARATORS", least
-    )  # with 0 robots hold the fronts, too
-    monkeypatch.setattr(
-        multifrontal, "LEAST_FRONTS", 1 if least == 0 else multifrontal.LEAST_FRONTS
-    )
-    graph = varied_graph(orders, 60, 2 + orders % 2)
-    robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
-    expected = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
-    losses = frozenset(np.random.default_rng(orders).integers(1, 300, 12).tolist())
-    engine = LeakyEngine(losses, Recovery(orders, max_restarts=1000), is_before, groups)
-    solution = solvers.solve(
-        graph, pipeline(coupling, robots), robots=solvers.Robots(robots, engine=engine)
-    )
-    (pool,) = engine.opened
-    assert pool.place.lost > 3
-    assert sum(pool.restarts) == pool.place.lost
-    np.testing.assert_array_equal(solution.poses.R, expected.poses.R)
-    np.testing.assert_array_equal(solution.poses.t, expected.poses.t)
-    assert solution.lower_bound == expected.lower_bound
-    assert repr(solution.ledger) == repr(expected.ledger)
 
 
 @pytest.mark.parametrize("orders", [7, 1000])
@@ -252,59 +208,6 @@ def test_of_two_refusals_the_first_robots_is_told():
     place.start(range(2))
     with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
         RecoveringPool(place, Recovery()).ask(refuse, [None] * 2)
-
-
-@pytest.mark.parametrize("coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS])
-def test_the_ledger_has_the_bytes_of_all_snapshots(coupling, monkeypatch):
-    graph = varied_graph(3, 40, 3)
-    robots = partition(graph, 4, PartitionMethod.CONTIGUOUS)
-    taken = []
-    snapshot = Agent.snapshot
-
-    def counted(agent):
-        record = snapshot(agent)
-        taken.append(sum(array.nbytes for array in record.values()))
-        return record
-
-    monkeypatch.setattr(Agent, "snapshot", counted)
-    here = solvers.solve(graph, pipeline(coupling, robots), robots=robots)
-    assert here.ledger.snapshot_bytes == sum(taken) == 0
-    solution = solvers.solve(
-        graph,
-        pipeline(coupling, robots),
-        robots=solvers.Robots(robots, engine=LeakyEngine(recovery=Recovery(7))),
-    )
-    assert solution.ledger.snapshot_bytes == sum(taken) > 0
-    assert solution.ledger.num_bytes == here.ledger.num_bytes
-    assert f"{sum(taken):,} bytes to the driver's process" in str(solution)
-
-
-def test_a_checkpoint_counts_the_snapshots_in_it(tmp_path, monkeypatch):
-    graph = varied_graph(6, 40, 3)
-    checkpoint = solvers.Checkpoint(tmp_path / "run.ckpt", rounds=2)
-    taken = []
-    snapshot = Agent.snapshot
-
-    def counted(agent):
-        record = snapshot(agent)
-        taken.append(sum(array.nbytes for array in record.values()))
-        return record
-
-    class KilledError(BaseException):
-        pass
-
-    def kill(state, record):
-        if record.k == 9:
-            raise KilledError
-
-    monkeypatch.setattr(Agent, "snapshot", counted)
-    settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
-    with pytest.raises(KilledError):
-        solvers.solve(
-            graph, settings, robots=solvers.Robots(4, checkpoint=checkpoint), callback=kill
-        )
-    resumed = solvers.solve(graph, settings, robots=solvers.Robots(4, checkpoint=checkpoint))
-    assert resumed.ledger.snapshot_bytes == sum(taken) > 0  # the first run's, too
 
 
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():

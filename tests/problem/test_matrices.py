@@ -10,7 +10,6 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import stack_transposes
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import random_geometric
-from pgo_models.problem import matrices
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.matrices import (
     BlockLaplacian,
@@ -181,20 +180,6 @@ def test_a_dense_Q_has_a_largest_side() -> None:
     graph = random_geometric(2001, np.random.default_rng(0))
     with pytest.raises(SettingError, match=r"side 6003, 0\.3 GB; use PGOProblem\.apply_Q"):
         marginalized_matrix(graph)
-
-
-def test_the_largest_side_is_allowed_and_takes_288_MB(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert 8 * matrices.MAX_DENSE_SIDE**2 == 288_000_000
-    monkeypatch.setattr(matrices, "MAX_DENSE_SIDE", 30)
-    assert marginalized_matrix(random_geometric(10, np.random.default_rng(0))).shape == (30, 30)
-    assert marginalized_matrix(random_geometric(15, np.random.default_rng(0), d=2)).shape == (
-        30,
-        30,
-    )
-    for n, d, largest in ((11, 3, 30), (16, 2, 30), (10, 3, 29), (15, 2, 29)):
-        monkeypatch.setattr(matrices, "MAX_DENSE_SIDE", largest)
-        with pytest.raises(SettingError, match=r"use PGOProblem\.apply_Q"):
-            marginalized_matrix(random_geometric(n, np.random.default_rng(0), d=d))
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)

@@ -6,7 +6,6 @@ import pytest
 import pgo_models as pgo
 from pgo_models.problem import ordering
 from pgo_models.problem.cholesky import CholeskyBackend, analyze
-from pgo_models.problem.hessian import ground_pose, riemannian_hessian, tangent_order
 from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order, row_order
 
 WORLD = pgo.grid_world(4, 40, np.random.default_rng(0), d=3)
@@ -14,26 +13,6 @@ WORLD = pgo.grid_world(4, 40, np.random.default_rng(0), d=3)
 
 def test_rows_of_a_pose_stand_together_in_the_order_of_the_poses() -> None:
     assert row_order(np.array([2, 0, 1]), 1, 2).tolist() == [2, 7, 8, 0, 3, 4, 1, 5, 6]
-
-
-@pytest.mark.parametrize("dissected", [False, True])
-@pytest.mark.parametrize("backend", CholeskyBackend)
-def test_factors_in_either_order_solve(
-    backend: CholeskyBackend, dissected: bool, monkeypatch
-) -> None:
-    pytest.importorskip("cvxopt")
-    pytest.importorskip("pymetis")
-    if dissected:
-        monkeypatch.setattr(ordering, "DISSECTED_FROM", {2: 2, 3: 2})
-    problem = pgo.PGOProblem(WORLD, backend)
-    order = problem.pose_order
-    assert sorted(order) == list(range(WORLD.num_poses))
-    start = pgo.chordal_start(problem)
-    matrix = riemannian_hessian(problem.at(start), None)
-    ground_pose(matrix, problem)
-    b = np.random.default_rng(0).normal(size=(matrix.shape[0], 2))
-    x = analyze(matrix, backend, tangent_order(problem)).factorize(matrix).solve(b)
-    assert np.linalg.norm(matrix @ x - b) < 1e-9 * np.linalg.norm(b)
 
 
 def test_a_dissected_world_in_space_fills_less() -> None:
@@ -49,18 +28,6 @@ def test_a_dissected_world_in_space_fills_less() -> None:
         for order in (pose_order(world), by_degree)
     ]
     assert filled[0] < 0.8 * filled[1]
-
-
-@pytest.mark.parametrize("dissected", [False, True])
-def test_a_pattern_is_ordered_as_the_graph_that_has_it(
-    dissected: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("pymetis")
-    if dissected:
-        monkeypatch.setattr(ordering, "DISSECTED_FROM", {2: 2, 3: 2})
-    lower = ordering.pattern_of_edges(WORLD.num_poses, WORLD.i, WORLD.j)
-    order = ordering.order_of_pattern(lower, WORLD.d)
-    np.testing.assert_array_equal(order, pose_order(WORLD))
 
 
 SCENES = [pgo.load("circle"), pgo.load("grid"), pgo.load("sphere"), WORLD]

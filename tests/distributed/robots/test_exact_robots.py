@@ -12,7 +12,6 @@ from graphs import (
     SEEDS,
     informed,
     random_poses,
-    turned_away,
     varied_graph,
     wound_ring,
 )
@@ -98,23 +97,6 @@ def test_no_bound_of_robots_is_above_F_on_long_roads(
     with closing(driver_at(problem, cut(problem.graph, 3), poses)) as driver:
         bound = best_bound_distributed(driver, 1e-6)
     assert (1.0 - 1e-6) * F <= bound.value <= F
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_the_bound_of_robots_holds_wherever_it_is_grounded(
-    d: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without a move G is not rounding; its quadratic terms alone keep the bound below F."""
-    monkeypatch.setattr(distributed_bound.central, "MOST_MOVES", 0)
-    problem = PGOProblem(varied_graph(0, 12, d))
-    best = polish(problem, chordal_start(problem))
-    F = ExactGraph.of_doubles(problem.graph).objective_of(best)
-    for size in (1e-3, 1e-5, 1e-7):
-        away = turned_away(problem, best, size, 0)
-        with closing(driver_at(problem, contiguous(problem.graph, 2), away)) as driver:
-            bound = prove_grounded(driver, 1e-9)
-        assert bound is not None
-        assert bound.value <= F < ExactGraph.of_doubles(problem.graph).objective_of(away)
 
 
 @pytest.mark.parametrize("d", [2, 3])
