@@ -11,7 +11,7 @@ import numpy as np
 from pgo_models.certificates.certificate import Verdict
 from pgo_models.certificates.fit import NO_FIT, Fit
 from pgo_models.figures import rounded_up
-from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.summaries import Summarised
 from solvers.robust.bridges import unchecked_bridges
@@ -20,10 +20,10 @@ from solvers.robust.rivals import Rival
 
 # Largest r^2 / c^2 of a doubtful edge, and the inverse of the least: residuals are within twice and
 # half their threshold.
-NEAR = 4.0
+_NEAR = 4.0
 # Edges that are named in a row of the summary, at most.
 _MAX_NAMED = 5
-# Share of the closures kept on which the answer may be in doubt without saying so.
+# Share of the closures kept that may be wrong by chance without a doubt; one closure always may.
 _TOLERATED_SHARE = 0.05
 
 
@@ -128,7 +128,7 @@ class Rejection(Summarised):
     @property
     def doubtful(self) -> BoolArray:
         """Edges, not known ones, whose residual is between half and twice its threshold, (m,)."""
-        is_near = (self.ratio > 1.0 / NEAR) & (self.ratio < NEAR)
+        is_near = (self.ratio > 1.0 / _NEAR) & (self.ratio < _NEAR)
         return np.asarray(~self.known & is_near)
 
     @property
@@ -151,22 +151,6 @@ class Rejection(Summarised):
         """Number of independent cycles among the edges kept; 0 where these form a tree."""
         return int(self.kept.sum()) - (self.problem.num_poses - 1)
 
-    @property
-    def num_rejected_near(self) -> float:
-        """Number of rejected edges near their thresholds that are not there by chance.
-
-        Edges near are within x = 4 times their thresholds. Wrong motions that lie anywhere are
-        within half of that with the share 2^(-p / 2), the ratio of the volumes, with p = 3 or 6
-        numbers of a motion; right edges that were rejected are within it, all but a few. So of n
-        edges near, r of them right, the half nearest to zero has r + (n - r) 2^(-p / 2).
-        """
-        d = self.problem.d
-        p = d + tangent_dimension(d)
-        share = float(2.0 ** (-0.5 * p))
-        num_near = int((self.rejected & self.doubtful).sum())
-        num_nearer = int((self.rejected & self.doubtful & (self.ratio < 0.5 * NEAR)).sum())
-        return max(0.0, (num_nearer - share * num_near) / (1.0 - share))
-
     @cached_property
     def bridges(self) -> BoolArray:
         """Edges kept, not known ones, each the only one between two parts of the map, (m,)."""
@@ -187,13 +171,9 @@ class Rejection(Summarised):
         num_lost = int((self._suspected_fixes & self.rejected).sum())
         if 2 * num_lost > num_fixes:
             doubts.append(f"{num_lost} of {num_fixes} fixes are rejected")
-        if self.by_chance > self._num_tolerated:
+        if self.by_chance > max(1.0, _TOLERATED_SHARE * self.num_closures_kept):
             number = rounded_up(self.by_chance, 2)
             doubts.append(f"up to {number} wrong closures are expected to fit this map by chance")
-        num_near = self.num_rejected_near
-        if num_near > self._num_tolerated:
-            among = "are expected among the edges rejected near their thresholds"
-            doubts.append(f"about {num_near:.0f} right ones {among}")
         return tuple(doubts)
 
     @property
@@ -350,11 +330,6 @@ class Rejection(Summarised):
         if self.proof is not None:
             robust |= self.proof.as_json()
         return {"rejected": rejected, "robust": robust}
-
-    @property
-    def _num_tolerated(self) -> float:
-        """Number of edges on which the answer may be in doubt without saying so."""
-        return max(1.0, _TOLERATED_SHARE * self.num_closures_kept)
 
     @property
     def _suspected_fixes(self) -> BoolArray:

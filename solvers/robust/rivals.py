@@ -30,7 +30,7 @@ from solvers.robust.weighted_edges import held_together
 _LIKELY = 0.05
 # A rival keeps more than this share of the closures kept, of edges that the map rejects and that
 # are beyond so many times their thresholds: one near its threshold makes no other map.
-_SHARE = 0.05
+_SHARE = 0.1
 _CLEAR = 4.0
 # Rejected closures and clusters that are looked at, at most: each is compared with all others.
 _MOST_SEEDS = 100
@@ -69,8 +69,8 @@ def rival_of(
     """The rival of a fit that costs the least, if any; attempts are edges kept, (m,), and poses.
 
     A known edge that is a suspect costs at most what one in so many exceeds with probability
-    `FALSE_ALARM`, as any of them may be it. If the truncated cost falls without it, that is a rival
-    whatever other edges fit then.
+    `FALSE_ALARM`, as any of them may be it. If the truncated cost clearly falls without it, that is
+    a rival whatever other edges fit then.
     """
     num_known = max(1, int(sets.known.sum()))
     improbable = sets.scale * chi2_thresholds(sets.problem, 1.0 - FALSE_ALARM / num_known)
@@ -85,7 +85,7 @@ def rival_of(
         rival = _settled(sets, fit, candidate, can_return, improbable)
         if rival is None or rival.gain <= -margin:
             continue
-        is_slip = rival.edge is not None and rival.gain > 0.0
+        is_slip = rival.edge is not None and rival.gain > margin
         is_other = rival.others > least_others
         if (is_slip or is_other) and (best is None or rival.gain > best.gain):
             best = rival

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from wrong_edges import ring_road
+from wrong_edges import joined_by, ring_road, spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models.graphs.scenes import NoiseModel
 from solvers.robust.rejection import Support
 
 
@@ -22,6 +23,33 @@ def with_slip(graph: pgo.PoseGraph, edge: int, shift: float) -> pgo.PoseGraph:
 def given(graph: pgo.PoseGraph) -> solvers.GNC:
     """Settings that take odometry for right, whatever speaks against it."""
     return solvers.GNC(known=np.arange(graph.num_edges) < graph.truth.num_poses - 1)
+
+
+def test_the_only_edge_between_two_robots() -> None:
+    doubt = "one edge is the only one between two parts of the map, and nothing checks it"
+    assert solvers.solve(joined_by(1), robust=solvers.GNC()).robust.doubts == (doubt,)
+    assert solvers.solve(joined_by(2), robust=solvers.GNC()).robust.doubts == ()
+
+
+@pytest.mark.parametrize("claim", [1.0, 2.5])
+def test_errors_larger_than_claimed(claim: float) -> None:
+    graph = ring_road(0, 45, 30)
+    graph = replace(graph, kappa=claim * graph.kappa, tau=claim * graph.tau)
+    robust = solvers.solve(graph, robust=given(graph)).robust
+    doubt = "the edges kept do not fit together"
+    assert robust.doubts == ((doubt,) if claim > 1.0 else ())
+
+
+@pytest.mark.parametrize("share", [0.4, 0.85])
+def test_wrong_closures_that_fit_by_chance(share: float) -> None:
+    """Twenty poses, whose odometry is so poor that it follows many a wrong closure."""
+    noise = NoiseModel(0.4, 0.15)
+    rng = np.random.default_rng(0)
+    right = pgo.grid_world(1, 20, rng, d=2, loop_closure_probability=0.1, noise=noise)
+    graph, _ = spoiled(right, share, "random", 0)
+    robust = solvers.solve(graph, robust=given(graph)).robust
+    is_doubted = any("expected to fit this map by chance" in doubt for doubt in robust.doubts)
+    assert is_doubted == (robust.by_chance > 1.0) == (share > 0.5)
 
 
 def test_without_a_slipped_step_more_edges_fit() -> None:
@@ -46,7 +74,7 @@ def test_a_slip_that_costs_every_closure_is_said_of_a_tree() -> None:
     assert solution.robust.headline.endswith("and without it 15 more edges fit")
 
 
-@pytest.mark.parametrize("num_wrong", [2, 3])
+@pytest.mark.parametrize("num_wrong", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_more_than_half_of_the_fixes_rejected_is_doubted(num_wrong: int) -> None:
     """Wrong fixes are far from each other, and the right ones agree."""
     graph = ring_road(0, 24, 16)

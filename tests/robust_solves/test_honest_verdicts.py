@@ -247,20 +247,9 @@ def test_nothing_is_doubted_where_all_is_well(share: float, kind: str) -> None:
 
 
 def test_what_speaks_against_the_edges_kept() -> None:
-    graph, is_wrong = spoiled(world(150, 0.1), 0.3, "random", 0)
+    graph, _ = spoiled(world(150, 0.1), 0.3, "random", 0)
     robust = solvers.solve(graph, robust=solvers.GNC()).robust
     assert robust.support is Support.CHECKED
-    near = replace(robust, ratio=np.where(is_wrong, 1.5, robust.ratio))
-    num_wrong = int(is_wrong.sum())
-    among = "are expected among the edges rejected near their thresholds"
-    doubt = f"about {num_wrong} right ones {among}"
-    assert doubt in near.headline
-    # Wrong motions that lie anywhere: of a ball of dimension 3 or 6 most lies far from the middle.
-    volumes = (np.arange(num_wrong) + 0.5) / num_wrong
-    p = {2: 3, 3: 6}[graph.d]
-    by_chance = robust.ratio.copy()
-    by_chance[is_wrong] = 4.0 * volumes ** (2.0 / p)
-    assert replace(robust, ratio=by_chance).support is Support.CHECKED
     misfit = replace(robust, is_misfit=True)
     assert misfit.headline.startswith("DOUBTFUL, the edges kept do not fit together: CERTIFIED")
     disputed = replace(robust, rival=Rival(None, -1.0, 40))
