@@ -64,6 +64,7 @@ from solvers.robots import Checkpoint as Checkpoint, Robots as Robots
 from solvers.robust.consistency import PCM as PCM, pairwise_consistent as pairwise_consistent
 from solvers.robust.gnc import GNC as GNC
 from solvers.robust.irls import IRLS as IRLS
+from solvers.robust.known import Known as Known
 from solvers.robust.losses import RobustLoss as RobustLoss
 from solvers.robust.outlier_record import OutlierProof as OutlierProof
 from solvers.robust.rejection import Rejection as Rejection, Support as Support
@@ -140,7 +141,7 @@ __all__ += ["NoiseEstimate", "NoiseLevel", "estimate_noise"]
 __all__ += ["SOC", "Anderson", "Coupling", "CvxpyStep", "PaperSOC", "PaperStop", "RStep"]
 __all__ += ["BalancedPenalty", "BoydPenalty", "FixedPenalty", "MultiplierPenalty", "PenaltyRule"]
 __all__ += ["GrowingStart", "HandednessSearch", "Newton", "Staircase", "gauss_newton", "polish"]
-__all__ += ["GNC", "IRLS", "PCM", "RobustLoss", "pairwise_consistent", "prove_outliers"]
+__all__ += ["GNC", "IRLS", "PCM", "Known", "RobustLoss", "pairwise_consistent", "prove_outliers"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "Ledger", "RayEngine"]
 __all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]

@@ -44,6 +44,7 @@ from solvers.result import Record, Stage, Status
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.robust.known import takes_odometry
 from solvers.robust.rejection import text_of_bridges
 from solvers.robust_solves.attempts import TIGHT_SCALES, with_tight_thresholds
 from solvers.soc.paper import PaperSOC
@@ -410,7 +411,7 @@ def _check_first_stage(soc: FirstStage) -> None:
 
 def check_robust(robust: GNC | PCM | None) -> None:
     """Raise a SettingError for wrong edges that robots with own files cannot find."""
-    if robust is not None and robust.known is not None:
+    if robust is not None and not takes_odometry(robust.known):
         raise SettingError(
             "robots with files of their own take their odometry to be right, and no other known "
             f"edges; for these {READ_HERE}"

@@ -28,8 +28,9 @@ from solvers.request import Pipeline, SolveRequest
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.robust.known import KnownEdges
 from solvers.robust.revision import inlier_problem
-from solvers.robust.weighted_edges import held_together, known_inliers
+from solvers.robust.weighted_edges import held_together
 from solvers.robust_solves.robust_solve import go_on_robustly
 from solvers.solution import Solution
 
@@ -123,9 +124,10 @@ def extend(
         grown = _solve_from(problem, pipeline, start, shared)
     else:
         kept, new = _decided_before(solution, graph)
-        kept = held_together(
-            graph, kept | known_inliers(graph, robust.known), np.zeros(graph.num_edges)
-        )
+        # Odometry that was rejected before is not taken for right again.
+        known = KnownEdges.of(graph, robust.known).edges & (kept | new)
+        robust = replace(robust, known=known)
+        kept = held_together(graph, kept | known, np.zeros(graph.num_edges))
         start = extended_poses(inlier_problem(problem, kept), ids, solution.poses)
         request = SolveRequest(problem, pipeline, start, robots=shared)
         grown = go_on_robustly(robust, kept, new, request)

@@ -36,7 +36,7 @@ from pgo_models.summaries import Summarised
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.riemannian.polish import polish
-from solvers.robust.consistency import odometry
+from solvers.robust.known import odometry
 
 _MOST_ROUNDS = 50
 _SETTLED = 1e-4  # largest relative change of a scale in the last round

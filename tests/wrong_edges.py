@@ -9,7 +9,7 @@ from pgo_models.geometry.rotations import BoolArray, exp_map, random_rotations
 from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, observe
-from solvers.robust.consistency import odometry
+from solvers.robust.known import odometry
 
 
 def spoiled(graph: PoseGraph, share: float, kind: str, seed: int) -> tuple[PoseGraph, BoolArray]:

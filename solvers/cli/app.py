@@ -69,6 +69,7 @@ COMMANDS = {
                 "largest_component",
                 "drop_edge",
                 "robust",
+                "known",
                 "prove_outliers",
             ),
             "Files that are written": ("out", "report", "film", "covariances", "proof", "times"),

@@ -10,7 +10,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
-from solvers.cli.options import BackEndName, FirstStage, Robust, Runner, Start
+from solvers.cli.options import BackEndName, FirstStage, Robust, Runner, Start, TakenForRight
 from solvers.network.engine import DEFAULT_MEMORY, Engine, InProcess
 from solvers.request import Pipeline
 from solvers.riemannian.newton import gauss_newton
@@ -36,6 +36,7 @@ FOR_OWN_FILES = {
     "out",
     "method",
     "robust",
+    "known",
     "engine",
     "address",
     "driver_memory",
@@ -196,12 +197,15 @@ def chosen_start(problem: PGOProblem, start: Start | None) -> Poses | None:
     return None
 
 
-def chosen_robust(robust: Robust | None) -> "GNC | PCM | None":
-    """How wrong edges are found, of the option --robust."""
+def chosen_robust(robust: Robust | None, known: TakenForRight | None = None) -> "GNC | PCM | None":
+    """How wrong edges are found, of the options --robust and --known."""
     if robust is None:
+        if known is not None:
+            raise SettingError("--known is of a robust solve; add --robust gnc")
         return None
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
+    from solvers.robust.known import Known
     from solvers.robust.losses import RobustLoss
 
     methods: dict[Robust, GNC | PCM] = {
@@ -210,4 +214,5 @@ def chosen_robust(robust: Robust | None) -> "GNC | PCM | None":
         Robust.PCM: PCM(),
         Robust.PCM_GNC: GNC(consistent=True),
     }
-    return methods[robust]
+    method = methods[robust]
+    return method if known is None else replace(method, known=Known[known.name])

@@ -18,7 +18,8 @@ BackEndName = enum.StrEnum("BackEndName", "FACTORIZED FISTA NESTEROV CLARABEL")
 Split = enum.StrEnum("Split", "GIVEN CONTIGUOUS METIS SINGLETONS")
 # Where robots run.
 Runner = enum.StrEnum("Runner", "PROCESS THREADS RAY")
-# How wrong edges are found.
+# Edges that a robust solve takes for right (`Known`), and how wrong ones are found.
+TakenForRight = enum.StrEnum("TakenForRight", "AUTO NONE ODOMETRY")
 Robust = enum.StrEnum("Robust", {"GNC": "gnc", "GM": "gm", "PCM": "pcm", "PCM_GNC": "pcm-gnc"})
 Scene = enum.StrEnum(
     "Scene",

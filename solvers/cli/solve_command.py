@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -60,6 +60,7 @@ from solvers.cli.options import (
     Split,
     SplitOption,
     Start,
+    TakenForRight,
     TrustFolderOption,
     UnitWeightsOption,
 )
@@ -82,6 +83,10 @@ from solvers.result import Status
 from solvers.robots import Checkpoint, Robots
 from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution, check_format, check_target
+
+if TYPE_CHECKING:
+    from solvers.robust.consistency import PCM
+    from solvers.robust.gnc import GNC
 
 _INDENT = 13  # columns of the labels of a solution
 
@@ -211,9 +216,16 @@ def solve_command(
     robust: Annotated[
         Robust | None,
         typer.Option(
-            help="Find wrong edges and leave them out, odometry taken to be right: graduated "
-            "non-convexity with truncated least squares (gnc) or Geman-McClure (gm), pairwise "
-            "consistency (pcm), or both (pcm-gnc)."
+            help="Find wrong edges and leave them out: graduated non-convexity with truncated "
+            "least squares (gnc) or Geman-McClure (gm), pairwise consistency (pcm), or both "
+            "(pcm-gnc)."
+        ),
+    ] = None,
+    known: Annotated[
+        TakenForRight | None,
+        typer.Option(
+            help="With --robust, edges taken for right: odometry, which joins consecutive poses; "
+            "none; or odometry unless cycles of edges contradict it (auto, the default)."
         ),
     ] = None,
     prove_outliers: Annotated[
@@ -246,7 +258,9 @@ def solve_command(
         largest_component,
         estimate_noise,
     )
-    stages = StageOptions(method, start, r_step, gap, max_iterations, tolerance, time_limit, robust)
+    stages = StageOptions(
+        method, start, r_step, gap, max_iterations, tolerance, time_limit, robust, known
+    )
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
     is_printed = any(map(is_standard_output, out or []))
     if is_printed and (verbose or as_json):
@@ -273,7 +287,7 @@ def solve_command(
         problem,
         stages.pipeline(place.method, place.partition, not network.has_no_driver),
         choices.chosen_start(problem, start),
-        robust=choices.chosen_robust(robust),
+        robust=stages.wrong_edges,
         robots=network.robots_at(place),
         anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=time_limit,
@@ -303,6 +317,12 @@ class StageOptions:
     tolerance: float | None
     time_limit: float
     robust: Robust | None
+    known: TakenForRight | None
+
+    @property
+    def wrong_edges(self) -> "GNC | PCM | None":
+        """How wrong edges are found."""
+        return choices.chosen_robust(self.robust, self.known)
 
     def check_robust(self) -> None:
         """Raise a SettingError where a robust solve is to have a first stage."""
@@ -557,7 +577,7 @@ def _solve_own_files(
         source.graph,
         pipeline,
         weighting=weightings[source.chosen_cost],
-        robust=choices.chosen_robust(stages.robust),
+        robust=stages.wrong_edges,
         robots=Robots(engine=engine, driver_memory=memory),
         out=outputs.out[0] if outputs.out else None,
         time_limit=stages.time_limit,
@@ -583,6 +603,8 @@ def _save_and_show(
     command_source = source.in_commands
     if stages.robust is not None:
         command_source += f" --robust {stages.robust.value}"
+        if stages.known is not None:
+            command_source += f" --known {stages.known.value}"
     # The edges are judged once, and only where that is shown.
     judged = cache(partial(edge_fit_of_solution, solution, source.graph, source.drop_edge))
     targets = _files_of_solution(solution, outputs)

@@ -42,7 +42,8 @@ from solvers.result import Outcome, Stage
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
 from solvers.robust.gnc import GNC, Inliers
-from solvers.robust.weighted_edges import first_poses, known_inliers
+from solvers.robust.known import KnownEdges
+from solvers.robust.weighted_edges import first_poses
 from solvers.soc.paper import PaperSOC
 from solvers.soc.subgraph import middle_separator, split_graph
 
@@ -140,7 +141,7 @@ class RobotsOfGraph(DriverPlace):
         driver = self.driver
         problem = self.here.problem
         if start is None:
-            known = known_inliers(problem.graph, gnc.known)
+            known = KnownEdges.of(problem.graph, gnc.known).edges
             driver.hand_out(first_poses(problem.graph, known))
             for traffic in tree_traffic(problem, self.robots):
                 driver.network.ledger = driver.network.ledger.after_round(traffic)

@@ -36,11 +36,11 @@ from solvers.robust.gnc import (
     measurement_of,
     next_state,
 )
+from solvers.robust.known import KnownEdges
 from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import (
     RatioSums,
     held_together,
-    known_inliers,
     negligible_weight,
 )
 
@@ -144,7 +144,7 @@ class SharedGNC:
         A wrong edge can cost so much that even a small share of its weight bends the map. So it
         has none where whole motions among the known inliers connect all poses.
         """
-        known = known_inliers(graph, gnc.known)
+        known = KnownEdges.of(graph, gnc.known).edges
         least_weight = negligible_weight(float((~known).sum()), graph.num_poses)
         apart = connecting_edges(graph, known & is_whole(graph), np.zeros(graph.num_edges))
         is_held = len(apart) == 0 and not graph.is_world_loose

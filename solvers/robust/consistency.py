@@ -18,17 +18,8 @@ from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from solvers.robust.chains import Chains, Closures, cycle_distances, is_whole, squared_distances
 from solvers.robust.cliques import maximum_clique
+from solvers.robust.known import Known, odometry
 from solvers.robust.value_equality import ValueEquality
-
-
-def odometry(graph: PoseGraph) -> BoolArray:
-    """Whether an edge joins poses of one robot whose ids are neighbours, (m,)."""
-    i = graph.i
-    j = graph.j
-    is_posed = ~graph.is_prior & ~np.isin(j, graph.landmarks)
-    are_neighbours = np.abs(graph.pose_ids[i] - graph.pose_ids[j]) == 1
-    of_one_robot = graph.robots[i] == graph.robots[j]
-    return np.asarray(is_posed & are_neighbours & of_one_robot)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +28,8 @@ class PCM(ValueEquality):
 
     Parameters
     ----------
-    known : BoolArray, (m,), optional
-        Edges that are right: `odometry` unless given.
+    known : Known or BoolArray, (m,)
+        Edges that are right; see `GNC`.
     quantile : float
         Probability that two right loop closures agree, in (0, 1).
 
@@ -57,7 +48,7 @@ class PCM(ValueEquality):
     True
     """
 
-    known: BoolArray | None = None
+    known: BoolArray | Known = Known.AUTO
     quantile: float = 0.99
 
     def __post_init__(self) -> None:
@@ -88,7 +79,7 @@ def pairwise_consistent(
     graph : PoseGraph
         Pose graph with m edges.
     known : BoolArray, (m,), optional
-        Edges that are right: `odometry` unless given.
+        Edges that are right: unless given, odometry (edges between consecutive poses of a robot).
     quantile : float
         Probability that two right loop closures agree, in (0, 1).
 

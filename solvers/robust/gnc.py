@@ -46,9 +46,10 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Stage, Status
+from solvers.robust.known import Known, KnownEdges
 from solvers.robust.losses import HARD_CONTROL, RobustLoss
 from solvers.robust.value_equality import ValueEquality
-from solvers.robust.weighted_edges import RatioSums, WeightedEdges, first_poses, known_inliers
+from solvers.robust.weighted_edges import RatioSums, WeightedEdges, first_poses
 
 # Newton steps with all edges kept, after the schedule has ended: at a minimum two are enough.
 LAST_STEPS = 10
@@ -90,9 +91,11 @@ class GNC(ValueEquality):
     scale : float
         Factor on the first thresholds. A small one keeps only the edges that agree best, before the
         thresholds are scaled.
-    known : BoolArray, (m,), optional
-        Known inliers, whose weight stays 1. Unless given, odometry (edges between consecutive poses
-        of a robot). Priors are suspects like closures.
+    known : Known or BoolArray, (m,)
+        Known inliers, whose weight stays 1. `Known.AUTO` takes odometry (edges between consecutive
+        poses of a robot) for right, if edges join nearly all consecutive poses and their cycles do
+        not contradict them; `Known.ODOMETRY` takes it for right in any case, `Known.NONE` no edge.
+        Priors are suspects like closures.
     growth : float
         Factor, above 1, by which the control mu is multiplied in every step (truncated least
         squares), or divided (Geman-McClure).
@@ -129,7 +132,7 @@ class GNC(ValueEquality):
     quantile: float = 0.99
     spread: float | None = 100.0
     scale: float = 1.0
-    known: BoolArray | None = None
+    known: BoolArray | Known = Known.AUTO
     growth: float = 2.0
     inner_steps: int = 1
     consistent: bool = False
@@ -156,12 +159,12 @@ class GNC(ValueEquality):
         Array, shape (m,)
             The quantile of the cost of a right edge; inf for known inliers.
         """
-        is_known = known_inliers(problem.graph, self.known)
+        is_known = KnownEdges.of(problem.graph, self.known).edges
         return np.where(is_known, np.inf, chi2_thresholds(problem, self.quantile))
 
     def init(self, problem: PGOProblem, start: Poses | None) -> GNCState:
         """State 0: at `start`, or where known inliers lead along a tree."""
-        known = known_inliers(problem.graph, self.known)
+        known = KnownEdges.of(problem.graph, self.known).edges
         poses = start if start is not None else first_poses(problem.graph, known)
         edges = WeightedEdges.at(problem, poses, known, self.quantile)
         schedule, sums = first_schedule(self, edges)

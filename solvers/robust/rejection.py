@@ -68,7 +68,7 @@ class Rejection(Summarised):
     problem : PGOProblem
         Problem with all edges.
     known : BoolArray, (m,)
-        Edges that were given as inliers.
+        Edges that were taken for right.
     kept : BoolArray, (m,)
         Edges that the solution is of.
     ratio : Array, (m,)
@@ -94,6 +94,8 @@ class Rejection(Summarised):
         Another map that explains the measurements about as well (`rival_of`).
     noise : float
         How many times their claim the squared errors are, where they are larger on all edges alike.
+    why_known : str
+        Why these edges were taken for right, or why none were.
     places : tuple of str
         `file:line` of every edge, where they are known.
     fit : Fit
@@ -116,6 +118,7 @@ class Rejection(Summarised):
     by_chance: float = 0.0
     rival: Rival | None = None
     noise: float = 1.0
+    why_known: str = ""
     places: tuple[str, ...] = ()
     fit: Fit = NO_FIT
     proof: OutlierProof | None = None
@@ -258,7 +261,7 @@ class Rejection(Summarised):
         bridges = [("bridges", self.named(self.bridges))] if self.bridges.any() else []
         rows = [
             ("given", self.conditional),
-            ("taken for right", self.named(self.known)),
+            ("taken for right", self._taken_for_right),
             ("rejected", rejected),
             ("doubtful", self.named(self.doubtful)),
             *bridges,
@@ -309,6 +312,7 @@ class Rejection(Summarised):
             "doubtful": np.flatnonzero(self.doubtful).tolist(),
             "bridges": np.flatnonzero(self.bridges).tolist(),
             "known": np.flatnonzero(self.known).tolist(),
+            "why_known": self.why_known,
             **lines,
             "quantile": self.quantile,
             "start": self.start,
@@ -330,6 +334,12 @@ class Rejection(Summarised):
         if self.proof is not None:
             robust |= self.proof.as_json()
         return {"rejected": rejected, "robust": robust}
+
+    @property
+    def _taken_for_right(self) -> str:
+        """The edges taken for right, and why."""
+        edges = self.named(self.known)
+        return f"{self.why_known}; {edges}" if self.why_known else edges
 
     @property
     def _suspected_fixes(self) -> BoolArray:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges
@@ -17,7 +16,6 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import PolishState, polish_step, start_polish
-from solvers.robust.consistency import odometry
 from solvers.robust.losses import RobustLoss
 
 # Largest weight of an edge that is left out, in a graph with as many closures as poses. An edge of
@@ -158,17 +156,6 @@ class WeightedEdges:
         newton = replace(polish_step(self.reduced, self.newton), factor=None)
         costs = self.problem.edge_costs(newton.poses)
         return replace(self, costs=costs, newton=newton)
-
-
-def known_inliers(graph: PoseGraph, known: BoolArray | None) -> BoolArray:
-    """Edges that are right, (m,): those given, else odometry."""
-    if known is None:
-        return odometry(graph)
-    if np.shape(known) != (graph.num_edges,):
-        raise SettingError(
-            f"known has shape {np.shape(known)}; give one for each of the {graph.num_edges} edges"
-        )
-    return np.asarray(known, dtype=bool)
 
 
 def held_together(graph: PoseGraph, kept: BoolArray, ratio: Array) -> BoolArray:

@@ -112,13 +112,14 @@ class DoubtedProblem:
 class Plan:
     """What an attempt does: settings, the edges that it begins with, (m,), and where it starts.
 
-    Without settings it keeps the edges that it begins with.
+    Without settings it keeps the edges that it begins with. A plan may have a `start` of its own.
     """
 
     name: str
     settings: GNC | None
     candidates: BoolArray
     starts_at_least_squares: bool = False
+    start: Poses | None = None
 
 
 def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
@@ -143,8 +144,12 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     as_set = Plan("as set", settings, candidates)
     tree = held_together(graph, known, np.zeros(graph.num_edges))
     known_alone = Plan("known inliers", None, tree)
+    least_squares = Plan("from least squares with every edge", settings, candidates, True)
     slow = Plan("smaller steps", with_smaller_steps(settings), candidates)
-    if doubted.is_large:
+    if not known.any():  # a tree of any edges is a poor start
+        first = [least_squares, as_set]
+        last = [slow, *tight]
+    elif doubted.is_large:
         less_tight, tightest = tight
         first = [tightest, known_alone, less_tight, as_set]
         last = [slow]
@@ -159,7 +164,8 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
             preselected = replace(settings, consistent=True)
             yield Plan("pairwise consistent edges", preselected, consistent)
     yield from last
-    yield Plan("from least squares with every edge", settings, candidates, True)
+    if known.any():
+        yield least_squares
     yield Plan(*_with_other_loss(settings), candidates)
 
 

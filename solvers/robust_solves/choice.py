@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from pgo_models.geometry.poses import Poses
@@ -80,6 +81,17 @@ class Choice:
         others = [other for other in self.estimates if other is not estimate]
         return any((other.kept != estimate.kept).sum() <= num_tolerated for other in others)
 
+    def evidence(self, estimate: Estimate, odometry: BoolArray) -> float:
+        """Logarithm, up to a constant, of the probability of all measurements under an estimate.
+
+        It is -TLS / 2, and the logarithm of the probability that of m edges of a kind just these k
+        are wrong, where each is with the probability k / m. The kinds are `odometry`, (m,), and
+        others: odometry that is hardly ever wrong is dear to reject, and edges between consecutive
+        scans that are wrong as often as others are not.
+        """
+        rejected = (~estimate.kept[odometry], ~estimate.kept[~odometry])
+        return sum(map(_log_chance, rejected)) - 0.5 * self.cost(estimate.poses)
+
     def attempts_beside(self, kept: BoolArray) -> tuple[Attempt, ...]:
         """Records of the attempts, each with the number of its edges that the answer rejects."""
         return tuple(
@@ -93,3 +105,11 @@ class Choice:
 
     def _num_closures_kept(self, estimate: Estimate) -> int:
         return int((estimate.kept & ~self.doubted.known).sum())
+
+
+def _log_chance(is_wrong: BoolArray) -> float:
+    """Logarithm of the probability of just these wrong edges, (k,), at their own rate."""
+    rate = float(is_wrong.mean()) if len(is_wrong) else 0.0
+    if rate in (0.0, 1.0):
+        return 0.0
+    return len(is_wrong) * (rate * math.log(rate) + (1.0 - rate) * math.log(1.0 - rate))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 
 import numpy as np
 
@@ -17,15 +20,17 @@ from solvers.network.ledger import Ledger
 from solvers.places import with_partition
 from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
+from solvers.robust.agreement import Agreement
+from solvers.robust.agreement_search import best_by_agreement
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.consistency import PCM, pairwise_consistent
 from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.gnc import GNC
+from solvers.robust.known import KnownEdges
 from solvers.robust.rejection import Rejection
 from solvers.robust.revision import Fit, drop_contradicted, error_scale, threshold_scale
 from solvers.robust.rivals import Rival, rival_of
-from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves.attempts import (
     DoubtedProblem,
     Estimate,
@@ -89,6 +94,8 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     if isinstance(robust, PCM):
         return job.answer_by_consistency(robust.quantile)
     ending = job.make_attempts(robust)
+    if ending not in OUT_OF_TIME:
+        job = job.with_odometry_doubted(robust)
     return job.answer_by_attempts(ending)
 
 
@@ -118,9 +125,11 @@ class _RobustSolve:
 
     `least_squares` are the poses of the solution with every edge, once it was found. `failures` are
     sentences on what failed that could only have improved the answer. `new` (m,) are the edges that
-    were not there before, if the graph has grown.
+    were not there before, if the graph has grown. `is_doubting` says whether odometry that was
+    claimed may be wrong.
     """
 
+    known: KnownEdges
     doubted: DoubtedProblem
     places: PlacesOfEdges
     start: Poses | None
@@ -128,6 +137,7 @@ class _RobustSolve:
     estimates: list[Estimate] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     new: BoolArray | None = None
+    is_doubting: bool = False
     began: float = field(default_factory=time.perf_counter)
 
     @classmethod
@@ -137,10 +147,10 @@ class _RobustSolve:
             raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
         request = with_partition(request)
         problem = request.problem
-        known = known_inliers(problem.graph, robust.known)
+        known = KnownEdges.of(problem.graph, robust.known)
         thresholds = chi2_thresholds(problem, robust.quantile)
-        doubted = DoubtedProblem(problem, known, thresholds, robust.quantile)
-        return cls(doubted, PlacesOfEdges(doubted, request), request.start)
+        doubted = DoubtedProblem(problem, known.edges, thresholds, robust.quantile)
+        return cls(known, doubted, PlacesOfEdges(doubted, request), request.start)
 
     @property
     def choice(self) -> Choice:
@@ -187,6 +197,7 @@ class _RobustSolve:
         probability `FALSE_ALARM`, at the scale of the errors.
         """
         known = self.doubted.known
+        given = known & (not self.known.is_claim)
         residuals = solution.edge_residuals
         is_strained = solution.certificate.bound.is_complex  # see `Choice.is_enough`
         if is_strained or not solution.is_certified or residuals.is_overall_misfit:
@@ -194,7 +205,7 @@ class _RobustSolve:
         problem = self.doubted.problem
         quantile = max(self.doubted.quantile, 1.0 - FALSE_ALARM / problem.graph.num_edges)
         scale = threshold_scale(error_scale(residuals))
-        if not (known | (residuals.cost <= scale * chi2_thresholds(problem, quantile))).all():
+        if not (given | (residuals.cost <= scale * chi2_thresholds(problem, quantile))).all():
             return False
         every_edge = self.doubted.every_edge
         remaining = drop_contradicted(problem, known, every_edge, solution.poses)
@@ -254,7 +265,9 @@ class _RobustSolve:
         ending = Status.CONVERGED
         last_failure: Exception = GraphError()
         try:
-            for plan in plans_in_order(settings, self.doubted):
+            for plan in itertools.chain(
+                self._by_agreement(), plans_in_order(settings, self.doubted)
+            ):
                 try:
                     if self._leads_nowhere_new(plan):
                         continue
@@ -294,7 +307,51 @@ class _RobustSolve:
             return any(np.array_equal(plan.candidates, other.found) for other in self.estimates)
         return plan.starts_at_least_squares and not self._has_least_squares()
 
+    def _by_agreement(self) -> Iterator[Plan]:
+        """The plan of edges found without odometry, where there is none or it is doubted."""
+        if self.is_doubting or not self.doubted.known.any():
+            with suppress(*FAILURES):
+                yield self._plan_of_agreement()
+
+    def _plan_of_agreement(self) -> Plan:
+        fit = best_by_agreement(self._search(self.choice).sets)
+        return Plan("trees of agreement", None, fit.kept, start=fit.poses)
+
+    def with_odometry_doubted(self, settings: GNC) -> _RobustSolve:
+        """The solve in which odometry that cycles contradict may be wrong, if it explains more.
+
+        What decides is `Choice.evidence`. A large graph, and one with a start, go without.
+        """
+        if not self.known.is_claim or self.doubted.is_large or self.start is not None:
+            return self
+        known = self.known.without_contradicted(Agreement.of(self.doubted.problem))
+        if known is self.known:
+            return self
+        doubted = replace(self.doubted, known=known.edges)
+        other = _RobustSolve(
+            known,
+            doubted,
+            replace(self.places, doubted=doubted),
+            start=None,
+            is_doubting=True,
+            least_squares=self.least_squares,
+            failures=self.failures,
+            began=self.began,
+        )
+        try:
+            other.make_attempts(settings)
+        except FAILURES as error:
+            self.failures.append(f"odometry could not be doubted ({error})")
+            return self
+        before = self.choice.cheapest
+        cheapest = other.choice.cheapest
+        other.estimates += self.estimates
+        evidence = partial(other.choice.evidence, odometry=self.known.edges)
+        return other if evidence(cheapest) > evidence(before) else self
+
     def _start_of(self, plan: Plan) -> Poses | None:
+        if plan.start is not None:
+            return plan.start
         return self.least_squares if plan.starts_at_least_squares else self.start
 
     def _has_least_squares(self) -> bool:
@@ -462,6 +519,7 @@ class _RobustSolve:
             by_chance=self._by_chance(solution, kept),
             rival=self._rival(solution, kept),
             fit=solution.certificate.fit,
+            why_known=self.known.reason,
         )
         ledgers = self.places.ledgers
         ledger = reduce(Ledger.joined, ledgers) if ledgers else None

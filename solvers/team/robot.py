@@ -29,6 +29,7 @@ from solvers.network.serialization import deserialize, serialize
 from solvers.request import Pipeline
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.robust.known import takes_odometry
 from solvers.robust.rejection import Support
 from solvers.solution import Solution
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent
@@ -230,7 +231,7 @@ class Robot:
         self._weighting = weighting
         self._sharing = sharing
         self._robust = robust
-        has_known = robust is not None and robust.known is not None
+        has_known = robust is not None and not takes_odometry(robust.known)
         if has_known and sharing is not Sharing.MEASUREMENTS:
             raise SettingError(
                 "a team that does not share its measurements takes its odometry to be right; "

@@ -48,7 +48,7 @@ from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
 from pgo_models.graphs.precisions import indefinite_edges
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.baselines.gtsam import poses_of_values
-from solvers.robust.consistency import odometry
+from solvers.robust.known import odometry
 from solvers.robust.revision import truncated_cost
 from solvers.robust.weighted_edges import first_poses
 

@@ -31,7 +31,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
 from solvers.baselines.gtsam import factor_graph, poses_of_values
-from solvers.robust.consistency import odometry
+from solvers.robust.known import odometry
 
 HEADS = (
     "graph",

@@ -61,7 +61,7 @@ from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.baselines.gtsam import poses_of_values
 from solvers.robust.bridges import unchecked_bridges
-from solvers.robust.consistency import odometry
+from solvers.robust.known import odometry
 from solvers.robust.revision import truncated_cost
 from solvers.robust.weighted_edges import first_poses, held_together
 

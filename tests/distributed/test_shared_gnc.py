@@ -29,8 +29,9 @@ from solvers.network.messages import count_bytes
 from solvers.network.serialization import deserialize, serialize
 from solvers.robots import Checkpoint
 from solvers.robust.gnc import GNC
+from solvers.robust.known import odometry
 from solvers.robust.losses import RobustLoss
-from solvers.robust.weighted_edges import first_poses, known_inliers
+from solvers.robust.weighted_edges import first_poses
 from solvers.soc.subgraph import split_graph
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
@@ -47,7 +48,7 @@ def by_two_robots(wrong) -> solvers.Solution:
 
 
 def allowed(problem: pgo.PGOProblem) -> np.ndarray:
-    return np.where(known_inliers(problem.graph, None), np.inf, chi2_thresholds(problem))
+    return np.where(odometry(problem.graph), np.inf, chi2_thresholds(problem))
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def first_attempt(solution: solvers.Solution) -> solvers.Stage:
 def test_sums_and_costs_are_those_of_the_whole_graph(wrong, loss: RobustLoss) -> None:
     problem = pgo.PGOProblem(wrong[0])
     gnc = GNC(loss=loss)
-    known = known_inliers(problem.graph, None)
+    known = odometry(problem.graph)
     poses = first_poses(problem.graph, known)
     ratio = problem.edge_costs(poses) / chi2_thresholds(problem)
     with closing(
@@ -170,7 +171,7 @@ def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
 
 
 def subgraph_known(problem: pgo.PGOProblem) -> np.ndarray:
-    return known_inliers(problem.graph, None)
+    return odometry(problem.graph)
 
 
 def test_attempts_are_added_up_on_the_ledger(by_two_robots) -> None:

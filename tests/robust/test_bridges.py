@@ -9,7 +9,7 @@ from wrong_edges import joined_by
 import pgo_models as pgo
 from pgo_models.graphs.pose_graph import edge_counts
 from solvers.robust.bridges import bridges, unchecked_bridges
-from solvers.robust.weighted_edges import known_inliers
+from solvers.robust.known import odometry
 
 
 def labels_without(link: int, i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
@@ -49,14 +49,14 @@ def test_bridges_are_those_without_which_nodes_that_count_fall_apart(
 def test_one_edge_between_two_robots_is_checked_by_nothing(num_between: int) -> None:
     graph = joined_by(num_between)
     kept = np.ones(graph.num_edges, dtype=bool)
-    is_bridge = unchecked_bridges(graph, known_inliers(graph, None), kept)
+    is_bridge = unchecked_bridges(graph, odometry(graph), kept)
     between = graph.robots[graph.i] != graph.robots[graph.j]
     np.testing.assert_array_equal(is_bridge, between if num_between == 1 else ~kept)
 
 
 def test_one_trajectory_has_no_such_edges() -> None:
     graph = pgo.grid_world(1, 60, np.random.default_rng(0), d=2)
-    known = known_inliers(graph, None)
+    known = odometry(graph)
     assert not unchecked_bridges(graph, known, np.ones(graph.num_edges, dtype=bool)).any()
     assert not unchecked_bridges(graph, known, known).any()
 
@@ -64,7 +64,7 @@ def test_one_trajectory_has_no_such_edges() -> None:
 def test_a_landmark_that_is_sighted_once_is_no_part_of_the_map() -> None:
     graph = pgo.grid_world(1, 30, np.random.default_rng(0), d=2)
     graph = graph.with_landmark(np.array([3]), np.array([[1.0, 2.0]]), 10.0)
-    known = known_inliers(graph, None)
+    known = odometry(graph)
     assert not unchecked_bridges(graph, known, np.ones(graph.num_edges, dtype=bool)).any()
 
 

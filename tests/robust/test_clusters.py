@@ -19,9 +19,9 @@ from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
-from solvers.robust.consistency import odometry
 from solvers.robust.distances import FirstOrder
 from solvers.robust.edge_sets import EdgeSets
+from solvers.robust.known import odometry
 from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
 

@@ -13,7 +13,8 @@ from pgo_models.geometry.rotations import Array, exp_map, random_rotations
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import edge_precisions, proper_information
 from pgo_models.graphs.scenes import NoiseModel
-from solvers.robust.consistency import odometry, pairwise_consistent
+from solvers.robust.consistency import pairwise_consistent
+from solvers.robust.known import odometry
 
 
 def relative(poses: Poses, i: Array, j: Array) -> Poses:

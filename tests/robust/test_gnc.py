@@ -14,10 +14,10 @@ from pgo_models.errors import SettingError
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.result import Status
 from solvers.robust.gnc import GNCSchedule, advanced, ending
+from solvers.robust.known import odometry
 from solvers.robust.weighted_edges import (
     connecting_edges,
     first_poses,
-    known_inliers,
     weighted_problem,
 )
 
@@ -107,7 +107,7 @@ def test_connecting_edges_connect_with_as_few_edges_as_possible(seed, share):
 
 def test_the_first_poses_follow_odometry():
     graph = clean()
-    first = first_poses(graph, known_inliers(graph, None))
+    first = first_poses(graph, odometry(graph))
     expected = pgo.odometry_start(graph)
     np.testing.assert_allclose(first.t, expected.t, rtol=0, atol=1e-9)
 
@@ -131,14 +131,14 @@ def test_the_robust_cost_is_that_of_the_papers_problem():
     gnc = solvers.GNC(spread=None)
     state = solvers.run(gnc, problem).state
     costs = problem.edge_costs(state.poses)
-    known = known_inliers(graph, None)
+    known = odometry(graph)
     least = np.minimum(costs, chi2_thresholds(problem, 0.99))
     assert state.objective == pytest.approx(costs[known].sum() + least[~known].sum(), rel=1e-12)
 
 
 def test_known_inliers_are_kept_whatever_they_cost():
     graph, is_wrong = spoiled(clean(), 0.1, "random", seed=0)
-    known = known_inliers(graph, None)
+    known = odometry(graph)
     known[np.flatnonzero(is_wrong)[:1]] = True
     state = solvers.run(solvers.GNC(known=known), pgo.PGOProblem(graph)).state
     assert state.inliers[known].all()

@@ -16,8 +16,8 @@ from pgo_models.problem.hessian import TangentLayout
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import measured_covariances
 from solvers.robust.clusters import ClosurePairs
-from solvers.robust.consistency import odometry
 from solvers.robust.edge_sets import EdgeSets, with_edges
+from solvers.robust.known import odometry
 from solvers.robust.linear_choice import LinearChoice, _linearised
 from solvers.robust.linear_search import LinearSearch
 from solvers.robust.revision import inlier_problem

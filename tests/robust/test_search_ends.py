@@ -18,8 +18,8 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
-from solvers.robust.consistency import odometry
 from solvers.robust.edge_sets import EdgeSets
+from solvers.robust.known import odometry
 
 CASES = Path(__file__).parent.parent / "cases"
 # Questions of searches that end: 432 at most of two hundred on these loops. One that turns in a

@@ -17,10 +17,10 @@ from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
+from solvers.robust.known import odometry
 from solvers.robust.rejection import Support
 from solvers.robust.revision import truncated_cost
 from solvers.robust.rivals import Rival
-from solvers.robust.weighted_edges import known_inliers
 from solvers.robust_solves import attempts as robust_attempts, robust_solve
 from solvers.robust_solves.attempts import Plan
 
@@ -124,7 +124,7 @@ def test_an_attempt_that_keeps_the_best_edges_alone_is_not_cheaper(
     """Small errors with heavy tails: thresholds at their mean would reject a fifth."""
     right = world(150, 0.2)
     rng = np.random.default_rng(0)
-    closures = np.flatnonzero(~known_inliers(right, None))
+    closures = np.flatnonzero(~odometry(right))
     far = rng.choice(closures, len(closures) // 5, replace=False)
     t_ij = right.t_ij.copy()
     t_ij[far] += 0.15 * rng.standard_normal((len(far), 2))
