@@ -13,8 +13,6 @@ from solvers.convex.orthogonal import (
     OrthogonalSolution as OrthogonalSolution,
     solve_orthogonal as solve_orthogonal,
 )
-from solvers.folder_solve import FolderSolution as FolderSolution, solve_folder as solve_folder
-from solvers.given_poses import certify as certify
 from solvers.growing import extend as extend
 from solvers.handedness.ascent import HandednessAscent as HandednessAscent
 from solvers.handedness.complex_relaxation import ComplexRelaxation as ComplexRelaxation
@@ -31,18 +29,8 @@ from solvers.network.ledger import Ledger as Ledger, Traffic as Traffic
 from solvers.network.messages import Worker as Worker
 from solvers.network.ray_engine import RayEngine as RayEngine
 from solvers.network.recovery import Recovery as Recovery
-from solvers.noise import (
-    NoiseEstimate as NoiseEstimate,
-    NoiseLevel as NoiseLevel,
-    estimate_noise as estimate_noise,
-)
 from solvers.pipeline import solve as solve
 from solvers.place import Automatic as Automatic
-from solvers.readings import (
-    ReadingComparison as ReadingComparison,
-    ReadingFit as ReadingFit,
-    compare_readings as compare_readings,
-)
 from solvers.reporting.edge_fit import EdgeFit as EdgeFit
 from solvers.reporting.film import film as film
 from solvers.reporting.report import write_report as write_report
@@ -88,6 +76,11 @@ from solvers.soc.r_step import (
 from solvers.soc.settings import Coupling as Coupling
 from solvers.soc.soc import SOC as SOC
 from solvers.solution import Solution as Solution
+from solvers.solves.folder_solve import (
+    FolderSolution as FolderSolution,
+    solve_folder as solve_folder,
+)
+from solvers.solves.given_poses import certify as certify
 from solvers.studies.benchmark import (
     BenchmarkMethod as BenchmarkMethod,
     BenchmarkSettings as BenchmarkSettings,
@@ -97,10 +90,20 @@ from solvers.studies.comparison import (
     ComparisonSettings as ComparisonSettings,
     compare_methods as compare_methods,
 )
+from solvers.studies.noise import (
+    NoiseEstimate as NoiseEstimate,
+    NoiseLevel as NoiseLevel,
+    estimate_noise as estimate_noise,
+)
 from solvers.studies.paper_tables import (
     Reproduction as Reproduction,
     ReproductionSettings as ReproductionSettings,
     reproduce_tables as reproduce_tables,
+)
+from solvers.studies.readings import (
+    ReadingComparison as ReadingComparison,
+    ReadingFit as ReadingFit,
+    compare_readings as compare_readings,
 )
 from solvers.studies.tightness import (
     NoiseSweep as NoiseSweep,

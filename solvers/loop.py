@@ -14,7 +14,7 @@ from pgo_models.errors import NotPositiveDefiniteError, SettingError, fitted_arg
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
-from solvers.progress import StageLine, Table, is_shown
+from solvers.progress.line import StageLine, Table, is_shown
 from solvers.result import History, Measurement, Outcome, Record, Run, Status
 
 P = TypeVar("P", contravariant=True)

@@ -181,7 +181,7 @@ def solve(
 def solution_for(request: SolveRequest) -> Solution:
     """Solution of a request: with terms of one's own, without wrong edges, or by the plan alone."""
     if request.pipeline.has_added_terms:
-        from solvers.extended_solve import solve_extended  # cvxpy is slow to import
+        from solvers.solves.extended_solve import solve_extended  # cvxpy is slow to import
 
         return solve_extended(request, solution_for)
     if request.robust is not None:

@@ -20,8 +20,8 @@ from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
-from solvers.gauge import choose_gauge as choose_gauge
 from solvers.network.ledger import Ledger
+from solvers.reporting.gauge import choose_gauge as choose_gauge
 from solvers.reporting.json_records import (
     certificate_json as certificate_json,
     network_json,

@@ -25,7 +25,7 @@ from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, victoria_park
 from pgo_models.problem.weighting import Weighting
-from solvers.folder_solve import FolderSolution
+from solvers.solves.folder_solve import FolderSolution
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 PAGE = Path(__file__).parents[1] / "notebooks/site/guide/capabilities.md"

@@ -28,8 +28,8 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.verify import verify_proof
 from solvers import solve
-from solvers.given_poses import certify
 from solvers.growing import extend
+from solvers.solves.given_poses import certify
 
 Call = Callable[..., tuple[int, str, str]]
 

@@ -12,8 +12,8 @@ from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import spanning_tree
-from solvers.noise import estimate_noise
 from solvers.robust.known import odometry
+from solvers.studies.noise import estimate_noise
 
 
 def noisy_walk(d: int, seed: int, closure_noise: float) -> PoseGraph:

@@ -175,7 +175,7 @@ def test_certify_keeps_its_bound_where_a_search_for_a_better_one_fails(
     problem = loose_problem()
     poses = solvers.solve(problem, FIRST_ALONE).poses
     before = pgo.certify_at(problem, poses)
-    monkeypatch.setattr(f"solvers.given_poses.{verb}", failing(FAILURES[0]))
+    monkeypatch.setattr(f"solvers.solves.given_poses.{verb}", failing(FAILURES[0]))
     with pytest.warns(GraphWarning, match="a search for a better bound failed"):
         certificate = solvers.certify(problem, poses)
     assert certificate.lower_bound >= before.lower_bound * (1 - 1e-9) > 0.0

@@ -10,7 +10,7 @@ from pgo_models.activity import Activity, doing
 from pgo_models.graphs.datasets import load
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.progress import Pace, StageLine, Table, is_shown
+from solvers.progress.line import Pace, StageLine, Table, is_shown
 from solvers.result import Measurement, Record, Status
 from solvers.riemannian.newton import Newton
 

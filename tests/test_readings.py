@@ -12,7 +12,7 @@ from pgo_models.graphs.g2o import write_g2o
 from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel
-from solvers.readings import compare_readings
+from solvers.studies.readings import compare_readings
 
 Change = Callable[[list[str]], list[str]]
 

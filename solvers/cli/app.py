@@ -19,7 +19,7 @@ from typer.core import TyperGroup
 
 from solvers.cli.help import Helpful
 from solvers.cli.shell import run_command
-from solvers.distribution import text_of_version
+from solvers.reporting.distribution import text_of_version
 
 # BLAS reads these once, when a command imports it.
 _NUMBERS_OF_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")

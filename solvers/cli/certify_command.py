@@ -36,7 +36,6 @@ from solvers.cli.shell import (
     save_then_show,
     wrapped,
 )
-from solvers.given_poses import certify
 from solvers.reporting.versions import installed_versions
 from solvers.solution import (
     both_costs,
@@ -46,6 +45,7 @@ from solvers.solution import (
     verdict_suffix,
     write_json,
 )
+from solvers.solves.given_poses import certify
 
 _INDENT = 13  # columns of the labels of a certificate
 

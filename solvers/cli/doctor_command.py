@@ -10,8 +10,8 @@ from solvers.cli.options import (
     UnitWeightsOption,
 )
 from solvers.cli.shell import JsonOption, save_then_show, wrapped
-from solvers.readings import ReadingComparison, compare_readings
 from solvers.reporting.result_table import finite_or_none
+from solvers.studies.readings import ReadingComparison, compare_readings
 
 
 @explained_by_its_graph

@@ -31,7 +31,7 @@ from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
 from solvers.solution import Solution, note_of_weights
 
 if TYPE_CHECKING:  # what commands that solve nothing do not need
-    from solvers.readings import ReadingComparison
+    from solvers.studies.readings import ReadingComparison
 
 # Ratios of the cost to the expected one beyond which other readings of a file are tried,
 _FAR_ABOVE = 10.0
@@ -143,7 +143,7 @@ def reading_that_is_meant(fit: EdgeFit, source: GraphOptions) -> list[Advice]:
         return []
     if not _can_be_read_again(source.graph):
         return []
-    from solvers.readings import compare_readings
+    from solvers.studies.readings import compare_readings
 
     with suppress(PGOError):  # the file may have changed since it was read
         comparison = compare_readings(source.graph, trust_folder=source.trust_folder)
@@ -165,7 +165,7 @@ def _advice_on_noise(graph: PoseGraph, source: GraphOptions) -> list[Advice]:
         return []
     if not (information == np.eye(information.shape[1])).all():
         return []
-    from solvers.noise import estimate_noise
+    from solvers.studies.noise import estimate_noise
 
     try:
         estimate = estimate_noise(graph.unit_weights())

@@ -211,7 +211,7 @@ def load_graph(
 
 def with_estimated_noise(graph: PoseGraph) -> PoseGraph:
     """The graph with weights of the noise that its edges have; what that is goes to stderr."""
-    from solvers.noise import estimate_noise
+    from solvers.studies.noise import estimate_noise
 
     estimate = estimate_noise(graph)
     print(f"pgo: noise of {estimate}, estimated from the measurements", file=sys.stderr)

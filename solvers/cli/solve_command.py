@@ -77,7 +77,7 @@ from solvers.cli.shell import (
 )
 from solvers.network.engine import Engine
 from solvers.pipeline import solve
-from solvers.progress_bars import JobBar
+from solvers.progress.bars import JobBar
 from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.robots import Checkpoint, Robots
@@ -562,7 +562,7 @@ def _solve_own_files(
     outputs: Outputs,
 ) -> int:
     """Solve a folder whose files the robots read themselves; the exit code."""
-    from solvers.folder_solve import solve_folder
+    from solvers.solves.folder_solve import solve_folder
 
     weightings = {
         None: Weighting.OWN,

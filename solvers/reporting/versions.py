@@ -4,7 +4,7 @@ import os
 import platform
 
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
-from solvers.distribution import DISTRIBUTION, installed_version, packages_of_extras
+from solvers.reporting.distribution import DISTRIBUTION, installed_version, packages_of_extras
 
 
 def installation() -> list[tuple[str, str]]:

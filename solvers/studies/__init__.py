@@ -1,1 +1,1 @@
-"""Methods side by side, the paper's tables, and a study of noise."""
+"""Methods side by side, the paper's tables, and what a file means and how noisy it is."""

@@ -20,7 +20,7 @@ from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
-from solvers.progress_bars import JobBar
+from solvers.progress.bars import JobBar
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent

@@ -16,7 +16,7 @@ from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
-from solvers.progress_bars import JobBar
+from solvers.progress.bars import JobBar
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
 

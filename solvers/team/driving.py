@@ -20,7 +20,6 @@ from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.folder_solve import FilesOfRobots, FolderSolution, check_robust
 from solvers.loop import RunMonitor
 from solvers.network.engine import DEFAULT_MEMORY
 from solvers.network.messages import Idle, Worker, obey, raise_first_error
@@ -29,6 +28,7 @@ from solvers.request import Pipeline, SolveRequest
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.solution import Solution
+from solvers.solves.folder_solve import FilesOfRobots, FolderSolution, check_robust
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent, give_measurements, take_answer
 from solvers.team.messages import Ask, Reply, Term, error_of_message
 from solvers.team.wire import Order

@@ -3,9 +3,9 @@
 Whoever has a network gives the robot what arrives (`receive`) and the time (`tick`), and sends what
 it has to say (`outbox`). Every robot keeps its own measurements. The robot whose name comes first
 among those that are awake drives: it runs the solve of robots with files of their own
-(`solvers.folder_solve`), and learns the interface between the robots. What two robots tell each
-other goes from one to the other. Any robot can drive. Messages may be lost, late, repeated, or come
-in any order.
+(`solvers.solves.folder_solve`), and learns the interface between the robots. What two robots tell
+each other goes from one to the other. Any robot can drive. Messages may be lost, late, repeated, or
+come in any order.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.own_files import SOLVE_PARTS
 from solvers.distributed.robots.own_file import READ_HERE
-from solvers.folder_solve import FolderSolution
 from solvers.network.serialization import deserialize, serialize
 from solvers.request import Pipeline
 from solvers.robust.consistency import PCM
@@ -32,6 +31,7 @@ from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
 from solvers.robust.rejection import Support
 from solvers.solution import Solution
+from solvers.solves.folder_solve import FolderSolution
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent
 from solvers.team.driving import Drive
 from solvers.team.letters import LetterName, Letters

@@ -29,9 +29,9 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
-from solvers.given_poses import certify
 from solvers.result import Status
 from solvers.riemannian.polish import polish
+from solvers.solves.given_poses import certify
 
 needs_gtsam = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"

@@ -31,7 +31,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import PGOError
 from pgo_models.figures import rounded_up
-from solvers.readings import compare_readings
+from solvers.studies.readings import compare_readings
 
 HEAD = (
     "| file | poses | points | edges | cost | gap | verdict | CPU s | assumed, or why refused |\n"

@@ -45,8 +45,8 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting
 from solvers import solve
-from solvers.given_poses import certify
 from solvers.riemannian.polish import polish, relative_decrement
+from solvers.solves.given_poses import certify
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE, NoiseModel(0.5, 0.8), NoiseModel(0.1, 2.0)])
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)

@@ -53,8 +53,8 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.given_poses import certify
 from solvers.riemannian.polish import polish
+from solvers.solves.given_poses import certify
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 LOUD = st.sampled_from(

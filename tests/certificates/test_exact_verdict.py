@@ -33,8 +33,8 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.given_poses import certify
 from solvers.riemannian.polish import polish
+from solvers.solves.given_poses import certify
 
 SPREADS = st.sampled_from([0.0, 1.0, 3.0, 10.0, 30.0])
 

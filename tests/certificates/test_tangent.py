@@ -37,9 +37,9 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.given_poses import certify
 from solvers.riemannian.polish import polish
 from solvers.riemannian.shrunk_bound import bound_by_shrinking
+from solvers.solves.given_poses import certify
 
 COUPLED = st.booleans()
 

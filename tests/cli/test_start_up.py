@@ -31,7 +31,7 @@ UNUSED_BY_SOLVE = EXTRAS | {
     "solvers.baselines",
     "solvers.convex",
     "solvers.distributed",
-    "solvers.folder_solve",
+    "solvers.solves.folder_solve",
     "solvers.reporting.report",
     "solvers.robust_solves",
     "solvers.robust.gnc",

@@ -28,9 +28,9 @@ from pgo_models.graphs.scenes import NoiseModel, observe
 from solvers.distributed import (
     robots_with_files,
 )
-from solvers.folder_solve import FolderSolution, solve_folder
 from solvers.robots import Robots
 from solvers.soc.settings import Coupling
+from solvers.solves.folder_solve import FolderSolution, solve_folder
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 LIMIT = 27.0  # MB beside the program itself

@@ -23,7 +23,6 @@ from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.initialization import spanning_tree
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.given_poses import certify
 from solvers.handedness.complex_relaxation import (
     ComplexCost,
     ComplexRelaxation,
@@ -31,6 +30,7 @@ from solvers.handedness.complex_relaxation import (
 )
 from solvers.loop import iterate, run
 from solvers.result import Status
+from solvers.solves.given_poses import certify
 
 LOUD = NoiseModel(0.3, 1.0)
 

@@ -26,7 +26,7 @@ from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.verify import verify_proof
-from solvers.given_poses import certify
+from solvers.solves.given_poses import certify
 
 Call = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]

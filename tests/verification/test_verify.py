@@ -47,8 +47,8 @@ from pgo_models.verification import verify
 from pgo_models.verification.balls import arb
 from pgo_models.verification.costs import QuadraticForm, add_edge
 from pgo_models.verification.verify import verify_proof
-from solvers.given_poses import certify
 from solvers.riemannian.polish import polish
+from solvers.solves.given_poses import certify
 from solvers.studies.tightness import SweptScene, noisy_scene
 
 WEIGHTINGS = st.sampled_from(COSTS)

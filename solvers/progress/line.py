@@ -129,7 +129,7 @@ class StageLine:
         if _is_in_notebook():
             return _NotebookBar(self._name, self._max_iterations, elapsed, self._pace.clock)
         # rich is imported only if a line is shown
-        progress_bars = import_module("solvers.progress_bars")
+        progress_bars = import_module("solvers.progress.bars")
         bar = progress_bars.JobBar(self._max_iterations, True, self._name, elapsed)
         return bar.__enter__()
 
