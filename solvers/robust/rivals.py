@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # and scipy.special when it is used
 
+from pgo_models.errors import FAILURES
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
@@ -82,7 +83,10 @@ def rival_of(
     for candidate in _candidates(sets, fit, improbable, attempts):
         if not sets.has_time():
             break
-        rival = _settled(sets, fit, candidate, can_return, improbable)
+        try:
+            rival = _settled(sets, fit, candidate, can_return, improbable)
+        except FAILURES:  # its edges do not tie the poses
+            continue
         if rival is None or rival.gain <= -margin:
             continue
         is_slip = rival.edge is not None and rival.gain > margin

@@ -105,3 +105,16 @@ def test_two_maps_that_explain_the_closures_about_as_well(num_wrong: int) -> Non
     doubt = "another map, with 2 edges rejected here, fits about as well"
     assert robust.headline.startswith(f"DOUBTFUL, {doubt}: CERTIFIED")
     assert robust.rival.others == 2
+
+
+def test_a_step_that_alone_ties_rotations_is_no_suspect() -> None:
+    """Without a step the fixes tie the positions of a chain, and nothing its rotations."""
+    graph = ring_road(0, 24, 16)
+    poses = np.arange(0, 24, 5)
+    positions = graph.truth.t[poses]
+    positions[:2] += 100.0
+    chain = graph.without_edges(~given(graph).known)
+    chain = chain.with_position_prior(poses, positions, 4.0)
+    robust = solvers.solve(chain, robust=given(chain)).robust
+    assert robust.rejected.any()
+    assert robust.rival is None or robust.rival.edge is None
