@@ -1,6 +1,5 @@
 from solvers.baselines.gauss_seidel import GaussSeidel as GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
-from solvers.baselines.sweep_order import Sweep as Sweep
 from solvers.convex.bregman import (
     AlternatingBregman as AlternatingBregman,
     Bregman as Bregman,
@@ -158,7 +157,7 @@ __all__ += [
 __all__ += ["Automatic", "ComplexRelaxation", "HandednessAscent", "HullLagrangian"]
 __all__ += ["EdgeFit", "Outcome", "OutlierProof", "Rejection", "Support"]
 __all__ += ["CustomRStep", "RSubproblem", "RotationStep"]
-__all__ += ["OrthogonalSolution", "Sweep"]
+__all__ += ["OrthogonalSolution"]
 __all__ += ["Engine", "Recovery", "Traffic", "Worker", "WorkerPool"]
 __all__ += ["BenchmarkMethod", "BenchmarkSettings", "Comparison", "ComparisonSettings"]
 __all__ += ["NoiseSweep", "SweptScene"]

@@ -38,10 +38,7 @@ SOLVERS: dict[str, Make] = {
         robots=pgo.partition(problem.graph, min(3, problem.num_poses)), **changes
     ),
     "gauss_seidel_singletons": lambda problem, **changes: solvers.GaussSeidel(
-        sweep=solvers.Sweep.ROBOTS, alpha=1.2, **changes
-    ),
-    "jacobi": lambda problem, **changes: solvers.GaussSeidel(
-        sweep=solvers.Sweep.JACOBI, gauss_newton_steps=3, **changes
+        alpha=1.2, gauss_newton_steps=3, **changes
     ),
     "newton": lambda problem, **changes: solvers.Newton(**changes),
     "gauss_newton": lambda problem, **changes: replace(solvers.gauss_newton(), **changes),

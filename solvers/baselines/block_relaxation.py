@@ -1,4 +1,4 @@
-"""Linear least squares shared among robots: block Jacobi, JOR, Gauss-Seidel and SOR.
+"""Linear least squares shared among robots: block Gauss-Seidel, and SOR.
 
 With H = J^T diag(w) J and b = -J^T diag(w) r, the robots of one turn, rows a, set
 
@@ -6,11 +6,7 @@ With H = J^T diag(w) J and b = -J^T diag(w) r, the robots of one turn, rows a, s
 
 each by the Cholesky factor of its own diagonal block; of the others' x they need separators only
 (Choudhary et al. 2017; Bertsekas & Tsitsiklis, Parallel and Distributed Computation, section 2.4).
-Turns of robots that are no neighbours converge for 0 < alpha < 2 and every positive definite H
-(SOR). All robots at once converge for 0 < alpha <= 1: with D the diagonal blocks, 2 D - H is the H
-of the problem in which one end of every edge between robots has its sign flipped. It is a sum of
-squares, positive definite if connected with a fixed pose, as each end of an edge determines its
-pose.
+Turns of robots that are no neighbours converge for 0 < alpha < 2 and every positive definite H.
 """
 
 from dataclasses import dataclass

@@ -36,7 +36,7 @@ from solvers.baselines.block_relaxation import (
     sweep_turns,
     take_turns,
 )
-from solvers.baselines.sweep_order import Schedule, Sweep, schedule
+from solvers.baselines.sweep_order import Schedule, schedule
 from solvers.network.ledger import Ledger
 from solvers.result import Measurement, Status
 
@@ -100,11 +100,12 @@ class GaussSeidel:
     Both linear problems are solved by block relaxation over robots. One step is one sweep: every
     robot updates once. One round of the ledger is one exchange: the robots of a turn have updated
     and send their separators (d^2 numbers a pose in the first stage, 3 or 6 in the second) to their
-    neighbours. So a sweep of `Sweep.JACOBI` takes one round, of `COLORS` one a colour, of `ROBOTS`
-    one a robot, and the flagged first sweep of a stage as many as robots lie on the way from the
-    robot of pose 0 to the farthest (of `ROBOTS`: as there are robots). All robots know from one
-    all-reduce a sweep whether a stage has ended. The projection between the stages costs nothing:
-    neighbours project what they were sent. Order and colours are fixed before, off the ledger.
+    neighbours. Robots of one colour, which are no neighbours, take one turn, so that a sweep takes
+    a round a colour. Without a start the first sweep of a stage is flagged: a robot listens only to
+    neighbours that have an estimate. It takes as many rounds as robots lie on the way from the
+    robot of pose 0 to the farthest. All robots know from one all-reduce a sweep whether a stage has
+    ended. The projection between the stages costs nothing: neighbours project what they were sent.
+    Order and colours are fixed before, off the ledger.
 
     With one robot both systems are solved exactly: that is the centralised counterpart, which every
     choice of robots converges to. `primal_residual` is the distance of the relaxed rotations from
@@ -117,14 +118,8 @@ class GaussSeidel:
     ----------
     robots : Partition or None
         Who owns which pose; one pose a robot unless given.
-    sweep : Sweep
-        Order of the robots in a sweep.
     alpha : float in (0, 2)
-        Over-relaxation. Up to 1 every sweep converges; above, `Sweep.JACOBI` may not.
-    is_flagged : bool
-        Whether without a start the first sweep of a stage is flagged: a robot listens only to
-        neighbours that have an estimate. Else all begin at identity rotations and zero
-        translations.
+        Over-relaxation.
     gauss_newton_steps : int, at least 1
         Number of linearisations in the second stage, one in the paper that the method is from.
     tolerance : float
@@ -150,9 +145,7 @@ class GaussSeidel:
     """
 
     robots: Partition | None = None
-    sweep: Sweep = Sweep.COLORS
     alpha: float = 1.0
-    is_flagged: bool = True
     gauss_newton_steps: int = 1
     tolerance: float = 1e-5
     max_iterations: int = 5000
@@ -177,9 +170,9 @@ class GaussSeidel:
                 "rotations alone do not tell those of landmarks, which have none; "
                 "use another method"
             )
-        turns = schedule(problem.graph, robots, self.sweep)
+        turns = schedule(problem.graph, robots)
         linear = rotation_problem(problem, poses.R[0])
-        is_flagged = start is None and self.is_flagged
+        is_flagged = start is None
         sweep, first = _prepared_sweeps(problem, linear, turns, problem.d**2, is_flagged)
         return GaussSeidelState(
             k=0,

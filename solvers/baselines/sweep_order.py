@@ -4,7 +4,6 @@ Flagged initialisation of Choudhary et al. 2017: in a first sweep, from the robo
 robot listens only to neighbours that already have an estimate. Later sweeps have a fixed order.
 """
 
-import enum
 import heapq
 from dataclasses import dataclass
 
@@ -17,17 +16,6 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
 
 
-class Sweep(enum.Enum):
-    """In which order the robots update once each."""
-
-    JACOBI = "all robots at once: block Jacobi, and JOR when alpha is not 1"
-    COLORS = (
-        "robots of one colour at once, colour after colour: "
-        "Gauss-Seidel, and SOR when alpha is not 1"
-    )
-    ROBOTS = "one robot after another: Gauss-Seidel, and SOR when alpha is not 1"
-
-
 @dataclass(frozen=True, eq=False)
 class Schedule:
     """Turns of a sweep.
@@ -37,8 +25,7 @@ class Schedule:
     robot : (n,) array
         Owner of every pose.
     group : (n,) array
-        In which turn of a sweep the pose is updated. Robots of one turn are no neighbours, except
-        in `Sweep.JACOBI`, which has one turn.
+        In which turn of a sweep the pose is updated. Robots of one turn are no neighbours.
     first : (n,) array
         In which turn of the flagged first sweep the pose gets its first estimate.
     sent : (q,) array
@@ -72,14 +59,14 @@ class Schedule:
         return Traffic(links // self.num_robots, links % self.num_robots, num_bytes)
 
 
-def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
+def schedule(graph: PoseGraph, robots: Partition) -> Schedule:
     """Fix the turns of all robots; a SettingError when the partition is of another number of poses.
 
     The order starts at the robot of pose 0 and goes on with the robot that has the most edges to
-    those before it. Each robot takes, in that order, the first colour that no neighbour has. In the
-    flagged sweep of `Sweep.ROBOTS` this is also the order of the first estimates; otherwise all
-    robots go at once that have a neighbour with an estimate. A robot whose poses fall into pieces
-    that only other robots connect estimates each piece when it is reached.
+    those before it. Each robot takes, in that order, the first colour that no neighbour has; the
+    robots of a colour take one turn. In the flagged sweep all robots go at once that have a
+    neighbour with an estimate. A robot whose poses fall into pieces that only other robots connect
+    estimates each piece when it is reached.
     """
     is_cut = robots.cut_edges(graph)
     i = graph.i[is_cut]
@@ -95,17 +82,9 @@ def schedule(graph: PoseGraph, robots: Partition, sweep: Sweep) -> Schedule:
     owner = np.empty(num_pieces, dtype=np.int64)
     owner[piece] = robot
     robot_order = _in_order_of_appearance(owner[order])
-    if sweep is Sweep.JACOBI:
-        group: IntArray = np.zeros(num_robots, dtype=np.int64)
-    elif sweep is Sweep.COLORS:
-        group = _greedy_colors(edge_counts(robot[i], robot[j], num_robots), robot_order)
-    else:
-        group = np.argsort(robot_order)  # the inverse permutation: the position of every robot
-    if sweep is Sweep.ROBOTS:
-        first = np.argsort(order)
-    else:
-        num_steps = dijkstra(between, unweighted=True, indices=[int(piece[0])])
-        first = num_steps[0].astype(np.int64)
+    group = _greedy_colors(edge_counts(robot[i], robot[j], num_robots), robot_order)
+    num_steps = dijkstra(between, unweighted=True, indices=[int(piece[0])])
+    first = num_steps[0].astype(np.int64)
     ends = np.concatenate([i, j])
     robots_of_other_ends = robot[np.concatenate([j, i])]
     sent, receiver = np.divmod(np.unique(ends * num_robots + robots_of_other_ends), num_robots)

@@ -17,7 +17,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.baselines.gauss_seidel import DGSStage, GaussSeidel, GaussSeidelState
 from solvers.baselines.gtsam import run_gtsam
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
-from solvers.baselines.sweep_order import Sweep, schedule
+from solvers.baselines.sweep_order import schedule
 from solvers.loop import Solver, run
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solve
@@ -213,7 +213,7 @@ def _paper_soc(
     result = budget.run(soc, problem, start, remember)
     poses = problem.with_best_translations(last_rotations[0])
     robots = partition(problem.graph, method=PartitionMethod.SINGLETONS)
-    sweep = schedule(problem.graph, robots, Sweep.JACOBI)
+    sweep = schedule(problem.graph, robots)
     traffic = sweep.traffic(np.arange(problem.num_poses), problem.d**2)
     bytes_per_round = float(traffic.num_bytes.sum())
     k = result.history.k

@@ -57,7 +57,7 @@ def test_settings_out_of_range_are_refused() -> None:
 
 
 @needs_gtsam
-@settings(max_examples=examples(20), deadline=None)
+@settings(max_examples=examples(5), deadline=None)
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_its_cost_is_F_to_leading_order(seed: int, n: int, d: int) -> None:
     # A turn and move of size h away from where all residuals are zero costs h^2; what differs is of
@@ -181,7 +181,7 @@ def test_semidefinite_matrices_are_whole_in_its_graph(d: int) -> None:
 
 
 @needs_gtsam
-@settings(max_examples=examples(20), deadline=None)
+@settings(max_examples=examples(5), deadline=None)
 @given(seed=SEEDS, n=st.integers(2, 10), d=DIMENSIONS)
 def test_chi2_in_its_convention_is_twice_its_error(seed: int, n: int, d: int) -> None:
     import gtsam

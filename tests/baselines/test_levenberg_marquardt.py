@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 from budget import examples
 from graphs import (
@@ -19,7 +18,6 @@ from hypothesis import given, settings, strategies as st
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
-from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
@@ -28,7 +26,6 @@ from solvers.result import Status
 from solvers.riemannian.polish import polish, relative_decrement
 
 ROUNDING = 1e-14
-ZERO = np.zeros(1, dtype=np.int64)
 STARTS: dict[str, Callable[[PGOProblem], Poses | None]] = {
     "file": lambda problem: problem.graph.initial,
     "odometry": lambda problem: odometry_start(problem.graph),
@@ -48,7 +45,7 @@ def test_the_four_starts_lead_to_the_optimum(
     assert result.objective == pytest.approx(OPTIMUM[name], rel=0, abs=optimum_tolerance(name))
 
 
-@settings(max_examples=examples(30))
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS, spread=st.sampled_from([1.0, 1e3]))
 def test_F_never_rises_from_hostile_starts(seed: int, n: int, d: int, spread: float) -> None:
     problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
@@ -58,7 +55,7 @@ def test_F_never_rises_from_hostile_starts(seed: int, n: int, d: int, spread: fl
     assert result.objective == problem.objective(result.poses)
 
 
-@settings(max_examples=examples(30))
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS)
 def test_it_ends_where_newton_does(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
@@ -67,45 +64,6 @@ def test_it_ends_where_newton_does(seed: int, n: int, d: int) -> None:
     assert relative_decrement(problem, result.poses) <= 1e-10
     expected = problem.objective(polish(problem, chordal_start(problem)))
     assert result.objective == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-def test_damping_falls_after_foreseen_steps_and_rises_ever_faster_after_refused_ones() -> None:
-    problem = PGOProblem(varied_graph(0, 30, 3, LOUD_NOISE, weights=3.0))
-    solver = LevenbergMarquardt(damping=1e-6)
-    state = solver.init(problem, random_poses(30, 3, 0))
-    refused_in_a_row = 0
-    most = 0
-    for _ in range(60):
-        following = solver.step(problem, state)
-        if following.poses is state.poses:
-            refused_in_a_row += 1
-            assert following.damping == pytest.approx(2.0**refused_in_a_row * state.damping)
-        else:
-            refused_in_a_row = 0
-            # 1 - (2 ratio - 1)^3 is below 2: a poor step that is taken raises the damping, by less
-            # than a refused one.
-            assert state.damping / 3 * (1 - 1e-12) <= following.damping <= 2 * state.damping
-            assert following.growth == 2.0
-        most = max(most, refused_in_a_row)
-        state = following
-    assert most >= 1
-
-
-@given(seed=SEEDS, n=st.integers(2, 8), d=DIMENSIONS, damping=st.sampled_from([1e-6, 1e-2, 10.0]))
-def test_a_step_solves_the_damped_equations_of_the_poses(
-    seed: int, n: int, d: int, damping: float
-) -> None:
-    problem = varied_problem(seed, n, d)
-    poses = random_poses(n, d, seed)
-    state = LevenbergMarquardt(damping=damping).init(problem, poses)
-    layout = TangentLayout(n, d)
-    gradient = layout.join(*problem.riemannian_gradient(poses))
-    A = riemannian_hessian(problem.at(poses), None).toarray()
-    for column in np.concatenate([layout.translations(ZERO)[0], layout.rotations(ZERO)[0]]):
-        A[column, column] *= 2
-    residual = (A + damping * np.diag(np.diag(A))) @ state.step + gradient
-    np.testing.assert_allclose(residual, 0, rtol=0, atol=1e-8 * np.abs(gradient).max())
-    assert state.decrement == pytest.approx(-0.5 * gradient @ state.step / state.objective)
 
 
 def test_settings_are_checked() -> None:

@@ -1,21 +1,17 @@
 import importlib.util
 import math
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from budget import examples
-from hypothesis import given, settings, strategies as st
 
 import pgo_models as pgo
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import SettingError
 from pgo_models.graphs.published_results import published_rows
-from solvers import Run, Status, solve
+from solvers import Status, solve
 from solvers.reporting.convergence_plots import Effort
-from solvers.studies import benchmark_runs as trial_runs
-from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings, StageRecord
+from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import run_benchmark
 
 BY_ROBOTS = {
@@ -85,10 +81,10 @@ def test_the_curve_of_a_trial_ends_where_the_trial_does(contender, problem, boun
     assert curve.history.objective[-1] == pytest.approx(trial.objective, rel=1e-9)
 
 
-@given(st.sampled_from(sorted(SCENES)), st.integers(0, 99), st.integers(2, 40))
-@settings(max_examples=examples(6))
-def test_the_papers_method_keeps_to_its_rounds(scene, seed, rounds):
-    problem = pgo.PGOProblem(SCENES[scene](np.random.default_rng(seed)))
+@pytest.mark.parametrize("rounds", [2, 11, 40])
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_papers_method_keeps_to_its_rounds(scene, rounds):
+    problem = pgo.PGOProblem(SCENES[scene](np.random.default_rng(7)))
     trial = run_benchmark(
         BenchmarkMethod.PAPER, problem, BenchmarkSettings(max_rounds=rounds), problem.graph.initial
     )
@@ -96,21 +92,6 @@ def test_the_papers_method_keeps_to_its_rounds(scene, seed, rounds):
     if trial.stages[-1].status is not Status.CONVERGED:
         assert trial.remark == f"stopped within {rounds} rounds"
     assert trial.objective == pytest.approx(problem.objective(trial.poses), rel=1e-12)
-
-
-@pytest.mark.parametrize("rounds", [4, 12, 17])
-def test_the_papers_method_hands_its_last_iterate_on_even_where_an_earlier_one_is_better(rounds):
-    for seed in range(3):
-        graph = pgo.circle(np.random.default_rng(seed))
-        trial = run_benchmark(
-            BenchmarkMethod.PAPER,
-            pgo.PGOProblem(graph),
-            BenchmarkSettings(max_rounds=rounds),
-            graph.initial,
-        )
-        assert trial.iterations[0] == rounds // 2
-        last_of_first_stage = trial.stages[0].history.objective[-1]
-        assert trial.first_objective == pytest.approx(last_of_first_stage, rel=1e-9)
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -130,18 +111,6 @@ def test_the_papers_method_beats_the_papers_gap_within_its_iterations(scene):
         assert relative_gap(trial.objective, solve(problem).lower_bound) <= theirs
 
 
-def test_dgs_that_is_cut_short_in_its_first_stage_is_no_answer(problem, monkeypatch):
-    monkeypatch.setattr(trial_runs, "_MOST_SWEEPS", 3)
-    trial = run_benchmark(BenchmarkMethod.GAUSS_SEIDEL, problem)
-    assert not trial.is_answer
-    assert trial.remark == "MAX_ITERATIONS in its first stage: no poses after 3 sweeps"
-
-
-def test_a_stage_that_did_not_converge_is_said(problem, monkeypatch):
-    monkeypatch.setattr(trial_runs, "WARM_START", replace(trial_runs.WARM_START, max_iterations=2))
-    assert run_benchmark(BenchmarkMethod.JOINT, problem).remark == "SOC: MAX_ITERATIONS"
-
-
 @pytest.mark.parametrize(
     "contender", [BenchmarkMethod.STAIRCASE, BenchmarkMethod.CONSENSUS, BenchmarkMethod.PAPER]
 )
@@ -150,30 +119,6 @@ def test_time_runs_out_for_all_stages_together(contender, problem):
     assert trial.status is Status.TIME_LIMIT
     assert "TIME_LIMIT" in trial.remark
     assert math.isfinite(trial.objective)
-
-
-@pytest.mark.parametrize(
-    "contender",
-    [method for method in HERE if method is not BenchmarkMethod.GTSAM],
-    ids=lambda method: method.value,
-)
-def test_ctrl_c_leaves_no_half_trial(contender, problem, monkeypatch):
-    def as_if_interrupted(true):
-        return lambda *arguments, **options: _interrupted(true(*arguments, **options))
-
-    monkeypatch.setattr(trial_runs, "run", as_if_interrupted(trial_runs.run))
-    monkeypatch.setattr(trial_runs, "solve", as_if_interrupted(trial_runs.solve))
-    with pytest.raises(KeyboardInterrupt):
-        run_benchmark(contender, problem)
-
-
-def _interrupted(result):
-    """A run or solution as the loop hands it back after Ctrl-C."""
-    if isinstance(result, Run):
-        return replace(result, status=Status.INTERRUPTED)
-    return replace(
-        result, stages=tuple(replace(stage, status=Status.INTERRUPTED) for stage in result.stages)
-    )
 
 
 @pytest.mark.parametrize(
@@ -201,19 +146,3 @@ def test_robots_are_at_most_one_a_pose_and_contiguous_without_metis(monkeypatch)
 
     monkeypatch.setitem(sys.modules, "pymetis", None)
     assert BenchmarkSettings().robots(graph).method is pgo.PartitionMethod.CONTIGUOUS
-
-
-def test_a_stage_that_is_not_counted_leaves_the_sum_unknown(problem):
-    trial = run_benchmark(BenchmarkMethod.PAPER, problem)
-    first = trial.stages[0]
-    uncounted = StageRecord(first.name, first.status, first.history)
-    mixed = BenchmarkRun(
-        BenchmarkMethod.PAPER,
-        (uncounted, trial.stages[1]),
-        trial.poses,
-        trial.objective,
-        trial.status,
-    )
-    assert mixed.rounds is None
-    assert mixed.num_bytes is None
-    assert mixed.curve(0.0).rounds is None

@@ -98,16 +98,6 @@ def test_ctrl_c_keeps_the_methods_that_are_done(monkeypatch):
     assert "interrupted: the methods left out were not run" in compared.table().notes
 
 
-def test_a_dgs_without_poses_has_no_figures_and_no_curve(monkeypatch):
-    monkeypatch.setattr("solvers.studies.benchmark_runs._MOST_SWEEPS", 2)
-    compared = compare_methods(
-        pgo.grid(np.random.default_rng(1)), ComparisonSettings((BenchmarkMethod.GAUSS_SEIDEL,))
-    )
-    assert compared.curves == []
-    assert compared.table().parts[0].rows[0][1:3] == ("-", "-")
-    assert compared.table().records[0]["objective"] is None
-
-
 def test_plots_are_written_as_pictures_and_pages(compared, tmp_path):
     for suffix, begin in ((".png", b"\x89PNG"), (".svg", b"<?xml"), (".html", b"<html")):
         compared.save_plot(tmp_path / f"plot{suffix}")
@@ -138,25 +128,6 @@ def test_a_panel_holds_the_methods_whose_effort_is_counted():
         "rounds only",
     ]
     assert [axes.get_xlabel() for axes in plot_efforts([central]).axes] == labels[2:]
-
-
-def test_a_method_looks_the_same_in_all_panels_and_unlike_the_others():
-    counts = np.arange(9.0)
-    curves = [curve(method.label, rounds=counts, num_bytes=counts) for method in BenchmarkMethod]
-    looks = [
-        [(line.get_color(), line.get_marker()) for line in axes.lines]
-        for axes in plot_efforts(curves).axes
-    ]
-    assert looks[0] == looks[1] == looks[2]
-    assert len(set(looks[0])) == len(BenchmarkMethod)
-
-
-def test_long_curves_are_thinned_in_pages_with_first_and_last_kept():
-    long = curve("long", length=5000)
-    (trace,) = explore_efforts([long]).data
-    shown = long.gap[long.gap > 0]
-    assert len(trace.x) <= 400
-    assert trace.y[-1] == pytest.approx(shown[-1], rel=1e-4)
 
 
 def test_there_must_be_something_to_draw():

@@ -167,13 +167,6 @@ def test_a_mistake_of_ours_is_no_reason(monkeypatch):
         reproduce_tables(ReproductionSettings(("grid",), 1))
 
 
-def test_dgs_cut_short_in_its_first_stage_has_no_figures(monkeypatch):
-    monkeypatch.setattr("solvers.studies.benchmark_runs._MOST_SWEEPS", 2)
-    row = reproduce_tables(ReproductionSettings(("grid",), 1)).rows[1]
-    assert row.cells == ()
-    assert row.reasons == ("MAX_ITERATIONS in its first stage: no poses after 2 sweeps",)
-
-
 @pytest.fixture
 def no_data(tmp_path, monkeypatch):
     """No benchmark graph is here, and none in a cache."""
@@ -240,5 +233,6 @@ def assert_row_shows_what_it_should(name: str) -> None:
 
 
 @pytest.mark.usefixtures("benchmark_data")
+@pytest.mark.slow
 def test_the_garage_shows_what_it_should():
     assert_row_shows_what_it_should("parking-garage")
