@@ -119,3 +119,33 @@ def slipped_loop(seed: int) -> PoseGraph:
     if rng.random() < 0.5:
         t_ij[rng.integers(n - 1, graph.num_edges)] += rng.normal(0.0, 0.5, 2)
     return replace(graph, t_ij=t_ij)
+
+
+def false_fixes(seed: int) -> tuple[PoseGraph, BoolArray]:
+    """A small world with five to ten fixes, a minority of them false, and which edges are wrong.
+
+    The false ones are shifted by 5 to 100 m: in two worlds of three by the same motion, else each
+    by its own. Fixes are good to half a metre; a step of odometry is to 5 cm and 0.01 rad or, in
+    every other world, to 1 cm and 0.05 rad.
+    """
+    rng = np.random.default_rng(seed)
+    d = 3 if seed % 4 == 3 else 2
+    n = int(rng.integers(10, 60))
+    noise = NoiseModel(0.01, 0.05) if seed % 2 else NoiseModel(0.05, 0.01)
+    graph = grid_world(1, n, rng, d=d, loop_closure_probability=0.1, noise=noise)
+    # An error of the angle w adds 2 kappa w^2 to F: so the precisions are those of the errors.
+    graph = replace(graph, kappa=np.full(graph.num_edges, 0.5 / noise.rotation_std**2))
+    assert graph.truth is not None
+    num_fixes = int(rng.integers(5, 11))
+    num_false = int(rng.integers(1, (num_fixes - 1) // 2 + 1))
+    poses = rng.choice(n, num_fixes, replace=False)
+    shifts = rng.standard_normal((num_false, d))
+    if rng.random() < 2.0 / 3.0:
+        shifts[:] = shifts[0]
+    shifts *= np.exp(rng.uniform(np.log(5.0), np.log(100.0))) / np.linalg.norm(shifts[0])
+    positions = graph.truth.t[poses] + rng.normal(0.0, 0.5, (num_fixes, d))
+    positions[:num_false] += shifts
+    spoiled_graph = graph.with_position_prior(poses, positions, 4.0)
+    is_wrong = np.zeros(spoiled_graph.num_edges, dtype=bool)
+    is_wrong[graph.num_edges :][:num_false] = True
+    return spoiled_graph, is_wrong

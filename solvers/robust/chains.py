@@ -110,7 +110,7 @@ def measured_covariances(graph: PoseGraph) -> Array:
     whole = is_whole(graph)
     information = gaussian_information(graph)
     covariances = np.zeros(information.shape)
-    covariances[whole] = np.linalg.inv(_definite(information[whole]))
+    covariances[whole] = np.linalg.inv(definite(information[whole]))
     return covariances
 
 
@@ -210,7 +210,7 @@ def _summed(graph: PoseGraph, step_to: IntArray, poses: Motions, measured: Array
     return np.asarray(np.cumsum(growth, axis=0))
 
 
-def _definite(information: Array) -> Array:
+def definite(information: Array) -> Array:
     """Matrices (m, k, k) that have an inverse: where nothing is known, the variance is large."""
     is_singular = ~are_definite(information, LEAST_SCALED)
     if not is_singular.any():

@@ -30,8 +30,9 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM
 from solvers.robust.candidates import Candidates
 from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
+from solvers.robust.fixes import agreeing_fixes, is_fix
 from solvers.robust.linear_search import LinearSearch
-from solvers.robust.revision import Fit, is_held
+from solvers.robust.revision import Fit, inlier_problem, is_held
 from solvers.robust.weighted_edges import first_poses, held_together
 
 # Probability with which a right edge comes back in the end, where few wrong ones lie between this
@@ -401,7 +402,30 @@ class ClusterSearch:
             other = self._without_misfits(self._in_place_of_misfits(fit, run))
             if self.sets.is_better(other, fit):
                 return other
+        for other in self.aligned_anew(fit):
+            if self.sets.is_better(other, fit):
+                return other
         return None
+
+    def aligned_anew(self, fit: Fit) -> Iterator[Fit]:
+        """Fits with fixes that agree, some of them rejected, in place of all fixes kept.
+
+        A map follows its fixes by a motion as a whole. Near it nothing is seen of others that agree
+        on another motion, so these begin at the chordal start.
+        """
+        graph = self.sets.problem.graph
+        fixes = is_fix(graph)
+        if not (fixes & ~fit.kept & ~self.sets.known).any():
+            return
+        groups = agreeing_fixes(self.sets.chains, fixes & ~self.sets.known, self.sets.scale)
+        others = np.flatnonzero(groups.have_any(~fit.kept))[: self._most_failures]
+        for group in map(groups.__getitem__, others.tolist()):
+            kept = with_edges(fit.kept & (self.sets.known | ~fixes), group)
+            if not self.sets.has_time():
+                return
+            if is_held(graph, kept):
+                start = chordal_start(inlier_problem(self.sets.problem, kept))
+                yield self._within_thresholds(self.sets.settled(kept, start))
 
     def _rivals(self, fit: Fit) -> Iterator[IntArray]:
         """Rejected runs with new closures that are near odometry, if known edges hold the poses.
@@ -430,14 +454,17 @@ class ClusterSearch:
 
     def _in_place_of_misfits(self, fit: Fit, cluster: IntArray) -> Fit:
         """The fit with a cluster, and then with the edges within their thresholds alone."""
-        other = self.sets.settled(with_edges(fit.kept, cluster), fit.poses)
+        return self._within_thresholds(self.sets.settled(with_edges(fit.kept, cluster), fit.poses))
+
+    def _within_thresholds(self, fit: Fit) -> Fit:
+        """The fit with the edges within their thresholds alone, as the map follows them."""
         for _ in range(_MOST_ROUNDS):
-            ratio = self.sets.problem.edge_costs(other.poses) / self.sets.allowed
+            ratio = self.sets.problem.edge_costs(fit.poses) / self.sets.allowed
             kept = held_together(self.sets.problem.graph, self.sets.known | (ratio <= 1.0), ratio)
-            if np.array_equal(kept, other.kept):
-                return other
-            other = self.sets.settled(kept, other.poses)
-        return other
+            if np.array_equal(kept, fit.kept):
+                return fit
+            fit = self.sets.settled(kept, fit.poses)
+        return fit
 
     @property
     def _most_failures(self) -> int:

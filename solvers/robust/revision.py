@@ -63,9 +63,17 @@ def inlier_problem(problem: PGOProblem, kept: BoolArray) -> PGOProblem:
 
 
 def is_held(graph: PoseGraph, kept: BoolArray) -> bool:
-    """Whether the edges kept, (m,), connect the poses and fix the rotation of the world."""
-    is_connected = len(graph.components(kept)) == 1
-    return is_connected and (not graph.is_world_loose or graph.is_world_fixed(kept))
+    """Whether the edges kept, (m,), connect the poses, and determine them up to one gauge.
+
+    Positions connect poses that they do not turn (`PoseGraph.check_connected`).
+    """
+    if len(graph.components(kept)) > 1:
+        return False
+    try:
+        graph.without_edges(~kept).check_connected()
+    except GraphError:
+        return False
+    return True
 
 
 def truncated_cost(problem: PGOProblem, known: BoolArray, thresholds: Array, poses: Poses) -> float:

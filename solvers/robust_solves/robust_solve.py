@@ -411,8 +411,10 @@ class _RobustSolve:
         if fits or solution.status in OUT_OF_TIME:
             return None
         fit = Fit.of(self.doubted.problem, kept, solution.poses)
-        attempts = [(estimate.kept, estimate.poses) for estimate in self.estimates]
-        return rival_of(self._search(self.choice).sets, fit, attempts)
+        search = self._search(self.choice)
+        others = [(estimate.kept, estimate.poses) for estimate in self.estimates]
+        others += [(other.kept, other.poses) for other in search.aligned_anew(fit)]
+        return rival_of(search.sets, fit, others)
 
     def _has_time(self) -> bool:
         monitor = self.places.request.monitor
