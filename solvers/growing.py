@@ -223,7 +223,7 @@ def update_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     def solve_afresh(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
         return place.better(best, solve_at(place, settings, start))
 
-    return unless_it_fails(Step.WHOLE, solve_afresh, place, settings, update)
+    return unless_it_fails(Step.AGAIN, solve_afresh, place, settings, update)
 
 
 def _joined(before: Ledger | None, after: Ledger | None) -> Ledger | None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from pgo_models.certificates.certificate import (
     judge,
     with_terms,
 )
-from pgo_models.certificates.lower_bound import NO_BOUND, has_complex_form
+from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
@@ -32,15 +30,24 @@ from solvers.handedness.complex_relaxation import (
 )
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search
-from solvers.place import AUTO, BROKEN_OFF, Attempt, Ending, FirstStage, Place, after_search
+from solvers.place import (
+    BROKEN_OFF,
+    Attempt,
+    Ending,
+    OwnStart,
+    Place,
+    Step,
+    Traits,
+    after_search,
+)
 from solvers.result import History, Outcome, Record, Run, Stage, Status
-from solvers.riemannian.newton import Newton, needs_no_soc
+from solvers.riemannian.newton import Newton
 from solvers.riemannian.polish import polish
-from solvers.riemannian.prefixes import GrowingStart
+from solvers.riemannian.prefixes import GrowingStart, entry_tree
 from solvers.riemannian.shrunk_bound import with_shrunk_information
 from solvers.riemannian.staircase import DualBound, Staircase, StaircaseState
 from solvers.soc.paper import PaperSOC
-from solvers.soc.soc import SOC, WARM_START
+from solvers.soc.soc import SOC
 
 if TYPE_CHECKING:  # what a plain solve does not need
     from solvers.robust.gnc import GNC, Inliers
@@ -61,51 +68,44 @@ class Here(Place):
     where: str = ""
 
     @property
-    def d(self) -> int:
-        """Dimension of the space, 2 or 3."""
-        return self.problem.d
+    def traits(self) -> Traits:
+        """What the page asks about the graph and its cost."""
+        problem = self.problem
+        return Traits(
+            d=problem.d,
+            num_poses=problem.num_poses,
+            num_bodies=len(problem.graph.bodies),
+            has_translations=problem.has_translations,
+            is_quadratic=problem.convex_part is problem,
+            is_chi2=problem.weighting is Weighting.INFORMATION,
+            averages=problem.d == 2,
+            has_landmarks=len(problem.graph.landmarks) > 0,
+        )
+
+    def start(self, start: Poses | OwnStart, soc: SOC | PaperSOC | None) -> Attempt:
+        """Take the given start, or find one; the monitor shows which stages will follow."""
+        began = time.perf_counter()
+        problem = self.problem
+        name = start.value if isinstance(start, OwnStart) else "given start"
+        between = [] if soc is None else [type(soc).__name__]
+        self.monitor.plan[:] = [name, *between, Newton.__name__, "certificate"]
+        with self.monitor.showing(name, problem.side):
+            if not isinstance(start, OwnStart):
+                poses = problem.seen_poses(start)
+            elif start is OwnStart.TREE:
+                poses = spanning_tree_start(problem.convex_part.graph)
+            else:
+                poses = chordal_start(problem.convex_part, start is OwnStart.AVERAGED)
+        seconds = time.perf_counter() - began
+        objective = problem.objective(poses)
+        self.table.add(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
+        self.monitor.poses_found.append(poses)
+        return Attempt(poses)
 
     @property
-    def has_landmarks(self) -> bool:
-        """Whether the graph has landmarks."""
-        return len(self.problem.graph.landmarks) > 0
-
-    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, SOC | PaperSOC | None]:
-        """Find a start, or take the given one; with it goes the SOC to run from there, if any."""
-        began = time.perf_counter()
-        chosen = self._chosen_soc(given, soc)
-        name, find = self._start_named(given, soc, chosen)
-        between = [] if chosen is None else [type(chosen).__name__]
-        self.monitor.plan[:] = [name, *between, Newton.__name__, "certificate"]
-        with self.monitor.showing(name, self.problem.side):
-            poses = find()
-        seconds = time.perf_counter() - began
-        objective = self.problem.objective(poses)
-        self.stages.append(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
-        self.monitor.poses_found.append(poses)
-        return Attempt(poses), chosen
-
-    def _chosen_soc(self, given: Poses | None, soc: FirstStage) -> SOC | PaperSOC | None:
-        """SOC that is asked for; of AUTO none where Newton alone is faster."""
-        if soc is not AUTO:
-            return soc
-        # The minimum of the convex part is no nearer to that of chi2 than the start is.
-        is_convex = self.problem.convex_part is self.problem
-        newton_alone = not is_convex or (given is None and needs_no_soc(self.problem))
-        return None if newton_alone else WARM_START
-
-    def _start_named(
-        self, given: Poses | None, soc: FirstStage, chosen: SOC | PaperSOC | None
-    ) -> tuple[str, Callable[[], Poses]]:
-        """Name of a start, and the function that finds its poses."""
-        problem = self.problem
-        if given is not None:
-            return "given start", partial(problem.seen_poses, given)
-        if isinstance(chosen, PaperSOC):
-            return "spanning tree", partial(spanning_tree_start, problem.convex_part.graph)
-        is_averaged = soc is AUTO and chosen is None and problem.d == 2
-        name = "averaged start" if is_averaged else "chordal start"
-        return name, partial(chordal_start, problem.convex_part, is_averaged)
+    def odometry_joins(self) -> bool:
+        """Whether every pose but the first has an edge to an earlier one."""
+        return entry_tree(self.problem.graph) is not None
 
     def run_soc(self, attempt: Attempt, soc: SOC | PaperSOC) -> Attempt:
         """Run SOC on the convex part of the problem.
@@ -123,7 +123,7 @@ class Here(Place):
         if convex_part is not problem:
             objective = problem.objective(poses)
             stage = replace(stage, name=f"{stage.name}, convex", objective=objective)
-        self.stages.append(stage)
+        self.table.add(stage)
         del finished  # its state has the factor, and Newton's is far larger
         if problem.num_poses > MANY_POSES:
             problem.analysis.release_memory()
@@ -132,7 +132,7 @@ class Here(Place):
     def run_newton(self, attempt: Attempt, newton: Newton) -> Attempt:
         """Run Newton from the poses."""
         finished = self.monitor.run(newton, self.problem, attempt.known_poses)
-        self.stages.append(Stage.of(finished))
+        self.table.add(Stage.of(finished))
         decrement = finished.state.polish.decrement
         return replace(attempt, poses=finished.poses, status=finished.status, decrement=decrement)
 
@@ -176,12 +176,10 @@ class Here(Place):
         decrement = cheaper.decrement
         return replace(best, poses=poses, certificate=judged, status=status, decrement=decrement)
 
-    def start_grown(self, growing: GrowingStart) -> Attempt | None:
-        """Start at poses that prefixes lead to; None where odometry does not join the poses."""
-        if not growing.has_prefixes(self.problem.graph):
-            return None
+    def start_grown(self, growing: GrowingStart) -> Attempt:
+        """Start at poses that prefixes of the graph lead to."""
         finished = self.monitor.run(growing, self.problem)
-        self.stages.append(replace(Stage.of(finished), name=f"growing start{self.where}"))
+        self.table.add(replace(Stage.of(finished), name=f"growing start{self.where}"))
         return Attempt(finished.poses, status=finished.status)
 
     def start_again(self) -> Poses | None:
@@ -192,14 +190,12 @@ class Here(Place):
         isotropic = PGOProblem(problem.graph, problem.backend, Weighting.ISOTROPIC)
         return polish(isotropic, chordal_start(isotropic))
 
-    def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
+    def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Run the Riemannian staircase from the best poses, and round its solution.
 
         Of a run that was cut short the state with the best poses is kept, not the one with the best
         bound: so the bound is that of the last state that was seen.
         """
-        if self.problem.convex_part is not self.problem:
-            return None
         bounds: list[DualBound | None] = [None]
         asked = self.monitor.callback
 
@@ -209,23 +205,30 @@ class Here(Place):
 
         monitor = replace(self.monitor, callback=remember_bound)
         finished = monitor.run(staircase, self.problem, best.known_poses)
-        self.stages.append(Stage.of(finished))
+        self.table.add(Stage.of(finished))
         return Attempt(finished.poses, finished.status, dual_bound=bounds[-1])
 
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
-        return replace(best, certificate=with_shrunk_information(self.problem, best.proof))
+        began = time.perf_counter()
+        certificate = with_shrunk_information(self.problem, best.proof)
+        seconds = time.perf_counter() - began
+        name = f"{Step.SMALLER_MATRICES.value}{self.where}"
+        objective = certificate.objective
+        self.table.add(
+            Stage(name, Status.CONVERGED, 0, objective, seconds, History(), finds_poses=False)
+        )
+        return replace(best, certificate=certificate)
 
     def solve_in_complex_numbers(self, best: Attempt, method: ComplexRelaxation) -> Attempt:
         """Solve the relaxation with complex numbers, and return the better poses and bound."""
         problem = self.problem
-        if not has_complex_form(problem):
-            return best
         finished: Outcome[ComplexState] = self.monitor.run(method, problem, best.known_poses)
         stage = stage_of_search(finished)
-        self.stages.append(replace(stage, name=f"{stage.name}{self.where}"))
-        for found in certificates_of_relaxation(problem, method, finished.state, self.gap):
-            best = self.better(best, Attempt(found.poses, best.status, certificate=found))
+        self.table.add(replace(stage, name=f"{stage.name}{self.where}"))
+        for certificate in certificates_of_relaxation(problem, method, finished.state, self.gap):
+            rounded = Attempt(certificate.poses, best.status, certificate=certificate)
+            best = self.better(best, rounded)
         return after_search(best, best.proof, stage)
 
     def bound_by_terms(
@@ -235,23 +238,17 @@ class Here(Place):
         problem = self.problem
         ground = problem.at_best_translations(best.known_poses)
         terms, stage = search.run(problem, ground, self.monitor, Pi)
-        self.stages.append(stage)
+        self.table.add(stage)
         judged = judge(problem, best.known_poses, best.proof)
         return after_search(best, with_terms(problem, judged, terms, ground), stage)
 
-    def hulls(self, search: HandednessSearch) -> HullLagrangian | None:
-        """Return the method for the relaxation with hulls of rotations, if it suits the graph."""
-        return search.relaxation(self.problem, self.gap)
-
-    def solve_hulls(
-        self, best: Attempt, method: HullLagrangian, start: HullState | None
-    ) -> tuple[Attempt, HullState]:
+    def solve_hulls(self, best: Attempt, method: HullLagrangian) -> Attempt:
         """Solve that relaxation, and return the better poses and the better bound."""
         problem = self.problem
-        begin = best.known_poses if start is None else start
+        begin = best.known_poses if best.hulls is None else best.hulls
         finished: Outcome[HullState] = self.monitor.run(method, problem, begin)
         stage = stage_of_search(finished)
-        self.stages.append(replace(stage, name=f"{stage.name}{self.where}"))
+        self.table.add(replace(stage, name=f"{stage.name}{self.where}"))
         state = finished.state
         if state.bound is not None:
             poses = polish(problem, round_factor(problem, state.point.Y)[0])
@@ -265,7 +262,7 @@ class Here(Place):
                 state.bound.bound,
             )
             best = self.better(best, Attempt(poses, best.status, certificate=relaxed))
-        return after_search(best, best.proof, stage), state
+        return replace(after_search(best, best.proof, stage), hulls=state)
 
     @property
     def has_poses(self) -> bool:
@@ -277,7 +274,7 @@ class Here(Place):
         candidates = self.monitor.poses_found or [spanning_tree_start(self.problem.graph)]
         poses = min(candidates, key=self.problem.objective)
         stage = ending(self.problem.objective(poses))
-        self.stages.append(stage)
+        self.table.add(stage)
         return self.without_bound(Attempt(poses, stage.status))
 
     def without_bound(self, attempt: Attempt) -> Attempt:

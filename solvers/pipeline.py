@@ -49,24 +49,11 @@ def solve(
 ) -> Solution:
     """Solve a pose graph, and certify how far the answer is from the global optimum.
 
-    A solve runs a list of stages. Each begins with the poses of the one before:
-
-    1. a start: the chordal relaxation, or a spanning tree for the coupling of the paper;
-    2. SOC, until Newton can take over;
-    3. Newton, down to rounding level;
-    4. the dual certificate at the result: a proven lower bound on the cost of all poses;
-    5. where the certificate is wider than asked for, an attempt from a start that grows, if
-       odometry joins the poses: prefixes of the graph, each solved from the one before;
-    6. where it is still wider, a second attempt from the first start on;
-    7. where it is still wider, the Riemannian staircase, whose optimum is the best bound that the
-       semidefinite relaxation has;
-    8. where that is not tight, in space, handedness terms: what tells rotations from reflections.
-
-    In one place, SOC with its default settings is left out where Newton alone is faster: in the
-    plane, where the start is averaged; on small graphs; for rotations alone; and for chi2 that is
-    not quadratic and convex, where SOC would run on its `convex_part`. For such a chi2 the second
-    attempt starts at the optimum of F, and smaller information matrices take the place of the
-    staircase. Robots leave SOC out in the plane, where every edge has a tau > 0.
+    A solve is an attempt: a start, SOC until Newton can take over, Newton, and the certificate,
+    which is a proven lower bound on the cost of all poses. Where the gap is wider than asked for,
+    further attempts and relaxations of the cost follow, which can only improve the answer.
+    `solvers.plan` lists all steps in their order, and says which of them suit which graph and cost;
+    `Pipeline` has their settings.
 
     Priors may be far from zero, as positions in UTM or ECEF coordinates are. The stages, and a
     callback, then see all poses from a point among them. The solution has the coordinates of the
@@ -127,10 +114,10 @@ def solve(
     References
     ----------
     Z. Ebrahimi and M. Deghat, "Distributed Pose Graph Optimization using the Splitting Method based
-    on the Alternating Direction Method of Multipliers" (stage 2; `solvers.soc.soc` says how it
+    on the Alternating Direction Method of Multipliers" (SOC; `solvers.soc.soc` says how it
     differs from their Algorithm 1). D. M. Rosen, L. Carlone, A. S. Bandeira and J. J. Leonard,
     "SE-Sync: A certifiably correct algorithm for synchronization over the special Euclidean group",
-    IJRR 2019 (stages 4 and 7).
+    IJRR 2019 (certificate and staircase).
 
     Examples
     --------

@@ -23,7 +23,7 @@ from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
 from solvers.network.ledger import Ledger
-from solvers.result import OUT_OF_TIME, Stage, Status
+from solvers.result import OUT_OF_TIME, Stage, StageTable, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import DualBound, Staircase
@@ -48,18 +48,67 @@ AnySOC = SOC | PaperSOC
 FirstStage = AnySOC | Automatic | None
 
 
+class OwnStart(enum.Enum):
+    """Starts that an attempt finds itself, where it is given no poses."""
+
+    CHORDAL = "chordal start"
+    AVERAGED = "averaged start"
+    TREE = "spanning tree"
+
+
 class Step(enum.Enum):
     """Steps of a solve after its first attempt, each of which may improve the answer."""
 
-    WHOLE = "a whole solve"
-    GROWING = "an attempt from a growing start"
-    LAST_STEPS = "the last steps of Newton's method"
-    SECOND = "a second attempt"
-    STAIRCASE = "the Riemannian staircase"
-    SMALLER_MATRICES = "smaller information matrices"
-    COMPLEX = "the relaxation with complex numbers"
+    AGAIN = "complete solve"
+    GROWING = "growing start"
+    LAST_STEPS = "last steps of Newton"
+    SECOND = "second attempt"
+    STAIRCASE = "staircase"
+    SMALLER_MATRICES = "smaller matrices"
+    COMPLEX = "complex numbers"
     TERMS = "handedness terms"
-    HULLS = "the relaxation with hulls of rotations"
+    HULLS = "hulls of rotations"
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What the page asks about a graph and its cost, whoever has the graph.
+
+    Parameters
+    ----------
+    d : int
+        Dimension of the space, 2 or 3.
+    num_poses : int
+        Number of poses and landmarks.
+    num_bodies : int
+        Number of poses that are no landmarks.
+    has_translations : bool
+        False of rotations alone.
+    is_quadratic : bool
+        Whether SOC and the semidefinite relaxation are of the cost itself, and not of its convex
+        part.
+    is_chi2 : bool
+        Whether smaller information matrices may give a better bound.
+    averages : bool
+        Whether rotations of the plane can be averaged for a start.
+    has_landmarks : bool
+        Whether the graph has landmarks.
+    has_robots : bool
+        Whether robots run the attempts.
+    has_driver : bool
+        Whether Newton and the certificate can be run.
+    """
+
+    d: int
+    num_poses: int
+    num_bodies: int
+    has_translations: bool
+    is_quadratic: bool
+    is_chi2: bool
+    averages: bool
+    has_landmarks: bool = False
+    has_robots: bool = False
+    has_driver: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +129,8 @@ class Attempt:
         Bound on the semidefinite relaxation that led to the poses, with its multipliers.
     failures : tuple of str
         A sentence on every step that failed, and left the answer as it was.
-    not_tried : tuple of Step
-        Steps that might have helped, and that the place cannot take.
+    hulls : HullState or None
+        Where the relaxation with hulls of rotations was last solved.
     """
 
     poses: Poses | None = None
@@ -90,7 +139,7 @@ class Attempt:
     certificate: Certificate | None = None
     dual_bound: DualBound | None = None
     failures: tuple[str, ...] = ()
-    not_tried: tuple[Step, ...] = ()
+    hulls: HullState | None = None
 
     @property
     def known_poses(self) -> Poses:
@@ -117,7 +166,12 @@ class Attempt:
     @property
     def is_open(self) -> bool:
         """Whether the certificate could still improve, and there is time for it."""
-        return self.proof.can_improve and not self.is_out_of_time
+        return is_open(self.proof, self.status)
+
+
+def is_open(certificate: Certificate, status: Status) -> bool:
+    """Whether an answer could still improve, and neither a time limit nor Ctrl-C has ended it."""
+    return certificate.can_improve and status not in OUT_OF_TIME
 
 
 def after_search(best: Attempt, certificate: Certificate, stage: Stage) -> Attempt:
@@ -132,30 +186,23 @@ class Place(ABC):
 
     Each verb takes an attempt and returns the next one; none changes an attempt. Where robots hold
     the poses, an attempt goes on from those that they hold now. The verbs of the first attempt are
-    abstract. A place that lacks the verb of a later step says so in `missing`, and does not write
-    it; then `way_out` says how to have the step taken.
+    abstract. A place may lack the verb of a later step, and then `lacks` says why.
 
     Parameters
     ----------
     monitor : RunMonitor
         Time limit, callback and progress of the solve.
-    stages : list of Stage
-        What was done so far, in order. Stages are appended, also those of attempts whose poses are
-        dropped.
+    table : StageTable
+        Where every stage is written down when it has ended.
     """
 
     monitor: RunMonitor
-    stages: list[Stage]
+    table: StageTable
 
     @property
     @abstractmethod
-    def d(self) -> int:
-        """Dimension of the space, 2 or 3."""
-
-    @property
-    @abstractmethod
-    def has_landmarks(self) -> bool:
-        """Whether the graph has landmarks."""
+    def traits(self) -> Traits:
+        """What the page asks about the graph and its cost."""
 
     @property
     def ledger(self) -> Ledger | None:
@@ -163,32 +210,38 @@ class Place(ABC):
         return None
 
     @property
-    def missing(self) -> frozenset[Step]:
-        """Steps that cannot be taken here, though they might help."""
-        return frozenset()
-
-    @property
     def way_out(self) -> str:
-        """How to have the missing steps taken."""
+        """How to have the steps taken that this place cannot take."""
         return ""
 
     def note(self, best: Attempt) -> str:
-        """Say which steps failed and, where the gap is too wide, which ones are missing."""
+        """Say which steps failed and, where the gap is too wide, which were skipped and why."""
         sentences = list(best.failures)
-        if best.not_tried and not best.proof.is_certified:
-            steps = ", ".join(step.value for step in best.not_tried)
-            sentences.append(f"not tried here: {steps}; {self.way_out}")
+        skipped: dict[str, list[str]] = {}
+        for stage in self.table.stages:
+            if not stage.was_taken:
+                skipped.setdefault(stage.reason, []).append(stage.name)
+        if skipped and not best.proof.is_certified:
+            parts = [f"{', '.join(names)} ({reason})" for reason, names in skipped.items()]
+            sentences.append(f"not tried: {', '.join(parts)}")
+            sentences += [self.way_out] if self.way_out else []
         return "; ".join(sentences)
 
     @abstractmethod
-    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
-        """Find a start, or take the given one; with it goes the SOC to run from there, if any.
+    def start(self, start: Poses | OwnStart, soc: AnySOC | None) -> Attempt:
+        """Take the given start, or find one; `soc` is the SOC that will run from there, if any."""
 
-        AUTO leaves SOC out where Newton alone is faster.
-        """
+    @property
+    def odometry_joins(self) -> bool:
+        """Whether every pose but the first has an edge to an earlier one."""
+        return False
+
+    def lacks(self, step: Step) -> str:
+        """Why no graph could have a step taken here, in a few words; "" where some could."""
+        return ""
 
     @abstractmethod
-    def run_soc(self, attempt: Attempt, soc: Any) -> Attempt:  # noqa: ANN401 - as `start` chose it
+    def run_soc(self, attempt: Attempt, soc: Any) -> Attempt:  # noqa: ANN401 - as the page chose it
         """Run SOC from the poses, which stay where SOC finds none that cost less."""
 
     @abstractmethod
@@ -223,19 +276,16 @@ class Place(ABC):
         """Return the cheaper poses with the best bound that either has: after any other step."""
         raise self._refusal(Step.SECOND.value)
 
-    def start_grown(self, growing: GrowingStart) -> Attempt | None:
-        """Start at poses that prefixes of the graph lead to; None where it has no prefixes."""
+    def start_grown(self, growing: GrowingStart) -> Attempt:
+        """Start at poses that prefixes of the graph lead to."""
         raise self._refusal(Step.GROWING.value)
 
     def start_again(self) -> Poses | None:
         """Return where a second attempt starts without SOC; None where it runs SOC once more."""
         raise self._refusal(Step.SECOND.value)
 
-    def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
-        """Solve the semidefinite relaxation from the best poses, and round its solution to poses.
-
-        None where the cost is not convex and quadratic, and so has no such relaxation.
-        """
+    def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
+        """Solve the semidefinite relaxation from the best poses, and round its solution."""
         raise self._refusal(Step.STAIRCASE.value)
 
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
@@ -258,16 +308,11 @@ class Place(ABC):
         """
         raise self._refusal(Step.TERMS.value)
 
-    def hulls(self, search: HandednessSearch) -> HullLagrangian | None:
-        """Return the method for the relaxation with hulls of rotations, if it suits the graph."""
-        raise self._refusal(Step.HULLS.value)
+    def solve_hulls(self, best: Attempt, method: HullLagrangian) -> Attempt:
+        """Solve the relaxation with hulls of rotations, from where it was last solved.
 
-    def solve_hulls(
-        self, best: Attempt, method: HullLagrangian, start: HullState | None
-    ) -> tuple[Attempt, HullState]:
-        """Solve that relaxation, from a state of it or the best poses.
-
-        Returned are the better poses and the better bound, and the state that it ends at.
+        The first time it begins at the best poses. Returned are the better poses and the better
+        bound, with the state that the method ends at.
         """
         raise self._refusal(Step.HULLS.value)
 

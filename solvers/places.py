@@ -15,7 +15,7 @@ from pgo_models.geometry.poses import Poses
 from solvers.here import Here
 from solvers.place import Attempt, Place
 from solvers.request import Pipeline, SolveRequest, solution_of
-from solvers.result import Stage
+from solvers.result import StageTable
 from solvers.solution import Solution
 
 if TYPE_CHECKING:  # what a solve in one place does not need
@@ -56,7 +56,7 @@ def open_place(request: SolveRequest, gnc: GNC | None = None) -> AbstractContext
 
 @contextmanager
 def _open_here(request: SolveRequest) -> Iterator[Place]:
-    yield Here(request.monitor, [], request.problem, request.pipeline.gap)
+    yield Here(request.monitor, StageTable(), request.problem, request.pipeline.gap)
 
 
 @contextmanager
@@ -83,11 +83,11 @@ def _open_robots(request: SolveRequest, gnc: GNC | None) -> Iterator[Place]:
     mark = run_fingerprint(problem, robots.partition, settings, request.start)
     engine = robots.engine if robots.engine is not None else InProcess()
     thresholds = None if gnc is None else gnc.thresholds(problem)
-    stages: list[Stage] = []
-    shown = request.monitor, stages
-    here = Here(*shown, problem, pipeline.gap, where=", in one place")
-    journal = Journal(robots.checkpoint, mark, stages)
+    monitor = request.monitor
+    table = StageTable()
+    here = Here(monitor, table, problem, pipeline.gap, where=", in one place")
+    journal = Journal(robots.checkpoint, mark, table)
     opened = open_driver(problem, robots.partition, engine, robots.driver_memory, thresholds)
     with closing(opened) as driver:
         kind = RobotsOfGraph if robots.has_driver else RobotsAlone
-        yield kind(*shown, driver, journal, robots.faults, here, robots.partition)
+        yield kind(monitor, table, driver, journal, robots.faults, here, robots.partition)

@@ -4,44 +4,50 @@ A place (`solvers.place`) is where a solve runs, and takes every step in its own
 process, by robots of one graph, or by robots that have files of their own. This page has the order
 of the steps, and what happens when one of them is interrupted, out of time, or fails.
 
-1. A start.
-2. SOC, the splitting of orthogonality constraints, until Newton can take over.
+1. A start: given poses, or else the chordal relaxation. In the plane its rotations are averaged
+   where no SOC is asked for. PaperSOC starts at a spanning tree.
+2. SOC, the splitting of orthogonality constraints, until Newton can take over. `soc_to_run` says
+   where it is left out.
 3. Newton, down to rounding level.
 4. The certificate of the poses. Steps 1 to 4 are an attempt.
-5. Another attempt, from a start that grows; and the end of Newton in the first one, which has few
-   steps where a start that grows may follow.
-6. A second attempt, by a finer SOC or from another start.
-7. The semidefinite relaxation: poses that its solution rounds to, and its bound. In the plane it is
-   the one with rotations as complex numbers, which is never worse. For chi2, bounds by smaller
-   information matrices, whose cost is below chi2.
+5. Another attempt, from a start that grows: prefixes of the graph, each solved from the one before.
+   On graphs with landmarks Newton of the first attempt has few steps, as this attempt may follow.
+   If this attempt does not close the gap, the first one takes the rest of its steps.
+6. A second attempt by a finer SOC. It starts at the optimum of F where the cost is a chi2 that SOC
+   cannot run on.
+7. A relaxation of the cost: poses that its solution rounds to, and its bound. In the plane it has
+   rotations as complex numbers, and is never worse than the semidefinite one, which the staircase
+   solves. For chi2, bounds by smaller information matrices, whose cost is below chi2.
 8. In space, handedness terms, which are never negative on rotations and tell them from reflections:
    the cost less these terms has a better bound. If need be they begin where the relaxation with
    convex hulls of rotations is solved.
 
-Steps 5 to 8 are taken while the answer is open: its certificate is wider than asked for and could
-improve, and neither the time limit nor Ctrl-C has ended the solve. A Newton that was cut short goes
-on in any case. They can only improve the answer. What fails in them, as linear algebra does
-(`pgo_models.errors.FAILURES`), leaves the answer before it, with a sentence.
+Steps 5 to 8 are taken while the answer is open, where the settings ask for them and nothing stands
+against them (`improved`). They can only improve the answer. What fails in them, as linear algebra
+does (`pgo_models.errors.FAILURES`), leaves the answer before it, with a sentence. A step that is
+asked for and cannot be taken has a line in the table of stages, which says why.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FAILURES, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
-from solvers.handedness.hull_lagrangian import HullState
+from solvers.handedness.hull_lagrangian import HullLagrangian
 from solvers.network.faults import RobotSilentError
-from solvers.place import Attempt, FirstStage, Place, Step
+from solvers.place import AUTO, AnySOC, Attempt, FirstStage, OwnStart, Place, Step, Traits
 from solvers.request import Pipeline
 from solvers.result import Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.soc.paper import PaperSOC
-from solvers.soc.soc import SOC
+from solvers.soc.soc import SOC, WARM_START
 
+# Poses in space up to which Newton alone is faster than SOC and Newton in one process.
+SMALL = 1000
 # Newton steps of a first attempt on graphs with landmarks. On all graphs tried, those that ended at
 # the global minimum took at most as many, and the others 17 to 100.
 LANDMARK_STEPS = 16
@@ -53,8 +59,9 @@ Improvement = Callable[[Place, Pipeline, Attempt], Attempt]
 
 def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     """Solve at a place, from a start or the place's own: all steps in their order."""
+    newton = _first_newton(place.traits, settings)
     try:
-        first = attempt(place, settings.soc, _first_newton(place, settings), start)  # steps 1 to 4
+        first = attempt(place, settings.soc, newton, start)  # steps 1 to 4
     except KeyboardInterrupt:
         if not place.has_poses:
             raise
@@ -63,48 +70,111 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
         return place.salvage(Stage.without_factor)
     except RobotSilentError as error:
         return replace(place.salvage(Stage.silence), failures=(str(error),))
+    if not place.traits.has_driver:
+        return first
     best = improved(Step.GROWING, from_growing_start, place, settings, first)  # step 5
     growth_has_ended_it = first.is_open and not best.is_open  # certified, or out of time
     if _was_cut_short(place, settings, first) and not growth_has_ended_it:
-        best = unless_it_fails(Step.LAST_STEPS, _LastSteps(first), place, settings, best)
+        go_on = partial(with_last_steps, first)
+        best = unless_it_fails(Step.LAST_STEPS, go_on, place, settings, best)
     best = improved(Step.SECOND, from_second_start, place, settings, best)  # step 6
-    best = improved(Step.COMPLEX, from_complex_numbers, place, settings, best)  # step 7
-    if best.proof.source is not BoundSource.COMPLEX:
-        best = improved(Step.STAIRCASE, from_relaxation, place, settings, best)
-    best = improved(Step.SMALLER_MATRICES, by_smaller_matrices, place, settings, best)
-    best = improved(Step.TERMS, _Terms(), place, settings, best)  # step 8
-    return improved(Step.HULLS, _Hulls(), place, settings, best)
+    best = by_relaxation(place, settings, best)  # step 7
+    return by_handedness(place, settings, best)  # step 8
 
 
-def attempt(place: Place, soc: FirstStage, newton: Newton, start: Poses | None) -> Attempt:
+def attempt(place: Place, asked: FirstStage, newton: Newton, start: Poses | None) -> Attempt:
     """Start, SOC where it is asked for or pays, Newton unless time is up, and the certificate."""
-    found, soc_to_run = place.start(start, soc)
-    if found.has_certificate:  # a checkpoint has the outcome
-        return found
-    if soc_to_run is not None and not found.is_out_of_time:
-        found = place.run_soc(found, soc_to_run)
-    return newton_and_certificate(place, newton, found)
+    place.table.begin_attempt()
+    soc = soc_to_run(asked, place.traits, start)
+    current = place.start(_start_of(asked, soc, place.traits, start), soc)
+    if current.has_certificate:  # a checkpoint has the outcome
+        return current
+    if soc is not None and not current.is_out_of_time:
+        current = place.run_soc(current, soc)
+    return newton_and_certificate(place, newton, current)
 
 
-def newton_and_certificate(place: Place, newton: Newton, found: Attempt) -> Attempt:
-    """Newton from the poses that were found, unless time is up, and the certificate."""
-    if not found.is_out_of_time:
-        found = place.run_newton(found, newton)
-    return place.certify(found)
+def soc_to_run(asked: FirstStage, traits: Traits, start: Poses | None) -> AnySOC | None:
+    """SOC of an attempt: the one that is asked for; AUTO stands for the fastest way.
+
+    That is SOC with a coarse tolerance, or none where Newton alone is faster: from the averaged
+    start, and in one process from the chordal start of a small graph or of rotations alone, and for
+    a cost that is not convex and quadratic. SOC then runs on the convex part, whose minimum is no
+    nearer to that of the cost than the start is.
+    """
+    if asked is not AUTO:
+        return asked
+    has_own_start = start is None
+    if has_own_start and traits.averages:
+        return None
+    is_small = traits.num_poses <= SMALL or not traits.has_translations
+    newton_alone = not traits.is_quadratic or (has_own_start and is_small)
+    return None if newton_alone and not traits.has_robots else WARM_START
+
+
+def _start_of(
+    asked: FirstStage, soc: AnySOC | None, traits: Traits, start: Poses | None
+) -> Poses | OwnStart:
+    """Start of an attempt: given poses, or else the one that suits what runs from it."""
+    if start is not None:
+        return start
+    if isinstance(soc, PaperSOC):
+        return OwnStart.TREE
+    is_averaged = asked is AUTO and soc is None and traits.averages
+    return OwnStart.AVERAGED if is_averaged else OwnStart.CHORDAL
+
+
+def newton_and_certificate(place: Place, newton: Newton, current: Attempt) -> Attempt:
+    """Newton from the current poses, unless time is up, and the certificate."""
+    if not current.is_out_of_time:
+        current = place.run_newton(current, newton)
+    return place.certify(current)
 
 
 def improved(
     step: Step, improve: Improvement, place: Place, settings: Pipeline, best: Attempt
 ) -> Attempt:
-    """Take a step if the answer is open and the settings ask for it; return the better answer.
+    """Take a step where the answer is open, the settings ask for it, and nothing is against it.
 
-    A step that the place cannot take is remembered, and named by the note of the solution.
+    What is against it has a line in the table of stages.
     """
-    if not (best.is_open and settings.asks_for(step, place.d)):
+    if not (best.is_open and settings.asks_for(step)):
         return best
-    if step in place.missing:
-        return replace(best, not_tried=(*best.not_tried, step))
+    reason = obstacle(step, place, settings, best)
+    if reason:
+        place.table.skip(step.value, reason, best.proof.objective)
+        return best
     return unless_it_fails(step, improve, place, settings, best)
+
+
+def obstacle(step: Step, place: Place, settings: Pipeline, best: Attempt) -> str:
+    """Why a step cannot be taken, in a few words; "" where it can.
+
+    An attempt that reached a limit would reach it again from another start. Few Newton steps are no
+    such limit: the first attempt has the rest of them after the growing start.
+    """
+    if step in (Step.GROWING, Step.SECOND) and not best.status.is_success:
+        has_few_steps = step is Step.GROWING and _was_cut_short(place, settings, best)
+        if not has_few_steps:
+            return f"the attempt before it ended with {best.status.name}"
+    return place.lacks(step) or _misfit(step, place, settings)
+
+
+def _misfit(step: Step, place: Place, settings: Pipeline) -> str:
+    """Why a step does not suit the graph or its cost, in a few words; "" where it does."""
+    traits = place.traits
+    if step is Step.GROWING and settings.growing is not None:
+        if traits.num_bodies <= settings.growing.first_size:
+            return f"no more than {settings.growing.first_size} poses"
+        return "" if place.odometry_joins else "odometry does not join the poses"
+    if step is Step.COMPLEX and not traits.has_translations:
+        return "rotations alone do not gain by it"
+    if step in (Step.STAIRCASE, Step.HULLS) and not traits.is_quadratic:
+        return "the cost is not convex and quadratic"
+    search = settings.handedness
+    if step is Step.HULLS and search is not None and traits.num_poses > search.most_hull_poses:
+        return f"more than {search.most_hull_poses} poses"
+    return ""
 
 
 def unless_it_fails(
@@ -117,50 +187,36 @@ def unless_it_fails(
     try:
         return improve(place, settings, best)
     except KeyboardInterrupt:
-        place.stages.append(Stage.interruption(best.proof.objective))
+        place.table.add(Stage.interruption(best.proof.objective))
         return replace(best, status=Status.INTERRUPTED)
     except FAILURES as error:
-        place.stages.append(Stage.failure(step.value, best.proof.objective))
+        place.table.add(Stage.failure(step.value, best.proof.objective))
         sentence = f"{step.value} failed ({error}); the answer before it stands"
         return replace(best, failures=(*best.failures, sentence))
 
 
 def from_growing_start(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Step 5: the better of the answer and an attempt from prefixes of the graph that grow.
-
-    It is made after an attempt that ended well, or whose Newton took the few steps it was given.
-    """
-    growing = settings.growing
-    ended_well = best.status.is_success or _was_cut_short(place, settings, best)
-    begun = place.start_grown(growing) if growing is not None and ended_well else None
-    if begun is None:
-        return best
-    if not begun.has_certificate:
-        begun = newton_and_certificate(place, settings.newton, begun)
-    return place.better(best, begun)
+    """Step 5: the better of the answer and an attempt from prefixes of the graph that grow."""
+    assert settings.growing is not None
+    place.table.begin_attempt()
+    grown = place.start_grown(settings.growing)
+    if not grown.has_certificate:
+        grown = newton_and_certificate(place, settings.newton, grown)
+    return place.better(best, grown)
 
 
-@dataclass(frozen=True, eq=False)
-class _LastSteps:
+def with_last_steps(first: Attempt, place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Newton of the first attempt to its end, so that no answer is worse for having cut it short.
 
     It goes on from the poses of the first attempt, whose place in the answer it takes.
     """
-
-    first: Attempt
-
-    def __call__(self, place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-        finished = newton_and_certificate(place, settings.newton, self.first)
-        return finished if best is self.first else place.better(best, finished)
+    place.table.begin_attempt()
+    finished = newton_and_certificate(place, settings.newton, first)
+    return finished if best is first else place.better(best, finished)
 
 
 def from_second_start(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Step 6: the better of the answer and an attempt by a finer SOC, or from another start.
-
-    An attempt that did not end well has reached a limit, and a second one would reach it, too.
-    """
-    if not best.status.is_success:
-        return best
+    """Step 6: the better of the answer and an attempt by a finer SOC, or from another start."""
     start = place.start_again()
     soc = finer(settings.soc) if start is None else None
     return place.better(best, attempt(place, soc, settings.newton, start))
@@ -173,83 +229,101 @@ def finer(soc: FirstStage) -> SOC | PaperSOC:
     return replace(known, tolerance=tolerance, max_iterations=SOC.max_iterations)
 
 
-def from_relaxation(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Step 7: the better of the answer and what the solution of the relaxation rounds to.
+def by_relaxation(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """Step 7: the relaxation that suits the cost and, for chi2, smaller information matrices."""
+    traits = place.traits
+    if traits.d == 2:
+        best = improved(Step.COMPLEX, from_complex_numbers, place, settings, best)
+    if best.proof.source is not BoundSource.COMPLEX:
+        best = improved(Step.STAIRCASE, from_staircase, place, settings, best)
+    if traits.is_chi2:
+        best = improved(Step.SMALLER_MATRICES, by_smaller_matrices, place, settings, best)
+    return best
+
+
+def from_complex_numbers(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """The better of the answer and what the relaxation in complex numbers rounds to."""
+    assert settings.handedness is not None
+    return place.solve_in_complex_numbers(best, settings.handedness.plane)
+
+
+def from_staircase(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """The better of the answer and an attempt from what the semidefinite relaxation rounds to.
 
     The bound is the best of three: that of the answer, of the rounded poses, of the relaxation.
     """
     assert settings.staircase is not None
+    place.table.begin_attempt()
     rounded = place.climb(best, replace(settings.staircase, gap=settings.gap))
-    if rounded is None:
-        return best
     return place.better(best, newton_and_certificate(place, settings.newton, rounded))
 
 
 def by_smaller_matrices(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Step 7 for chi2: the answer with the best bound that smaller information matrices give."""
+    """The answer with the best bound that smaller information matrices give."""
     return place.bound_by_smaller_matrices(best)
 
 
-def from_complex_numbers(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Step 7 in the plane: the better of the answer and what the relaxation rounds to."""
-    search = settings.handedness
-    return best if search is None else place.solve_in_complex_numbers(best, search.plane)
+def by_handedness(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """Step 8: handedness terms at the poses, and then from the relaxation with hulls.
 
-
-@dataclass(frozen=True, eq=False)
-class _Terms:
-    """Step 8: the answer with the best bound that handedness terms at its poses give.
-
-    The search begins with the terms of the multipliers Pi, (pairs, 4, 4), or with none.
+    That relaxation is solved in passes. Each goes on from where the one before has ended, to a
+    smaller tolerance, and ends with handedness terms from there. The last pass is the one that does
+    not come within its tolerance, or fails.
     """
-
-    Pi: Array | None = None
-
-    def __call__(self, place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-        search = settings.handedness
-        return best if search is None else place.bound_by_terms(best, search, self.Pi)
-
-
-@dataclass(frozen=True, eq=False)
-class _Hulls:
-    """Step 8, continued: terms that begin where the relaxation with hulls of rotations is solved.
-
-    It is solved in passes. Each goes on from the `state` of the one before, with the tolerance of
-    the settings times a smaller factor. A pass that fails leaves the answer of the one before.
-    """
-
-    passes_left: int = HULL_PASSES
-    state: HullState | None = None
-    tolerance_factor: float = 1.0
-
-    def __call__(self, place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-        method = None if settings.handedness is None else place.hulls(settings.handedness)
-        if method is None:
-            return best
-        method = replace(method, tolerance=self.tolerance_factor * method.tolerance)
+    if place.traits.d == 2:
+        return best
+    best = improved(Step.TERMS, by_terms, place, settings, best)
+    for _ in range(HULL_PASSES):
         before = best
-        best, state = place.solve_hulls(best, method, self.state)
-        is_close = state.closeness <= method.tolerance
-        has_moved = best.poses is not before.poses
-        if not best.is_open or not (is_close or has_moved):
+        best = improved(Step.HULLS, from_hulls, place, settings, before)
+        state = best.hulls
+        if state is None or state is before.hulls:  # the pass was not taken, or failed
             return best
-        best = unless_it_fails(Step.TERMS, _Terms(state.Pi), place, settings, best)
-        if not best.is_open or not is_close or self.passes_left == 1:
+        is_close = state.closeness <= _hulls(settings).tolerance
+        if is_close or best.poses is not before.poses:
+            best = improved(Step.TERMS, by_terms, place, settings, best)
+        if not is_close:
             return best
-        closer = _Hulls(self.passes_left - 1, state, CLOSER * self.tolerance_factor)
-        return unless_it_fails(Step.HULLS, closer, place, settings, best)
+        settings = _with_closer_hulls(settings)
+    return best
 
 
-def _first_newton(place: Place, settings: Pipeline) -> Newton:
+def by_terms(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """The answer with the best bound of terms, which begin where the hulls were solved, if ever."""
+    assert settings.handedness is not None
+    Pi = None if best.hulls is None else best.hulls.Pi
+    return place.bound_by_terms(best, settings.handedness, Pi)
+
+
+def from_hulls(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """One pass over the relaxation with hulls: the better of the answer and what it rounds to."""
+    return place.solve_hulls(best, replace(_hulls(settings), gap=settings.gap))
+
+
+def _hulls(settings: Pipeline) -> HullLagrangian:
+    """Method for the relaxation with hulls, where the settings ask for it."""
+    assert settings.handedness is not None
+    assert settings.handedness.hulls is not None
+    return settings.handedness.hulls
+
+
+def _with_closer_hulls(settings: Pipeline) -> Pipeline:
+    """The settings of the next pass over the relaxation with hulls."""
+    assert settings.handedness is not None
+    hulls = _hulls(settings)
+    closer = replace(hulls, tolerance=CLOSER * hulls.tolerance)
+    return replace(settings, handedness=replace(settings.handedness, hulls=closer))
+
+
+def _first_newton(traits: Traits, settings: Pipeline) -> Newton:
     """Newton of the first attempt, with few steps where a growing start may follow soon."""
     newton = settings.newton
-    may_grow = settings.growing is not None and Step.GROWING not in place.missing
-    if not (place.has_landmarks and may_grow):
+    if not traits.has_landmarks or settings.growing is None:
         return newton
     return replace(newton, max_iterations=min(newton.max_iterations, LANDMARK_STEPS))
 
 
 def _was_cut_short(place: Place, settings: Pipeline, first: Attempt) -> bool:
     """Whether Newton of the first attempt was given few steps, and took them all."""
-    has_more = _first_newton(place, settings) != settings.newton
+    has_more = _first_newton(place.traits, settings) != settings.newton
     return has_more and first.status is Status.MAX_ITERATIONS

@@ -32,35 +32,29 @@ if TYPE_CHECKING:  # what a solve in one place does not need
 
 @dataclass(frozen=True)
 class Pipeline:
-    """Settings of a whole solve: which stages it has, and the settings of each.
-
-    The first stage is SOC, from which Newton takes over. Where the certificate is wider than the
-    relative `gap`, another attempt starts from prefixes of the graph that grow, and a second one
-    runs SOC to a fine tolerance and Newton again. The solve keeps the better poses and the better
-    bound. Where it is still wider, the staircase solves the semidefinite relaxation from the best
-    poses, and Newton starts from what it rounds to. In space, handedness terms follow. In the plane
-    the relaxation with rotations as complex numbers takes the place of the staircase.
+    """Settings of a solve: which of the steps that `solvers.plan` lists it takes, and how.
 
     Parameters
     ----------
     soc : SOC, PaperSOC, ExtendedSOC, Automatic or None
-        The first stage, whose tolerance says when Newton takes over. None goes from the start
-        straight to Newton. With Automatic.AUTO, the default, the place chooses: a SOC with a coarse
-        tolerance, or none where Newton alone is faster.
+        SOC of step 2, whose tolerance says when Newton takes over. None goes from the start
+        straight to Newton. With Automatic.AUTO, the default, it is a SOC with a coarse tolerance,
+        or none where Newton alone is faster.
     newton : Newton
-        The second stage, which goes down to rounding level.
+        Newton of step 3, which goes down to rounding level.
     gap : float
-        Relative gap to certify, (objective - lower_bound) / objective; positive.
+        Relative gap to certify, (objective - lower_bound) / objective; positive. Steps 5 to 8
+        follow where the certificate of step 4 is wider.
     growing : GrowingStart or None
-        The start of another attempt where the certificate of the first is wider than `gap`; None
-        leaves it out. It is found in one place, also for robots that share a graph.
+        The growing start of step 5, which is found in one place, also for robots that share a
+        graph. None leaves the step out.
     second_try : bool
-        Whether a second attempt is made where the certificate is still wider.
+        Whether step 6 is taken, the second attempt.
     staircase : Staircase or None
-        The next stage, where the certificate is still wider; None leaves it out.
+        The staircase of step 7; None leaves the step out.
     handedness : HandednessSearch or None
-        What tells rotations from reflections, where the relaxation is not tight: the last stage in
-        space, and in the plane the relaxation in place of the staircase. None leaves it out.
+        What tells rotations from reflections: step 8 and, in the plane, the relaxation of step 7.
+        None leaves both out.
 
     Raises
     ------
@@ -119,36 +113,32 @@ class Pipeline:
             handedness=None,
         )
 
-    def asks_for(self, step: Step, d: int) -> bool:
-        """Whether a step after the first attempt is to be taken, where the answer is open.
-
-        Handedness terms are for graphs in space. In the plane the relaxation with rotations as
-        complex numbers, which knows all that such terms could, takes the place of the staircase.
+    def asks_for(self, step: Step) -> bool:
+        """Whether there are settings for a step that may improve the answer.
 
         Parameters
         ----------
         step : Step
-            One of the steps that may improve the answer.
-        d : int
-            Dimension of the space, 2 or 3.
+            A step of `solvers.plan` after the first attempt.
 
         Returns
         -------
         bool
-            Whether there are settings for it.
+            False for what `solve` is to leave out. A staircase of None also leaves out what takes
+            its place: complex numbers, and smaller matrices.
         """
-        tells_reflections = self.handedness is not None
-        seeks_terms = tells_reflections and d == 3
+        search = self.handedness
+        has_relaxation = self.staircase is not None
         return {
-            Step.WHOLE: True,
+            Step.AGAIN: True,
             Step.GROWING: self.growing is not None,
             Step.LAST_STEPS: True,
             Step.SECOND: self.second_try,
-            Step.STAIRCASE: self.staircase is not None,
-            Step.SMALLER_MATRICES: self.staircase is not None,
-            Step.COMPLEX: tells_reflections and self.staircase is not None and d == 2,
-            Step.TERMS: seeks_terms,
-            Step.HULLS: seeks_terms,
+            Step.STAIRCASE: has_relaxation,
+            Step.SMALLER_MATRICES: has_relaxation,
+            Step.COMPLEX: has_relaxation and search is not None,
+            Step.TERMS: search is not None,
+            Step.HULLS: search is not None and search.hulls is not None,
         }[step]
 
     @property
@@ -255,7 +245,7 @@ def solution_of(request: SolveRequest, place: Place, best: Attempt) -> Solution:
         objective=certificate.objective,
         certificate=certificate,
         status=best.status,
-        stages=tuple(place.stages),
+        stages=place.table.stages,
         seconds=time.perf_counter() - request.monitor.began,
         ledger=place.ledger,
         robots=None if request.robots is None else request.robots.partition,

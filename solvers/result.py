@@ -1,7 +1,7 @@
-"""What happened in a run: Status, one Record per iterate, History, Outcome and Run."""
+"""What happened: Status, Record, History, Outcome and Run of a method, and stages of a solve."""
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -32,6 +32,7 @@ class Status(enum.Enum):
     FAILED = "a numerical failure ended this step; the answer before it stands"
     SILENT = "a robot that is needed stays silent, see the note; bring it back"
     NOT_FACTORED = "a matrix has no Cholesky factor in doubles; its weights are too far apart"
+    SKIPPED = "this step was not taken, for the reason beside it"
 
     @property
     def is_success(self) -> bool:
@@ -243,6 +244,10 @@ class Stage(Summarised):
     finds_poses : bool
         False for a search for a better bound, which leaves the poses as they are: how it ended says
         nothing of them.
+    attempt : int
+        Number of the attempt that it belongs to, from 1 on; 0 of a step that is part of none.
+    reason : str
+        Why it was skipped; empty where it was taken.
     """
 
     name: str
@@ -253,6 +258,18 @@ class Stage(Summarised):
     history: History
     method: object = None
     finds_poses: bool = True
+    attempt: int = 0
+    reason: str = ""
+
+    @property
+    def was_taken(self) -> bool:
+        """False of a line that says why a step was skipped."""
+        return self.status is not Status.SKIPPED
+
+    @property
+    def ending(self) -> str:
+        """Its status as tables show it, with the reason of a step that was skipped."""
+        return self.status.name if self.was_taken else f"skipped: {self.reason}"
 
     @classmethod
     def of(cls, run: Run[S]) -> "Stage":
@@ -302,6 +319,29 @@ class Stage(Summarised):
         return cls(name, Status.FAILED, 0, objective, 0.0, History(), finds_poses=False)
 
     @classmethod
+    def skipped(cls, name: str, reason: str, objective: float) -> "Stage":
+        """Return a stage that says that a step was wanted and not taken.
+
+        Parameters
+        ----------
+        name : str
+            Name of the step.
+        reason : str
+            Why it was not taken, in a few words.
+        objective : float
+            Cost of the poses that stand.
+
+        Returns
+        -------
+        Stage
+            With `Status.SKIPPED`.
+        """
+        history = History()
+        return cls(
+            name, Status.SKIPPED, 0, objective, 0.0, history, finds_poses=False, reason=reason
+        )
+
+    @classmethod
     def interruption(cls, objective: float) -> "Stage":
         """Return a stage that says that the solve was broken off.
 
@@ -332,3 +372,29 @@ class Stage(Summarised):
             With `Status.SILENT`.
         """
         return cls("wait for a robot", Status.SILENT, 0, objective, 0.0, History())
+
+
+class StageTable:
+    """The stages of a solve, which are written down as they end.
+
+    It also has stages of attempts whose poses were dropped, and the number of the current attempt.
+    """
+
+    def __init__(self) -> None:
+        self.stages: tuple[Stage, ...] = ()
+        self.attempt = 0
+
+    def begin_attempt(self) -> None:
+        """Number the stages that follow as those of another attempt."""
+        self.attempt += 1
+
+    def add(self, stage: Stage) -> None:
+        """Write down a stage that has ended; a search for a bound is part of no attempt."""
+        number = self.attempt if stage.finds_poses else 0
+        self.stages = (*self.stages, replace(stage, attempt=number))
+
+    def skip(self, name: str, reason: str, objective: float) -> None:
+        """Write down that a step was wanted and not taken, once."""
+        line = Stage.skipped(name, reason, objective)
+        if line not in self.stages:  # a checkpoint may have it
+            self.add(line)

@@ -357,22 +357,31 @@ class Solution:
     def __str__(self) -> str:
         rows = [f"{label:<12} {text}" for label, text in self._summary()]
         rows.append("")
-        for name, iterations, cost, seconds, ending in self._stage_lines():
-            rows.append(f"{name:<14} {iterations:>10} {cost:>16} {seconds:>9}  {ending}")
+        lines = self._stage_lines()
+        width = max(14, *(len(line[-5]) for line in lines))
+        for *number, name, iterations, cost, seconds, ending in lines:
+            attempt = "".join(f"{text:<8}" for text in number)
+            figures = f" {iterations:>10} {cost:>16} {seconds:>9}" if iterations else ""
+            rows.append(f"{attempt}{name:<{width}}{figures}  {ending}")
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
         heads, *rows = self._stage_lines()
         return facts_table(self._summary()) + rows_table(heads, rows)
 
-    def _stage_lines(self) -> list[tuple[str, str, str, str, str]]:
-        """Heads and rows of the table of stages."""
-        lines = [("stage", "iterations", self.certificate.cost, "seconds", "ended")]
+    def _stage_lines(self) -> list[list[str]]:
+        """Heads and rows of the table of stages, whose attempts are numbered if there are more."""
+        lines = [["stage", "iterations", self.certificate.cost, "seconds", "ended"]]
         for stage in self.stages:
-            cost = rounded_up(stage.objective)
-            seconds = f"{stage.seconds:.3f}"
-            lines.append((stage.name, str(stage.iterations), cost, seconds, stage.status.name))
-        return lines
+            figures = ["", "", ""]
+            if stage.was_taken:
+                cost = rounded_up(stage.objective)
+                figures = [str(stage.iterations), cost, f"{stage.seconds:.3f}"]
+            lines.append([stage.name, *figures, stage.ending])
+        if max((stage.attempt for stage in self.stages), default=0) <= 1:
+            return lines
+        numbers = [str(stage.attempt) if stage.attempt else "" for stage in self.stages]
+        return [[number, *line] for number, line in zip(["attempt", *numbers], lines, strict=True)]
 
     def _summary(self) -> Facts:
         """What is printed above the stages."""

@@ -34,7 +34,7 @@ SHORT_SEARCH = HandednessSearch(
 )
 # Settings with which a step follows the first attempt at once, and the verb that it begins with.
 PIPELINES = {
-    Step.GROWING: replace(FIRST_ALONE, growing=solvers.GrowingStart()),
+    Step.GROWING: replace(FIRST_ALONE, growing=solvers.GrowingStart(first_size=5)),
     Step.SECOND: replace(FIRST_ALONE, second_try=True),
     Step.STAIRCASE: replace(FIRST_ALONE, staircase=solvers.Staircase()),
     Step.SMALLER_MATRICES: replace(FIRST_ALONE, staircase=solvers.Staircase(max_iterations=1)),
@@ -45,10 +45,12 @@ PIPELINES = {
 
 
 def loose_problem(step: Step | None = None) -> PGOProblem:
-    """F of a graph whose certificate stays open through all steps, and is in the plane if need be.
+    """A problem whose certificate stays open through all steps, and that suits a step.
 
-    Complex numbers are for graphs there.
+    Complex numbers are for graphs in the plane, smaller matrices for chi2.
     """
+    if step is Step.SMALLER_MATRICES:
+        return loose_problem_of_chi2()
     graph = varied_graph(1, 10, 3, LOUD)
     if step is Step.COMPLEX:
         graph = planar_lattice(4, 4, 0.5)
@@ -245,5 +247,48 @@ def test_an_update_stands_where_the_whole_solve_after_it_fails(
     pipeline = replace(PIPELINES[Step.STAIRCASE], handedness=None)
     grown = solvers.extend(solution, problem.graph, pipeline=pipeline)
     assert len(calls) == 2
-    assert "a whole solve failed" in grown.note
+    assert "complete solve failed" in grown.note
     assert grown.lower_bound > 0.0
+
+
+def test_attempts_are_numbered_and_a_step_that_does_not_suit_the_graph_has_a_line() -> None:
+    """The graph has fewer poses than the first prefix of a start that grows."""
+    pipeline = replace(FIRST_ALONE, growing=solvers.GrowingStart(), second_try=True)
+    solution = solvers.solve(loose_problem(), pipeline)
+    attempts = [(stage.attempt, stage.name) for stage in solution.stages if stage.name != "SOC"]
+    assert attempts == [
+        (1, "chordal start"),
+        (1, "Newton"),
+        (0, "growing start"),
+        (2, "chordal start"),
+        (2, "Newton"),
+    ]
+    skipped = solution.stages[2]
+    assert skipped.status is Status.SKIPPED
+    assert skipped.reason == "no more than 60 poses"
+    assert solution.note == "not tried: growing start (no more than 60 poses)"
+    text = str(solution)
+    assert "growing start   skipped: no more than 60 poses" in text
+    assert "attempt stage" in text
+    assert solution.as_json()["stages"][2]["reason"] == "no more than 60 poses"
+
+
+def test_a_first_attempt_at_its_limit_is_why_no_other_is_made() -> None:
+    few_steps = replace(PIPELINES[Step.SECOND], newton=solvers.Newton(max_iterations=1))
+    solution = solvers.solve(loose_problem(), few_steps)
+    assert solution.stages[-1].ending == "skipped: the attempt before it ended with MAX_ITERATIONS"
+
+
+def test_the_table_of_a_certified_solve_has_neither_numbers_nor_skipped_steps() -> None:
+    solution = solvers.solve(pgo.load("grid"))
+    assert all(stage.was_taken and stage.attempt == 1 for stage in solution.stages)
+    assert "\nstage  " in str(solution)
+
+
+def test_chi2_that_has_no_relaxation_says_so() -> None:
+    solution = solvers.solve(
+        loose_problem_of_chi2(), replace(FIRST_ALONE, staircase=solvers.Staircase())
+    )
+    skipped = [(stage.name, stage.reason) for stage in solution.stages if not stage.was_taken]
+    assert skipped == [("staircase", "the cost is not convex and quadratic")]
+    assert solution.stages[-1].name == "smaller matrices"

@@ -37,7 +37,7 @@ from solvers.distributed.substructured import SubstructuredState
 from solvers.loop import Method, RunMonitor
 from solvers.network.ledger import Ledger, Traffic
 from solvers.network.serialization import deserialize, serialize
-from solvers.result import History, Measurement, Outcome, Record, Stage, Status
+from solvers.result import History, Measurement, Outcome, Record, Stage, StageTable, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.robots import Checkpoint
@@ -141,14 +141,14 @@ class Journal:
     """
 
     def __init__(
-        self, checkpoint: Checkpoint | None, mark: Mapping[str, str], stages: list[Stage]
+        self, checkpoint: Checkpoint | None, mark: Mapping[str, str], table: StageTable
     ) -> None:
         """Read the checkpoint, if there is one.
 
         A FileFormatError when the file is no checkpoint, or is damaged; a SettingError when it is
         that of another graph, partition or settings; a PGOError where none can be written.
         """
-        self.stages = stages
+        self.table = table
         self._checkpoint = checkpoint
         self._mark = mark
         self._finished: list[JudgedPoses] = []  # outcomes of attempts
@@ -161,7 +161,7 @@ class Journal:
         path = Path(checkpoint.path)
         if path.exists():
             self._saved, self._snapshots = _read(path, mark)
-            stages[:] = self._saved.stages
+            table.stages = self._saved.stages
         check_writable(path)
 
     def take_outcome(self) -> JudgedPoses | None:
@@ -258,7 +258,7 @@ class Journal:
         snapshots = driver.snapshots()
         saved = Saved(
             attempts=tuple(self._finished),
-            stages=tuple(self.stages),
+            stages=self.table.stages,
             method=name,
             state=state,
             records=tuple(records),

@@ -1,8 +1,7 @@
-"""What a driver and its robots do of a solve, whether the calling process has the graph or not.
+"""Steps of a solve by a driver and its robots, whether the calling process has the graph or not.
 
-Between two of them the robots hold the poses, and an
-attempt has none until its certificate is found. `robots_of_graph` and `robots_with_files` are the
-places that have these verbs.
+Between two steps the robots hold the poses, and an attempt has none until its certificate is found.
+`robots_of_graph` and `robots_with_files` are the places that have these verbs.
 """
 
 from __future__ import annotations
@@ -22,13 +21,12 @@ from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.distributed.substructured import SubstructuredSOC
 from solvers.network.faults import Faults
 from solvers.network.ledger import Ledger
-from solvers.place import AUTO, AnySOC, Attempt, FirstStage, Place
+from solvers.place import AnySOC, Attempt, OwnStart, Place
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.staircase import Staircase
 from solvers.soc.paper import PaperSOC
 from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, WARM_START
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +72,15 @@ class DriverPlace(PlaceOfRobots):
     `faults` go wrong between the robots of a CONSENSUS stage, which then does not wait.
     """
 
-    @property
-    def d(self) -> int:
-        """Dimension of the space, 2 or 3."""
-        return self.driver.d
-
-    def chordal_start(self, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
-        """Have the robots relax the rotations; with the start goes the SOC to run from there.
-
-        AUTO is in the plane the averaged start and no SOC, as in one place: from there Newton's
-        method needs fewer rounds than both. In space it is SOC with a coarse tolerance.
-        """
-        is_averaged = soc is AUTO and self.driver.can_average
-        name = "averaged start" if is_averaged else "chordal start"
+    def own_start(self, start: OwnStart) -> Attempt:
+        """Have the robots relax the rotations, and average them where the start says so."""
+        is_averaged = start is OwnStart.AVERAGED
 
         def go() -> None:
             self.driver.go_to_chordal_start(is_averaged)
 
-        return self.begin(name, go), None if is_averaged else chosen_soc(soc)
+        name = OwnStart.AVERAGED if is_averaged else OwnStart.CHORDAL
+        return self.begin(name.value, go)
 
     def begin(self, name: str, go_to_start: Callable[[], None]) -> Attempt:
         """Bring the robots to a start."""
@@ -105,7 +94,7 @@ class DriverPlace(PlaceOfRobots):
             objective = self._final_objective()
             driver.choose_cost(final=False)
         seconds = time.perf_counter() - began
-        self.stages.append(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
+        self.table.add(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
         return Attempt()
 
     def run_soc(self, attempt: Attempt, soc: AnySOC) -> Attempt:
@@ -134,7 +123,7 @@ class DriverPlace(PlaceOfRobots):
             finished.history,
             soc,
         )
-        self.stages.append(stage)
+        self.table.add(stage)
         if self.faults is None:
             return replace(attempt, status=finished.status)
         rounds = driver.network.ledger.rounds
@@ -183,7 +172,7 @@ class DriverPlace(PlaceOfRobots):
             finished.history,
             newton,
         )
-        self.stages.append(stage)
+        self.table.add(stage)
         return replace(attempt, status=finished.status, decrement=finished.state.decrement)
 
     def climb_from_current(self, staircase: Staircase) -> Attempt:
@@ -206,18 +195,10 @@ class DriverPlace(PlaceOfRobots):
             finished.history,
             staircase,
         )
-        self.stages.append(stage)
+        self.table.add(stage)
         return Attempt(status=finished.status, dual_bound=finished.state.bound)
 
     def _final_objective(self) -> float:
         """The cost that is solved, at the current poses; the driver stays with that cost."""
         self.driver.choose_cost(final=True)
         return self.driver.current.objective
-
-
-def chosen_soc(soc: FirstStage) -> AnySOC | None:
-    """SOC of robots that is asked for; AUTO stands for one with a coarse tolerance."""
-    if soc is AUTO:
-        return WARM_START
-    assert soc is None or isinstance(soc, SOC | PaperSOC)  # as the places have checked
-    return soc

@@ -36,7 +36,7 @@ from solvers.distributed.driver_place import PlaceOfRobots
 from solvers.here import Here
 from solvers.network.counted_pool import Count
 from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
-from solvers.place import Attempt, Ending, FirstStage, Step
+from solvers.place import AnySOC, Attempt, Ending, OwnStart, Traits
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.soc.consensus import ConsensusState, ask_all
@@ -78,25 +78,15 @@ class RobotsAlone(PlaceOfRobots):
     robots: Partition
 
     @property
-    def d(self) -> int:
-        """Dimension of the space, 2 or 3."""
-        return self.here.d
-
-    @property
-    def has_landmarks(self) -> bool:
-        """Whether the graph has landmarks."""
-        return self.here.has_landmarks
-
-    @property
-    def missing(self) -> frozenset[Step]:
-        """All steps after SOC: they need a certificate, and with it a driver."""
-        return frozenset(Step)
+    def traits(self) -> Traits:
+        """Those of the graph, and that there is no driver."""
+        return replace(self.here.traits, has_robots=True, has_driver=False)
 
     def note(self, best: Attempt) -> str:
         """What a solution lacks for want of a driver."""
         return note_without_driver(self.here.problem)
 
-    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, SOC | None]:
+    def start(self, start: Poses | OwnStart, soc: AnySOC | None) -> Attempt:
         """Start at given poses, or by CONSENSUS with relaxed rotations from a spanning tree."""
         assert isinstance(soc, SOC)  # as `Pipeline` has checked
         self.driver.network.tree = robot_tree(self.here.problem, self.robots)
@@ -104,18 +94,18 @@ class RobotsAlone(PlaceOfRobots):
         name = "given start"
         iterations = 0
         history = History()
-        if given is not None:
-            self.driver.hand_out(given)
-            begun = Attempt(given)
+        if not isinstance(start, OwnStart):
+            self.driver.hand_out(start)
+            begun = Attempt(start)
         else:
             name, begun, iterations, history = self._start_by_rounds(soc)
         poses = begun.known_poses
         if not self.journal.goes_on_with():
             objective = self.here.problem.objective(poses)
             seconds = time.perf_counter() - began
-            self.stages.append(Stage(name, begun.status, iterations, objective, seconds, history))
+            self.table.add(Stage(name, begun.status, iterations, objective, seconds, history))
         self.monitor.poses_found.append(poses)
-        return begun, soc
+        return begun
 
     def _start_by_rounds(self, soc: SOC) -> tuple[str, Attempt, int, History]:
         """Start at a spanning tree, and run the chordal relaxation from there.
@@ -164,7 +154,7 @@ class RobotsAlone(PlaceOfRobots):
         poses, status = cheaper_end(problem, attempt.known_poses, end, outcome, soc.tolerance)
         objective = problem.objective(poses)
         seconds = time.perf_counter() - began
-        self.stages.append(
+        self.table.add(
             Stage("SOC", status, outcome.iterations, objective, seconds, outcome.history, soc)
         )
         self.monitor.poses_found.append(poses)
@@ -181,7 +171,7 @@ class RobotsAlone(PlaceOfRobots):
     @property
     def has_poses(self) -> bool:
         """Whether the robots have begun."""
-        return bool(self.stages)
+        return bool(self.table.stages)
 
     def salvage(self, ending: Ending) -> Attempt:
         """The best poses known, with the bound F >= 0."""

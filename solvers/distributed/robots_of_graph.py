@@ -17,7 +17,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
-from solvers.distributed.driver_place import AttemptWithFaults, DriverPlace, chosen_soc
+from solvers.distributed.driver_place import AttemptWithFaults, DriverPlace
 from solvers.distributed.elimination_choice import bytes_of_edges, choose_elimination
 from solvers.distributed.handedness import (
     RobotsPoint,
@@ -32,19 +32,18 @@ from solvers.distributed.robots_alone import tree_traffic
 from solvers.distributed.robust import SharedGNC, inliers_of
 from solvers.handedness.ascent import AscentState
 from solvers.handedness.complex_relaxation import ComplexRelaxation
-from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
+from solvers.handedness.hull_lagrangian import HullLagrangian
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.here import Here
 from solvers.network.counted_pool import Count
 from solvers.network.engine import DEFAULT_MEMORY, Engine
-from solvers.place import AnySOC, Attempt, Ending, FirstStage, after_search
+from solvers.place import AnySOC, Attempt, Ending, OwnStart, Traits, after_search
 from solvers.result import Outcome, Stage
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
 from solvers.robust.gnc import GNC, Inliers
 from solvers.robust.known import KnownEdges
 from solvers.robust.weighted_edges import first_poses
-from solvers.soc.paper import PaperSOC
 from solvers.soc.subgraph import middle_separator, split_graph
 
 
@@ -83,32 +82,38 @@ class RobotsOfGraph(DriverPlace):
     robots: Partition
 
     @property
-    def has_landmarks(self) -> bool:
-        """Whether the graph has landmarks."""
-        return self.here.has_landmarks
+    def traits(self) -> Traits:
+        """Those of the graph; its rotations are averaged where all robots can."""
+        # The rotation of a loose world depends on positions alone.
+        averages = self.driver.can_average and not self.here.problem.graph.is_world_loose
+        return replace(self.here.traits, averages=averages, has_robots=True)
 
-    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
-        """Start at given poses, the chordal relaxation, or the outcome that a checkpoint has.
+    @property
+    def odometry_joins(self) -> bool:
+        """Whether every pose but the first has an edge to an earlier one."""
+        return self.here.odometry_joins
 
-        PaperSOC starts at a spanning tree, as in one place.
+    def start(self, start: Poses | OwnStart, soc: AnySOC | None) -> Attempt:
+        """Start at given poses, at an own start, or at the outcome that a checkpoint has.
+
+        The spanning tree is found in one place, and so is the start of a graph with a loose world.
         """
         known = self._known_outcome()
         if known is not None:
-            return known, None
+            return known
         problem = self.here.problem
-        if given is not None:
-            poses = problem.seen_poses(given)
-            return self.begin("given start", partial(self.driver.set_poses, poses)), chosen_soc(soc)
+        if not isinstance(start, OwnStart):
+            return self._start_at("given start", problem.seen_poses(start))
         if problem.graph.is_world_loose:
-            # The rotation of the world depends on positions alone.
-            poses = chordal_start(problem.convex_part)
-            set_poses = partial(self.driver.set_poses, poses)
-            return self.begin("chordal start, in one place", set_poses), chosen_soc(soc)
-        if isinstance(soc, PaperSOC):
+            return self._start_at("chordal start, in one place", chordal_start(problem.convex_part))
+        if start is OwnStart.TREE:
             poses = spanning_tree_start(problem.convex_part.graph)
-            set_poses = partial(self.driver.set_poses, poses)
-            return self.begin("spanning tree, in one place", set_poses), soc
-        return self.chordal_start(soc)
+            return self._start_at("spanning tree, in one place", poses)
+        return self.own_start(start)
+
+    def _start_at(self, name: str, poses: Poses) -> Attempt:
+        """Bring the robots to poses that this process has."""
+        return self.begin(name, partial(self.driver.set_poses, poses))
 
     def _known_outcome(self) -> Attempt | None:
         """Outcome of the attempt that begins, if a checkpoint is of a later one."""
@@ -155,7 +160,7 @@ class RobotsOfGraph(DriverPlace):
         """Return the cheaper poses with the best bound that either has."""
         return self.here.better(best, other)
 
-    def start_grown(self, growing: GrowingStart) -> Attempt | None:
+    def start_grown(self, growing: GrowingStart) -> Attempt:
         """Start the robots at poses that prefixes lead to, which are solved in one place."""
         known = self._known_outcome()
         if known is not None:
@@ -163,8 +168,6 @@ class RobotsOfGraph(DriverPlace):
         if self.journal.goes_on_with():
             return Attempt()
         grown = self.here.start_grown(growing)
-        if grown is None:
-            return None
         self.driver.choose_cost(final=True)
         self.driver.set_poses(grown.known_poses)
         return Attempt(status=grown.status)
@@ -173,11 +176,8 @@ class RobotsOfGraph(DriverPlace):
         """The optimum of F, found in one place, where the cost is another; else None."""
         return self.here.start_again()
 
-    def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
+    def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Have the robots climb the staircase from the best poses, and round its solution."""
-        problem = self.here.problem
-        if problem.convex_part is not problem:
-            return None
         self.driver.set_poses(best.known_poses)
         return self.climb_from_current(staircase)
 
@@ -207,7 +207,7 @@ class RobotsOfGraph(DriverPlace):
         first = RobotsPoint.first(driver, search.ascent.num_eigenvalues)
         outcome: Outcome[AscentState[RobotsPoint]] = self.monitor.run(search.ascent, first)
         stage = stage_of_search(outcome)
-        self.stages.append(stage)
+        self.table.add(stage)
         bound = best_bound_with_terms(driver, here.gap, return_to_best(driver))
         certificate = best.proof
         if bound.value > certificate.bound.value:
@@ -222,20 +222,14 @@ class RobotsOfGraph(DriverPlace):
             )
         return after_search(best, certificate, stage)
 
-    def hulls(self, search: HandednessSearch) -> HullLagrangian | None:
-        """Return the method for the relaxation with hulls, if it suits the graph."""
-        return self.here.hulls(search)
-
-    def solve_hulls(
-        self, best: Attempt, method: HullLagrangian, start: HullState | None
-    ) -> tuple[Attempt, HullState]:
+    def solve_hulls(self, best: Attempt, method: HullLagrangian) -> Attempt:
         """Solve the relaxation with hulls in one place."""
-        return self.here.solve_hulls(best, method, start)
+        return self.here.solve_hulls(best, method)
 
     @property
     def has_poses(self) -> bool:
         """Whether the robots have begun."""
-        return bool(self.stages)
+        return bool(self.table.stages)
 
     def salvage(self, ending: Ending) -> Attempt:
         """The best poses known, those of the robots among them, with the bound F >= 0."""

@@ -35,7 +35,15 @@ from solvers.distributed.robots.own_file import (
     return_to_answer,
 )
 from solvers.network.counted_pool import Count
-from solvers.place import BROKEN_OFF, AnySOC, Attempt, Ending, FirstStage, Step
+from solvers.place import (
+    BROKEN_OFF,
+    AnySOC,
+    Attempt,
+    Ending,
+    OwnStart,
+    Step,
+    Traits,
+)
 from solvers.result import Status
 from solvers.riemannian.staircase import Staircase
 
@@ -73,31 +81,40 @@ class RobotsWithFiles(DriverPlace):
     is_on_the_way: bool = False
 
     @property
-    def has_landmarks(self) -> bool:
-        """Files with landmarks are refused when they are read."""
-        return False
+    def traits(self) -> Traits:
+        """What the driver knows of them; files with landmarks are refused when they are read."""
+        driver = self.driver
+        return Traits(
+            d=driver.d,
+            num_poses=driver.num_poses,
+            num_bodies=driver.num_poses,
+            has_translations=driver.has_translations,
+            is_quadratic=not driver.has_two_costs,
+            is_chi2=driver.has_two_costs,
+            averages=driver.can_average,
+            has_robots=True,
+        )
 
-    @property
-    def missing(self) -> frozenset[Step]:
-        """Steps for which one process needs the whole graph."""
-        steps = {Step.GROWING, Step.COMPLEX, Step.HULLS, Step.TERMS}
-        if self.driver.has_two_costs:
-            steps.add(Step.SMALLER_MATRICES)
-        return frozenset(steps)
+    def lacks(self, step: Step) -> str:
+        """Why a step cannot be taken: most need one process with the graph of all robots."""
+        if step is Step.SECOND and self.begins_at is not None:
+            return "there is no other start"
+        return "" if step in (Step.SECOND, Step.STAIRCASE) else "no process has the graph"
 
     @property
     def way_out(self) -> str:
         """How to have the missing steps taken."""
         return READ_HERE
 
-    def start(self, given: Poses | None, soc: FirstStage) -> tuple[Attempt, AnySOC | None]:
-        """Start at the chordal relaxation, or at poses that the robots have found.
+    def start(self, start: Poses | OwnStart, soc: AnySOC | None) -> Attempt:
+        """Start at poses that the robots know of, or else at the own start of robots.
 
         Nobody could give the poses of all robots.
         """
+        assert isinstance(start, OwnStart)
         if self.begins_at is None:
-            return self.chordal_start(soc)
-        return self.begin(self.begins_at, partial(go_to_poses_found, self.driver)), None
+            return self.own_start(start)
+        return self.begin(self.begins_at, partial(go_to_poses_found, self.driver))
 
     def certify(self, attempt: Attempt) -> Attempt:
         """Find a bound, and have the robots keep the current poses if these are the cheapest."""
@@ -126,7 +143,7 @@ class RobotsWithFiles(DriverPlace):
     def certificate_of_kept(self, bound: LowerBound, source: BoundSource) -> Certificate:
         """Certificate of the poses that the robots keep."""
         kept = self.kept[-1]
-        no_poses = Poses(np.zeros((0, self.d, self.d)), np.zeros((0, self.d)))
+        no_poses = Poses.identity(0, self.driver.d)
         judgement = judge_cost(self.name, kept.objective, kept.rounding, bound, self.gap)
         return Certificate(
             objective=judgement.objective,
@@ -157,19 +174,13 @@ class RobotsWithFiles(DriverPlace):
         """A second attempt runs SOC once more."""
         return None
 
-    def climb(self, best: Attempt, staircase: Staircase) -> Attempt | None:
-        """Have the robots climb from the poses that they keep, where SOC can run on the cost."""
+    def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
+        """Have the robots climb from the poses that they keep."""
         driver = self.driver
-        if driver.has_two_costs:
-            return None
         kept = self.kept[-1]
         driver.network.ask(return_to_answer, [None] * len(kept.robots), Count.PIGGYBACKED)
         driver.current = kept.cover
         return self.climb_from_current(staircase)
-
-    def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
-        """Return the same answer: the cost is F, for which smaller matrices change nothing."""
-        return best
 
     @property
     def has_poses(self) -> bool:
@@ -181,7 +192,7 @@ class RobotsWithFiles(DriverPlace):
         if not self.kept:
             raise PGOError(f"{self.name}: weights too far apart for doubles; see pgo info FILE")
         stage = ending(self.kept[-1].objective)
-        self.stages.append(stage)
+        self.table.add(stage)
         certificate = self.certificate_of_kept(NO_BOUND, BoundSource.GIVEN)
         return Attempt(status=stage.status, certificate=certificate)
 

@@ -1,6 +1,6 @@
 """The search for handedness terms: an ascent at given poses, and the relaxation with hulls."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 from pgo_models.certificates.dual_variables import multipliers
@@ -68,16 +68,6 @@ class HandednessSearch:
         first = HandedPoint.first(matrix, P, self.ascent.num_eigenvalues)
         ascent: Outcome[AscentState[HandedPoint]] = monitor.run(self.ascent, first)
         return HandednessTerms.at(poses, i, j, ascent.state.point.P), stage_of_search(ascent)
-
-    def relaxation(self, problem: PGOProblem, gap: float) -> HullLagrangian | None:
-        """The method for the relaxation with hulls; None where it does not suit the problem.
-
-        It is for costs that are convex and quadratic, of graphs that are not too large.
-        """
-        is_small_enough = problem.num_poses <= self.most_hull_poses
-        if self.hulls is None or problem.convex_part is not problem or not is_small_enough:
-            return None
-        return replace(self.hulls, gap=gap)
 
 
 def stage_of_search(outcome: Outcome[S]) -> Stage:

@@ -36,10 +36,12 @@ def certificate_json(certificate: Certificate) -> dict[str, object]:
 
 
 def stage_json(stage: Stage) -> dict[str, object]:
-    """What `.json` files hold of a stage."""
+    """What `.json` files hold of a stage: its attempt is 0 of one that is part of none."""
     return {
         "name": stage.name,
+        "attempt": stage.attempt,
         "status": stage.status.name,
+        "reason": stage.reason,
         "iterations": stage.iterations,
         "objective": stage.objective,
         "seconds": stage.seconds,

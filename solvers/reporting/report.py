@@ -373,14 +373,14 @@ def _stages(solution: Solved, names: Sequence[str]) -> _Table:
     """Table of the stages and how they ended."""
     rows = []
     for name, stage in zip(names, solution.stages, strict=True):
-        row = [
-            _Cell(name),
-            _number(stage.iterations, "d"),
-            _Cell(rounded_up(stage.objective), stage.objective),
-            _number(stage.seconds, ".3f"),
-            _Cell(stage.status.name),
-        ]
-        rows.append(row)
+        figures = [_Cell("")] * 3
+        if stage.was_taken:
+            figures = [
+                _number(stage.iterations, "d"),
+                _Cell(rounded_up(stage.objective), stage.objective),
+                _number(stage.seconds, ".3f"),
+            ]
+        rows.append([_Cell(name), *figures, _Cell(stage.ending)])
     heads = ["stage", "iterations", solution.certificate.cost, "seconds", "ended"]
     return _Table("stages", [], heads, rows)
 
@@ -405,13 +405,13 @@ def _settings(solution: Solved, names: Sequence[str]) -> list[tuple[str, list[tu
 
 
 def _stage_names(solution: Solved) -> list[str]:
-    """Names of the stages, of which repeated ones are numbered."""
+    """Names of the stages, with the number of a later attempt; repeated names are numbered."""
     count: Counter[str] = Counter()
     names = []
     for stage in solution.stages:
-        count[stage.name] += 1
-        is_repeated = count[stage.name] > 1
-        names.append(f"{stage.name} ({count[stage.name]})" if is_repeated else stage.name)
+        name = f"{stage.name}, attempt {stage.attempt}" if stage.attempt > 1 else stage.name
+        count[name] += 1
+        names.append(f"{name} ({count[name]})" if count[name] > 1 else name)
     return names
 
 

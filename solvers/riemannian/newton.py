@@ -19,8 +19,6 @@ from solvers.riemannian.polish import (
     start_run,
 )
 
-SMALL = 1000  # poses in space up to which Newton alone is faster
-
 
 @dataclass(frozen=True, eq=False)
 class NewtonState(Summarised):
@@ -141,12 +139,3 @@ def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
     False
     """
     return Newton(max_iterations=max_iterations, second_order=False, secants=False)
-
-
-def needs_no_soc(problem: PGOProblem) -> bool:
-    """Whether Newton alone is faster from the chordal start.
-
-    It is in the plane, where its matrix is no larger than SOC's, on small graphs, and for rotations
-    alone, whose chordal start is near their optimum.
-    """
-    return problem.d == 2 or problem.num_poses <= SMALL or not problem.has_translations

@@ -218,17 +218,6 @@ class GrowingStart:
             not_negative=["max_iterations"],
         )
 
-    def has_prefixes(self, graph: PoseGraph) -> bool:
-        """Return whether a graph has shorter prefixes to begin with, joined by odometry.
-
-        Returns
-        -------
-        bool
-            True where it has more poses than the first prefix, each but the first with an edge to
-            an earlier one.
-        """
-        return len(graph.bodies) > self.first_size and entry_tree(graph) is not None
-
     def init(self, problem: PGOProblem, start: Poses | None) -> PrefixState:
         """State 0: `start`, or odometry."""
         tree = entry_tree(problem.graph)

@@ -273,7 +273,7 @@ class PlacesOfEdges:
         if plan.settings is None:
             start = first_poses(doubted.problem.graph, doubted.known) if start is None else start
             solution = self.solution_nearby(kept, start)
-            stage = replace(solution.stages[-1], name=plan.name)
+            stage = replace(solution.stages[-1], name=plan.name, attempt=0)
             return Estimate.of(doubted, kept, 1.0, solution, stage, began)
         gnc = replace(plan.settings, known=doubted.known[kept])
         with self._opened(self._request_of(kept), gnc) as place:

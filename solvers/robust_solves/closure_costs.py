@@ -26,6 +26,7 @@ from solvers.here import Here
 from solvers.loop import RunMonitor, iterate
 from solvers.plan import solve_at
 from solvers.request import Pipeline
+from solvers.result import StageTable
 from solvers.riemannian.staircase import Staircase
 from solvers.robust.chains import is_whole
 from solvers.robust_solves.chain_sums import ChainSums
@@ -181,7 +182,7 @@ def _bound_above(problem: PGOProblem, s: float) -> float:
     bound = 0.0
     gap = _WIDE_GAP
     for _ in range(2):
-        place = Here(RunMonitor(progress=False), [], problem, gap)
+        place = Here(RunMonitor(progress=False), StageTable(), problem, gap)
         try:
             found = solve_at(place, replace(_FOR_BOUNDS, gap=gap), None)
         except FAILURES:

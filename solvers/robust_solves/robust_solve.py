@@ -17,6 +17,7 @@ from pgo_models.geometry.rotations import BoolArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.network.ledger import Ledger
+from solvers.place import is_open
 from solvers.places import with_partition
 from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
@@ -480,7 +481,7 @@ class _RobustSolve:
         without a given start, and the solution of lower cost is returned.
         """
         of_attempt = estimate.solution
-        if of_attempt.status in OUT_OF_TIME or not of_attempt.certificate.can_improve:
+        if not is_open(of_attempt.certificate, of_attempt.status):
             return of_attempt
         solution = self.places.solution(estimate.kept, estimate.poses)
         has_changed = not np.array_equal(estimate.kept, estimate.found)

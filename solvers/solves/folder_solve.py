@@ -40,7 +40,7 @@ from solvers.network.ray_engine import RayEngine
 from solvers.place import AUTO, Attempt, FirstStage
 from solvers.plan import solve_at
 from solvers.request import Pipeline
-from solvers.result import Record, Stage, Status
+from solvers.result import Record, Stage, StageTable, Status
 from solvers.robots import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
@@ -272,15 +272,15 @@ class FilesOfRobots:
         self, pipeline: Pipeline, monitor: RunMonitor, out: Path | None = None
     ) -> FolderSolution:
         """The solution, which robots write to the folder `out`, if it is given."""
-        stages: list[Stage] = []
+        table = StageTable()
         opened = open_files(
             self.files, self.engine, self.memory, self.weighting, self.trust_folder, self.robust
         )
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
-        journal = Journal(None, {}, stages)
+        journal = Journal(None, {}, table)
         with closing(opened.driver):
             place = RobotsWithFiles(
-                monitor, stages, opened.driver, journal, None, name, pipeline.gap, opened.weighting
+                monitor, table, opened.driver, journal, None, name, pipeline.gap, opened.weighting
             )
             first = pipeline
             if isinstance(
@@ -303,7 +303,7 @@ class FilesOfRobots:
             certificate=best.proof,
             sizes=opened.sizes,
             status=best.status,
-            stages=tuple(stages),
+            stages=table.stages,
             ledger=driver.network.ledger,
             frame=frame,
             F=F,
@@ -370,7 +370,7 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
 def _after_pass(answer: _Answer, job: Pass, pipeline: Pipeline) -> _Answer:
     """The answer after a pass, with the edges before where that finds nothing better."""
     revision = revised(answer.opened, job, answer.place.monitor)
-    answer.place.stages.append(revision.stage)
+    answer.place.table.add(revision.stage)
     place = replace(answer.place, driver=revision.opened.driver)
     start = "poses of GNC" if revision.is_better else answer.found
     answer = replace(answer, opened=revision.opened, place=place)

@@ -270,7 +270,8 @@ def _gtsam(problem: PGOProblem, budget: _Budget, start: Poses | None) -> Benchma
 
 def _records_of(solution: Solution) -> StageRecords:
     """Records of the stages of a solution; seconds and rounds of its start are in the first."""
-    start, *iterative = solution.stages
+    start, *others = solution.stages
+    iterative = [stage for stage in others if len(stage.history)]
     num_robots = 1 if solution.robots is None else solution.robots.num_robots
     seconds_before = start.seconds
     rounds_before = 0.0
