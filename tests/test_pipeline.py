@@ -100,7 +100,8 @@ def test_a_bad_start_is_rescued_by_the_relaxation(d):
     problem, wound = wound_ring(20, d)
     solution = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False), wound)
     relaxation = ["ComplexRelaxation"] if d == 2 else ["Staircase", "Newton"]
-    assert [stage.name for stage in solution.stages] == ["given start", "Newton", *relaxation]
+    taken = [stage.name for stage in solution.stages if stage.was_taken]
+    assert taken == ["given start", "Newton", *relaxation]
     assert solution.is_certified
     assert solution.certificate.source is BoundSource.GIVEN
     assert solution.objective < 0.1 * solution.stages[1].objective
@@ -130,7 +131,10 @@ def test_where_the_relaxation_is_not_tight_its_bound_is_reported(seed):
 def test_a_staircase_that_is_cut_short_gives_a_valid_bound():
     problem, wound = wound_ring(20, 3)
     cut = solvers.Pipeline(
-        soc=None, second_try=False, staircase=solvers.Staircase(max_iterations=8)
+        soc=None,
+        growing=None,
+        second_try=False,
+        staircase=solvers.Staircase(max_iterations=8),
     )
     solution = solvers.solve(problem, cut, wound)
     assert solution.stages[2].status is solvers.Status.MAX_ITERATIONS
