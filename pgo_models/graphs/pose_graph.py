@@ -470,7 +470,17 @@ class PoseGraph(ReadOnly):
                 t_ij = self.t_ij.copy()
                 t_ij[is_prior] -= origin
                 self._set("t_ij", read_only(t_ij))
+                self._move_world_of_poses(self.world, origin)
         self._set("origin", read_only(origin))
+
+    def _move_world_of_poses(self, world: int, origin: Array) -> None:
+        """Let the world pose of estimate and truth, where they have one, stand at the origin."""
+        for name in ("initial", "truth"):
+            poses: Poses | None = getattr(self, name)
+            if poses is not None and poses.num_poses == self.num_poses:
+                t = poses.t.copy()
+                t[world] += poses.R[world] @ origin
+                self._set(name, poses.with_translations(t))
 
     def _settle_landmarks(self) -> None:
         """Set kappa and information of the edges to landmarks, see the docstring of the class."""

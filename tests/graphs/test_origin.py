@@ -91,3 +91,18 @@ def test_poses_without_the_world_pose_are_in_the_frame_of_the_file():
     np.testing.assert_array_equal(graph.in_frame_of_priors(near).t, graph.initial.t)
     problem = pgo.PGOProblem(graph)
     assert problem.objective(near) == pytest.approx(problem.objective(graph.initial), rel=1e-9)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_poses_with_the_world_pose_of_the_priors_as_given_are_the_same_poses(d: int):
+    near, _ = with_gps(1, 6, d, np.zeros(3))
+    t_ij = near.t_ij + np.where(near.is_prior[:, None], UTM[:d], 0.0)
+    poses = near.completed(near.truth)
+    t = poses.t.copy()
+    t[near.in_files] += UTM[:d]
+    given = poses.with_translations(t)
+    far = replace(near, t_ij=t_ij, truth=given, initial=given, origin=None)
+    assert far.origin.any()
+    expected = pgo.PGOProblem(near).objective(poses)
+    for kept in (far.truth, far.initial):
+        assert pgo.PGOProblem(far).objective(kept) == pytest.approx(expected, rel=1e-6)
