@@ -287,7 +287,12 @@ def test_readings_of_ends_and_lengths(
     graph = read(tmp_path, [*CHAIN, CLOSURE, prior], reading=reading)
     assert list(zip(graph.i.tolist(), graph.j.tolist(), strict=True)) == [*ends, (3, 0)]
     scaled = written.t_ij * np.array([*lengths, 1])[:, None]
-    np.testing.assert_allclose(graph.t_ij, scaled, rtol=1e-15, atol=0)
+    np.testing.assert_allclose(
+        (graph.t_ij + np.where(graph.is_prior[:, None], graph.origin, 0.0)),
+        scaled,
+        rtol=1e-15,
+        atol=0,
+    )
     np.testing.assert_array_equal(graph.information, written.information)
 
 
