@@ -4,7 +4,7 @@
     python notebooks/build.py 02 05    # these two
 
 The command needs the extras `notebooks` and `plot`, and reduces the size of the outputs. Edit the
-.py file, never the .ipynb file; tests/test_notebooks.py checks that the two agree.
+.py file, never the .ipynb file; tests/thorough/test_notebooks.py checks that the two agree.
 """
 
 import base64

@@ -1,13 +1,15 @@
-"""How many examples hypothesis draws: all of them under HYPOTHESIS_PROFILE=all, seven tenths under
-`thorough`, which CI has time for, and a quarter else.
+"""How many examples hypothesis draws, and whether they are the same in every run.
+
+They are, unless HYPOTHESIS_PROFILE=drawn: then there are more of them, drawn anew from the seed
+that `--hypothesis-seed` names.
 """
 
 import os
 
-PROFILE = os.environ.get("HYPOTHESIS_PROFILE", "light")
-EXAMPLES = {"light": 25, "thorough": 70, "all": 100}[PROFILE]
+PROFILE = os.environ.get("HYPOTHESIS_PROFILE", "fixed")
+EXAMPLES = {"fixed": 25, "drawn": 70}[PROFILE]
 
 
 def examples(at_most: int) -> int:
-    """Examples of a test that draws fewer, or more, than others."""
+    """Examples of a test that draws fewer, or more, than others: `at_most` of a hundred."""
     return max(3, at_most * EXAMPLES // 100)

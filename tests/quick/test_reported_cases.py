@@ -1,0 +1,221 @@
+"""Small files that once got a wrong verdict (`tests/cases`), as people met them: by the command."""
+
+import json
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.graphs.g2o_readings import Reading
+from pgo_models.graphs.pose_graph import PoseGraph
+
+pytest.importorskip("flint")
+CASES = Path(__file__).parents[1] / "cases"
+ROOT = Path(__file__).parents[2]
+Call = Callable[..., tuple[int, str, str]]
+
+
+def solved(pgo_command: Call, name: str, *options: object) -> dict[str, object]:
+    """What `pgo solve --json` prints; the exit code has to be 0."""
+    code, out, err = pgo_command("solve", CASES / f"{name}.g2o", "--json", *options)
+    assert code == 0, err
+    record: dict[str, object] = json.loads(out)
+    return record
+
+
+@pytest.mark.parametrize("options", [(), ("--robots", 2)])
+@pytest.mark.parametrize(("name", "gap"), [("utm_2d", 1e-11), ("utm_3d", 1e-10)])
+def test_gps_in_utm_coordinates_keeps_the_proof(
+    name: str, gap: float, options: tuple[object, ...], pgo_command: Call, tmp_path: Path
+) -> None:
+    proof = tmp_path / "proof.json"
+    record = solved(pgo_command, name, *options, "--proof", proof, "--out", tmp_path / "out.g2o")
+    assert record["verdict"] == "CERTIFIED"
+    assert 0.0 <= record["proven_gap"] < gap
+    assert pgo_command("verify", CASES / f"{name}.g2o", proof)[0] == 0
+    judged = pgo_command("certify", CASES / f"{name}.g2o", "--estimate", tmp_path / "out.g2o")
+    assert judged[0] == 0, judged[1]
+    assert "CERTIFIED" in judged[1]
+
+
+def test_a_square_written_in_nine_digits_is_exact_to_them(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    proof = tmp_path / "proof.json"
+    record = solved(pgo_command, "square_9_digits", "--proof", proof)
+    assert record["verdict"] == "EXACT"
+    assert 0.0 < record["exact_to"] < 1e-9
+    assert pgo_command("verify", CASES / "square_9_digits.g2o", proof)[0] == 0
+
+
+def test_a_pose_far_away_excuses_no_other(pgo_command: Call) -> None:
+    code, out, _ = pgo_command("certify", CASES / "exact_far.g2o")
+    assert code == 3
+    assert "EXACT" not in out
+    assert "gap          1 " in out
+
+
+def test_a_search_that_breaks_down_leaves_an_answer(pgo_command: Call, tmp_path: Path) -> None:
+    written = tmp_path / "out.g2o"
+    code, out, err = pgo_command("solve", CASES / "crash_y83.g2o", "--robots", 2, "--out", written)
+    assert code in (0, 2, 3), err
+    assert written.exists()
+    assert "chi2" in out
+
+
+@pytest.mark.filterwarnings("ignore:.*ODOMETRY matrices are taken as covariances")
+def test_the_bound_of_covariances_is_below_the_least_cost_of_the_file(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    proof = tmp_path / "proof.json"
+    options = ("--cost", "isotropic", "--json", "--proof", proof)
+    code, out, _ = pgo_command("solve", CASES / "cov_1e12.g2o", *options)
+    assert code in (0, 3)
+    assert 4e8 < json.loads(out)["lower_bound"] <= 422245656.8
+    assert pgo_command("verify", CASES / "cov_1e12.g2o", proof)[0] == 0
+
+
+def test_no_claim_is_taken_that_is_above_what_is_proven(pgo_command: Call) -> None:
+    code, out, _ = pgo_command("verify", ROOT / "data/grid.g2o", CASES / "claim_level.json")
+    assert code == 3
+    assert "FAILED at the claims: what is proven is less than 1000000.0" in " ".join(out.split())
+
+
+def test_a_true_proof_that_needs_512_bits_verifies(pgo_command: Call) -> None:
+    assert pgo_command("verify", CASES / "verify_f5.g2o", CASES / "verify_f5.json")[0] == 0
+
+
+@pytest.mark.parametrize("name", ["verify_f53", "condF_1e12"])
+@pytest.mark.parametrize("cost", ["chi2", "isotropic"])
+def test_what_solve_proves_verifies(
+    name: str, cost: str, pgo_command: Call, tmp_path: Path
+) -> None:
+    proof = tmp_path / "proof.json"
+    record = solved(pgo_command, name, "--cost", cost, "--proof", proof)
+    assert record["verdict"] == "CERTIFIED"
+    assert pgo_command("verify", CASES / f"{name}.g2o", proof)[0] == 0
+
+
+def said(pgo_command: Call, *arguments: object) -> tuple[int, str, str]:
+    """What `pgo_command` returns, with the warnings behind its standard error."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        code, out, err = pgo_command(*arguments)
+    return code, out, err + "".join(str(warning.message) for warning in caught)
+
+
+def read(pgo_command: Call, name: str, written: Path, *options: object) -> tuple[PoseGraph, str]:
+    """The graph that `pgo info --out` writes, as g2o has it, and what is said on stderr."""
+    case = CASES / f"{name}.g2o"
+    code, _, err = said(pgo_command, "info", case, *options, "--out", written)
+    assert code == 0, err
+    with warnings.catch_warnings(action="error"):  # nothing is left to be assumed
+        return read_g2o(written), err
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "chi2", "num_edges"),
+    [
+        ("full_3x3", "", 1 / 3, 3),
+        ("comments", "", 0.0, 2),
+        ("tutorial_tags", "", 0.0, 1),
+        ("switchable", "1 switchable edges are read as edges that hold always", 1 / 3, 3),
+        ("hdl_priors", "EDGE_SE3_PRIORQUAT has w first", 0.2607370929, 6),
+        ("kernel_and_data", "1 ROBOTLASER1 lines are skipped", 30.6181682, 51),
+        ("toro_order", "EDGE_SE2 matrices are read in TORO's order", 25 / 3, 3),
+    ],
+)
+def test_files_in_other_forms_are_read_and_written_plainly(
+    name: str, words: str, chi2: float, num_edges: int, pgo_command: Call, tmp_path: Path
+) -> None:
+    written = tmp_path / "plain.g2o"
+    graph, err = read(pgo_command, name, written)
+    assert words in err
+    assert bool(words) == bool(err)
+    assert graph.num_edges == num_edges
+    for path in (CASES / f"{name}.g2o", written):
+        code, out, err = said(pgo_command, "solve", path, "--json")
+        assert code == 0, err
+        assert json.loads(out)["objective"] == pytest.approx(chi2, rel=1e-6, abs=1e-20)
+
+
+@pytest.mark.parametrize("name", ["toro_order", "comments", "kernel_and_data"])
+def test_proofs_of_files_in_other_forms_verify(
+    name: str, pgo_command: Call, tmp_path: Path
+) -> None:
+    proof = tmp_path / "proof.json"
+    assert said(pgo_command, "solve", CASES / f"{name}.g2o", "--proof", proof)[0] == 0
+    code, out, _ = pgo_command("verify", CASES / f"{name}.g2o", proof)
+    assert (code, "VERIFIED" in out) == (0, True)
+
+
+def test_edges_without_matrices_ask_for_a_choice_of_weights(pgo_command: Call) -> None:
+    code, out, err = pgo_command("solve", CASES / "no_information.g2o")
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1
+    assert "no_information.g2o:1: no information matrix on 3 EDGE_SE3:QUAT lines" in err
+    assert "--cost unit" in err
+    assert solved(pgo_command, "no_information", "--cost", "unit")["verdict"] == "CERTIFIED"
+
+
+def test_a_decimal_comma_is_refused_with_the_reason(pgo_command: Call) -> None:
+    code, _, err = pgo_command("solve", CASES / "decimal_comma.g2o")
+    assert code == 1
+    assert "decimal_comma.g2o:1: '1,5' is no number; write it with a decimal point" in err
+
+
+def test_a_missing_vertex_is_placed_and_the_frame_stays(pgo_command: Call, tmp_path: Path) -> None:
+    written = tmp_path / "out.g2o"
+    case = CASES / "missing_vertex.g2o"
+    code, out, err = said(pgo_command, "solve", case, "--out", written)
+    assert code == 0
+    assert "1 of 3 poses have no VERTEX line (the first is 2); they are placed along edges" in err
+    assert "aligned with the estimate" in out
+    np.testing.assert_allclose(read_g2o(written).initial.t[0], [50, 60], rtol=0, atol=0.5)
+
+
+def test_a_pose_without_edges_is_left_out_when_asked(pgo_command: Call) -> None:
+    case = CASES / "isolated_vertex.g2o"
+    code, _, err = pgo_command("solve", case)
+    assert code == 1
+    assert "pose 7 has no edges; leave out what is not connected with --largest-component" in err
+    code, out, err = said(pgo_command, "solve", case, "--largest-component")
+    assert code == 0
+    assert "without 1 poses (with 7) and 0 edges" in err
+    assert "3 poses, 3 edges" in out
+
+
+@pytest.mark.parametrize("command", ["solve", "doctor"])
+@pytest.mark.parametrize(
+    ("name", "reading", "question"),
+    [
+        ("closures_reversed", "closures-reversed", "5 closures reversed"),
+        ("degrees", "degrees", "were they written in degrees?"),
+        ("covariances_for_information", "covariances", "are they covariances?"),
+    ],
+)
+def test_the_reading_that_is_meant_is_named_and_can_be_written(
+    name: str, reading: str, question: str, command: str, pgo_command: Call, tmp_path: Path
+) -> None:
+    code, out, _ = pgo_command(command, CASES / f"{name}.g2o")
+    assert code == 0
+    assert question in " ".join(out.split())
+    assert f"--reading {reading} --out" in " ".join(out.replace("\\", "").split())
+    corrected = tmp_path / "corrected.g2o"
+    read(pgo_command, name, corrected, "--reading", reading)
+    code, out, _ = pgo_command("doctor", corrected)
+    assert (code, "no other reading fits better" in " ".join(out.split())) == (0, True)
+
+
+def test_a_cost_far_below_what_is_expected_is_reported(pgo_command: Call, tmp_path: Path) -> None:
+    graph = read_g2o(CASES / "closures_reversed.g2o", reading=Reading.CLOSURES_REVERSED)
+    write_g2o(replace(graph, information=3.0 * graph.information), tmp_path / "loose.g2o")
+    code, out, _ = pgo_command("solve", tmp_path / "loose.g2o")
+    text = " ".join(out.split())
+    assert code == 0
+    assert "times what is expected: the information matrices claim too little" in text
+    assert "or they are covariances. pgo doctor" in text
