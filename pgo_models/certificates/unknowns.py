@@ -235,13 +235,12 @@ class ComplexUnknowns(Unknowns):
         """H_c in double precision, without the pose left out; None where it is out of range.
 
         Lambda_i is lambda_i / 2 I, and H_c has U^* M U - lambda_i + 2 eta on the diagonal of r_i.
-        The shares of the diagonal D are those of four errors. In exact arithmetic, for any z and
-        the two columns Z_c of its Z, that of the stored M is at most sum_c Z_c^T diag(shares
-        diagonal) Z_c (`matrix_errors`); with D / 2 for the diagonal of both rows of r, that is z^T
-        diag(share D) z with the mean of their shares. An entry that is a sum is off by u of itself,
-        and v^T |E| v <= sum_a v_a^2 (|E| w)_a / w_a for any positive w; here w = D^-1/2. Where
-        there is a factor, D is no smaller than any of the numbers on the diagonal in between, of
-        which lambda, eta and the margin (twice) each leave a rounding; 6 u is more.
+        In exact arithmetic, for any z and the two columns Z_c of its Z, the error of the stored M
+        is at most sum_c Z_c^T diag(shares diagonal) Z_c (`matrix_errors`). Both rows of r_i have
+        both of its numbers in these columns, so that their shares add up. Twice that is more than
+        all errors: an entry of H_c is a sum of two of M, rounded once, where `matrix_errors` counts
+        more than four roundings of every entry; and lambda, eta and the margin round at most six
+        times beside the diagonal, of which it counts 4 d.
         """
         n = self.problem.num_poses
         of_r = slice(2 * n, None)
@@ -259,13 +258,10 @@ class ComplexUnknowns(Unknowns):
         diagonal[of_r] += shifts
         if not is_in_range(data, diagonal):
             return None
-        row_diagonal = np.concatenate([diagonal[: 2 * n : 2], 0.5 * diagonal[of_r]])
+        row_diagonal = np.concatenate([diagonal[: 2 * n : 2], diagonal[of_r]])
         of_rows = matrix_errors(self.problem, row_diagonal)
-        mean_of_r = 0.5 * (of_rows[n::2] + of_rows[n + 1 :: 2])
-        of_M = np.repeat(np.concatenate([of_rows[:n], mean_of_r]), 2)
-        w = 1.0 / np.sqrt(diagonal)
-        of_sums = UNIT_ROUNDOFF * w * (abs(self.M) @ w)
-        entries = OUTWARD * (of_M + of_sums + 6.0 * UNIT_ROUNDOFF)
+        of_numbers = np.concatenate([of_rows[:n], of_rows[n::2] + of_rows[n + 1 :: 2]])
+        entries = 2.0 * np.repeat(of_numbers, 2)
         data[meets(self.M, self.fixed)] = 0.0
         data[positions[self.fixed]] = 2.0 * diagonal[self.fixed]
         return StoredMatrix(stored, diagonal, self.fixed, entries, self.analysis, positions)

@@ -39,7 +39,6 @@ _FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, second_try=False
 # A wide gap can be proven far from a stationary point.
 _COARSE_STAIRCASE = Staircase(tolerance=1e-2, gap=_WIDE_GAP)
 _MOST_STEPS = 100
-_ROUNDING = 2.0**-40  # of an eigenvalue, over the trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +156,11 @@ def _set_precisions_below(graph: PoseGraph, edges: IntArray, kappa: Array, tau: 
 
 
 def _least_eigenvalues(blocks: Array) -> Array:
-    """Smallest eigenvalues, (m,), rounded down, and zero where rounding hides them."""
-    traces = np.einsum("mkk->m", blocks)
-    least = np.linalg.eigvalsh(blocks)[:, 0]
-    return np.asarray(np.maximum(least - _ROUNDING * traces, 0.0))
+    """Smallest eigenvalues, (m,), of blocks of `shrink_information`, zero where that hides them.
+
+    It makes blocks smaller by more than the rounding of their eigenvalues.
+    """
+    return np.asarray(np.maximum(np.linalg.eigvalsh(blocks)[:, 0], 0.0))
 
 
 def _relaxed_bound(problem: PGOProblem, s: float) -> float:

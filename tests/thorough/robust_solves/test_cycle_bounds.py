@@ -80,6 +80,23 @@ def test_an_edge_that_is_passed_twice_pays_once() -> None:
     assert pair <= least_cost(graph, np.ones(13, dtype=bool))
 
 
+def pair_bound_on_a_line(ends: list[tuple[int, int]], longer: list[float]) -> float:
+    """The bound for two closures of a straight chain whose steps can be stretched alone."""
+    t = np.stack([np.arange(9.0), np.zeros(9)], axis=1)
+    i, j = np.array([*((k, k + 1) for k in range(8)), *ends]).T
+    measured = t[j] - t[i]
+    measured[8:, 0] += longer
+    R = np.tile(np.eye(2), (10, 1, 1))
+    tau = np.concatenate([np.ones(8), [1e9, 1e9]])
+    graph = pgo.PoseGraph(9, i, j, R, measured, np.full(10, 1e12), tau)
+    return float(bounds_of(graph, np.arange(10) < 8).of_pairs(np.array([8, 9]))[0, 1])
+
+
+def test_closures_that_share_a_pose_and_no_step_keep_all_of_their_bound() -> None:
+    """The cycle of both has six steps, none of them twice."""
+    assert pair_bound_on_a_line([(0, 3), (3, 6)], [1.0, 0.0]) == pytest.approx(1 / 6, rel=1e-3)
+
+
 @pytest.mark.parametrize("size", [1e-150, 1e-4, 1e150])
 def test_the_unit_of_the_weights_does_not_matter(size: float) -> None:
     graph = chain_with_closures(5, 20, 2, 2)
