@@ -117,7 +117,9 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def with_wrong_closures(world: World, rng: np.random.Generator, kind: str, share: float) -> World:
+    """The world with wrong closures, `share` of all, at least one."""
     seed = int(rng.integers(2**31))
+    share = max(share, 1.0 / (1.0 + int((~odometry(world.graph)).sum())))
     graph, is_added = spoiled(world.graph, share, kind, seed)
     is_wrong = is_added.copy()
     is_wrong[: world.graph.num_edges] = world.is_wrong
