@@ -350,8 +350,8 @@ class Rejection(Summarised):
         """What is said of a rival."""
         if rival.edge is None:
             return f"another map, with {rival.others} edges rejected here, fits about as well"
-        fit = f"{rival.others} more edges fit" if rival.others else "the others fit"
-        return f"{self._label(rival.edge)} is taken for right, and without it {fit}"
+        edge = self._label(rival.edge)
+        return f"{edge} is taken for right, and without it {rival.others} more edges fit"
 
     def _label(self, e: int) -> str:
         """Name of an edge, with file and line where they are known."""

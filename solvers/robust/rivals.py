@@ -35,9 +35,10 @@ _SHARE = 0.1
 _CLEAR = 4.0
 # Rejected closures and clusters that are looked at, at most: each is compared with all others.
 _MOST_SEEDS = 100
-# Steps that are tried of either kind, those that closures skip and those that cost the most; and
-# clusters.
+# Maps of each kind that are tried, at most, and poses times these, as each of a large graph takes
+# seconds; the kinds are clusters, steps that closures skip, and steps that cost the most.
 _MOST_TRIED = 4
+_MOST_WORK = 4000
 # Rounds in which edges leave and come back by their thresholds.
 _MOST_ROUNDS = 5
 
@@ -70,8 +71,8 @@ def rival_of(
     """The rival of a fit that costs the least, if any; attempts are edges kept, (m,), and poses.
 
     A known edge that is a suspect costs at most what one in so many exceeds with probability
-    `FALSE_ALARM`, as any of them may be it. If the truncated cost clearly falls without it, that is
-    a rival whatever other edges fit then.
+    `FALSE_ALARM`, as any of them may be it. If the truncated cost clearly falls without it, one
+    edge that comes back is enough: without any, the step costs much, and no closure tells why.
     """
     num_known = max(1, int(sets.known.sum()))
     improbable = sets.scale * chi2_thresholds(sets.problem, 1.0 - FALSE_ALARM / num_known)
@@ -89,11 +90,16 @@ def rival_of(
             continue
         if rival is None or rival.gain <= -margin:
             continue
-        is_slip = rival.edge is not None and rival.gain > margin
+        is_slip = rival.edge is not None and rival.gain > margin and rival.others > 0
         is_other = rival.others > least_others
         if (is_slip or is_other) and (best is None or rival.gain > best.gain):
             best = rival
     return best
+
+
+def _num_tried(sets: EdgeSets) -> int:
+    """Maps of each kind that are tried."""
+    return max(1, min(_MOST_TRIED, _MOST_WORK // sets.problem.num_poses))
 
 
 def _margin(sets: EdgeSets) -> float:
@@ -149,7 +155,7 @@ def _candidates(
     yield from _with_clusters(sets, fit)
     ratio = sets.problem.edge_costs(fit.poses) / improbable
     ratio[~sets.known] = 0.0
-    for edge in np.argsort(-ratio, kind="stable")[:_MOST_TRIED].tolist():
+    for edge in np.argsort(-ratio, kind="stable")[: _num_tried(sets)].tolist():
         if ratio[edge] > 0.0:
             kept = fit.kept.copy()
             kept[edge] = False
@@ -185,7 +191,7 @@ def _with_clusters(sets: EdgeSets, fit: Fit) -> Iterator[_Candidate]:
         edges[contradicting] = False
         yield _Candidate(edges, fit.poses)
         num_tried += 1
-        if num_tried == _MOST_TRIED:
+        if num_tried == _num_tried(sets):
             return
 
 
@@ -219,7 +225,7 @@ def _skipped(sets: EdgeSets, fit: Fit) -> Iterator[_Candidate]:
     votes.sort(key=lambda vote: -vote[0])
     steps: list[int] = []
     for _, step, seed, agree in votes:
-        if step in steps or len(steps) == _MOST_TRIED:
+        if step in steps or len(steps) == _num_tried(sets):
             continue
         steps.append(step)
         edges = with_edges(fit.kept, rejected[agree])

@@ -406,10 +406,10 @@ class _RobustSolve:
     def _rival(self, solution: Solution, kept: BoolArray) -> Rival | None:
         """Another map that is about as likely; not looked for where the solve was broken off.
 
-        Nor where every edge is kept and all fit together.
+        Nor where every edge is kept and all fit together, nor where a map takes minutes.
         """
         fits = kept.all() and not solution.edge_residuals.is_doubtful
-        if fits or solution.status in OUT_OF_TIME:
+        if fits or self.doubted.is_large or solution.status in OUT_OF_TIME:
             return None
         fit = Fit.of(self.doubted.problem, kept, solution.poses)
         search = self._search(self.choice)
