@@ -17,16 +17,17 @@ def unchecked_bridges(graph: PoseGraph, known: BoolArray, kept: BoolArray) -> Bo
     """Which kept edges, not known to be right, are the only ones between two parts of the map.
 
     The result, `known` and `kept` are (m,). All known edges are kept, and the edges kept connect
-    the poses. A part has a known edge or a cycle, so that the edge to a landmark that is sighted
-    once is not among them.
+    the poses. A part has a pose of a robot or camera, a known edge, or a cycle, so that the edge to
+    a landmark that is sighted once is not among them.
     """
     of_known = edge_counts(graph.i[known], graph.j[known], graph.num_poses)
     num_pieces, piece = connected_components(of_known, directed=False)
-    has_known = np.zeros(num_pieces, dtype=bool)
-    has_known[piece[graph.i[known]]] = True
+    is_anchor = np.zeros(num_pieces, dtype=bool)
+    is_anchor[piece[graph.i[known]]] = True
+    is_anchor[piece[graph.bodies]] = True
     links = np.flatnonzero(kept & ~known & (piece[graph.i] != piece[graph.j]))
     is_bridge = np.zeros(graph.num_edges, dtype=bool)
-    is_bridge[links[bridges(piece[graph.i[links]], piece[graph.j[links]], has_known)]] = True
+    is_bridge[links[bridges(piece[graph.i[links]], piece[graph.j[links]], is_anchor)]] = True
     return is_bridge
 
 

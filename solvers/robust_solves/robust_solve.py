@@ -73,8 +73,10 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        least-squares solution; with the other loss. Each attempt is revised: clusters of closures
        are added, removed and exchanged (`ClusterSearch`), then edges are dropped that all others
        contradict (`drop_contradicted`). It ends early when no further attempt is needed
-       (`Choice.is_enough`). Where few closures hold the map of the cheapest one, each is left out
-       in turn (`linear_search`).
+       (`Choice.is_enough`). Without known edges, trees of edges whose cycles agree come first
+       (`best_by_agreement`). Odometry that nobody has named, and that cycles contradict, is not
+       known in further attempts (`with_odometry_doubted`). Where few closures hold the map of the
+       cheapest one, each is left out in turn (`linear_search`).
     3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
        whether it is certified or not. Newton and all further steps of the pipeline
        (`solvers.plan`) solve for the edges kept.

@@ -77,8 +77,18 @@ def test_parts_are_held_by_cycles_where_no_edge_is_known(num_between: int) -> No
     assert is_bridge[between].sum() == (1 if num_between == 1 else 0)
 
 
-def test_a_chain_without_known_edges_has_no_parts() -> None:
+def test_nothing_checks_any_edge_of_a_chain_that_is_not_known() -> None:
     graph = pgo.grid_world(1, 30, np.random.default_rng(0), d=2, loop_closure_probability=0.0)
     nothing = np.zeros(graph.num_edges, dtype=bool)
     assert graph.num_edges == graph.num_poses - 1
-    assert not unchecked_bridges(graph, nothing, ~nothing).any()
+    assert unchecked_bridges(graph, nothing, ~nothing).all()
+
+
+def test_a_pose_that_hangs_on_one_edge_is_checked_by_nothing_unless_the_edge_is_known() -> None:
+    turns = np.eye(2)[None].repeat(4, axis=0)
+    graph = pgo.PoseGraph(
+        4, [0, 1, 0, 2], [1, 2, 2, 3], turns, np.zeros((4, 2)), np.ones(4), np.ones(4)
+    )
+    kept = np.ones(4, dtype=bool)
+    assert np.flatnonzero(unchecked_bridges(graph, ~kept, kept)).tolist() == [3]
+    assert not unchecked_bridges(graph, kept, kept).any()

@@ -11,7 +11,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models import PGOProblem, PoseGraph, Weighting
 from pgo_models.graphs.scenes import NoiseModel
-from solvers import GNC, Known
+from solvers import GNC, Known, Support
 
 CASES = Path(__file__).parents[1] / "cases"
 
@@ -41,6 +41,15 @@ def test_the_wrong_edges_of_reported_graphs_are_found(
     assert rejected_lines(name, solution) == wrong
     assert solution.robust.cost <= cost + 0.01
     assert solution.is_certified
+
+
+def test_a_pose_that_hangs_on_one_edge_is_doubted() -> None:
+    graph = pgo.read_g2o(CASES / "p1_camera_board_rig_57.g2o")
+    of_board = np.flatnonzero(graph.j == graph.num_poses - 1)
+    left_out = np.isin(np.arange(graph.num_edges), of_board[:-1])
+    solution = solvers.solve(graph.without_edges(left_out), robust=GNC())
+    assert solution.robust.bridges.sum() == 1
+    assert solution.robust.standing is Support.DOUBTFUL
 
 
 def spread(graph: PoseGraph, step: int) -> PoseGraph:
