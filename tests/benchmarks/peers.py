@@ -44,7 +44,7 @@ LEVELS = (1e-3, 1e-4, 1e-6)
 MAX_ROUNDS = 1000
 MAX_SECONDS = 60.0  # CPU time of a run
 # The best of these counts.
-PENALTIES = (0.4, 0.3, 0.2, 0.1, 0.03, 0.02, 0.01)  # of MESA
+PENALTIES = (0.4, 0.3, 0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)  # of MESA
 MULTIPLIER_STEPS = (1.9, 1.0)  # of MESA
 OVER_RELAXATIONS = (1.0, 1.5, 1.8)  # of DGS
 DGS_TOLERANCE = 1e-3  # change of a sweep after which DGS linearises again

@@ -31,6 +31,7 @@ INSIDE = {
     "KKTResiduals": "figures of an OrthogonalSolution, which shows them",
     "RankReport": "figures of a RelaxationSolution, which shows them",
     "Attempt": "row of the attempts that a Rejection lists",
+    "Rival": "row of the rivals that a Rejection lists",
     "StepSettings": "settings of SOC as robots are sent them",
     "Solved": "base of Solution, whose fields Solution documents",
     "BenchmarkRun": "row of a study, shown by its table",
