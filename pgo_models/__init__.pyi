@@ -1,5 +1,4 @@
 from pgo_models.certificates.certificate import (
-    BoundSource as BoundSource,
     Certificate as Certificate,
     Verdict as Verdict,
     certify_at as certify_at,
@@ -8,9 +7,7 @@ from pgo_models.certificates.dual_variables import (
     certificate_matrix as certificate_matrix,
     multipliers as multipliers,
 )
-from pgo_models.certificates.fit import Fit as Fit
-from pgo_models.certificates.handedness import HandednessTerms as HandednessTerms
-from pgo_models.certificates.lower_bound import LowerBound as LowerBound, prove_bound as prove_bound
+from pgo_models.certificates.lower_bound import prove_bound as prove_bound
 from pgo_models.certificates.proof_file import save_proof as save_proof
 from pgo_models.convex.bregman import BregmanProblem as BregmanProblem
 from pgo_models.convex.constraint_sets import ConstraintSet as ConstraintSet
@@ -18,15 +15,9 @@ from pgo_models.convex.convex_solver import ConvexSolver as ConvexSolver
 from pgo_models.convex.graph_subproblem import (
     GraphQP as GraphQP,
     ModelChange as ModelChange,
-    PoseVariables as PoseVariables,
-    Unknowns as Unknowns,
     graph_qp as graph_qp,
 )
-from pgo_models.convex.orthogonality import OrthogonalProblem as OrthogonalProblem, Term as Term
-from pgo_models.convex.rotation_subproblem import (
-    RotationQP as RotationQP,
-    rotation_qp as rotation_qp,
-)
+from pgo_models.convex.orthogonality import OrthogonalProblem as OrthogonalProblem
 from pgo_models.errors import PGOError as PGOError
 from pgo_models.geometry.poses import (
     Poses as Poses,
@@ -40,8 +31,6 @@ from pgo_models.geometry.rotations import (
     random_rotations as random_rotations,
 )
 from pgo_models.graphs.datasets import (
-    Registry as Registry,
-    known_datasets as known_datasets,
     load as load,
 )
 from pgo_models.graphs.edge_lists import (
@@ -54,16 +43,13 @@ from pgo_models.graphs.g2o import read_g2o as read_g2o, write_g2o as write_g2o
 from pgo_models.graphs.g2o_readings import Reading as Reading
 from pgo_models.graphs.grid_worlds import grid_world as grid_world
 from pgo_models.graphs.gtsam_graphs import from_gtsam as from_gtsam, to_gtsam as to_gtsam
-from pgo_models.graphs.jrl import read_jrl as read_jrl
 from pgo_models.graphs.partitioning import (
-    Partition as Partition,
     PartitionMethod as PartitionMethod,
     partition as partition,
 )
 from pgo_models.graphs.pose_graph import PoseGraph as PoseGraph
 from pgo_models.graphs.precisions import (
     RotationWeight as RotationWeight,
-    indefinite_edges as indefinite_edges,
     without_indefinite_coupling as without_indefinite_coupling,
 )
 from pgo_models.graphs.residuals import Chi2Convention as Chi2Convention, chi2 as chi2
@@ -83,28 +69,22 @@ from pgo_models.graphs.trajectories import (
 from pgo_models.plots.films import animate as animate, animate_poses as animate_poses
 from pgo_models.plots.graph_plots import compare_poses as compare_poses, plot_graph as plot_graph
 from pgo_models.plots.interactive_plots import explore_graph as explore_graph
-from pgo_models.problem.cholesky import CholeskyBackend as CholeskyBackend
 from pgo_models.problem.initialization import (
     chordal_start as chordal_start,
     odometry_start as odometry_start,
     spanning_tree_start as spanning_tree_start,
 )
-from pgo_models.problem.marginals import Marginals as Marginals
-from pgo_models.problem.problem import EvaluatedPoses as EvaluatedPoses, PGOProblem as PGOProblem
+from pgo_models.problem.problem import PGOProblem as PGOProblem
 from pgo_models.problem.thresholds import (
-    EdgeResiduals as EdgeResiduals,
     chi2_thresholds as chi2_thresholds,
     edge_residuals as edge_residuals,
 )
 from pgo_models.problem.weighting import Weighting as Weighting
 from pgo_models.relaxations.solve_sdp import (
     RelaxationForm as RelaxationForm,
-    RelaxationSolution as RelaxationSolution,
-    RelaxationStatus as RelaxationStatus,
     solve_relaxation as solve_relaxation,
 )
 from pgo_models.verification.verify import (
-    Verification as Verification,
     verify_proof as verify_proof,
 )
 
@@ -119,24 +99,23 @@ __all__ += [
     "chi2_thresholds",
     "edge_residuals",
 ]
-__all__ += ["indefinite_edges", "without_indefinite_coupling"]
-__all__ += ["Partition", "PartitionMethod", "partition"]
-__all__ += ["Reading", "known_datasets", "load", "read_g2o", "read_jrl", "write_g2o"]
+__all__ += ["without_indefinite_coupling"]
+__all__ += ["PartitionMethod", "partition"]
+__all__ += ["Reading", "load", "read_g2o", "write_g2o"]
 __all__ += ["read_kitti", "read_tum", "write_tum"]
 __all__ += ["from_gtsam", "from_networkx", "from_pandas"]
 __all__ += ["to_gtsam", "to_networkx", "to_pandas"]
 __all__ += ["circle", "grid", "grid_world", "random_geometric", "sphere", "victoria_park"]
-__all__ += ["CholeskyBackend", "EvaluatedPoses", "Marginals", "PGOProblem", "Weighting"]
+__all__ += ["PGOProblem", "Weighting"]
 __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]
 __all__ += ["Certificate", "Verdict", "certificate_matrix", "certify_at"]
 __all__ += ["multipliers", "prove_bound"]
-__all__ += ["Verification", "save_proof", "verify_proof"]
+__all__ += ["save_proof", "verify_proof"]
 __all__ += ["BregmanProblem", "ConstraintSet", "ConvexSolver", "ModelChange"]
 __all__ += ["OrthogonalProblem"]
-__all__ += ["graph_qp", "rotation_qp", "solve_relaxation"]
+__all__ += ["graph_qp", "solve_relaxation"]
 __all__ += ["animate", "animate_poses", "compare_poses", "explore_graph", "plot_graph"]
 # Types in the signatures of the names above.
-__all__ += ["EdgeResiduals", "NoiseModel", "Registry"]
-__all__ += ["BoundSource", "Fit", "HandednessTerms", "LowerBound"]
-__all__ += ["GraphQP", "PoseVariables", "RotationQP", "Term", "Unknowns"]
-__all__ += ["RelaxationForm", "RelaxationSolution", "RelaxationStatus"]
+__all__ += ["NoiseModel"]
+__all__ += ["GraphQP"]
+__all__ += ["RelaxationForm"]

@@ -6,6 +6,7 @@ from typing import Any
 
 import pgo_models as pgo
 import solvers
+from solvers.riemannian.prefixes import GrowingStart
 
 Make = Callable[..., Any]
 
@@ -44,9 +45,7 @@ SOLVERS: dict[str, Make] = {
     "gauss_newton": lambda problem, **changes: replace(solvers.gauss_newton(), **changes),
     "levenberg_marquardt": lambda problem, **changes: solvers.LevenbergMarquardt(**changes),
     "staircase": lambda problem, **changes: solvers.Staircase(**changes),
-    "growing_start": lambda problem, **changes: solvers.GrowingStart(
-        first_size=2, growth=0.1, **changes
-    ),
+    "growing_start": lambda problem, **changes: GrowingStart(first_size=2, growth=0.1, **changes),
     "gnc": lambda problem, **changes: solvers.GNC(spread=None, **changes),
     "gnc_geman_mcclure": lambda problem, **changes: solvers.GNC(
         solvers.RobustLoss.GEMAN_MCCLURE, spread=None, **changes

@@ -12,6 +12,7 @@ import numpy as np
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import PGOError
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import grid
 from solvers.network.messages import Idle
 from solvers.pipeline import solve
@@ -121,7 +122,7 @@ def _serve(link: Connection, megabytes: float, make: Callable[[Any], Any], share
         link.send(answer)
 
 
-def long_run() -> tuple[pgo.PoseGraph, solvers.Pipeline, pgo.Partition]:
+def long_run() -> tuple[pgo.PoseGraph, solvers.Pipeline, Partition]:
     """Graph, settings and robots of a run with 150 iterations of SOC."""
     graph = pgo.load("circle")
     robots = pgo.partition(graph, 3)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 import pgo_models as pgo
 import solvers
+from pgo_models.graphs.partitioning import Partition
+from solvers.result import History
 
 Array = NDArray[np.float64]
 
@@ -27,7 +29,7 @@ def judged(graph: pgo.PoseGraph, poses: pgo.Poses) -> pgo.Certificate:
 def solved(graph: pgo.PoseGraph, folder: Path) -> solvers.Solution:
     """Solution by robots, saved, with covariances and one more edge left out."""
     robots = pgo.partition(graph, num_robots=3)
-    assert_type(robots, pgo.Partition)
+    assert_type(robots, Partition)
     pipeline = solvers.Pipeline(soc=solvers.SOC(robots=robots, penalty=solvers.MultiplierPenalty()))
     solution = solvers.solve(graph, pipeline, verbose=False)
     assert_type(solution, solvers.Solution)
@@ -42,7 +44,7 @@ def film(graph: pgo.PoseGraph) -> list[float]:
     """Costs of the first iterates, of an iterable of states."""
     problem = pgo.PGOProblem(graph)
     run = solvers.run(solvers.PaperSOC(max_iterations=5), problem)
-    assert_type(run.history, solvers.History)
+    assert_type(run.history, History)
     return [record.measurement.objective for record in run.history.records]
 
 

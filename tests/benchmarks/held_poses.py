@@ -13,6 +13,7 @@ from solvers.distributed.robots_alone import collect_copies
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.engine import InProcess
+from solvers.result import Record
 from solvers.soc.consensus import ConsensusState
 
 MOST_ITERATIONS = 400
@@ -34,7 +35,7 @@ def rounds_held(name: str, num_robots: int, costs: Sequence[float]) -> dict[str,
     start = driver.network.ledger.rounds
     first: dict[float, int] = {}
 
-    def has_reached_all(state: ConsensusState, record: solvers.Record) -> bool:
+    def has_reached_all(state: ConsensusState, record: Record) -> bool:
         cost = problem.objective(collect_copies(driver))
         for wanted in costs:
             if cost <= wanted:

@@ -26,6 +26,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.figures import rounded_up
+from pgo_models.graphs.precisions import indefinite_edges
 from solvers.baselines.gtsam import run_gtsam
 
 NAMES = (
@@ -50,7 +51,7 @@ def ours(path: Path, weighting: pgo.Weighting) -> tuple[float, float, float]:
 
 def name_of(path: Path) -> str:
     """Name of a graph, and how many coupling blocks its chi2 leaves out."""
-    count = int(pgo.indefinite_edges(pgo.read_g2o(path)).sum())
+    count = int(indefinite_edges(pgo.read_g2o(path)).sum())
     return f"{path.stem}, without {count} coupling blocks" if count else path.stem
 
 

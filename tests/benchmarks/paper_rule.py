@@ -17,6 +17,7 @@ import numpy as np
 import pgo_models as pgo
 import solvers
 from solvers.soc.paper import PaperState
+from solvers.soc.penalty import BoydPenalty
 
 SCENES = {"circle": pgo.circle, "grid": pgo.grid, "sphere": pgo.sphere}
 METHODS = {
@@ -26,9 +27,7 @@ METHODS = {
         solvers.PaperSOC.as_published()
     ),
     **{
-        f"the paper's rule, first rho {scale:g} m_i": solvers.PaperSOC(
-            penalty=solvers.BoydPenalty(scale)
-        )
+        f"the paper's rule, first rho {scale:g} m_i": solvers.PaperSOC(penalty=BoydPenalty(scale))
         for scale in (0.1, 1.0, 10.0, 100.0)
     },
 }

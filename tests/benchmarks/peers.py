@@ -29,6 +29,7 @@ from rich.table import Table
 
 import pgo_models as pgo
 import solvers
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
@@ -37,6 +38,7 @@ from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.engine import InProcess
 from solvers.network.ledger import Ledger
+from solvers.result import Record
 
 REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
 GRAPHS = ("smallGrid3D", "sphere2500", "intel", "kitti_07", "kitti_00")
@@ -80,7 +82,7 @@ class Case:
     """A graph, its robots and its certified optimum."""
 
     problem: pgo.PGOProblem
-    robots: pgo.Partition
+    robots: Partition
     optimum: float
 
     @classmethod
@@ -112,7 +114,7 @@ def consensus(case: Case) -> dict[str, Any]:
     start = driver.network.ledger
     soc = solvers.SOC(robots=case.robots, tolerance=1e-12, max_iterations=MAX_ROUNDS)
 
-    def is_over(state: object, record: solvers.Record) -> bool:
+    def is_over(state: object, record: Record) -> bool:
         ledger = driver.network.ledger
         objective = case.problem.objective(collect_copies(driver))
         return watch.is_over(objective, ledger.rounds, ledger.num_bytes)
@@ -146,7 +148,7 @@ def gauss_seidel(case: Case) -> dict[str, Any]:
             case.robots, alpha=alpha, gauss_newton_steps=MAX_ROUNDS, tolerance=DGS_TOLERANCE
         )
 
-        def is_over(state: Any, record: solvers.Record, watch: Watch = watch) -> bool:
+        def is_over(state: Any, record: Record, watch: Watch = watch) -> bool:
             ledger = state.ledger
             return watch.is_over(record.measurement.objective, ledger.rounds, ledger.num_bytes)
 
@@ -169,7 +171,7 @@ def mesa(case: Case) -> dict[str, Any]:
             max_iterations=MAX_ROUNDS,
         )
 
-        def is_over(state: Any, record: solvers.Record, watch: Watch = watch) -> bool:
+        def is_over(state: Any, record: Record, watch: Watch = watch) -> bool:
             rounds = ledger.rounds + state.ledger.rounds
             num_bytes = ledger.num_bytes + state.ledger.num_bytes
             return watch.is_over(record.measurement.objective, rounds, num_bytes)

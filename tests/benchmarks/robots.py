@@ -42,6 +42,7 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import Engine, InProcess
 from solvers.network.faults import Faults
 from solvers.network.ray_engine import RayEngine
+from solvers.result import History, Record, Run
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 
@@ -116,7 +117,7 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
     soc = solvers.SOC(robots=shared, tolerance=1e-12, max_iterations=MAX_ROUNDS)
     gaps = []
 
-    def is_done(state: AsynchronousState, record: solvers.Record) -> bool:
+    def is_done(state: AsynchronousState, record: Record) -> bool:
         R = np.empty((graph.num_poses, graph.d, graph.d))
         for own in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
             R[own.poses] = own.R
@@ -309,7 +310,7 @@ def run_cli(arguments: list[str]) -> None:
     )
 
 
-def to_gap(problem: pgo.PGOProblem, soc: solvers.SOC, optimum: float) -> solvers.Run:
+def to_gap(problem: pgo.PGOProblem, soc: solvers.SOC, optimum: float) -> Run:
     """Run until the smallest of the levels is reached."""
     return solvers.run(
         soc,
@@ -323,7 +324,7 @@ def gap_of(objective: float, optimum: float) -> float:
     return (objective - optimum) / max(1.0, optimum)
 
 
-def rounds_to(history: solvers.History, optimum: float) -> list[int | None]:
+def rounds_to(history: History, optimum: float) -> list[int | None]:
     """First iterate within each of the levels."""
     gaps = [gap_of(objective, optimum) for objective in history.objective]
     return [next((k for k, gap in enumerate(gaps) if gap <= level), None) for level in LEVELS]

@@ -12,6 +12,7 @@ from hypothesis import given, settings, strategies as st
 
 import pgo_models as pgo
 import solvers
+from solvers.result import Record
 
 SIZES = st.integers(3, 8)
 
@@ -82,7 +83,7 @@ def test_a_callback_and_ctrl_c_end_a_run_with_its_best_poses(make):
     )
     assert (stopped.status, stopped.iterations) == (solvers.Status.STOPPED, 2)
 
-    def interrupt(state: Any, record: solvers.Record) -> None:
+    def interrupt(state: Any, record: Record) -> None:
         if state.k == 2:
             raise KeyboardInterrupt
 

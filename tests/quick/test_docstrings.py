@@ -14,7 +14,7 @@ import solvers
 # left out; one that is there names all parameters.
 CHECKED = {"PR02", "SS01", "SS02", "SS03", "SS04", "SS05", "SS06"}
 OF_A_SECTION = {"PR01"}
-# Every solver has these; `solvers.Method` and `solvers.Solver` document them.
+# Every solver has these; `Method` and `solvers.Solver` document them.
 OF_EVERY_SOLVER = {"init", "step", "measure", "converged", "poses"}
 DOCUMENTED = (types.FunctionType, property, classmethod, staticmethod, cached_property)
 

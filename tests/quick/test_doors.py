@@ -17,6 +17,7 @@ from public_results import RESULTS
 
 import pgo_models as pgo
 import solvers
+from pgo_models.convex.graph_subproblem import Unknowns
 
 WRONG: dict[str, Any] = {
     "None": None,
@@ -188,7 +189,7 @@ ALIKE: dict[str, Callable[[dict[str, Any]], tuple[Any, Any]]] = {
     ),
     "a member by its name": lambda it: (
         pgo.graph_qp(it["graph"], 12.0, unknowns="rotations").variables.unknowns,
-        pgo.Unknowns.ROTATIONS,
+        Unknowns.ROTATIONS,
     ),
     "a member of a setting by its name": lambda it: (
         solvers.SOC(r_step="clarabel"),

@@ -19,6 +19,7 @@ from pgo_models.errors import NotPositiveDefiniteError, PGOError
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.trajectories import read_kitti, read_tum
+from pgo_models.problem.cholesky import CholeskyBackend
 from solvers.cli.shell import save_then_show
 from solvers.reporting import result_files
 
@@ -100,7 +101,7 @@ def test_tables_and_curves_are_written_in_every_format(pgo_command, tmp_path):
     assert all((tmp_path / name).stat().st_size > 0 for name in names)
 
 
-@pytest.mark.parametrize("backend", pgo.CholeskyBackend)
+@pytest.mark.parametrize("backend", CholeskyBackend)
 @pytest.mark.parametrize("weighting", pgo.Weighting)
 def test_each_backend_solves_certifies_and_says_how_sure_it_is(backend, weighting, planar):
     for graph in (pgo.load("grid"), pgo.load(planar)):

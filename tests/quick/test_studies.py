@@ -5,6 +5,7 @@ import pytest
 
 import pgo_models as pgo
 import solvers
+from solvers.studies.paper_tables import ReproductionSettings
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
@@ -33,7 +34,7 @@ def test_little_noise_is_certified_and_much_is_not():
 
 
 def test_a_row_of_the_papers_tables_is_reproduced():
-    settings = solvers.ReproductionSettings(only=("circle",), num_seeds=1)
+    settings = ReproductionSettings(only=("circle",), num_seeds=1)
     reproduction = solvers.reproduce_tables(settings)
     assert reproduction.is_complete
     assert len(reproduction.rows) > 0

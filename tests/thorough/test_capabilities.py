@@ -25,6 +25,8 @@ from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import NoiseModel, victoria_park
 from pgo_models.problem.weighting import Weighting
+from solvers.place import Automatic
+from solvers.riemannian.prefixes import GrowingStart
 from solvers.solves.folder_solve import FolderSolution
 from solvers.studies.tightness import SweptScene, noisy_scene
 
@@ -72,7 +74,7 @@ def with_driver(
 def without_driver(
     graph: PoseGraph, pipeline: solvers.Pipeline, weighting: Weighting, **options: Any
 ) -> Answer:
-    if pipeline.soc is solvers.Automatic.AUTO:
+    if pipeline.soc is Automatic.AUTO:
         pipeline = replace(pipeline, soc=consensus(graph))
     robots = replace(options.pop("robots", solvers.Robots()), owners=2, driver_memory=0.0)
     return here(graph, pipeline, weighting, robots=robots, **options)
@@ -282,7 +284,7 @@ def grows(place: Place) -> bool:
     i, j = np.concatenate([np.stack([along, along + 1], axis=1), far]).T
     R_ij = pgo.random_rotations(25, 2, rng)
     graph = PoseGraph(14, i, j, R_ij, rng.standard_normal((25, 2)), np.ones(25), np.ones(25))
-    pipeline = solvers.Pipeline(growing=solvers.GrowingStart(first_size=6), second_try=False)
+    pipeline = solvers.Pipeline(growing=GrowingStart(first_size=6), second_try=False)
     answer = place.solve(graph, pipeline, Weighting.ISOTROPIC)
     refuse_what_the_note_names(answer, "growing start")
     return any(stage.name.startswith("growing start") for stage in answer.stages)

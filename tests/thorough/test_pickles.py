@@ -28,14 +28,21 @@ from signals import sparse_signal
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.dual_variables import multipliers
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.graphs.datasets import SE_SYNC
+from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
+from pgo_models.problem.marginals import Marginals
 from solvers.loop import iterate, run
+from solvers.network.ledger import Traffic
 from solvers.reporting.edge_fit import judge_edges
+from solvers.soc.r_step import RotationStep, RSubproblem
+from solvers.studies.comparison import Comparison
+from solvers.studies.paper_tables import Reproduction, ReproductionSettings
 
 Make = Callable[[], Any]
 GRAPH = pgo.random_geometric(12, np.random.default_rng(0), d=2)
-BACKENDS = pytest.mark.parametrize("backend", pgo.CholeskyBackend, ids=lambda backend: backend.name)
+BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend, ids=lambda backend: backend.name)
 
 
 def pickled(value: Any) -> Any:
@@ -50,17 +57,17 @@ def with_weak_prior(variables: Any) -> pgo.ModelChange:
 
 
 @functools.cache
-def solved(backend: pgo.CholeskyBackend = pgo.CholeskyBackend.CHOLMOD) -> solvers.Solution:
+def solved(backend: CholeskyBackend = CholeskyBackend.CHOLMOD) -> solvers.Solution:
     solution = solvers.solve(pgo.PGOProblem(GRAPH, backend))
     str(solution), solution.marginals(), solution.edge_residuals, solution.as_json()
     return solution
 
 
-def marginals() -> pgo.Marginals:
+def marginals() -> Marginals:
     problem = solved().problem
     poses = solved().poses
     hessian = riemannian_hessian(problem.at(poses), multipliers(problem, poses))
-    found = pgo.Marginals(hessian, TangentLayout(problem.num_poses, problem.d))
+    found = Marginals(hessian, TangentLayout(problem.num_poses, problem.d))
     found.joint(1, 2)
     assert found.diagonal.size
     return found
@@ -82,22 +89,22 @@ def quadratic_program() -> pgo.GraphQP:
 
 
 @functools.cache
-def comparison() -> solvers.Comparison:
+def comparison() -> Comparison:
     return solvers.compare_methods(pgo.PGOProblem(GRAPH))
 
 
 def handedness_terms() -> object:
     graph = pgo.circle(np.random.default_rng(0))
     P = np.tile(np.eye(3), (graph.num_edges, 1, 1))
-    return pgo.HandednessTerms.at(graph.truth, graph.i, graph.j, P)
+    return HandednessTerms.at(graph.truth, graph.i, graph.j, P)
 
 
-def subproblem() -> solvers.RSubproblem:
+def subproblem() -> RSubproblem:
     """Subproblem that a back end of the user is given."""
     given = []
 
     class Recorder:
-        def prepare(self, subproblem: solvers.RSubproblem) -> solvers.RotationStep:
+        def prepare(self, subproblem: RSubproblem) -> RotationStep:
             given.append(subproblem)
             return solvers.CvxpyStep().prepare(subproblem)
 
@@ -164,11 +171,11 @@ MADE: dict[str, Make] = {
     "EdgeFit": lambda: judge_edges(solved().problem, solved().poses),
     "RSubproblem": subproblem,
     "HandednessTerms": handedness_terms,
-    "Traffic": lambda: solvers.Traffic(np.array([0]), np.array([1]), np.array([8])),
+    "Traffic": lambda: Traffic(np.array([0]), np.array([1]), np.array([8])),
     "NoiseSweep": lambda: solvers.noise_sweep(
         solvers.SweptScene.GRID, np.array([0.1]), 1, np.random.default_rng(0)
     ),
-    "Reproduction": lambda: solvers.Reproduction(solvers.ReproductionSettings(), (), True),
+    "Reproduction": lambda: Reproduction(ReproductionSettings(), (), True),
 }
 
 
@@ -186,21 +193,14 @@ MADE["ReadingComparison"] = lambda: solvers.compare_readings("grid")
 MADE["Fit"] = lambda: solvers.solve(GRAPH).certificate.fit
 MADE["ReadingFit"] = lambda: solvers.compare_readings("grid").written
 SETTINGS = (
-    "Anderson",
     "CvxpyStep",
     "PaperSOC",
     "BalancedPenalty",
-    "BoydPenalty",
     "MultiplierPenalty",
 )
 SETTINGS += (
     "Newton",
     "Staircase",
-    "GrowingStart",
-    "ComplexRelaxation",
-    "HandednessAscent",
-    "HandednessSearch",
-    "HullLagrangian",
     "GNC",
     "IRLS",
     "PCM",
@@ -218,18 +218,11 @@ SETTINGS += (
     "TwoLineBregman",
     "OrthogonalSOC",
 )
-SETTINGS += ("BenchmarkSettings", "ComparisonSettings", "Recovery", "ReproductionSettings")
+SETTINGS += ("BenchmarkSettings", "ComparisonSettings")
 MADE |= {name: getattr(solvers, name) for name in SETTINGS}
 MADE["Robot"] = lambda: solvers.Robot("a", ["a", "b"], b"sixteen or more bytes")
 PROTOCOLS = {
-    "Method",
     "Solver",
-    "CustomRStep",
-    "RotationStep",
-    "Engine",
-    "Worker",
-    "WorkerPool",
-    "PenaltyRule",
     "ConstraintSet",
 }
 
@@ -306,7 +299,7 @@ def test_a_copied_state_goes_on_as_the_original_does(
 
 
 def test_a_factor_that_is_used_up_stays_so():
-    problem = pgo.PGOProblem(GRAPH, pgo.CholeskyBackend.CHOLMOD)
+    problem = pgo.PGOProblem(GRAPH, CholeskyBackend.CHOLMOD)
     shifted = problem.with_pattern_of_M(problem.M.data.copy())
     shifted.setdiag(shifted.diagonal() + 1.0)
     first = problem.analysis.factorize(shifted)

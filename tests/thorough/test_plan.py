@@ -24,6 +24,7 @@ from solvers.here import Here
 from solvers.place import Attempt, Place, Step
 from solvers.plan import solve_at
 from solvers.result import Status
+from solvers.riemannian.prefixes import GrowingStart
 from solvers.robust_solves.attempts import Estimate, PlacesOfEdges, Plan
 from solvers.robust_solves.robust_solve import _RobustSolve
 
@@ -34,7 +35,7 @@ SHORT_SEARCH = HandednessSearch(
 )
 # Settings with which a step follows the first attempt at once, and the verb that it begins with.
 PIPELINES = {
-    Step.GROWING: replace(FIRST_ALONE, growing=solvers.GrowingStart(first_size=5)),
+    Step.GROWING: replace(FIRST_ALONE, growing=GrowingStart(first_size=5)),
     Step.SECOND: replace(FIRST_ALONE, second_try=True),
     Step.STAIRCASE: replace(FIRST_ALONE, staircase=solvers.Staircase()),
     Step.SMALLER_MATRICES: replace(FIRST_ALONE, staircase=solvers.Staircase(max_iterations=1)),
@@ -253,7 +254,7 @@ def test_an_update_stands_where_the_whole_solve_after_it_fails(
 
 def test_attempts_are_numbered_and_a_step_that_does_not_suit_the_graph_has_a_line() -> None:
     """The graph has fewer poses than the first prefix of a start that grows."""
-    pipeline = replace(FIRST_ALONE, growing=solvers.GrowingStart(), second_try=True)
+    pipeline = replace(FIRST_ALONE, growing=GrowingStart(), second_try=True)
     solution = solvers.solve(loose_problem(), pipeline)
     attempts = [(stage.attempt, stage.name) for stage in solution.stages if stage.name != "SOC"]
     assert attempts == [

@@ -20,6 +20,7 @@ from pgo_models.graphs.partitioning import partition
 from solvers.distributed import checkpoint
 from solvers.distributed.checkpoint import Journal
 from solvers.network.engine import InProcess
+from solvers.riemannian.prefixes import GrowingStart
 from solvers.robots import Checkpoint
 from solvers.soc.soc import WARM_START
 
@@ -110,7 +111,7 @@ def line_with_closures(seed, n, num_closures):
     return pgo.PoseGraph(n, *ends.T, R_ij, t_ij, ones, ones)
 
 
-@pytest.mark.parametrize("growing", [None, solvers.GrowingStart(first_size=6)])
+@pytest.mark.parametrize("growing", [None, GrowingStart(first_size=6)])
 @pytest.mark.parametrize("part", [0.1, 0.5, 0.8])
 def test_a_second_attempt_goes_on_too(part, growing, tmp_path):
     graph = line_with_closures(1, 14, 12)  # the relaxation is not tight

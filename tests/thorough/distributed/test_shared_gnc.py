@@ -27,6 +27,7 @@ from solvers.network.counted_pool import Count
 from solvers.network.engine import InProcess
 from solvers.network.messages import count_bytes
 from solvers.network.serialization import deserialize, serialize
+from solvers.result import Stage
 from solvers.robots import Checkpoint
 from solvers.robust.gnc import GNC
 from solvers.robust.known import odometry
@@ -75,7 +76,7 @@ def test_it_is_the_central_run(wrong, weighting: pgo.Weighting, coupling: solver
     assert shared.ledger.rounds > 0
 
 
-def first_attempt(solution: solvers.Solution) -> solvers.Stage:
+def first_attempt(solution: solvers.Solution) -> Stage:
     return next(stage for stage in solution.stages if stage.name == "GNC, as set")
 
 

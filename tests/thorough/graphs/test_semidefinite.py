@@ -14,7 +14,11 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import GraphError
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import is_semidefinite_exactly, proper_information
+from pgo_models.graphs.precisions import (
+    indefinite_edges,
+    is_semidefinite_exactly,
+    proper_information,
+)
 from pgo_models.problem.thresholds import edge_residuals
 from solvers.robust.consistency import pairwise_consistent
 
@@ -58,7 +62,7 @@ def test_semidefinite_matrices_of_every_rank_and_unit_are_whole(
     information = B @ np.swapaxes(B, 1, 2)
     information = 0.5 * (information + np.swapaxes(information, 1, 2))
     graph = replace(graph, information=information)
-    assert not pgo.indefinite_edges(graph).any()
+    assert not indefinite_edges(graph).any()
     assert pgo.without_indefinite_coupling(graph) is graph
     for stored, counted in zip(information, proper_information(graph), strict=True):
         assert is_semidefinite_exactly(counted)
@@ -81,7 +85,7 @@ def test_eigenvalues_below_rounding_are_seen(seed: int, d: int, below: float) ->
     lowered = singular - below * np.diag(np.diag(singular))
     information = graph.information.copy()
     information[1] = scale[:, None] * (lowered + lowered.T) * scale
-    found = pgo.indefinite_edges(replace(graph, information=information))
+    found = indefinite_edges(replace(graph, information=information))
     assert np.flatnonzero(found).tolist() == [1]
 
 
@@ -122,7 +126,7 @@ def test_coupling_that_is_left_out_is_remembered_and_said() -> None:
     assert not changed.information[[2, 4], 2:, :2].any()
     others = np.delete(np.arange(graph.num_edges), [2, 4])
     np.testing.assert_array_equal(changed.information[others], graph.information[others])  # type: ignore[index]
-    assert not pgo.indefinite_edges(changed).any()
+    assert not indefinite_edges(changed).any()
     solution = solvers.solve(
         pgo.PGOProblem(changed, weighting=pgo.Weighting.INFORMATION), progress=False
     )

@@ -25,6 +25,7 @@ from pgo_models.errors import (
     SettingError,
 )
 from pgo_models.figures import rounded_up
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from solvers.cli import app as cli
 from solvers.distributed.robots import recursion
@@ -230,7 +231,7 @@ def test_errors_can_be_sent(error):
 )
 def test_robots_are_dealt_among_actors_by_size(robots, wanted, groups, graph):
     sizes = [40, 2, 3, 5, 10][:robots]
-    parts = pgo.Partition(np.repeat(np.arange(robots), [*sizes[:-1], 60 - sum(sizes[:-1])]), graph)
+    parts = Partition(np.repeat(np.arange(robots), [*sizes[:-1], 60 - sum(sizes[:-1])]), graph)
     shares = split_graph(graph, parts)
     place = ray_engine._RayPlace(
         ray, partial(Agent, backend=None), shares, RayEngine(actors=wanted), False

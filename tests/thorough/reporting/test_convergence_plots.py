@@ -7,9 +7,10 @@ import pytest
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.graphs.published_results import PublishedRun
-from solvers import History, Measurement, Record
+from solvers import Measurement
 from solvers.reporting.comparison_plots import plot_efforts
 from solvers.reporting.convergence_plots import Curve, Effort, explore_convergence, plot_convergence
+from solvers.result import History, Record
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")

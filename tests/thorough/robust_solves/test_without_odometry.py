@@ -11,7 +11,8 @@ import pgo_models as pgo
 import solvers
 from pgo_models import PGOProblem, PoseGraph, Weighting
 from pgo_models.graphs.scenes import NoiseModel
-from solvers import GNC, Known, Support
+from solvers import GNC, Known
+from solvers.robust.rejection import Support
 
 CASES = Path(__file__).parents[1] / "cases"
 

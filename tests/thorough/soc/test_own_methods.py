@@ -11,13 +11,15 @@ from scipy.sparse.linalg import splu
 
 import pgo_models as pgo
 import solvers
+from pgo_models.convex.graph_subproblem import PoseVariables
 from pgo_models.errors import SettingError
+from solvers.soc.r_step import RSubproblem
 
 
 class OwnStep:
     """Step (a) by SciPy's sparse LU."""
 
-    def prepare(self, subproblem: solvers.RSubproblem) -> "OwnFactor":
+    def prepare(self, subproblem: RSubproblem) -> "OwnFactor":
         return OwnFactor(splu(subproblem.matrix), 0.5 * subproblem.rho[:, None])
 
 
@@ -136,7 +138,7 @@ def test_an_own_constraint_has_its_dual_value() -> None:
     written: list[cp.Constraint] = []
 
     def least_cost(most: float) -> float:
-        def changer(unknown: pgo.PoseVariables) -> pgo.ModelChange:
+        def changer(unknown: PoseVariables) -> pgo.ModelChange:
             written.append(cp.norm(unknown.translation_residual(e)) <= most)
             return pgo.ModelChange(constraints=[written[-1]])
 

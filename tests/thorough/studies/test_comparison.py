@@ -6,9 +6,10 @@ import pytest
 
 import pgo_models as pgo
 from pgo_models.errors import SettingError
-from solvers import History, Measurement, Record, compare_methods
+from solvers import Measurement, compare_methods
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
+from solvers.result import History, Record
 from solvers.studies import comparison
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.comparison import ComparisonSettings, check_plot_format
