@@ -14,7 +14,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from solvers import GNC, Known
 from solvers.robust.rejection import Support
 
-CASES = Path(__file__).parents[1] / "cases"
+CASES = Path(__file__).parents[2] / "cases"
 
 
 def rejected_lines(name: str, solution: solvers.Solution) -> list[int]:
