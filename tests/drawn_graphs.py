@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from graphs import LOUD_NOISE, exact_graph, informed, varied_graph
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import PoseGraph, Poses
 from pgo_models.geometry.rotations import (
     Array,
     project_to_rotations,
@@ -17,8 +17,8 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.graphs.g2o import write_g2o
 from pgo_models.graphs.g2o_rows import numbers_of
-from pgo_models.graphs.pose_graph import PoseGraph
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers import SweptScene
+from solvers.studies.tightness import noisy_scene
 
 Draw = Callable[[np.random.Generator], PoseGraph]
 

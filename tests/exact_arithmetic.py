@@ -13,9 +13,9 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import PoseGraph, Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.matrices import rotation_columns
 

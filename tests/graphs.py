@@ -8,16 +8,12 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
-from pgo_models import PartitionMethod
+from pgo_models import NoiseModel, PartitionMethod, PGOProblem, PoseGraph, Poses, Weighting
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, observe, random_geometric
+from pgo_models.graphs.scenes import MILD_NOISE, observe, random_geometric
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 from solvers.studies.tightness import noisy_lattice
 

@@ -11,7 +11,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models import PoseGraph
 
 STEP = 0.02  # seconds
 KEY = b"a key for tests, not for a team"

@@ -3,10 +3,9 @@
 import cvxpy as cp
 import numpy as np
 
-from pgo_models.convex.orthogonality import OrthogonalProblem
+from pgo_models import OrthogonalProblem, PoseGraph
 from pgo_models.convex.orthogonality_examples import sparse_components
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import PoseGraph
 
 
 def smallest_eigenvectors(A: Array, count: int) -> OrthogonalProblem:

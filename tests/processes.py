@@ -11,7 +11,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import PGOError
+from pgo_models import PGOError
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import grid
 from solvers.network.messages import Idle

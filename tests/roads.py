@@ -6,9 +6,8 @@ import enum
 
 import numpy as np
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import PoseGraph, Poses
 from pgo_models.geometry.rotations import exp_map
-from pgo_models.graphs.pose_graph import PoseGraph
 
 
 class Shape(enum.Enum):

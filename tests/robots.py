@@ -14,13 +14,13 @@ import pytest
 from graphs import MILD_NOISE
 from hypothesis import strategies as st
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses
 from pgo_models.geometry.rotations import Array, random_rotations
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.problem import PGOProblem
+from solvers import InProcess
 from solvers.distributed import multifrontal, robots_of_graph
 from solvers.distributed.driver import Driver
 from solvers.distributed.elimination_choice import leave_poses
@@ -30,7 +30,7 @@ from solvers.distributed.robots.agent import Agent
 from solvers.distributed.robots.elimination import Elimination, unpacked
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
-from solvers.network.engine import Engine, InProcess, WorkerPool
+from solvers.network.engine import Engine, WorkerPool
 from solvers.network.messages import Idle
 from solvers.soc.subgraph import Subgraph
 

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from pgo_models.geometry.poses import Poses
-from pgo_models.problem.problem import PGOProblem
+from pgo_models import PGOProblem, Poses
 
 
 def dense_relative_gradient(problem: PGOProblem, poses: Poses) -> float:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
-from pgo_models.convex.bregman import BregmanProblem
+from pgo_models import BregmanProblem, PoseGraph
 from pgo_models.convex.convex_solver import finite_array
 from pgo_models.convex.graph_subproblem import Neighbours, robot_qp
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.pose_graph import IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pgo_models.convex.bregman import BregmanProblem
+from pgo_models import BregmanProblem
 from pgo_models.convex.bregman_examples import basis_pursuit
 from pgo_models.geometry.rotations import Array
 

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import NoiseModel, PoseGraph, Poses
 from pgo_models.geometry.rotations import BoolArray, exp_map, random_rotations
 from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, observe
+from pgo_models.graphs.scenes import observe
 from solvers.robust.known import odometry
 
 

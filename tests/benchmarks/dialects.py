@@ -29,7 +29,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import PGOError
+from pgo_models import PGOError
 from pgo_models.figures import rounded_up
 from solvers.studies.readings import compare_readings
 

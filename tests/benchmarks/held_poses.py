@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import pgo_models as pgo
 import solvers
+from solvers import InProcess
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_alone import collect_copies
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
-from solvers.network.engine import InProcess
 from solvers.result import Record
 from solvers.soc.consensus import ConsensusState
 

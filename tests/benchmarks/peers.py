@@ -31,12 +31,12 @@ import pgo_models as pgo
 import solvers
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start
+from solvers import InProcess
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
 from solvers.distributed.robots_alone import collect_copies
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
-from solvers.network.engine import InProcess
 from solvers.network.ledger import Ledger
 from solvers.result import Record
 

@@ -34,14 +34,13 @@ import pgo_models as pgo
 import solvers
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.separators import vertex_cover
+from solvers import Faults, InProcess, RayEngine
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.counted_pool import Count
-from solvers.network.engine import Engine, InProcess
-from solvers.network.faults import Faults
-from solvers.network.ray_engine import RayEngine
+from solvers.network.engine import Engine
 from solvers.result import History, Record, Run
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot

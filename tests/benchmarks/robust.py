@@ -43,10 +43,10 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
 from pgo_models.graphs.precisions import indefinite_edges
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.baselines.gtsam import poses_of_values
 from solvers.robust.known import odometry
 from solvers.robust.revision import truncated_cost

@@ -30,8 +30,8 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models import Poses
 from pgo_models.figures import rounded_up
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 
 NAMES = "tinyGrid3D smallGrid3D intel sphere2500 torus3D cubicle parking-garage manhattan"

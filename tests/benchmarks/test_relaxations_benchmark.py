@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from pgo_models import PGOProblem, Weighting
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.scenes import circle, grid, sphere
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.solve_sdp import (
     DEFAULT_RELAXATION_GAP,
     RelaxationSolution,

@@ -14,8 +14,9 @@ import pytest
 
 import pgo_models as pgo
 import solvers
+from pgo_models import PGOError
 from pgo_models.convex.huber import huber_change
-from pgo_models.errors import NotPositiveDefiniteError, PGOError
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.trajectories import read_kitti, read_tum

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pgo_models import PoseGraph, Reading
 from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.g2o_readings import Reading
-from pgo_models.graphs.pose_graph import PoseGraph
 
 pytest.importorskip("flint")
 CASES = Path(__file__).parents[1] / "cases"

@@ -20,15 +20,14 @@ from networks import KEY, Network, give_edge
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import PGOError
+from pgo_models import NoiseModel, PGOError, PoseGraph, Weighting
 from pgo_models.graphs.g2o import write_g2o_folder
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, victoria_park
-from pgo_models.problem.weighting import Weighting
+from pgo_models.graphs.scenes import victoria_park
+from solvers import SweptScene
 from solvers.place import Automatic
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.solves.folder_solve import FolderSolution
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import noisy_scene
 
 PAGE = Path(__file__).parents[2] / "notebooks/site/guide/capabilities.md"
 WORKS = "yes"

@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pgo_models.errors import FileFormatError, PGOError
+from pgo_models import PGOError
+from pgo_models.errors import FileFormatError
 from pgo_models.files import (
     LONGEST_OF_ALL,
     finite_number,

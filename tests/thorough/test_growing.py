@@ -12,22 +12,26 @@ import pytest
 from graphs import COSTS, informed
 
 import solvers
-from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
-from pgo_models.convex.graph_subproblem import ModelChange
+from pgo_models import (
+    ModelChange,
+    NoiseModel,
+    PartitionMethod,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Verdict,
+    Weighting,
+)
+from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.errors import GraphError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, orthogonality_error
 from pgo_models.graphs.datasets import load
-from pgo_models.graphs.partitioning import Partition, PartitionMethod
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, grid, random_geometric
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
-from solvers import growing as growing_solves
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.scenes import grid, random_geometric
+from solvers import Status, growing as growing_solves
 from solvers.growing import extend, extended_partition, extended_poses
 from solvers.place import Attempt, Place
 from solvers.plan import solve_at
-from solvers.result import Status
 
 
 def first_poses(graph: PoseGraph, count: int) -> PoseGraph:

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from graphs import random_poses, varied_problem
 
+from pgo_models import PGOProblem, Poses
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
-from pgo_models.geometry.poses import Poses
-from pgo_models.problem.problem import PGOProblem
+from solvers import SOC, Measurement, Newton, Status
 from solvers.loop import iterate, run
-from solvers.result import Measurement, Record, Status
-from solvers.riemannian.newton import Newton
-from solvers.soc.soc import SOC
+from solvers.result import Record
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from hypothesis import example, given, settings, strategies as st
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel, Verdict, Weighting
 from pgo_models.certificates import definiteness
-from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, Verdict
+from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource
 from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.graphs.trajectories import read_times
-from pgo_models.problem.weighting import Weighting
+from solvers import SweptScene
 from solvers.soc.soc import WARM_START_TOLERANCE
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import noisy_scene
 
 
 @pytest.mark.parametrize("name", OPTIMUM)

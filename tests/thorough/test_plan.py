@@ -10,11 +10,10 @@ from graphs import informed, planar_lattice, varied_graph
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel, PGOProblem, Weighting
 from pgo_models.errors import GraphWarning, NotPositiveDefiniteError
 from pgo_models.graphs.g2o import write_g2o_folder
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from solvers import Status
 from solvers.distributed.robots_of_graph import RobotsOfGraph
 from solvers.distributed.robots_with_files import RobotsWithFiles
 from solvers.handedness.ascent import HandednessAscent
@@ -23,7 +22,6 @@ from solvers.handedness.search import HandednessSearch
 from solvers.here import Here
 from solvers.place import Attempt, Place, Step
 from solvers.plan import solve_at
-from solvers.result import Status
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.robust_solves.attempts import Estimate, PlacesOfEdges, Plan
 from solvers.robust_solves.robust_solve import _RobustSolve

@@ -16,9 +16,9 @@ from pages import Page
 
 import pgo_models as pgo
 import solvers
+from solvers import BenchmarkMethod, ComparisonSettings
 from solvers.reporting.report import report_page
-from solvers.studies.benchmark import BenchmarkMethod
-from solvers.studies.comparison import ComparisonSettings, compare_methods
+from solvers.studies.comparison import compare_methods
 
 GRAPHS = {
     **{name: pgo.load(name) for name in ("sphere", "circle", "grid", "robots")},

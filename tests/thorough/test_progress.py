@@ -6,13 +6,12 @@ from types import ModuleType, TracebackType
 import pytest
 
 import solvers
+from pgo_models import PGOProblem, Weighting
 from pgo_models.activity import Activity, doing
 from pgo_models.graphs.datasets import load
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from solvers import Measurement, Newton, Status
 from solvers.progress.line import Pace, StageLine, Table, is_shown
-from solvers.result import Measurement, Record, Status
-from solvers.riemannian.newton import Newton
+from solvers.result import Record
 
 RECORDS = [
     Record(k, 0.25 * k, Measurement(100.0 / (k + 1), 10.0**-k, 2 * 10.0**-k)) for k in range(3)

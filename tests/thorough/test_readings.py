@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
+from pgo_models import NoiseModel, PoseGraph, Reading
 from pgo_models.graphs.g2o import write_g2o
-from pgo_models.graphs.g2o_readings import Reading
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.studies.readings import compare_readings
 
 Change = Callable[[list[str]], list[str]]

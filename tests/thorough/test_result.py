@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from graphs import varied_problem
 
+from solvers import Measurement, Newton, Status
 from solvers.loop import run
-from solvers.result import History, Measurement, Record, Run, Status
-from solvers.riemannian.newton import Newton
+from solvers.result import History, Record, Run
 
 
 def history() -> History:

@@ -96,7 +96,7 @@ def test_an_unwritable_place_is_one_error(solution, tmp_path):
 
 
 def test_the_uncertified_solution_of_an_impossible_graph_saves_too(tmp_path):
-    from pgo_models.graphs.scenes import NoiseModel
+    from pgo_models import NoiseModel
 
     graph = pgo.random_geometric(12, np.random.default_rng(5), noise=NoiseModel(1.0, 2.5))
     solution = solvers.solve(graph, solvers.Pipeline(handedness=None))  # they would certify it

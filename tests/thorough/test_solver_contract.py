@@ -20,14 +20,28 @@ from scipy.sparse import issparse
 
 import pgo_models
 import solvers
+from pgo_models import PGOProblem, Poses
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import orthogonality_error
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.problem import PGOProblem
-from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
-from solvers.convex.extended_soc import ExtendedSOC
+from solvers import (
+    GNC,
+    PCM,
+    SOC,
+    BalancedPenalty,
+    Checkpoint,
+    ExtendedSOC,
+    Faults,
+    FixedPenalty,
+    InProcess,
+    LevenbergMarquardt,
+    MultiplierPenalty,
+    Newton,
+    Solver,
+    Staircase,
+    Status,
+)
 from solvers.distributed.asynchronous import AsynchronousSOC
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
@@ -38,20 +52,13 @@ from solvers.distributed.robust import SharedGNC
 from solvers.distributed.staircase import SubstructuredStaircase
 from solvers.distributed.substructured import SubstructuredSOC
 from solvers.handedness.ascent import HandednessAscent
-from solvers.loop import Method, Solver, iterate, run
+from solvers.loop import Method, iterate, run
 from solvers.network.counted_pool import Count
-from solvers.network.engine import Engine, InProcess
-from solvers.network.faults import Faults
-from solvers.result import Record, Status
-from solvers.riemannian.newton import Newton
+from solvers.network.engine import Engine
+from solvers.result import Record
 from solvers.riemannian.newton_step import ModelOrder
-from solvers.riemannian.staircase import Staircase
-from solvers.robots import Checkpoint
-from solvers.robust.consistency import PCM
-from solvers.robust.gnc import GNC, GNCState
+from solvers.robust.gnc import GNCState
 from solvers.soc.anderson import Anderson
-from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty
-from solvers.soc.soc import SOC
 
 Make = Callable[..., Any]
 

@@ -20,16 +20,13 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import Chi2Convention, NoiseModel, PGOProblem, Poses, Weighting
 from pgo_models.errors import GraphError, MissingExtraError, NotPositiveDefiniteError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.g2o import write_g2o
-from pgo_models.graphs.residuals import Chi2Convention, chi2
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from pgo_models.graphs.residuals import chi2
+from solvers import Status
 from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
-from solvers.result import Status
 from solvers.riemannian.polish import polish
 from solvers.solves.given_poses import certify
 

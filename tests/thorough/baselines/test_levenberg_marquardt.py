@@ -16,13 +16,11 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import PGOProblem, Poses
 from pgo_models.errors import SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
-from pgo_models.problem.problem import PGOProblem
-from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
+from solvers import LevenbergMarquardt, Status
 from solvers.loop import run
-from solvers.result import Status
 from solvers.riemannian.polish import polish, relative_decrement
 
 ROUNDING = 1e-14

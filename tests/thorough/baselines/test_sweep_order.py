@@ -6,9 +6,9 @@ from budget import examples
 from graphs import DIMENSIONS, SEEDS, scattered, varied_graph
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import PartitionMethod, PoseGraph
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.partitioning import Partition, partition
 from solvers.baselines.sweep_order import Schedule, schedule
 
 NUM_POSES = st.integers(2, 25)

@@ -22,28 +22,18 @@ from graphs import (
 )
 from hypothesis import assume, given, settings, strategies as st
 
-from pgo_models.certificates.certificate import (
-    DEFAULT_GAP,
-    BoundSource,
-    Certificate,
-    Verdict,
-    certify_at,
-    judge,
-)
+from pgo_models import Certificate, NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
+from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, certify_at, judge
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, Fit, fits_to_rounding
 from pgo_models.certificates.lower_bound import best_bound, prove_bound
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, random_rotations
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, observe
+from pgo_models.graphs.scenes import MILD_NOISE, circle, grid, observe
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
-from pgo_models.problem.weighting import Weighting
 from solvers import solve
 from solvers.riemannian.polish import polish, relative_decrement
 from solvers.solves.given_poses import certify

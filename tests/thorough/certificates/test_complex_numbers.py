@@ -34,6 +34,7 @@ from proofs import PLANE
 from roads import Shape, road
 
 import solvers
+from pgo_models import NoiseModel, PGOProblem, Weighting
 from pgo_models.certificates.certificate import certify_at
 from pgo_models.certificates.definiteness import DefiniteProof
 from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
@@ -48,11 +49,8 @@ from pgo_models.certificates.unknowns import ComplexUnknowns
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 from solvers.solves.given_poses import certify
 

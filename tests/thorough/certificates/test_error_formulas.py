@@ -13,6 +13,7 @@ from graphs import varied_graph
 from robots import interface_of
 from scipy.sparse import csc_array
 
+from pgo_models import PGOProblem
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
@@ -34,7 +35,6 @@ from pgo_models.problem.floating_point import (
     gamma,
 )
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots import elimination as substructure, proof as robot_proof
 from solvers.distributed.robots.elimination import Cut, eliminate, row_sums
 from solvers.riemannian.polish import polish

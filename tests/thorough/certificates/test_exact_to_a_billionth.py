@@ -16,11 +16,8 @@ from hypothesis import given, settings, strategies as st
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import Verdict
-from pgo_models.geometry.poses import Poses
+from pgo_models import PGOProblem, PoseGraph, Poses, Verdict
 from pgo_models.geometry.rotations import exp_map
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.problem import PGOProblem
 
 
 def off_by(graph: PoseGraph, size: float, seed: int) -> Poses:

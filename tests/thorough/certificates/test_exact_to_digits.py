@@ -19,12 +19,8 @@ from written import write_robot_files, written_text
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import Certificate, Verdict
+from pgo_models import Certificate, PGOProblem, PoseGraph, Poses, Verdict, Weighting
 from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, NO_FIT, Fit
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.cli.app import main
 
 SQUARE = "".join(

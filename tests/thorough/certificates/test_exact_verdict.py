@@ -17,22 +17,13 @@ from hypothesis import given, settings, strategies as st
 from roads import road
 
 import solvers
+from pgo_models import Certificate, NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
 from pgo_models.certificates import fit
-from pgo_models.certificates.certificate import (
-    BoundSource,
-    Certificate,
-    Verdict,
-    certify_with,
-)
+from pgo_models.certificates.certificate import BoundSource, certify_with
 from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.certificates.rounding_errors import objective_rounding, rounding_level
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 from solvers.solves.given_poses import certify
 

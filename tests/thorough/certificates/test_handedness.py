@@ -10,6 +10,7 @@ from graphs import COSTS, LOUD_NOISE, SEEDS, informed, random_poses, varied_grap
 from hypothesis import given, settings, strategies as st
 
 import solvers
+from pgo_models import PGOProblem, PoseGraph, Poses, Weighting
 from pgo_models.certificates.certificate import certify_at
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
 from pgo_models.certificates.handedness import (
@@ -20,7 +21,6 @@ from pgo_models.certificates.handedness import (
 )
 from pgo_models.certificates.lower_bound import best_bound, best_bound_with_terms
 from pgo_models.certificates.rounding_errors import evaluate_certificate, matrix_errors
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
     exp_map,
@@ -28,11 +28,8 @@ from pgo_models.geometry.rotations import (
     orthogonality_error,
     random_rotations,
 )
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF, gamma
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
 SIZES = st.integers(2, 7)

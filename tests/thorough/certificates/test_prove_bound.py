@@ -15,18 +15,16 @@ from graphs import (
 )
 from hypothesis import assume, given, settings, strategies as st
 
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
 from pgo_models.activity import Activity, watched_by
 from pgo_models.certificates.definiteness import smallest_eta
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.errors import SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel
+from pgo_models.graphs.scenes import MILD_NOISE
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from solvers.riemannian.polish import polish
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE, NoiseModel(0.5, 0.8), NoiseModel(0.1, 2.0)])

@@ -24,6 +24,7 @@ from graphs import DIMENSIONS, SEEDS, exact_graph, turned_away, varied_graph, wo
 from hypothesis import given, settings, strategies as st
 from roads import road
 
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
 from pgo_models.certificates.lower_bound import prove_bound
@@ -34,13 +35,9 @@ from pgo_models.certificates.rounding_errors import (
     matrix_error,
     objective_rounding,
 )
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, random_rotations
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from solvers.riemannian.polish import polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)

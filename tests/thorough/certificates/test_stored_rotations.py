@@ -9,16 +9,14 @@ from exact_arithmetic import ExactGraph, exact, largest_share, nearest_rotations
 from graphs import DIMENSIONS, SEEDS, exact_graph, varied_graph
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import NoiseModel, PGOProblem, PoseGraph
 from pgo_models.certificates.certificate import certify_at
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.certificates.rounding_errors import matrix_error
 from pgo_models.geometry.rotations import orthogonality_error
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from solvers.riemannian.polish import polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)

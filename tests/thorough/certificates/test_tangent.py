@@ -14,6 +14,7 @@ from hypothesis import assume, example, given, settings, strategies as st
 from roads import Shape, road
 
 import solvers
+from pgo_models import Chi2Convention, NoiseModel, PGOProblem, PoseGraph, Poses, Weighting
 from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
@@ -25,18 +26,13 @@ from pgo_models.certificates.rounding_errors import (
 )
 from pgo_models.certificates.shrunk_information import shrink_information
 from pgo_models.errors import GraphError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import are_definite, proper_information, uncoupled_share
-from pgo_models.graphs.residuals import Chi2Convention, chi2
-from pgo_models.graphs.scenes import NoiseModel
+from pgo_models.graphs.residuals import chi2
 from pgo_models.problem.information_costs import ExcessCost, TangentCost
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import rotation_columns
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 from solvers.riemannian.shrunk_bound import bound_by_shrinking
 from solvers.solves.given_poses import certify

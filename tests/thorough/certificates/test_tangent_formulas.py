@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from graphs import informed, random_poses
 
+from pgo_models import PGOProblem, Weighting
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.rounding_errors import (
     evaluate_edges,
@@ -26,8 +27,6 @@ from pgo_models.problem.excess import CoupledExcess, Tangent
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u, gamma
 from pgo_models.problem.information_costs import ExcessCost, TangentCost
 from pgo_models.problem.matrices import rotation_columns
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.distributed.robots.elimination import Cut
 from solvers.distributed.robots.proof import verify_interior
 

@@ -10,6 +10,7 @@ from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import assume, given
 from robots import contiguous, driver_at
 
+from pgo_models import PGOProblem, PoseGraph, Poses
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.certificate import certify_at, judge
 from pgo_models.certificates.definiteness import FIRST_MARGIN, prove_definite, shifted_certificate
@@ -18,11 +19,8 @@ from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.errors import ProofError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, random_rotations
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from solvers.distributed import lower_bound as distributed_bound
 from solvers.distributed.interface import Interface
 from solvers.distributed.robots import proof as robot_proof

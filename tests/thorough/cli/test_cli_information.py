@@ -11,11 +11,9 @@ import pytest
 from graphs import REFERENCE, informed
 
 import solvers
+from pgo_models import NoiseModel, PGOProblem, Weighting
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.precisions import proper_information
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 
 Call = Callable[..., tuple[int, str, str]]
 FULL = REFERENCE["full_information_optimum"]

@@ -13,12 +13,11 @@ from commands import one_line
 from graphs import varied_graph
 
 import solvers
+from pgo_models import PGOProblem, Weighting
 from pgo_models.geometry.poses import absolute_rotation_error
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 
 Call = Callable[..., tuple[int, str, str]]
 GRID = locate("grid")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
+from pgo_models import Reading
 from pgo_models.graphs.g2o import write_g2o
-from pgo_models.graphs.g2o_readings import Reading
 
 CASES = Path(__file__).parents[2] / "cases"
 

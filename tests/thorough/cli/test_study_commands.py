@@ -8,8 +8,8 @@ import typer
 
 import pgo_models as pgo
 import solvers
+from solvers import BenchmarkSettings
 from solvers.cli import app as cli, study_commands
-from solvers.studies.benchmark import BenchmarkSettings
 from solvers.studies.paper_tables import ReproductionSettings
 
 PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]

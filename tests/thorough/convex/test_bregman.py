@@ -11,7 +11,8 @@ from shared_rotations import shared_rotation_step
 from signals import sparse_signal
 
 import solvers
-from pgo_models.convex.bregman import BregmanPoint, BregmanProblem
+from pgo_models import BregmanProblem
+from pgo_models.convex.bregman import BregmanPoint
 from pgo_models.convex.bregman_examples import (
     differences,
     total_variation_denoising,
@@ -23,15 +24,9 @@ from pgo_models.geometry.rotations import Array, random_rotations, stack_transpo
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.matrices import connection_laplacian
-from solvers.convex.bregman import (
-    AlternatingBregman,
-    Bregman,
-    MethodOfMultipliers,
-    TwoLineBregman,
-    feasibility_bound,
-)
+from solvers import AlternatingBregman, Bregman, MethodOfMultipliers, Status, TwoLineBregman
+from solvers.convex.bregman import feasibility_bound
 from solvers.loop import iterate, run
-from solvers.result import Status
 
 EQUIVALENCE = 1e-7  # state by state, as the forms are stated in the paper
 # an interior-point iterate is accurate to the square root of its gap where J is flat

@@ -6,8 +6,8 @@ from hypothesis import given, settings, strategies as st
 from scipy.sparse import csr_array
 from shared_rotations import shared_rotation_step
 
+from pgo_models import BregmanProblem, PartitionMethod, PGOError
 from pgo_models.convex.bregman import (
-    BregmanProblem,
     augmented_lagrangian_subproblem,
     block_subproblems,
     bregman_subproblem,
@@ -20,9 +20,9 @@ from pgo_models.convex.bregman_examples import (
     total_variation_scale_space,
 )
 from pgo_models.convex.convex_solver import solve_compiled
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import random_rotations
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
+from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.scenes import grid
 from solvers import Bregman, Status, run
 

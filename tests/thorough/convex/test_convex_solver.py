@@ -10,29 +10,25 @@ import pytest
 from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC, SOLVER_MAP_QP
 from graphs import varied_problem
 
-from pgo_models.convex.bregman import BregmanProblem
-from pgo_models.convex.convex_solver import (
-    COLD,
+from pgo_models import (
+    BregmanProblem,
     ConvexSolver,
-    as_solver,
-    check_convex,
-    solve_compiled,
+    ModelChange,
+    OrthogonalProblem,
+    PGOError,
+    PGOProblem,
+    RelaxationForm,
 )
-from pgo_models.convex.graph_subproblem import ModelChange, PoseVariables, graph_qp
-from pgo_models.convex.orthogonality import OrthogonalProblem
+from pgo_models.convex.convex_solver import COLD, as_solver, check_convex, solve_compiled
+from pgo_models.convex.graph_subproblem import PoseVariables, graph_qp
 from pgo_models.convex.orthogonality_examples import procrustes
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.graphs.scenes import circle
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
-from solvers.convex.bregman import TwoLineBregman
-from solvers.convex.extended_soc import ExtendedSOC
-from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
+from pgo_models.relaxations.solve_sdp import solve_relaxation
+from solvers import SOC, CvxpyStep, ExtendedSOC, OrthogonalSOC, Status, TwoLineBregman
+from solvers.convex.orthogonal import solve_orthogonal
 from solvers.loop import run
 from solvers.pipeline import solve
-from solvers.result import Status
-from solvers.soc.r_step import CvxpyStep
-from solvers.soc.soc import SOC
 
 FINE_SCS = ConvexSolver("SCS", {"eps_abs": 1e-10, "eps_rel": 1e-10, "max_iters": 100_000})
 SOLVERS = ["CLARABEL", "SCS", "OSQP", FINE_SCS]

@@ -11,25 +11,18 @@ import pytest
 from graphs import varied_problem
 from scipy.optimize import Bounds, minimize
 
-from pgo_models.certificates.certificate import Verdict
-from pgo_models.convex.graph_subproblem import Changer, ModelChange, PoseVariables, graph_qp
-from pgo_models.errors import PGOError, SettingError
-from pgo_models.geometry.poses import Poses
+from pgo_models import ModelChange, PGOError, PGOProblem, Poses, Verdict
+from pgo_models.convex.graph_subproblem import Changer, PoseVariables, graph_qp
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, exp_map, log_map
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from solvers.convex.extended_soc import ExtendedSOC, ExtendedStep, with_priors
+from solvers import SOC, Coupling, ExtendedSOC, MultiplierPenalty, Newton, Pipeline, RStep, Status
+from solvers.convex.extended_soc import ExtendedStep, with_priors
 from solvers.loop import run
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import Run, Status
-from solvers.riemannian.newton import Newton
+from solvers.result import Run
 from solvers.soc.joint import SOCState
-from solvers.soc.penalty import MultiplierPenalty
-from solvers.soc.r_step import RStep
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 N = 7
 D = 2

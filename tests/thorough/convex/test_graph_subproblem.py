@@ -5,8 +5,8 @@ from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, translation_scale, varied_problem
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import ModelChange, PGOProblem
 from pgo_models.convex.graph_subproblem import (
-    ModelChange,
     Neighbours,
     PoseVariables,
     Unknowns,
@@ -16,12 +16,10 @@ from pgo_models.convex.graph_subproblem import (
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.partitioning import partition
-from pgo_models.problem.problem import PGOProblem
+from solvers import SOC, FixedPenalty, PaperSOC, RStep
 from solvers.soc.consensus import LocalConsensus
-from solvers.soc.paper import PaperSOC, PaperState
-from solvers.soc.penalty import FixedPenalty
-from solvers.soc.r_step import RStep, RSubproblem, prepare
-from solvers.soc.soc import SOC
+from solvers.soc.paper import PaperState
+from solvers.soc.r_step import RSubproblem, prepare
 from solvers.soc.subgraph import split_graph
 
 ACCURACY = 1e-8

@@ -10,17 +10,15 @@ from graphs import polar_factor
 from hypothesis import given, settings, strategies as st
 from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
 
-from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
+from pgo_models import OrthogonalProblem, PGOProblem
+from pgo_models.convex.orthogonality import OrthogonalPoint, kkt_residuals
 from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
 from pgo_models.graphs.scenes import MILD_NOISE, grid, random_geometric
-from pgo_models.problem.problem import PGOProblem
-from solvers.convex.orthogonal import OrthogonalSOC, solve_orthogonal
+from solvers import SOC, Newton, OrthogonalSOC, Status
+from solvers.convex.orthogonal import solve_orthogonal
 from solvers.loop import iterate, run
-from solvers.result import Status
-from solvers.riemannian.newton import Newton
-from solvers.soc.soc import SOC
 
 SEEDS = st.integers(0, 2**32 - 1)
 TOLERANCE = OrthogonalSOC.tolerance

@@ -6,10 +6,11 @@ from graphs import polar_factor
 from hypothesis import given, settings, strategies as st
 from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
 
+from pgo_models import OrthogonalProblem, PGOError
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
-from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, kkt_residuals
+from pgo_models.convex.orthogonality import OrthogonalPoint, kkt_residuals
 from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.scenes import grid
 

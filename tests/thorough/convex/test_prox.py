@@ -8,8 +8,8 @@ import pytest
 from budget import examples
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import ConvexSolver
 from pgo_models.convex import prox
-from pgo_models.convex.convex_solver import ConvexSolver
 from pgo_models.geometry.rotations import Array, quaternions_from_rotations
 
 SEEDS = st.integers(0, 2**32 - 1)

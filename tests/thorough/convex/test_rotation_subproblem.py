@@ -5,8 +5,9 @@ from budget import examples
 from graphs import DIMENSIONS, SEEDS, SIZES, varied_problem
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import PGOError
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import SettingError
 
 PENALISE_TRANSLATIONS = st.booleans()
 

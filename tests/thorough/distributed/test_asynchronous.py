@@ -20,30 +20,34 @@ from robots import (
     spoil,
 )
 
+from pgo_models import NoiseModel, PGOProblem
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import NoiseModel, circle, grid
+from pgo_models.graphs.scenes import circle, grid
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
+from solvers import (
+    SOC,
+    Coupling,
+    Faults,
+    FixedPenalty,
+    MultiplierPenalty,
+    PaperSOC,
+    Pipeline,
+    Robots,
+    Status,
+)
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.driver import Driver
 from solvers.loop import iterate, run
 from solvers.network.counted_pool import Count
-from solvers.network.faults import Faults
 from solvers.network.ledger import Ledger
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import Record, Status
+from solvers.result import Record
 from solvers.riemannian.polish import polish
-from solvers.robots import Robots
 from solvers.soc.consensus import LocalConsensus, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 LEVEL = 1e-6

@@ -17,11 +17,10 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.graphs.partitioning import partition
+from solvers import Checkpoint, InProcess
 from solvers.distributed import checkpoint
 from solvers.distributed.checkpoint import Journal
-from solvers.network.engine import InProcess
 from solvers.riemannian.prefixes import GrowingStart
-from solvers.robots import Checkpoint
 from solvers.soc.soc import WARM_START
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end

@@ -9,8 +9,9 @@ from robots import Killed
 
 import pgo_models as pgo
 import solvers
-from pgo_models.errors import EngineError, PGOError
-from solvers.robots import Checkpoint
+from pgo_models import PGOError
+from pgo_models.errors import EngineError
+from solvers import Checkpoint
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 

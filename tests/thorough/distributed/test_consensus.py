@@ -20,30 +20,33 @@ from robots import (
     spoil,
 )
 
+from pgo_models import NoiseModel, PartitionMethod, PGOProblem, PoseGraph
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, grid
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.scenes import grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
+from solvers import (
+    SOC,
+    BalancedPenalty,
+    Coupling,
+    MultiplierPenalty,
+    Pipeline,
+    Robots,
+    RStep,
+    Status,
+)
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots import recursion
 from solvers.loop import iterate, run
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import Status
-from solvers.robots import Robots
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus import ConsensusState, LocalConsensus
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.penalty import BalancedPenalty, MultiplierPenalty, PenaltyRule
-from solvers.soc.r_step import RStep
+from solvers.soc.penalty import PenaltyRule
 from solvers.soc.recursion_block import RecursionBlock
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

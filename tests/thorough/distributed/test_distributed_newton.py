@@ -19,24 +19,20 @@ from graphs import (
 from hypothesis import assume, given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis
 
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.rounding_errors import rounding_level
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, ground_pose, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.relaxations.low_rank import LiftedPoses, append_dimension
+from solvers import Newton, Status
 from solvers.distributed.driver import collect
 from solvers.distributed.newton import SubstructuredNewton, model_at
 from solvers.loop import iterate, run
-from solvers.result import Status
-from solvers.riemannian.newton import Newton
 from solvers.riemannian.newton_step import ModelOrder
 
 SIZES = st.integers(2, 20)

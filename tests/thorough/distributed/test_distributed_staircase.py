@@ -13,18 +13,15 @@ from robots import PARTITIONERS, Partitioner, contiguous, metis, singletons
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel, PGOProblem
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.problem import PGOProblem
+from solvers import InProcess, Staircase, Status
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
 from solvers.loop import run
-from solvers.network.engine import InProcess
-from solvers.result import Status
-from solvers.riemannian.staircase import Staircase
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 

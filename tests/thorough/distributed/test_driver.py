@@ -29,28 +29,23 @@ from robots import (
     metis,
 )
 
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, grid
+from pgo_models.graphs.scenes import grid
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
+from solvers import InProcess, Pipeline, Robots, Solution
 from solvers.distributed.driver import collect
 from solvers.distributed.robots import current_poses, descent, recursion, start, translations
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.network.engine import InProcess
 from solvers.pipeline import solve
 from solvers.place import AUTO, FirstStage
-from solvers.request import Pipeline
-from solvers.robots import Robots
 from solvers.soc.soc import WARM_START
 from solvers.soc.subgraph import split_graph
-from solvers.solution import Solution
 
 SIZES = st.integers(2, 24)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

@@ -10,16 +10,13 @@ import pytest
 from graphs import varied_graph
 from robots import Killed, share
 
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.problem import PGOProblem
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph
+from pgo_models.graphs.partitioning import Partition, partition
+from solvers import Checkpoint, InProcess, Pipeline, Robots, Solution
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.network.engine import Engine, InProcess
+from solvers.network.engine import Engine
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.robots import Checkpoint, Robots
-from solvers.solution import Solution
 
 OFF = ("describe", "set_poses", "cost", "result", "take_front")
 

@@ -15,22 +15,19 @@ from hypothesis import given, settings, strategies as st
 from robots import driver_at, eliminate_all
 
 import solvers
-from pgo_models.certificates.certificate import Verdict
+from pgo_models import NoiseModel, PGOProblem, Verdict, Weighting
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.precisions import proper_information
-from pgo_models.graphs.scenes import NoiseModel, circle
+from pgo_models.graphs.scenes import circle
 from pgo_models.problem.excess import Tangent
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from solvers import Checkpoint, Coupling
 from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import prove_with_eta
 from solvers.network.counted_pool import Count
 from solvers.riemannian.polish import polish
-from solvers.robots import Checkpoint
-from solvers.soc.settings import Coupling
 
 QUIET = NoiseModel(0.02, 0.02)
 

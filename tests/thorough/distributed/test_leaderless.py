@@ -19,15 +19,24 @@ from robots import (
     singletons,
 )
 
-from pgo_models.certificates.certificate import Verdict
+from pgo_models import PGOProblem, Poses, Verdict, Weighting
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from solvers import (
+    SOC,
+    Checkpoint,
+    Coupling,
+    Faults,
+    InProcess,
+    MultiplierPenalty,
+    PaperSOC,
+    Pipeline,
+    Robots,
+    Status,
+)
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_alone import (
     NO_CERTIFICATE,
@@ -38,20 +47,12 @@ from solvers.distributed.robots_alone import (
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.network.counted_pool import Count, CountedPool
-from solvers.network.engine import InProcess
-from solvers.network.faults import Faults
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import Record, Status
+from solvers.result import Record
 from solvers.riemannian.polish import polish
-from solvers.robots import Checkpoint, Robots
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import MultiplierPenalty
 from solvers.soc.recursion_block import Rotations
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 TOLERANCE = 1e-6
 OFF = ("describe", "set_poses")

@@ -16,20 +16,19 @@ from robots import PARTITIONERS, Partitioner
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import BoundSource, Verdict, certify_at
+from pgo_models import NoiseModel, PGOError, PoseGraph, Poses, Verdict
+from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, NO_FIT, Fit
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
-from pgo_models.errors import FileFormatError, GraphError, PGOError, SettingError
-from pgo_models.geometry.poses import Poses
+from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
-from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
-from pgo_models.graphs.scenes import NoiseModel, observe
+from pgo_models.graphs.pose_graph import isotropic_information
+from pgo_models.graphs.scenes import observe
+from solvers import Coupling, Robots
 from solvers.distributed import (
     robots_with_files,
 )
-from solvers.robots import Robots
-from solvers.soc.settings import Coupling
 from solvers.solves.folder_solve import FolderSolution, solve_folder
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"

@@ -12,9 +12,8 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel, PoseGraph
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.distributed import own_revision
 from solvers.distributed.own_files import strongest_neighbours
 from solvers.distributed.robots.own_consistency import AgreeingCounts

@@ -14,15 +14,13 @@ import solvers
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.initialization import spanning_tree_start
+from solvers import BalancedPenalty, FixedPenalty, InProcess, PaperSOC, RStep
 from solvers.distributed.driver import collect
 from solvers.distributed.paper import PaperByRobots
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import iterate
-from solvers.network.engine import InProcess
-from solvers.soc.paper import PaperSOC
 from solvers.soc.paper_robot import PaperReply, PaperRobot
-from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, PenaltyRule
-from solvers.soc.r_step import RStep
+from solvers.soc.penalty import BoydPenalty, PenaltyRule
 
 # FISTA takes long where rho is small beside the weights.
 RULES = [

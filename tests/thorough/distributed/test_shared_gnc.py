@@ -13,10 +13,11 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.thresholds import chi2_thresholds
+from solvers import GNC, Checkpoint, InProcess, RobustLoss
 from solvers.distributed.robots import current_poses
 from solvers.distributed.robots.agent import CLASSES, Agent, order_interior
 from solvers.distributed.robots.records import Reweigh
@@ -24,14 +25,10 @@ from solvers.distributed.robots.reweighting import reweigh, sum_ratios
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.robust import SharedGNC
 from solvers.network.counted_pool import Count
-from solvers.network.engine import InProcess
 from solvers.network.messages import count_bytes
 from solvers.network.serialization import deserialize, serialize
 from solvers.result import Stage
-from solvers.robots import Checkpoint
-from solvers.robust.gnc import GNC
 from solvers.robust.known import odometry
-from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import first_poses
 from solvers.soc.subgraph import split_graph
 

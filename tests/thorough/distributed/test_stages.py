@@ -21,27 +21,21 @@ from graphs import (
 from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, metis, scattered
 
+from pgo_models import NoiseModel, PGOProblem, Poses
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import NoiseModel, grid, victoria_park
+from pgo_models.graphs.scenes import grid, victoria_park
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from solvers.network.engine import InProcess
-from solvers.network.faults import Faults
+from solvers import SOC, Coupling, Faults, InProcess, Newton, Pipeline, Robots, Solution, Status
 from solvers.pipeline import solve
 from solvers.place import AUTO
-from solvers.request import Pipeline
-from solvers.result import Record, Status
-from solvers.riemannian.newton import Newton, gauss_newton
-from solvers.robots import Robots
+from solvers.result import Record
+from solvers.riemannian.newton import gauss_newton
 from solvers.soc.anderson import Anderson
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC, WARM_START
-from solvers.solution import Solution
+from solvers.soc.soc import WARM_START
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 

@@ -13,28 +13,21 @@ from hypothesis import given, settings
 from robots import Recording, arrays_in, bytes_of, metis, scattered
 from shared_gradients import dense_relative_gradient
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import NoiseModel, PartitionMethod, PGOProblem, PoseGraph, Poses
 from pgo_models.geometry.rotations import exp_map
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, observe
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.scenes import observe
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
+from solvers import SOC, Coupling, Faults, InProcess, Measurement, Pipeline, Robots, Status
 from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_alone import cheaper_end, collect_copies
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
-from solvers.network.engine import InProcess
-from solvers.network.faults import Faults
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import History, Measurement, Outcome, Record, Status
+from solvers.result import History, Outcome, Record
 from solvers.riemannian.polish import polish
-from solvers.robots import Robots
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 ROUNDING = 1e-6  # relative, of a gradient that is evaluated twice
 LOSSY = Faults(loss=0.2, max_delay=2, seed=1)

@@ -20,22 +20,18 @@ from robots import (
     singletons,
 )
 
+from pgo_models import NoiseModel, PGOProblem, PoseGraph
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
+from solvers import SOC, BalancedPenalty, Coupling, FixedPenalty, MultiplierPenalty, Status
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import iterate, run
-from solvers.result import Status
 from solvers.soc.anderson import Anderson
 from solvers.soc.joint import SOCState
-from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.soc.penalty import PenaltyRule
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

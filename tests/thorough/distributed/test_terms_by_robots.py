@@ -9,16 +9,15 @@ from graphs import LOUD_NOISE, SEEDS, varied_graph
 from hypothesis import example, given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner, contiguous, driver_at, graph_of, metis
 
+from pgo_models import PGOProblem, Poses, Weighting
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
 from pgo_models.certificates.lower_bound import best_bound_with_terms
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.rotation_hull import matrices_at
+from solvers import Status, SweptScene
 from solvers.distributed import handedness, lower_bound as robots_bound
 from solvers.distributed.driver import Driver
 from solvers.distributed.lower_bound import (
@@ -32,9 +31,8 @@ from solvers.loop import Outcome, run
 from solvers.network.counted_pool import Count
 from solvers.network.messages import restore, take_snapshot
 from solvers.pipeline import solve
-from solvers.result import Status
 from solvers.riemannian.polish import polish
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import noisy_scene
 
 SIZES = st.integers(3, 12)
 

@@ -13,10 +13,18 @@ from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.sparse import issparse
 
-from pgo_models import partition
-from pgo_models.convex.bregman import BregmanPoint, BregmanProblem
+from pgo_models import (
+    BregmanProblem,
+    PartitionMethod,
+    PGOError,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    partition,
+)
+from pgo_models.convex.bregman import BregmanPoint
 from pgo_models.convex.orthogonality import OrthogonalPoint
-from pgo_models.errors import GraphError, PGOError, SettingError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.arrays import (
     block_norms,
     inner_products,
@@ -25,11 +33,8 @@ from pgo_models.geometry.arrays import (
     whole_array,
     whole_number,
 )
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition, PartitionMethod
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import grid
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.low_rank import lifted_point
 
 GRAPH = grid(np.random.default_rng(0))

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from pgo_models import Poses
 from pgo_models.errors import GraphError
-from pgo_models.geometry.poses import Poses, absolute_trajectory_error, relative_pose_error
+from pgo_models.geometry.poses import absolute_trajectory_error, relative_pose_error
 from pgo_models.geometry.rotations import (
     Array,
     exp_map,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import pgo_models
-from pgo_models.errors import DatasetError, FileFormatError, PGOError
+from pgo_models import PGOError, PoseGraph
+from pgo_models.errors import DatasetError, FileFormatError
 from pgo_models.graphs.datasets import DATA_VARIABLE, SE_SYNC, Registry, known_datasets, load
 from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.graphs.trajectories import write_tum
 

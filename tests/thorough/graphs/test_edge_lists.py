@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.errors import GraphError
-from pgo_models.graphs.scenes import NoiseModel
 
 nx = pytest.importorskip("networkx")
 pd = pytest.importorskip("pandas")

@@ -10,8 +10,8 @@ from graphs import informed, varied_graph
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.errors import GraphError, GraphWarning
-from pgo_models.graphs.scenes import NoiseModel
 
 gtsam = pytest.importorskip("gtsam")
 

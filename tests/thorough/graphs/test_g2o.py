@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOError, SettingError
-from pgo_models.geometry.poses import Poses
+from pgo_models import PGOError, PGOProblem, PoseGraph, Poses, RotationWeight
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, SettingError
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.datasets import load
 from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
 from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import RotationWeight, edge_precisions, isotropic_information
+from pgo_models.graphs.precisions import edge_precisions, isotropic_information
 from pgo_models.graphs.scenes import random_geometric
-from pgo_models.problem.problem import PGOProblem
 
 EPS = np.finfo(float).eps
 SEEDS = st.integers(0, 2**32 - 1)

@@ -9,11 +9,9 @@ import pytest
 from graphs import random_poses
 
 import pgo_models as pgo
+from pgo_models import Chi2Convention, PoseGraph, Poses, Reading
 from pgo_models.errors import FileFormatError
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.g2o_readings import Reading
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.residuals import Chi2Convention, chi2
+from pgo_models.graphs.residuals import chi2
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"

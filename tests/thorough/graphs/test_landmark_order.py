@@ -5,8 +5,8 @@ import pytest
 
 import pgo_models as pgo
 import solvers
+from pgo_models import Poses
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.initialization import spanning_tree_start

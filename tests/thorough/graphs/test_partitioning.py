@@ -6,10 +6,10 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, strategies as st
 
+from pgo_models import PartitionMethod, PoseGraph
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.scenes import grid, random_geometric
 
 METHODS = st.sampled_from([PartitionMethod.CONTIGUOUS, PartitionMethod.METIS])

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from pgo_models import PoseGraph, Poses
 from pgo_models.errors import GraphError
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import random_geometric
 
 SEEDS = st.integers(0, 2**32 - 1)

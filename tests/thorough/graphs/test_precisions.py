@@ -8,9 +8,8 @@ import pytest
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import Verdict
+from pgo_models import NoiseModel, PoseGraph, Verdict
 from pgo_models.graphs.g2o import edge_places
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     are_definite,
     eliminated_products,
@@ -18,7 +17,6 @@ from pgo_models.graphs.precisions import (
     isotropic_information,
     smallest_eigenvalues,
 )
-from pgo_models.graphs.scenes import NoiseModel
 
 
 def weighted(graph: PoseGraph, factors: dict[int, float]) -> PoseGraph:

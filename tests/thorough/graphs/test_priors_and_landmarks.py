@@ -8,12 +8,10 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, strategies as st
 
+from pgo_models import PGOProblem, PoseGraph, Poses
 from pgo_models.errors import GraphError
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import grid, victoria_park
 from pgo_models.problem.hessian import riemannian_hessian
-from pgo_models.problem.problem import PGOProblem
 
 
 def chain(d: int = 3, n: int = 4) -> PoseGraph:

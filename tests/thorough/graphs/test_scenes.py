@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from pgo_models import NoiseModel, PoseGraph, Poses
 from pgo_models.errors import SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import log_map
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import edge_precisions, isotropic_information
-from pgo_models.graphs.scenes import NoiseModel, circle, grid, observe, random_geometric, sphere
+from pgo_models.graphs.scenes import circle, grid, observe, random_geometric, sphere
 
 SEEDS = st.integers(0, 2**32 - 1)
 DIMENSIONS = st.sampled_from([2, 3])

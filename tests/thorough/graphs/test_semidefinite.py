@@ -12,8 +12,8 @@ from hypothesis import given, strategies as st
 
 import pgo_models as pgo
 import solvers
+from pgo_models import PoseGraph
 from pgo_models.errors import GraphError
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     indefinite_edges,
     is_semidefinite_exactly,

@@ -6,9 +6,9 @@ from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, strategies as st
 from robots import PARTITIONERS, Partitioner, graph_of, one_robot, singletons, star
 
+from pgo_models import PartitionMethod, PoseGraph
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.graphs.separators import report_partition, vertex_cover
 

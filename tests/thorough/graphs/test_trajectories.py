@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 import pgo_models
-from pgo_models.errors import FileFormatError, GraphError, PGOError
-from pgo_models.geometry.poses import Poses
+from pgo_models import PGOError, Poses
+from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.rotations import exp_map, random_rotations
 from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum, write_kitti, write_tum
 

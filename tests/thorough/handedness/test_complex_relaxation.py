@@ -15,21 +15,19 @@ from graphs import SEEDS, best_known, informed, planar_lattice, random_poses, va
 from hypothesis import assume, example, given, settings, strategies as st
 
 import solvers
+from pgo_models import NoiseModel, PGOProblem, Weighting
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import project_to_tangent, retract
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.initialization import spanning_tree
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from solvers import Status
 from solvers.handedness.complex_relaxation import (
     ComplexCost,
     ComplexRelaxation,
     certificates_of_relaxation,
 )
 from solvers.loop import iterate, run
-from solvers.result import Status
 from solvers.solves.given_poses import certify
 
 LOUD = NoiseModel(0.3, 1.0)

@@ -9,14 +9,13 @@ from budget import examples
 from graphs import LOUD_NOISE, SEEDS, restarts, varied_problem
 from hypothesis import given, settings, strategies as st
 
+from pgo_models import NoiseModel, PGOProblem, RelaxationForm
 from pgo_models.certificates.dual_variables import factorize_certificate
 from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, random_rotations
 from pgo_models.geometry.stiefel import project_to_tangent, retract
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.matrices import inner
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.rotation_hull import (
     PRODUCTS,
     hull_changes,
@@ -25,13 +24,12 @@ from pgo_models.relaxations.rotation_hull import (
     matrices_at,
     terms_of,
 )
-from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
+from pgo_models.relaxations.solve_sdp import solve_relaxation
+from solvers import Pipeline, Status, SweptScene
 from solvers.handedness.hull_lagrangian import AugmentedLagrangian, HullLagrangian
 from solvers.loop import iterate, run
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import Status
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import noisy_scene
 
 SIZES = st.integers(2, 8)
 BURNING = NoiseModel(0.5, 1.5)

@@ -9,21 +9,20 @@ from graphs import LOUD_NOISE, SEEDS, restarts, varied_graph
 from hypothesis import given, settings, strategies as st
 
 import solvers
+from pgo_models import PGOProblem, RelaxationForm
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
+from pgo_models.relaxations.solve_sdp import solve_relaxation
+from solvers import Pipeline, Status, SweptScene
 from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor, iterate, run
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.result import Status
 from solvers.riemannian.polish import polish
-from solvers.studies.tightness import SweptScene, noisy_lattice, noisy_scene
+from solvers.studies.tightness import noisy_lattice, noisy_scene
 
 SIZES = st.integers(3, 8)
 

@@ -6,7 +6,7 @@ from graphs import varied_graph
 
 import solvers
 from pgo_models.errors import SettingError
-from solvers.network.engine import InProcess
+from solvers import InProcess
 
 
 @pytest.mark.parametrize("seed", range(3))

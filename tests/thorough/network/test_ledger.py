@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from pgo_models.errors import SettingError
-from solvers.network.faults import Faults, LossyChannel
+from solvers import Faults
+from solvers.network.faults import LossyChannel
 from solvers.network.ledger import DRIVER, Ledger, Traffic
 
 Link = tuple[int, int]

@@ -13,10 +13,10 @@ from graphs import varied_graph
 
 import pgo_models as pgo
 from pgo_models.errors import EngineError
+from solvers import RayEngine
 from solvers.cli import app as cli
 from solvers.distributed.robots.agent import Agent
 from solvers.network import ray_engine
-from solvers.network.ray_engine import RayEngine
 from solvers.soc.subgraph import split_graph
 
 pytestmark = pytest.mark.slow  # starts Ray

@@ -17,6 +17,7 @@ from graphs import varied_graph
 
 import pgo_models as pgo
 import solvers
+from pgo_models import PoseGraph
 from pgo_models.errors import (
     EngineError,
     FileFormatError,
@@ -26,12 +27,12 @@ from pgo_models.errors import (
 )
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import PoseGraph
+from solvers import RayEngine
 from solvers.cli import app as cli
 from solvers.distributed.robots import recursion
 from solvers.distributed.robots.agent import Agent, order_interior
 from solvers.network import ray_engine
-from solvers.network.ray_engine import RayEngine, connect
+from solvers.network.ray_engine import connect
 from solvers.network.recovery import Recovery
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.soc import WARM_START

@@ -8,9 +8,9 @@ from graphs import random_poses, varied_graph
 from robots import driver_at
 
 import solvers
+from pgo_models import PartitionMethod, PGOProblem
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
-from pgo_models.graphs.partitioning import PartitionMethod, partition
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.graphs.partitioning import partition
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent

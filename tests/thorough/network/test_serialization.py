@@ -7,10 +7,11 @@ import pytest
 from graphs import SEEDS, random_poses
 from hypothesis import given, strategies as st
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import Poses
 from pgo_models.geometry.rotations import stack_transposes
+from solvers import Measurement, Status
 from solvers.network.serialization import COMPUTED_AGAIN, deserialize, serialize
-from solvers.result import Measurement, Record, Status
+from solvers.result import Record
 from solvers.soc.anderson import AndersonShare
 from solvers.soc.recursion_block import Rotations, StepSettings, block_at
 

@@ -4,8 +4,8 @@ from scipy.sparse import diags_array, tril
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.errors import SettingError
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.plots.matrix_plots import (
     factor_of_M,
     plot_sparsity,

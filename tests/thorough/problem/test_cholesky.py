@@ -9,6 +9,7 @@ from graphs import DIMENSIONS, EPS, SEEDS, SIZES, varied_problem
 from hypothesis import HealthCheck, example, given, reject, settings, strategies as st
 from scipy.sparse import csc_array
 
+from pgo_models import PGOProblem
 from pgo_models.errors import MissingExtraError, NotPositiveDefiniteError
 from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem.cholesky import (
@@ -21,7 +22,6 @@ from pgo_models.problem.cholesky import (
 )
 from pgo_models.problem.cholmod import import_cvxopt
 from pgo_models.problem.ordering import row_order
-from pgo_models.problem.problem import PGOProblem
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 COLUMNS = st.sampled_from([None, 1, 3])

@@ -12,12 +12,11 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
+from pgo_models import PGOProblem, Poses
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, hat, stack_transposes, tangent_dimension
 from pgo_models.problem.hessian import TangentLayout, double_cross, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from solvers.riemannian.polish import polish
 
 

@@ -16,17 +16,15 @@ from hypothesis import given, strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
 from pgo_models.certificates.certificate import certify_at
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import orthogonality_error, random_rotations, unstack_transposes
 from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid, observe
+from pgo_models.graphs.scenes import MILD_NOISE, circle, grid, observe
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.matrices import residual_matrix
-from pgo_models.problem.problem import PGOProblem
 from solvers.riemannian.polish import polish
 
 

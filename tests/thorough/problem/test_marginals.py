@@ -8,16 +8,14 @@ from graphs import DIMENSIONS, SEEDS, exact_graph, random_poses, varied_graph, v
 from hypothesis import given, settings, strategies as st
 from scipy.sparse import csc_array
 
+from pgo_models import PGOError, PGOProblem, PoseGraph, Poses
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.errors import NotPositiveDefiniteError, PGOError, SettingError
-from pgo_models.geometry.poses import Poses
+from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.rotations import Array, hat, log_map
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.marginals import Marginals, write_covariances
-from pgo_models.problem.problem import PGOProblem
 from solvers.riemannian.polish import polish
 
 needs_gtsam = pytest.mark.skipif(

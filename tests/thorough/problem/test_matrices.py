@@ -6,9 +6,9 @@ from graphs import DIMENSIONS, EPS, SEEDS, SIZES, exact_graph, random_poses, var
 from hypothesis import given
 from scipy.sparse import csc_array
 
+from pgo_models import PGOProblem, PoseGraph
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import stack_transposes
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.matrices import (
@@ -21,7 +21,6 @@ from pgo_models.problem.matrices import (
     residual_matrix,
     rotation_columns,
 )
-from pgo_models.problem.problem import PGOProblem
 
 
 def rotation_cost(graph: PoseGraph, R: np.ndarray) -> float:

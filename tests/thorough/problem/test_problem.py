@@ -20,8 +20,8 @@ from graphs import (
 from hypothesis import given, strategies as st
 from scipy.sparse import csc_array
 
+from pgo_models import PGOProblem, PoseGraph, Poses, Weighting
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import (
     Array,
     exp_map,
@@ -29,7 +29,6 @@ from pgo_models.geometry.rotations import (
     stack_transposes,
     tangent_dimension,
 )
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem.cholesky import CholeskyBackend, factorize
 from pgo_models.problem.initialization import chordal_start, relaxed_rotations
@@ -39,8 +38,6 @@ from pgo_models.problem.matrices import (
     marginalized_matrix,
     residual_matrix,
 )
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 
 
 def cost_of_edge(problem: PGOProblem, poses: Poses, e: int) -> float:

@@ -12,22 +12,19 @@ from graphs import DIMENSIONS, LOUD_NOISE, REFERENCE, SEEDS, SIZES, random_poses
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models.certificates.certificate import Certificate, Verdict, certify_at
+from pgo_models import Certificate, PGOProblem, PoseGraph, Poses, RelaxationForm, Verdict, Weighting
+from pgo_models.certificates.certificate import certify_at
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.lower_bound import best_bound, prove_bound
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import extreme_weight
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.rotation_averaging import RotationAveraging
-from pgo_models.problem.weighting import Weighting
-from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
+from pgo_models.relaxations.solve_sdp import solve_relaxation
 from solvers.distributed.checkpoint import run_fingerprint
 
 OPTIMUM = REFERENCE["certified_optimum_of_rotations"]

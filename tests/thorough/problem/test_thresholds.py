@@ -11,13 +11,13 @@ from graphs import COSTS, COSTS_OF_POSES, informed, varied_graph
 from scipy.stats import chi2
 
 import pgo_models as pgo
+from pgo_models import RotationWeight, Weighting
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.pose_graph import isotropic_information
-from pgo_models.graphs.precisions import RotationWeight, edge_precisions
+from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.problem.initialization import chordal_start, spanning_tree
 from pgo_models.problem.thresholds import EdgeResiduals, chi2_thresholds, edge_residuals
-from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
 DRAWS = 20_000

@@ -9,9 +9,9 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, informed, random_poses, varied_graph
 from hypothesis import given, strategies as st
 
+from pgo_models import PGOProblem, Poses, Weighting
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.precisions import are_definite, isotropic_information
 from pgo_models.graphs.residuals import chi2
@@ -19,8 +19,6 @@ from pgo_models.problem.edge_cost import isotropic_cost
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
 COUPLED = st.booleans()

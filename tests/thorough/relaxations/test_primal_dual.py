@@ -17,26 +17,24 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
-from pgo_models.certificates.certificate import Verdict, relative_gap
+from pgo_models import ConvexSolver, PGOProblem, RelaxationForm, Verdict, Weighting
+from pgo_models.certificates.certificate import relative_gap
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.convex.convex_solver import ConvexSolver
 from pgo_models.errors import SettingError
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.scenes import circle, grid, sphere
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.rounding import rank_report, round_gram
 from pgo_models.relaxations.solve_sdp import (
     DEFAULT_RELAXATION_GAP,
-    RelaxationForm,
     RelaxationSolution,
     RelaxationStatus,
     solve_relaxation,
 )
+from solvers import SweptScene
 from solvers.pipeline import solve
 from solvers.riemannian.polish import polish
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import noisy_scene
 
 PLAIN_FORMS = [form for form in RelaxationForm if not form.has_hull]
 FORMS = st.sampled_from(PLAIN_FORMS)

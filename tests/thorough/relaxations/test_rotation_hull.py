@@ -11,19 +11,17 @@ from graphs import SEEDS, restarts, varied_problem
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models.certificates.certificate import Verdict
+from pgo_models import NoiseModel, PGOProblem, RelaxationForm, Verdict, Weighting
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import random_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.hull_models import dual_hull_relaxation, primal_hull_relaxation
 from pgo_models.relaxations.rotation_hull import hull_matrices, terms_of
-from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
+from pgo_models.relaxations.solve_sdp import solve_relaxation
 from pgo_models.verification.verify import verify_proof
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers import SweptScene
+from solvers.studies.tightness import noisy_scene
 
 HULLS = [RelaxationForm.HULL, RelaxationForm.HULL_DUAL]
 BURNING = NoiseModel(0.5, 1.5)

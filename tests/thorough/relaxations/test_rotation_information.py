@@ -9,12 +9,10 @@ import pytest
 from graphs import informed
 
 import solvers
+from pgo_models import NoiseModel, PGOProblem, RelaxationForm, Weighting
 from pgo_models.errors import SettingError
 from pgo_models.graphs.precisions import proper_information
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
-from pgo_models.relaxations.solve_sdp import RelaxationForm, solve_relaxation
+from pgo_models.relaxations.solve_sdp import solve_relaxation
 
 
 def rotations_informed(n: int) -> PGOProblem:

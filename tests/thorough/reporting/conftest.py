@@ -3,7 +3,7 @@ import pytest
 
 import pgo_models as pgo
 import solvers
-from pgo_models.graphs.scenes import NoiseModel
+from pgo_models import NoiseModel
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,7 @@ from pages import Page, own_part
 
 import pgo_models as pgo
 import solvers
-from pgo_models.graphs.scenes import NoiseModel
-from pgo_models.problem.weighting import Weighting
+from pgo_models import NoiseModel, Weighting
 from solvers.reporting.edge_fit import EdgeFit, fit_sentence, judge_edges
 from solvers.reporting.report import report_page
 

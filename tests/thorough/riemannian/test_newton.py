@@ -16,15 +16,14 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
+from pgo_models import PGOProblem, Poses
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from solvers import Newton, Status
 from solvers.loop import run
-from solvers.result import Status
-from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.newton import gauss_newton
 from solvers.riemannian.polish import polish, relative_decrement
 
 ROUNDING = 1e-14  # the relative change of F that a step does not tell apart from none

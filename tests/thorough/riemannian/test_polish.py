@@ -19,17 +19,14 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import PGOProblem, PoseGraph, Poses, Weighting
 from pgo_models.geometry.rotations import exp_map, orthogonality_error, tangent_dimension
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, factorize
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
-from pgo_models.problem.weighting import Weighting
+from solvers import SOC, Newton
 from solvers.loop import run
-from solvers.riemannian.newton import Newton
 from solvers.riemannian.newton_step import StepRules, newton_step
 from solvers.riemannian.polish import (
     CentralAlgebra,
@@ -41,7 +38,6 @@ from solvers.riemannian.polish import (
     relative_decrement,
     start_polish,
 )
-from solvers.soc.soc import SOC
 
 ROUNDING = 1e-14  # the relative change of F that polish does not tell apart from none
 

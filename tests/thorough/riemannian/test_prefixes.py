@@ -10,17 +10,13 @@ from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models.certificates.certificate import Verdict
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
 from pgo_models.errors import GraphError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, victoria_park
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from pgo_models.graphs.scenes import victoria_park
+from solvers import Status
 from solvers.loop import iterate
-from solvers.result import Status
 from solvers.riemannian.prefixes import EntryTree, GrowingStart, _prefix_problem, entry_tree
 
 FIRST_ALONE = solvers.Pipeline(growing=None, second_try=False, staircase=None)

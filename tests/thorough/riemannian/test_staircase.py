@@ -18,23 +18,17 @@ from graphs import (
 )
 from hypothesis import example, given, settings, strategies as st
 
-from pgo_models.certificates.certificate import (
-    DEFAULT_GAP,
-    BoundSource,
-    Verdict,
-    certify_at,
-    certify_with,
-)
+from pgo_models import PGOProblem, Verdict
+from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, certify_at, certify_with
 from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.errors import SettingError
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.solve_sdp import TOLERANCE, solve_relaxation
+from solvers import Newton, Staircase, Status, SweptScene
 from solvers.loop import run
-from solvers.result import Status
-from solvers.riemannian.newton import Newton, gauss_newton
+from solvers.riemannian.newton import gauss_newton
 from solvers.riemannian.polish import polish
-from solvers.riemannian.staircase import Staircase, StaircaseState
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.riemannian.staircase import StaircaseState
+from solvers.studies.tightness import noisy_scene
 
 # The solver's tolerance is on its own scale, of which the optimum of a relaxation is a small part.
 SDP_TOLERANCE = 1e4 * TOLERANCE

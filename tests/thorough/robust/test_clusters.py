@@ -11,10 +11,10 @@ from wrong_edges import ring_road, spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.geometry.rotations import BoolArray, exp_map
 from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust.cluster_search import ClusterSearch

@@ -7,12 +7,10 @@ import pytest
 from graphs import informed
 
 import pgo_models as pgo
+from pgo_models import NoiseModel, PoseGraph, Poses
 from pgo_models.errors import SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, random_rotations
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import edge_precisions, proper_information
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.robust.consistency import pairwise_consistent
 from solvers.robust.known import odometry
 

@@ -10,13 +10,14 @@ from wrong_edges import false_fixes
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.scenes import NoiseModel, observe
+from pgo_models.graphs.scenes import observe
+from solvers import Solution
 from solvers.robust.chains import Chains
 from solvers.robust.consistency import odometry
 from solvers.robust.fixes import agreeing_fixes, is_fix
 from solvers.robust.rejection import Rejection
-from solvers.solution import Solution
 
 CASES = Path(__file__).parent.parent / "cases"
 

@@ -12,7 +12,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
 from pgo_models.problem.thresholds import chi2_thresholds
-from solvers.result import Status
+from solvers import Status
 from solvers.robust.gnc import GNCSchedule, advanced, ending
 from solvers.robust.known import odometry
 from solvers.robust.weighted_edges import (

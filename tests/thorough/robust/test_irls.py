@@ -9,22 +9,17 @@ import pytest
 from graphs import COSTS_OF_POSES
 from hypothesis import given, strategies as st
 
+from pgo_models import PGOProblem, PoseGraph, Weighting
 from pgo_models.convex.graph_subproblem import Neighbours, Unknowns, graph_qp, robot_qp
 from pgo_models.convex.huber import huber_change
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.scenes import random_geometric
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
-from pgo_models.problem.weighting import Weighting
-from solvers.convex.extended_soc import ExtendedSOC
+from solvers import IRLS, SOC, ExtendedSOC, MultiplierPenalty, Status
 from solvers.loop import run
-from solvers.result import Status
 from solvers.riemannian.polish import relative_decrement
-from solvers.robust.irls import IRLS, huber
-from solvers.soc.penalty import MultiplierPenalty
-from solvers.soc.soc import SOC
+from solvers.robust.irls import huber
 
 
 def spoiled(seed: int, n: int = 8) -> PoseGraph:

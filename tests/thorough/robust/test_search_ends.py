@@ -14,8 +14,7 @@ import pytest
 from wrong_edges import slipped_loop, spoiled
 
 import pgo_models as pgo
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
+from pgo_models import NoiseModel, PoseGraph
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.edge_sets import EdgeSets

@@ -11,7 +11,7 @@ from graphs import DIMENSIONS, SEEDS, chain_with_closures, informed
 from hypothesis import given, strategies as st
 
 import pgo_models as pgo
-from pgo_models.graphs.scenes import NoiseModel
+from pgo_models import NoiseModel
 from solvers.riemannian.polish import polish
 from solvers.robust.chains import Chains
 from solvers.robust_solves.chain_sums import ChainSums

@@ -10,7 +10,7 @@ from wrong_edges import joined_by, ring_road, spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models.graphs.scenes import NoiseModel
+from pgo_models import NoiseModel
 from solvers.robust.rejection import Support
 
 

@@ -12,9 +12,8 @@ from wrong_edges import joined_by, noisy_sphere, spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.certificate import Verdict
+from pgo_models import NoiseModel, Verdict
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.riemannian.polish import polish
 from solvers.robust.known import odometry

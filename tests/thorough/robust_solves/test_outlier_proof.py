@@ -12,8 +12,8 @@ from hypothesis import given, settings, strategies as st
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.errors import SettingError
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.riemannian.polish import polish
 from solvers.robust.revision import truncated_cost
 from solvers.robust_solves.closure_costs import isotropic_below, precisions_below

@@ -8,8 +8,8 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.graphs.scenes import NoiseModel
 from solvers.cli import app as cli
 from solvers.robust import revision
 from solvers.robust.cluster_search import ClusterSearch

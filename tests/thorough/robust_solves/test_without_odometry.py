@@ -9,8 +9,7 @@ from wrong_edges import noisy_sphere
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PGOProblem, PoseGraph, Weighting
-from pgo_models.graphs.scenes import NoiseModel
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Weighting
 from solvers import GNC, Known
 from solvers.robust.rejection import Support
 

@@ -8,15 +8,13 @@ import pytest
 from graphs import EPS, SEEDS
 from hypothesis import given, strategies as st
 
+from pgo_models import PGOProblem
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.scenes import circle
-from pgo_models.problem.problem import PGOProblem
+from solvers import SOC, FixedPenalty, RStep
 from solvers.loop import run
 from solvers.soc.accelerated_gradients import minimize_with_fista, minimize_with_nesterov
-from solvers.soc.penalty import FixedPenalty
-from solvers.soc.r_step import RStep
-from solvers.soc.soc import SOC
 
 
 def quadratic(seed: int, side: int, condition: float) -> tuple[Array, float, float]:

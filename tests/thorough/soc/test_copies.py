@@ -9,26 +9,25 @@ from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, random_poses, translation_scal
 from hypothesis import assume, given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses
 from pgo_models.geometry.rotations import (
     Array,
     project_by_svd,
     stack_transposes,
     unstack_transposes,
 )
-from pgo_models.graphs.partitioning import Partition, PartitionMethod
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import columns_of
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
+from solvers import SOC, FixedPenalty, MultiplierPenalty
 from solvers.network.counted_pool import Count
 from solvers.riemannian.polish import polish
 from solvers.soc.consensus import ConsensusState, LocalConsensus, LocalRobots
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, first_penalties
+from solvers.soc.penalty import first_penalties
 from solvers.soc.recursion_block import Agreement
-from solvers.soc.soc import SOC
 
 SIZES = st.integers(2, 14)
 RHO = 3.0

@@ -8,6 +8,7 @@ from budget import examples
 from graphs import DIMENSIONS, REFERENCE, SEEDS, exact_graph, random_poses, varied_problem
 from hypothesis import assume, given, settings, strategies as st
 
+from pgo_models import PartitionMethod, PGOProblem
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import (
     Array,
@@ -16,25 +17,24 @@ from pgo_models.geometry.rotations import (
     stack_transposes,
     unstack_transposes,
 )
-from pgo_models.graphs.partitioning import PartitionMethod, partition
+from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.problem import PGOProblem
-from solvers.loop import iterate, run
-from solvers.pipeline import solve
-from solvers.result import Status
-from solvers.riemannian.newton import gauss_newton
-from solvers.soc.paper import PaperSOC, PaperStop
-from solvers.soc.penalty import (
+from solvers import (
+    SOC,
     BalancedPenalty,
-    BoydPenalty,
+    Coupling,
     FixedPenalty,
     MultiplierPenalty,
-    first_penalties,
+    PaperSOC,
+    RStep,
+    Status,
 )
-from solvers.soc.r_step import RStep
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.loop import iterate, run
+from solvers.pipeline import solve
+from solvers.riemannian.newton import gauss_newton
+from solvers.soc.paper import PaperStop
+from solvers.soc.penalty import BoydPenalty, first_penalties
 
 SIZES = st.integers(2, 12)
 PAPER_TABLES = REFERENCE["paper_tables"]

@@ -14,18 +14,12 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
+from pgo_models import PGOError, PGOProblem
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.errors import PGOError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
-from solvers.soc.penalty import (
-    BalancedPenalty,
-    BoydPenalty,
-    FixedPenalty,
-    MultiplierPenalty,
-    first_penalties,
-    rotation_scale,
-)
+from solvers import BalancedPenalty, FixedPenalty, MultiplierPenalty
+from solvers.soc.penalty import BoydPenalty, first_penalties, rotation_scale
 
 RESIDUALS = st.floats(1e-12, 1e3)
 

@@ -8,19 +8,17 @@ from graphs import DIMENSIONS, SEEDS, SIZES, translation_scale, varied_problem
 from hypothesis import given, settings, strategies as st
 from scipy.sparse import csr_array
 
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
+from solvers import SOC, FixedPenalty, MultiplierPenalty, PaperSOC, RStep
 from solvers.soc.consensus import LocalConsensus
-from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty, first_penalties
-from solvers.soc.r_step import RStep, RSubproblem, _largest_eigenvalue_bound, prepare
-from solvers.soc.soc import SOC
+from solvers.soc.penalty import first_penalties
+from solvers.soc.r_step import RSubproblem, _largest_eigenvalue_bound, prepare
 
 AGREEMENT = 1e-8  # the contract of the back ends
 SCENES = {"circle": circle, "grid": grid, "sphere": sphere}

@@ -8,16 +8,14 @@ from graphs import DIMENSIONS, SEEDS, varied_problem
 from hypothesis import assume, given, strategies as st
 from robots import PARTITIONERS, Partitioner, metis
 
+from solvers import SOC, InProcess, Status
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import iterate, run
-from solvers.network.engine import InProcess
 from solvers.network.ledger import DRIVER
 from solvers.network.messages import count_bytes
-from solvers.result import Status
 from solvers.soc.anderson import AndersonShare
 from solvers.soc.rounding import PartOfSums, RowChange, ShortNumbers
-from solvers.soc.soc import SOC
 
 BYTES = st.sampled_from([1, 2])
 

@@ -11,13 +11,11 @@ from robots import driver_at
 
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.initialization import chordal_start
+from solvers import SOC, Coupling, FixedPenalty, MultiplierPenalty
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.substructured import SubstructuredSOC
 from solvers.loop import iterate
-from solvers.soc.penalty import FixedPenalty, MultiplierPenalty
 from solvers.soc.safeguard import has_diverged, has_stalled, is_cycling
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 MERITS = st.lists(st.floats(1e-12, 1e12), max_size=40).map(tuple)
 UNITS = st.integers(-20, 20).map(lambda exponent: 2.0**exponent)

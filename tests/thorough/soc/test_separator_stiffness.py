@@ -5,11 +5,10 @@ import pytest
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, translation_scale, varied_problem
 from hypothesis import given, strategies as st
 
+from pgo_models import NoiseModel, PGOProblem
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyFactor
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.soc.separator_stiffness import GROUND, adapted_penalty, stiffness_of_separators, travel
 

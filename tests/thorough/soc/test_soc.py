@@ -15,6 +15,7 @@ from graphs import (
 )
 from hypothesis import assume, given, settings, strategies as st
 
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import (
@@ -23,23 +24,17 @@ from pgo_models.geometry.rotations import (
     stack_transposes,
     unstack_transposes,
 )
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import joint_matrix
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
+from solvers import SOC, Coupling, FixedPenalty, Measurement, PaperSOC, Status
 from solvers.loop import iterate, run
-from solvers.result import Measurement, Status
 from solvers.riemannian.polish import polish, relative_decrement
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.joint import SOCState
-from solvers.soc.paper import PaperSOC
-from solvers.soc.penalty import FixedPenalty
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 SIZES = st.integers(3, 12)
 METHODS = st.sampled_from(

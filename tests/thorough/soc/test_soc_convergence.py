@@ -17,26 +17,23 @@ from graphs import (
 )
 from hypothesis import assume, example, given, settings, strategies as st
 
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition
-from pgo_models.graphs.scenes import MILD_NOISE, NoiseModel, circle, grid
+from pgo_models import NoiseModel, PartitionMethod, PGOProblem, Poses
+from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models.graphs.scenes import MILD_NOISE, circle, grid
 from pgo_models.problem.initialization import chordal_start
-from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import (
     gradient_squares,
     relative_gradient,
     rotation_squares,
 )
+from solvers import SOC, BalancedPenalty, Coupling, FixedPenalty, MultiplierPenalty, RStep, Status
 from solvers.loop import iterate, run
-from solvers.result import Record, Status
+from solvers.result import Record
 from solvers.riemannian.polish import polish
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.joint import SOCState
-from solvers.soc.penalty import BalancedPenalty, FixedPenalty, MultiplierPenalty, PenaltyRule
-from solvers.soc.r_step import RStep
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
+from solvers.soc.penalty import PenaltyRule
 
 SIZES = st.integers(3, 12)
 METHODS = st.sampled_from(

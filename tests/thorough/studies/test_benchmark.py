@@ -9,9 +9,8 @@ import pgo_models as pgo
 from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import SettingError
 from pgo_models.graphs.published_results import published_rows
-from solvers import Status, solve
+from solvers import BenchmarkMethod, BenchmarkSettings, Status, solve
 from solvers.reporting.convergence_plots import Effort
-from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
 from solvers.studies.benchmark_runs import run_benchmark
 
 BY_ROBOTS = {

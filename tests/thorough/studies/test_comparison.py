@@ -6,13 +6,18 @@ import pytest
 
 import pgo_models as pgo
 from pgo_models.errors import SettingError
-from solvers import Measurement, compare_methods
+from solvers import (
+    BenchmarkMethod,
+    BenchmarkSettings,
+    ComparisonSettings,
+    Measurement,
+    compare_methods,
+)
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.result import History, Record
 from solvers.studies import comparison
-from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
-from solvers.studies.comparison import ComparisonSettings, check_plot_format
+from solvers.studies.comparison import check_plot_format
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")

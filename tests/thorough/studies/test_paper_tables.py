@@ -7,9 +7,8 @@ from graphs import OPTIMUM, REFERENCE, optimum_tolerance
 import pgo_models as pgo
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.graphs.published_results import published_rows
-from solvers import reproduce_tables
+from solvers import BenchmarkMethod, reproduce_tables
 from solvers.studies import paper_tables as reproduction
-from solvers.studies.benchmark import BenchmarkMethod
 from solvers.studies.paper_tables import (
     TABLE_CONTENDERS,
     Reproduction,

@@ -18,15 +18,15 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models import NoiseModel, PoseGraph
 from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel
+from solvers import Sharing
 from solvers.distributed.robots.own_file import Told
 from solvers.network.messages import Token
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
-from solvers.team.agent import OwnAnswer, Sharing
+from solvers.team.agent import OwnAnswer
 from solvers.team.messages import MESSAGES, Ask, Heard, Letter, Reply, TeamOutcome
 from solvers.team.robot import Envelope, TeamLedger
 from solvers.team.wire import opened, sealed

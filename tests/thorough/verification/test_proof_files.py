@@ -17,14 +17,12 @@ from graphs import COSTS, varied_graph
 from proofs import PLANE, SPACE, edited, proof_of, written
 
 import solvers
+from pgo_models import PGOProblem, RotationWeight, Weighting
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.proof_file import proof_json, save_proof
 from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.precisions import RotationWeight
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.verify import verify_proof
 from solvers.solves.given_poses import certify
 

@@ -28,28 +28,26 @@ from hypothesis import assume, given, settings, strategies as st
 from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
 
 import solvers
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses, Weighting
 from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import LowerBound, prove_at
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import FileFormatError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import exp_map, random_rotations
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import chi2
-from pgo_models.graphs.scenes import NoiseModel, victoria_park
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
+from pgo_models.graphs.scenes import victoria_park
 from pgo_models.verification import verify
 from pgo_models.verification.balls import arb
 from pgo_models.verification.costs import QuadraticForm, add_edge
 from pgo_models.verification.verify import verify_proof
+from solvers import SweptScene
 from solvers.riemannian.polish import polish
 from solvers.solves.given_poses import certify
-from solvers.studies.tightness import SweptScene, noisy_scene
+from solvers.studies.tightness import noisy_scene
 
 WEIGHTINGS = st.sampled_from(COSTS)
 BOTH = list(COSTS)

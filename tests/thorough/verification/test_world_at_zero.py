@@ -11,12 +11,10 @@ import pytest
 from graphs import varied_graph
 from proofs import written
 
+from pgo_models import PGOProblem, PoseGraph, Weighting
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.geometry.rotations import exp_map, tangent_dimension
 from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from pgo_models.verification.balls import ctx
 from pgo_models.verification.measurements import WORLD, Graph, read_graph
 from pgo_models.verification.proof import Proof, read_proof

@@ -21,24 +21,19 @@ from robots import (
     scattered,
 )
 
+from pgo_models import NoiseModel, PoseGraph
 from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
 from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.scenes import NoiseModel, grid
+from pgo_models.graphs.scenes import grid
+from solvers import SOC, Coupling, MultiplierPenalty, Pipeline, Robots, Solution
 from solvers.distributed.robots import descent, handedness, start, translations
 from solvers.distributed.robots.agent import begin_copies
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve
-from solvers.request import Pipeline
-from solvers.robots import Robots
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.penalty import MultiplierPenalty
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 from solvers.soc.subgraph import middle_separator
-from solvers.solution import Solution
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 # anything counts as stalled after three steps

@@ -16,15 +16,14 @@ from robots import (
 )
 from scipy.sparse import csc_array, diags_array
 
+from pgo_models import PGOProblem, Poses
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, tangent_dimension
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import riemannian_hessian
 from pgo_models.problem.matrices import columns_of
-from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import Interface, InterfaceFactor, TreeFactor
 from solvers.distributed.multifrontal import FrontOwners

@@ -28,18 +28,15 @@ from robots import (
     star,
 )
 
+from pgo_models import NoiseModel, PGOProblem, Poses, Weighting
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.lower_bound import pose_rows, prove_bound
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
-from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.scenes import NoiseModel
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import gamma
 from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import columns_of
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
 from solvers.distributed import lower_bound as distributed_bound
 from solvers.distributed.driver import collect
 from solvers.distributed.interface import Interface

@@ -25,6 +25,7 @@ from roads import road
 from robots import interface_of, matrix_of_schur, sparse_interface_of
 from scipy.sparse import csc_array, csr_array
 
+from pgo_models import PGOProblem
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.cholesky import (
@@ -38,7 +39,6 @@ from pgo_models.problem.cholesky import (
 )
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.ordering import row_order
-from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.distributed.interface import TreeFactor
 from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums, unpacked

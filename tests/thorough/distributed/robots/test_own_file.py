@@ -7,8 +7,8 @@ import pytest
 from graphs import varied_graph
 from robots import Recording, contiguous
 
+from pgo_models import Weighting
 from pgo_models.graphs.g2o import write_g2o_folder
-from pgo_models.problem.weighting import Weighting
 from solvers.distributed.own_files import open_files
 from solvers.distributed.robots import own_file
 from solvers.distributed.robots.own_file import FileAgent, PlacedFile

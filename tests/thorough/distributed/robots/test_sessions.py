@@ -10,10 +10,9 @@ import pytest
 from graphs import varied_graph
 from robots import arrays_in
 
+from pgo_models import PGOProblem, PoseGraph
 from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, largest_stiffness
-from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.robots import (
     climbing,
     current_poses,

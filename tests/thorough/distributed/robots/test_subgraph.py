@@ -5,9 +5,9 @@ from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner, complete, corner_cases, star
 
-from pgo_models.geometry.poses import Poses
+from pgo_models import PoseGraph, Poses
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import PoseGraph, middle_pose
+from pgo_models.graphs.pose_graph import middle_pose
 from pgo_models.graphs.separators import vertex_cover
 from solvers.soc.subgraph import Subgraph, split_graph
 
