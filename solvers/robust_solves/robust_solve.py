@@ -268,9 +268,7 @@ class _RobustSolve:
         ending = Status.CONVERGED
         last_failure: Exception = GraphError()
         try:
-            for plan in itertools.chain(
-                self._by_agreement(), plans_in_order(settings, self.doubted)
-            ):
+            for plan in self._plans(settings):
                 try:
                     if self._leads_nowhere_new(plan):
                         continue
@@ -309,6 +307,11 @@ class _RobustSolve:
         if plan.settings is None:
             return any(np.array_equal(plan.candidates, other.found) for other in self.estimates)
         return plan.starts_at_least_squares and not self._has_least_squares()
+
+    def _plans(self, settings: GNC) -> Iterator[Plan]:
+        """Plans of the attempts; the first two where odometry is doubted after other attempts."""
+        plans = itertools.chain(self._by_agreement(), plans_in_order(settings, self.doubted))
+        return itertools.islice(plans, 2) if self.is_doubting else plans
 
     def _by_agreement(self) -> Iterator[Plan]:
         """The plan of edges found without odometry, where there is none or it is doubted."""
