@@ -58,7 +58,7 @@ _MOST_HARD_STEPS = 10
 # Relative decrease of the weighted cost below which the poses follow the weights well enough.
 _NEARLY_STATIONARY = 1e-2
 # Scale of the thresholds: 2.5 times the quantile 0.99 is the quantile 1 - 1e-6, about.
-_LARGEST_SCALE = 2.5
+LARGEST_SCALE = 2.5
 _LEAST_SCALE = 1e-12
 # Bound on the control at which the schedule starts again after the thresholds were scaled: mu is at
 # most this for truncated least squares, and at least its inverse for Geman-McClure. Edges of up to
@@ -426,7 +426,7 @@ def rescaled_schedule(settings: GNC, state: ScheduleState[E]) -> GNCSchedule:
         return settled
     median = state.edges.median_ratio(schedule.scale, sums.kept)
     factor = settings.spread * median / expected_median_ratio(state.edges.d, settings.quantile)
-    factor = min(factor, _LARGEST_SCALE / schedule.scale)
+    factor = min(factor, LARGEST_SCALE / schedule.scale)
     rescalings_left = schedule.rescalings_left - 1
     hardly_changes = _NO_CHANGE[0] < factor < _NO_CHANGE[1]
     if hardly_changes or factor * schedule.scale < _LEAST_SCALE:

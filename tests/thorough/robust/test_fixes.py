@@ -15,8 +15,8 @@ from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.scenes import observe
 from solvers import Solution
 from solvers.robust.chains import Chains
-from solvers.robust.consistency import odometry
 from solvers.robust.fixes import agreeing_fixes, is_fix
+from solvers.robust.known import odometry
 from solvers.robust.rejection import Rejection
 
 CASES = Path(__file__).parent.parent / "cases"
