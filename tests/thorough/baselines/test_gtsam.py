@@ -146,14 +146,6 @@ def test_a_singular_system_is_named() -> None:
 
 
 @needs_gtsam
-def test_what_was_measured_exactly_is_recovered() -> None:
-    for d in (2, 3):
-        result = run_gtsam(PGOProblem(exact_graph(0, 10, d)))
-        assert result.status is Status.CONVERGED
-        assert result.objective <= 1e-12
-
-
-@needs_gtsam
 @pytest.mark.parametrize("d", [2, 3])
 def test_semidefinite_matrices_are_whole_in_its_graph(d: int) -> None:
     """`noiseModel.Gaussian.Information` factors them wrongly, without a word."""

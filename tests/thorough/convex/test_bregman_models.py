@@ -4,34 +4,22 @@ import pytest
 from budget import examples
 from hypothesis import given, settings, strategies as st
 from scipy.sparse import csr_array
-from shared_rotations import shared_rotation_step
 
-from pgo_models import BregmanProblem, PartitionMethod, PGOError
+from pgo_models import BregmanProblem, PGOError
 from pgo_models.convex.bregman import (
-    augmented_lagrangian_subproblem,
     block_subproblems,
     bregman_subproblem,
-    two_line_subproblem,
 )
 from pgo_models.convex.bregman_examples import (
-    basis_pursuit,
     differences,
     total_variation_denoising,
     total_variation_scale_space,
 )
 from pgo_models.convex.convex_solver import solve_compiled
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import random_rotations
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import grid
 from solvers import Bregman, Status, run
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def small_problem() -> BregmanProblem:
-    x = cp.Variable(3, name="x")
-    return BregmanProblem(cp.norm1(x), x, np.ones((1, 3)), [1.0])
 
 
 def test_values_are_stacked_row_by_row_in_the_order_named() -> None:
@@ -42,24 +30,6 @@ def test_values_are_stacked_row_by_row_in_the_order_named() -> None:
     np.testing.assert_array_equal(x, np.arange(1.0, 8.0))
     np.testing.assert_array_equal(problem.unstacked(x)[0], [[1.0, 2.0], [3.0, 4.0]])
     assert problem.objective(x) == pytest.approx(30.0 + 18.0, rel=1e-14)
-
-
-def test_dense_and_sparse_constraints_are_the_same() -> None:
-    x = cp.Variable(3)
-    K = np.array([[1.0, 0.0, 2.0]])
-    for given_as in (K, csr_array(K), K.tolist()):
-        problem = BregmanProblem(cp.norm1(x), x, given_as, [4.0])
-        np.testing.assert_array_equal(problem.residual(np.ones(3)), [-1.0])
-
-
-def test_problem_does_not_share_arrays_with_its_caller() -> None:
-    x = cp.Variable(2)
-    K = np.eye(2)
-    f = np.ones(2)
-    problem = BregmanProblem(cp.norm1(x), x, K, f)
-    K[:] = np.nan
-    f[:] = np.nan
-    np.testing.assert_array_equal(problem.residual(np.zeros(2)), [-1.0, -1.0])
 
 
 @pytest.mark.parametrize(
@@ -118,25 +88,6 @@ def test_bad_variables_are_refused(variable, message: str) -> None:
         BregmanProblem(cp.Constant(0.0), [variable], np.ones((1, 3)), [1.0])
 
 
-def test_subproblems_are_compiled_once() -> None:
-    problem = small_problem()
-    for compiled in (
-        bregman_subproblem(problem, 1.0),
-        two_line_subproblem(problem, 1.0),
-        augmented_lagrangian_subproblem(problem, 1.0),
-        *block_subproblems(problem, 1.0),
-    ):
-        assert compiled.problem.is_dcp(dpp=True)
-        assert [parameter.id for parameter in compiled.problem.parameters()] == [
-            compiled.parameter.id
-        ]
-        compiled.solve(np.full(compiled.parameter.shape, 0.1))
-        program = compiled.problem._cache.param_prog
-        assert program is not None
-        compiled.solve(np.full(compiled.parameter.shape, 0.2))
-        assert compiled.problem._cache.param_prog is program
-
-
 def test_a_term_that_couples_the_blocks_is_refused() -> None:
     u = cp.Variable(2, name="u")
     v = cp.Variable(2, name="v")
@@ -167,12 +118,6 @@ def test_differences_are_numpy_differences(seed: int, height: int, width: int) -
     np.testing.assert_array_equal(differences((width,)) @ image[0], np.diff(image[0]))
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (2, 2, 2)])
-def test_differences_need_a_signal_or_an_image(shape: tuple[int, ...]) -> None:
-    with pytest.raises(SettingError, match="signal or an image"):
-        differences(shape)
-
-
 @settings(max_examples=examples(10), deadline=None)
 @given(seed=SEEDS)
 def test_total_variation_models_have_the_right_objectives(seed: int) -> None:
@@ -188,42 +133,6 @@ def test_total_variation_models_have_the_right_objectives(seed: int) -> None:
     space = total_variation_scale_space(noisy)
     assert space.objective(u.ravel()) == pytest.approx(total_variation, rel=1e-12)
     np.testing.assert_array_equal(space.residual(noisy.ravel()), np.zeros(noisy.size))
-
-
-def test_examples_check_their_settings() -> None:
-    with pytest.raises(SettingError, match="weight must not be negative"):
-        total_variation_denoising(np.zeros(3), -1.0)
-    graph = grid(np.random.default_rng(0))
-    robots = partition(graph, 2)
-    V = np.zeros((graph.num_poses, 3, 3))
-    with pytest.raises(SettingError, match="rho must be positive"):
-        shared_rotation_step(graph, robots, V, 0.0)
-    with pytest.raises(SettingError, match="V has shape"):
-        shared_rotation_step(graph, robots, V[1:], 1.0)
-
-
-@settings(max_examples=examples(5), deadline=None)
-@given(seed=SEEDS, num_robots=st.integers(1, 3))
-def test_shared_rotation_step_adds_up_to_the_whole_graph(seed: int, num_robots: int) -> None:
-    rng = np.random.default_rng(seed)
-    graph = grid(rng)
-    robots = Partition(
-        np.r_[np.arange(num_robots), rng.integers(0, num_robots, 27 - num_robots)],
-        PartitionMethod.GIVEN,
-    )
-    V = random_rotations(27, 3, rng)
-    R = random_rotations(27, 3, rng)
-    model = shared_rotation_step(graph, robots, V, 3.0)
-    x = model.problem.stacked([np.swapaxes(R[poses], 1, 2) for poses in model.held])
-    assert np.linalg.norm(model.problem.residual(x)) == 0.0
-    np.testing.assert_array_equal(model.rotations(x), R)
-    error = R[graph.j] - R[graph.i] @ graph.R_ij
-    expected = np.sum(graph.kappa[:, None, None] * error**2) + 1.5 * np.sum((R - V) ** 2)
-    assert model.problem.objective(x) == pytest.approx(expected, rel=1e-12)
-
-
-def test_basis_pursuit_takes_any_matrix() -> None:
-    assert basis_pursuit(np.ones((2, 5)), np.ones(2)).K.shape == (2, 5)
 
 
 def test_a_semidefinite_constraint_in_an_indicator_is_refused_with_one_that_works() -> None:

@@ -25,7 +25,7 @@ from pgo_models.convex.orthogonality_examples import procrustes
 from pgo_models.errors import SettingError
 from pgo_models.graphs.scenes import circle
 from pgo_models.relaxations.solve_sdp import solve_relaxation
-from solvers import SOC, CvxpyStep, ExtendedSOC, OrthogonalSOC, Status, TwoLineBregman
+from solvers import SOC, CvxpyStep, OrthogonalSOC, Status, TwoLineBregman
 from solvers.convex.orthogonal import solve_orthogonal
 from solvers.loop import run
 from solvers.pipeline import solve
@@ -88,20 +88,6 @@ def test_bregman_iterations_and_orthogonality_constraints_by_another() -> None:
     )
     assert by_osqp.status is Status.CONVERGED
     assert by_osqp.objective == pytest.approx(exact.objective, rel=1e-3)
-
-
-def test_an_extended_model_by_another() -> None:
-    problem = varied_problem(4, 6, 2)
-
-    def change(unknown: PoseVariables) -> ModelChange:
-        return ModelChange(terms=[cp.sum_squares(unknown.t[[0, 3]])])
-
-    soc = SOC(tolerance=1e-4)
-    by_scs, exact = (
-        run(ExtendedSOC(change, soc, solver=solver), problem) for solver in ("SCS", "CLARABEL")
-    )
-    assert by_scs.status is exact.status is Status.CONVERGED
-    assert by_scs.history.objective[-1] == pytest.approx(exact.history.objective[-1], rel=1e-2)
 
 
 def test_a_warm_start_saves_iterations_and_a_cold_one_gives_equal_bits() -> None:
@@ -223,21 +209,6 @@ def test_options_reach_mosek_by_their_name_and_a_missing_licence_is_one_line(
         assert all(
             set(options) == {"solver", "warm_start", "verbose", "mosek_params"} for options in calls
         )
-
-
-def test_a_solver_that_is_not_installed_is_one_line_that_names_those_that_are() -> None:
-    missing = next(
-        name for name in ("MOSEK", "GUROBI", "KNITRO", "COPT") if name not in cp.installed_solvers()
-    )
-    for use in (
-        lambda: ConvexSolver(missing),
-        lambda: solve_relaxation(varied_problem(4, 5, 2), solver=missing),
-    ):
-        with pytest.raises(
-            SettingError, match=rf"^solver '{missing}' is not installed; cvxpy finds CLARABEL, "
-        ) as caught:
-            use()
-        assert "\n" not in str(caught.value)
 
 
 def test_what_is_not_convex_is_told_how_to_be_written() -> None:

@@ -152,15 +152,6 @@ def test_without_a_change_it_is_SOC() -> None:
     assert changed.objective == pytest.approx(plain.objective, rel=1e-8)
 
 
-def test_a_step_leaves_its_state_alone() -> None:
-    solver = ExtendedSOC(lambda unknown: ModelChange(), SETTINGS)
-    state = solver.init(problem(), None)
-    before = state.omega.copy(), state.B.copy()
-    solver.step(problem(), state)
-    np.testing.assert_array_equal(state.omega, before[0])
-    np.testing.assert_array_equal(state.B, before[1])
-
-
 def test_what_does_not_go_together_is_refused() -> None:
     robots = partition(problem().graph, 2)
     with pytest.raises(SettingError, match=r"solved by Coupling\.JOINT, got CONSENSUS"):
@@ -197,17 +188,6 @@ def test_the_default_start_is_moved_to_positions_in_a_frame_far_away(
     limit = best.objective if norm is cp.sum_squares else outcome.history.objective[0]
     assert outcome.history.objective[-1] <= limit * (1 + ACCURACY)
     assert np.abs(outcome.poses.t[where] - positions).max() < 1.0
-
-
-def test_what_says_nothing_of_the_frame_leaves_the_start_where_it_is() -> None:
-    graph = problem().graph
-    edges = np.arange(3)
-    rows = lambda unknown: cp.sum(cp.norm(unknown.translation_residual[edges], 2, axis=1))  # noqa: E731
-    method = ExtendedSOC(
-        lambda unknown: ModelChange(terms=[rows(unknown)], replaced_edges=edges), SETTINGS
-    )
-    np.testing.assert_array_equal(method.init(problem(), None).omega, chordal_start(problem()).R)
-    assert graph.num_edges > 3
 
 
 @pytest.mark.parametrize("robots", [None, 2])

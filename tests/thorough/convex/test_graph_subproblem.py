@@ -2,7 +2,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, SEEDS, random_poses, translation_scale, varied_problem
+from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings, strategies as st
 
 from pgo_models import ModelChange, PGOProblem
@@ -16,11 +16,9 @@ from pgo_models.convex.graph_subproblem import (
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.graphs.partitioning import partition
-from solvers import SOC, FixedPenalty, PaperSOC, RStep
-from solvers.soc.consensus import LocalConsensus
+from solvers import PaperSOC, RStep
 from solvers.soc.paper import PaperState
 from solvers.soc.r_step import RSubproblem, prepare
-from solvers.soc.subgraph import split_graph
 
 ACCURACY = 1e-8
 RHO = st.floats(0.1, 10.0)
@@ -80,29 +78,6 @@ def test_with_frozen_neighbours_it_is_the_papers_step(seed: int, n: int, d: int)
         np.testing.assert_allclose(Y, stack_transposes(following.R[own]), rtol=0, atol=ACCURACY)
 
 
-@settings(max_examples=examples(8))
-@given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS)
-def test_with_copies_it_is_the_consensus_step(seed: int, n: int, d: int) -> None:
-    problem, rho, V = drawn(seed, n, d)
-    robots = partition(problem.graph, 2)
-    graph = problem.graph.with_robots(robots.robot)
-    separator = np.zeros(n, dtype=bool)
-    separator[robots.separators(graph)] = True
-    rule = FixedPenalty(float(np.median(rho)))
-    soc = SOC(robots=robots, penalty=rule, translation_penalty=0.5)
-    count = np.bincount(np.concatenate([s.poses for s in split_graph(graph, robots)]), minlength=n)
-    share_t = np.where(separator, 0.5 * translation_scale(problem) / count, 0.0)
-    for a, robot in enumerate(LocalConsensus(soc).init(problem, random_poses(n, d, seed)).robots):
-        assert robot.step_a is not None
-        poses = robot.layout.subgraph.poses
-        held = robot.layout.held[:, 0]
-        qp = robot_qp(graph, a, rule.rho / count, Neighbours.COPIES, Unknowns.POSES, rho_t=share_t)
-        np.testing.assert_array_equal(qp.variables.poses, poses)
-        shift = V[np.concatenate([poses, (n + d * poses[:, None] + np.arange(d)).ravel()])]
-        expected = robot.step_a.solve(np.where(held[:, None], shift, 0.0))
-        np.testing.assert_allclose(qp.solve(shift)[held], expected[held], rtol=0, atol=ACCURACY)
-
-
 def test_a_frozen_translation_needs_a_penalty() -> None:
     problem, rho, V = drawn(0, 6, 2)
     graph = problem.graph.with_robots(np.arange(6) // 3)
@@ -119,16 +94,6 @@ def test_a_frozen_translation_needs_a_penalty() -> None:
     np.testing.assert_allclose(qp.solve(V[own], V), expected, rtol=0, atol=ACCURACY)
     with pytest.raises(SettingError, match="neighbours are frozen"):
         qp.solve(V[own])
-
-
-def test_the_shift_is_the_only_parameter_and_it_is_compiled_once() -> None:
-    problem, rho, V = drawn(1, 6, 3)
-    qp = graph_qp(problem.graph, rho)
-    assert qp.qp.problem.parameters() == [qp.qp.shift]
-    qp.solve(V)
-    compiled = qp.qp.problem._cache.param_prog
-    qp.solve(2.0 * V)
-    assert qp.qp.problem._cache.param_prog is compiled
 
 
 @settings(max_examples=examples(10))
@@ -175,28 +140,6 @@ def test_many_at_once_are_one_after_the_other(seed: int, n: int, d: int) -> None
         for which in (rng.permutation(count), mask, slice(1, None), [count - 1, 0], slice(None)):
             np.testing.assert_allclose(stack[which].value, one_by_one[which], rtol=0, atol=1e-14)
         assert stack[-1].shape == one_by_one.shape[1:]
-
-
-def test_a_term_on_many_edges_is_that_on_each() -> None:
-    problem, rho, V = drawn(5, 8, 3)
-    chosen = np.arange(problem.graph.num_edges) % 2 == 0
-    edges = np.flatnonzero(chosen).tolist()
-
-    def many(unknown: PoseVariables) -> ModelChange:
-        rotations = cp.reshape(unknown.rotation_residual[chosen], (len(edges), 9), order="C")
-        translations = unknown.translation_residual[chosen]
-        norms_R = cp.norm(rotations, 2, axis=1)
-        norms_t = cp.norm(translations, 2, axis=1)
-        return ModelChange(terms=[cp.sum(norms_R), cp.sum(norms_t)])
-
-    def each(unknown: PoseVariables) -> ModelChange:
-        terms = [cp.norm(unknown.rotation_residual(e), "fro") for e in edges]
-        terms += [cp.norm(unknown.translation_residual(e)) for e in edges]
-        return ModelChange(terms=terms)
-
-    X_many = graph_qp(problem.graph, rho, changer=many).solve(V)
-    X_each = graph_qp(problem.graph, rho, changer=each).solve(V)
-    np.testing.assert_allclose(X_many, X_each, rtol=0, atol=1e-6)
 
 
 def test_replaced_edges_leave_the_cost() -> None:

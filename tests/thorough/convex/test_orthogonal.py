@@ -1,22 +1,19 @@
 import itertools
 import math
-from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
 import pytest
-from budget import examples
 from graphs import polar_factor
-from hypothesis import given, settings, strategies as st
-from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
+from hypothesis import strategies as st
+from orthogonal_models import one_norm_components
 
-from pgo_models import OrthogonalProblem, PGOProblem
-from pgo_models.convex.orthogonality import OrthogonalPoint, kkt_residuals
+from pgo_models import OrthogonalProblem
+from pgo_models.convex.orthogonality import OrthogonalPoint
 from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
-from pgo_models.graphs.scenes import MILD_NOISE, grid, random_geometric
-from solvers import SOC, Newton, OrthogonalSOC, Status
+from pgo_models.geometry.rotations import Array, orthogonality_error
+from solvers import OrthogonalSOC, Status
 from solvers.convex.orthogonal import solve_orthogonal
 from solvers.loop import iterate, run
 
@@ -44,14 +41,6 @@ def test_a_solution_says_that_it_has_no_lower_bound() -> None:
     assert "lower bound  none: the sets are not convex" in text
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_nearest_orthonormal_matrix(seed: int) -> None:
-    B = rng_of(seed).standard_normal((5, 3))
-    solution = solve_orthogonal(procrustes(np.eye(5), B), rng_of(seed), starts=1)
-    assert_solved(solution)
-    np.testing.assert_allclose(solution.values[0], polar_factor(B), rtol=0, atol=BETTER)
-
-
 @pytest.mark.parametrize(("seed", "rotation"), [(0, False), (1, True), (2, True)])
 def test_balanced_procrustes_is_the_svd(seed: int, rotation: bool) -> None:
     rng = rng_of(seed)
@@ -73,27 +62,6 @@ def test_unbalanced_procrustes_finds_the_planted_answer() -> None:
     solution = solve_orthogonal(procrustes(A, A @ X), rng, starts=4)
     assert_solved(solution)
     np.testing.assert_allclose(solution.values[0], X, rtol=0, atol=BETTER)
-
-
-@settings(max_examples=examples(5), deadline=None)
-@given(seed=SEEDS, n=st.integers(3, 7), count=st.integers(1, 3))
-def test_smallest_eigenvectors_from_any_start(seed: int, n: int, count: int) -> None:
-    rng = rng_of(seed)
-    basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
-    values = np.arange(1.0, n + 1)
-    solution = solve_orthogonal(
-        smallest_eigenvectors((basis * values) @ basis.T, count), rng, starts=2
-    )
-    assert_solved(solution)
-    assert solution.objective == pytest.approx(values[:count].sum(), rel=TOLERANCE)
-    X = solution.values[0]
-    np.testing.assert_allclose(
-        X @ X.T, basis[:, :count] @ basis[:, :count].T, rtol=0, atol=2 * BETTER
-    )
-    # The multiplier of tr(X^T A X) is 2 X^T A X.
-    np.testing.assert_allclose(
-        np.linalg.eigvalsh(solution.kkt.multipliers[0]), 2 * values[:count], rtol=0, atol=1e-2
-    )
 
 
 def inliers_and_outliers(rng: np.random.Generator) -> tuple[Array, Array]:
@@ -120,21 +88,6 @@ def test_sparse_components_reach_their_bound() -> None:
     assert_solved(solution)
     bound = values[:2].sum() + 0.5 * 2
     assert bound * (1.0 - TOLERANCE) <= solution.objective <= bound * (1.0 + TOLERANCE)
-
-
-def test_rotation_averaging_equals_soc_and_newton_on_the_graph() -> None:
-    graph = random_geometric(8, rng_of(0), d=3, noise=MILD_NOISE)
-    solution = solve_orthogonal(rotation_averaging(graph), rng_of(0), starts=2)
-    assert_solved(solution)
-    # With tau far below kappa, F is its rotation part.
-    faint = PGOProblem(replace(graph, tau=1e-9 * graph.kappa))
-    soc = run(SOC(tolerance=1e-8), faint)
-    newton = run(Newton(), faint, soc.poses)
-    assert solution.objective == pytest.approx(newton.objective, rel=BETTER)
-    R = np.array(solution.values)
-    common = R[0] @ newton.poses.R[0].T
-    np.testing.assert_allclose(R, common @ newton.poses.R, rtol=0, atol=10 * BETTER)
-    assert orthogonality_error(R).max() < 1e-12
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -198,20 +151,6 @@ def test_unit_rows_solve_a_small_max_cut() -> None:
     )
 
 
-def test_over_relaxation_and_a_fixed_penalty_have_the_same_answer() -> None:
-    rng = rng_of(0)
-    A = rng.standard_normal((8, 3))
-    B = rng.standard_normal((8, 3))
-    problem = procrustes(A, B, rotation=True)
-    start = problem.point([polar_factor(A.T @ B, rotation=True)])
-    answers = [
-        run(method, problem, start).state.copies[0]
-        for method in (OrthogonalSOC(), OrthogonalSOC(alpha=1.6), OrthogonalSOC(penalty=60.0))
-    ]
-    for answer in answers[1:]:
-        np.testing.assert_allclose(answer, answers[0], rtol=0, atol=BETTER)
-
-
 def test_fixed_penalty_is_the_papers_recursion() -> None:
     rng = rng_of(1)
     A = rng.standard_normal((6, 3))
@@ -229,42 +168,12 @@ def test_fixed_penalty_is_the_papers_recursion() -> None:
         np.testing.assert_allclose(state.B[0], scaled, rtol=0, atol=1e-9)
 
 
-def test_scaling_the_objective_scales_the_penalty() -> None:
-    rng = rng_of(2)
-    A = rng.standard_normal((8, 3))
-    B = rng.standard_normal((8, 3))
-    plain = run(OrthogonalSOC(), procrustes(A, B))
-    scaled = run(OrthogonalSOC(), procrustes(100.0 * A, 100.0 * B))
-    assert plain.status is scaled.status is Status.CONVERGED
-    assert scaled.objective == pytest.approx(1e4 * plain.objective, rel=BETTER)
-
-
 # The contract of every solver.
 
 
 def example() -> OrthogonalProblem:
     rng = rng_of(5)
     return procrustes(rng.standard_normal((8, 3)), rng.standard_normal((8, 3)))
-
-
-def test_step_leaves_its_input_alone() -> None:
-    problem = example()
-    method = OrthogonalSOC()
-    state = list(itertools.islice(iterate(method, problem), 4))[-1]
-    X = state.X[0].copy()
-    copies = state.copies[0].copy()
-    B = state.B[0].copy()
-    rho = state.rho
-    first = method.step(problem, state)
-    second = method.step(problem, state)
-    for before, after in (
-        (X, state.X[0]),
-        (copies, state.copies[0]),
-        (B, state.B[0]),
-        (first.B[0], second.B[0]),
-    ):
-        np.testing.assert_array_equal(before, after)
-    assert (state.rho, state.k, first.k) == (rho, 3, 4)
 
 
 def test_warm_start_at_the_solution_stays() -> None:
@@ -293,26 +202,6 @@ def test_unfinished_starts_are_told_apart() -> None:
     assert "MAX_ITERATIONS" in repr(solution)
 
 
-def test_same_seed_gives_the_same_bits() -> None:
-    first, again = (solve_orthogonal(example(), rng_of(3), starts=2) for _ in range(2))
-    np.testing.assert_array_equal(first.values[0], again.values[0])
-    assert first.objectives == again.objectives
-
-
-def test_residuals_of_the_run_are_those_of_the_answer() -> None:
-    problem = example()
-    method = OrthogonalSOC()
-    for state in itertools.islice(iterate(method, problem), 3, 12, 4):
-        kkt = kkt_residuals(problem, method.point(problem, state), state.rho)
-        # Both bound the distance from stationarity, in the units of the gradient, of neighbouring
-        # iterates.
-        bound = state.scale * (
-            state.dual_residual
-            + 2.0 * state.rho / state.scale * math.sqrt(3) * state.primal_residual
-        )
-        assert kkt.stationarity <= bound + BETTER
-
-
 @pytest.mark.parametrize(
     ("settings_given", "message"),
     [
@@ -334,14 +223,6 @@ def test_starts_are_checked() -> None:
         solve_orthogonal(example(), rng_of(0), starts=0)
     with pytest.raises(SettingError, match="shapes"):
         run(OrthogonalSOC(), example(), OrthogonalPoint((np.eye(2),), (np.zeros((2, 2)),)))
-
-
-def test_rotation_start_of_a_graph_may_be_given() -> None:
-    graph = grid(rng_of(0))
-    problem = rotation_averaging(graph)
-    start = problem.point(list(random_rotations(graph.num_poses, 3, rng_of(1))))
-    problem.check_point(start)
-    assert len(start.copies) == graph.num_poses
 
 
 def test_ctrl_c_ends_all_starts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,17 +2,14 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
-from graphs import polar_factor
 from hypothesis import given, settings, strategies as st
-from orthogonal_models import one_norm_components, rotation_averaging, smallest_eigenvectors
+from orthogonal_models import smallest_eigenvectors
 
 from pgo_models import OrthogonalProblem, PGOError
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, Sparse, UnitColumns, UnitRows
 from pgo_models.convex.orthogonality import OrthogonalPoint, kkt_residuals
-from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
+from pgo_models.convex.orthogonality_examples import procrustes
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import random_rotations
-from pgo_models.graphs.scenes import grid
 
 EPS = float(np.finfo(float).eps)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -62,17 +59,6 @@ def test_what_a_projection_leaves_is_normal(seed: int, chosen) -> None:
     assert constraint.least_penalty(P, N) <= 1.0 + ROUNDING
 
 
-@given(seed=SEEDS, chosen=SETS_AND_SHAPES)
-def test_normal_part_is_an_orthogonal_projection(seed: int, chosen) -> None:
-    constraint, shape = chosen
-    rng = np.random.default_rng(seed)
-    P = constraint.random(shape, rng)
-    G = rng.standard_normal(shape)
-    N = constraint.normal_part(P, G)
-    np.testing.assert_allclose(constraint.normal_part(P, N), N, rtol=0, atol=ROUNDING)
-    assert abs(np.vdot(N, G - N)) <= ROUNDING
-
-
 @given(seed=SEEDS, chosen=st.sampled_from(SETS[:9]))
 def test_least_penalty_is_the_least(seed: int, chosen) -> None:
     constraint, shape = chosen
@@ -85,17 +71,6 @@ def test_least_penalty_is_the_least(seed: int, chosen) -> None:
     # SO(d) forgives one eigenvalue below the limit.
     if least > 1e-3 and not isinstance(constraint, Rotations):
         assert np.linalg.norm(constraint.project(P + N / (0.9 * least)) - P) > 0.1
-
-
-def test_normal_part_of_a_sparse_point_with_room_is_zero() -> None:
-    np.testing.assert_array_equal(
-        Sparse(2).normal_part(np.array([1.0, 0.0, 0.0]), np.ones(3)), np.zeros(3)
-    )
-
-
-def test_projection_of_zero_is_in_the_set() -> None:
-    for constraint, shape in SETS:
-        assert constraint.distance(constraint.project(np.zeros(shape))) <= ROUNDING
 
 
 def small(kind: str = "orthogonal", shape: tuple[int, ...] = (3, 2)) -> OrthogonalProblem:
@@ -178,16 +153,6 @@ def test_maximising_a_concave_function_minimises_its_negative() -> None:
     assert problem.objective([np.array([1.0, 0.0, 0.0])]) == 0.0
 
 
-def test_split_problem_is_compiled_once() -> None:
-    split = small().split()
-    assert split.problem.is_dcp(dpp=True)
-    split.solve([np.eye(3, 2)], 1.0)
-    program = split.problem._cache.param_prog
-    assert program is not None
-    split.solve([np.zeros((3, 2))], 7.0)
-    assert split.problem._cache.param_prog is program
-
-
 @settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS, rho=st.sampled_from([0.1, 1.0, 30.0]))
 def test_split_problem_gives_the_gradient(seed: int, rho: float) -> None:
@@ -198,19 +163,6 @@ def test_split_problem_gives_the_gradient(seed: int, rho: float) -> None:
     (X,), _ = procrustes(A, B).split().solve([V], rho)
     gradient = 2.0 * A.T @ (A @ X - B)
     np.testing.assert_allclose(rho * (V - X), gradient, rtol=0, atol=SUBPROBLEM * max(1.0, rho))
-
-
-def test_two_sets_of_a_variable_share_its_subproblem() -> None:
-    rng = np.random.default_rng(0)
-    problem = sparse_low_rank(rng.standard_normal((6, 20)), 2, 4)
-    V, W = rng.standard_normal((2, 6, 2))
-    split = problem.split()
-    np.testing.assert_allclose(
-        split.solve([V, W], 2.0)[0][0],
-        split.solve([(V + W) / 2, (V + W) / 2], 2.0)[0][0],
-        rtol=0,
-        atol=SUBPROBLEM,
-    )
 
 
 def test_infeasible_constraints_say_so() -> None:
@@ -245,58 +197,6 @@ def test_kkt_residuals_know_the_stationary_points(seed: int) -> None:
     residuals = kkt_residuals(problem, OrthogonalPoint((X,), (-G,)), rho)
     # With a large rho the subgradient is taken at X: the residual is the tangential gradient.
     assert residuals.stationarity == pytest.approx(tangential, rel=1e-2, abs=SUBPROBLEM * rho)
-
-
-def test_kkt_residuals_count_constraints_and_copies() -> None:
-    x = cp.Variable(2)
-    problem = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(x)), [x[0] >= 0.5]), unit_columns=[x])
-    assert problem.infeasibility([np.array([0.0, 1.0])]) == pytest.approx(0.5, rel=1e-14)
-    both = OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(x))), unit_columns=[x], sparse=[(x, 1)])
-    assert both.infeasibility([np.array([0.6, 0.8]), np.array([0.6, 0.0])]) == pytest.approx(
-        0.8, rel=1e-14
-    )
-
-
-def test_examples_check_their_matrices() -> None:
-    with pytest.raises(SettingError, match="not symmetric"):
-        smallest_eigenvectors(np.array([[1.0, 1.0], [0.0, 1.0]]), 1)
-    with pytest.raises(SettingError, match="has the eigenvalue -1"):
-        sparse_components(np.diag([1.0, -1.0]), 1, 0.1)
-    with pytest.raises(SettingError, match="A has 2 rows and B 3"):
-        procrustes(np.eye(2), np.ones((3, 2)))
-    with pytest.raises(SettingError, match="give a matrix"):
-        procrustes(np.ones(3), np.ones((3, 3)))
-
-
-@settings(max_examples=examples(20), deadline=None)
-@given(seed=SEEDS)
-def test_examples_have_the_objectives_they_claim(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((6, 4))
-    X = Orthonormal().random((4, 2), rng)
-    Y = rng.standard_normal((4, 9))
-    C = A.T @ A
-    for problem, value in [
-        (procrustes(A, A[:, :2]), np.sum((A @ X - A[:, :2]) ** 2)),
-        (smallest_eigenvectors(C, 2), np.trace(X.T @ C @ X)),
-        (one_norm_components(A, 2), np.abs(A @ X).sum()),
-        (sparse_components(C, 2, 0.3), np.trace(X.T @ C @ X) + 0.3 * np.abs(X).sum()),
-        (sparse_low_rank(Y, 2, 3), np.sum((Y - X @ X.T @ Y) ** 2)),
-    ]:
-        assert problem.objective([X]) == pytest.approx(value, rel=1e-10)
-    graph = grid(rng)
-    R = random_rotations(graph.num_poses, 3, rng)
-    error = np.sum(graph.kappa[:, None, None] * (R[graph.j] - R[graph.i] @ graph.R_ij) ** 2)
-    assert rotation_averaging(graph).objective(list(R)) == pytest.approx(error, rel=1e-10)
-
-
-@given(seed=SEEDS, d=st.integers(2, 4))
-def test_polar_factor_is_the_projection(seed: int, d: int) -> None:
-    A = np.random.default_rng(seed).standard_normal((d, d))
-    np.testing.assert_allclose(polar_factor(A), Orthonormal().project(A), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(
-        polar_factor(A, rotation=True), Rotations().project(A), rtol=0, atol=1e-12
-    )
 
 
 @pytest.mark.parametrize("kind", ["unit_columns", "unit_rows"])

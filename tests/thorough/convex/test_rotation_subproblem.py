@@ -1,11 +1,9 @@
-import cvxpy as cp
 import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, SIZES, varied_problem
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import PGOError
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
 from pgo_models.errors import SettingError
 
@@ -41,31 +39,6 @@ def test_the_solution_satisfies_the_normal_equations(
 
 @settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_rows_without_a_penalty_do_not_matter(seed: int, n: int, d: int) -> None:
-    qp, K, rng = posed(seed, n, d, with_translations=False)
-    V = rng.standard_normal((len(K), d))
-    qp.solve(V)  # compiles
-    X = qp.solve(V)
-    V[:n] = np.nan
-    np.testing.assert_array_equal(qp.solve(V), X)
-
-
-@settings(max_examples=examples(10))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, with_translations=PENALISE_TRANSLATIONS)
-def test_it_is_a_parametrised_quadratic_program(
-    seed: int, n: int, d: int, with_translations: bool
-) -> None:
-    qp, K, _ = posed(seed, n, d, with_translations)
-    assert qp.problem.is_dcp(dpp=True)
-    assert qp.problem.is_qp()
-    assert qp.problem.parameters() == [qp.shift]
-    assert qp.problem.variables() == [qp.X]
-    assert qp.X.shape == (len(K), d)
-    assert qp.shift.shape == (int((qp.penalty > 0).sum()), d)
-
-
-@settings(max_examples=examples(10))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_the_objective_is_the_R_subproblem(seed: int, n: int, d: int) -> None:
     qp, K, rng = posed(seed, n, d, with_translations=True)
     V, X = rng.standard_normal((2, len(K), d))
@@ -85,22 +58,3 @@ def test_penalties_must_not_be_negative(value: float) -> None:
         rotation_qp(*problem.residual_matrix, penalty, 2)
     with pytest.raises(SettingError, match="one must be positive"):
         rotation_qp(*problem.residual_matrix, np.zeros(problem.side), 2)
-
-
-def test_a_failure_of_the_backend_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = varied_problem(0, 4, 2)
-    qp = rotation_qp(*problem.residual_matrix, np.ones(problem.side), 2)
-    V = np.ones((problem.side, 2))
-    # leaves the status as it was: none
-    monkeypatch.setattr(qp.problem, "solve", lambda **settings: None)
-    with pytest.raises(PGOError, match="CLARABEL ended with status None"):
-        qp.solve(V)
-
-    def fail(**settings: object) -> None:
-        raise cp.SolverError("out of luck")
-
-    monkeypatch.setattr(qp.problem, "solve", fail)
-    with pytest.raises(
-        PGOError, match="CLARABEL ended with status solver_error on the R-subproblem: out of luck"
-    ):
-        qp.solve(V)

@@ -70,7 +70,7 @@ def assert_same(found, expected):
 @pytest.mark.parametrize(
     "coupling", [solvers.Coupling.SUBSTRUCTURED, solvers.Coupling.CONSENSUS, None]
 )
-@pytest.mark.parametrize("part", [0.0, 0.3, 0.7, 1.0])
+@pytest.mark.parametrize("part", [0.3, 1.0])
 def test_a_run_that_was_broken_off_goes_on_to_the_same_numbers(coupling, part, tmp_path):
     graph = varied_graph(int(10 * part), 50, 3)
     robots = partition(graph, 4)
@@ -111,7 +111,7 @@ def line_with_closures(seed, n, num_closures):
 
 
 @pytest.mark.parametrize("growing", [None, GrowingStart(first_size=6)])
-@pytest.mark.parametrize("part", [0.1, 0.5, 0.8])
+@pytest.mark.parametrize("part", [0.5])
 def test_a_second_attempt_goes_on_too(part, growing, tmp_path):
     graph = line_with_closures(1, 14, 12)  # the relaxation is not tight
     settings = pipeline(solvers.Coupling.SUBSTRUCTURED, None)
@@ -268,7 +268,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_left_alone(damage, broken_o
     length=st.none() | st.floats(0, 1, exclude_max=True),
 )
 @hypothesis_settings(
-    max_examples=examples(500), suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=examples(60), suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 def test_a_flipped_bit_or_a_lost_end_is_one_error(broken_off, place, bit, length):
     path = broken_off[1]

@@ -34,8 +34,8 @@ def full_disk_later() -> Iterator[Callable[[int], None]]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of the size of files are POSIX")
-@pytest.mark.parametrize("size", [0, 60, 5000, 30_000])
-@pytest.mark.parametrize("full_after", [1, 20])
+@pytest.mark.parametrize("size", [0, 5000])
+@pytest.mark.parametrize("full_after", [20])
 def test_a_full_disk_is_told_once_and_the_last_checkpoint_stays(size, full_after, tmp_path, caplog):
     path = tmp_path / "run.ckpt"
     graph = pgo.load("circle")

@@ -157,34 +157,6 @@ def test_the_iterates_of_corner_cases(graph: PoseGraph, parts: Partition) -> Non
     check(PGOProblem(graph), parts, SOC(robots=parts), 8)
 
 
-@pytest.mark.parametrize("seed", [3, 5])
-def test_robots_forget_when_the_acceleration_restarts(seed: int) -> None:
-    problem = varied_problem(seed, 14, 3, LOUD_NOISE)
-    parts = metis(problem.graph, 5)
-    start = chordal_start(problem)
-    acceleration = Anderson(memory=3, restart_ratio=1.001)
-    soc = SOC(
-        coupling=Coupling.CONSENSUS,
-        robots=parts,
-        penalty=BalancedPenalty(),
-        acceleration=acceleration,
-    )
-    engine = Recording()
-    driver = driver_at(problem, parts, start, engine)
-    restarts = []
-    for expected, other in islice(
-        zip(iterate(soc, problem, start), iterate(ConsensusSOC(soc), driver), strict=False), 16
-    ):
-        check_state(expected, other, engine)
-        orders = [
-            down[0][0].gamma is None
-            for order, down, _ in engine.log
-            if order == "ConsensusRobot.step"
-        ]
-        restarts.append(bool(orders) and bool(orders[-1]))
-    assert sum(restarts[:-3]) >= 1  # and steps follow
-
-
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("bytes_per_number", [1, 2, 8])
 def test_a_long_accelerated_run_ends_where_one_place_ends(d: int, bytes_per_number: int) -> None:

@@ -16,7 +16,6 @@ import solvers
 from pgo_models import NoiseModel, PGOProblem
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.lower_bound import prove_bound
-from pgo_models.graphs.partitioning import partition
 from solvers import InProcess, Staircase, Status
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots_of_graph import open_driver
@@ -114,16 +113,3 @@ def test_a_climb_goes_on_from_a_snapshot() -> None:
         assert np.isfinite(other.newton.objective)
     np.testing.assert_array_equal(first.current.R, second.current.R)
     np.testing.assert_array_equal(collect(first)[0].t, collect(second)[0].t)
-
-
-def test_a_rank_that_the_drivers_memory_does_not_hold_is_not_climbed_to() -> None:
-    problem, wound = wound_ring(20, 3)
-    enough = (
-        open_driver(problem, partition(problem.graph, 4), InProcess()).interface(3, 3).num_bytes
-    )
-    driver = driver_at(problem, contiguous, 3, wound, enough)
-    assert driver.fits(3)
-    assert not driver.fits(4)
-    found = run(SubstructuredStaircase(), driver)
-    assert found.status is Status.STALLED
-    assert driver.current.R.shape[1] == 3

@@ -1,7 +1,5 @@
 """The driver and its robots: their results, their messages, and how these are counted."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from budget import examples
@@ -10,9 +8,7 @@ from graphs import (
     LOUD_NOISE,
     MILD_NOISE,
     SEEDS,
-    random_poses,
     varied_graph,
-    varied_problem,
 )
 from hypothesis import example, given, settings, strategies as st
 from robots import (
@@ -25,14 +21,11 @@ from robots import (
     contiguous,
     corner_cases,
     driver_at,
-    eliminate_all,
-    metis,
 )
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
+from pgo_models import NoiseModel, PGOProblem, PoseGraph
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.rotations import tangent_dimension
+from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.cholesky import CholeskyBackend
@@ -44,8 +37,6 @@ from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.pipeline import solve
 from solvers.place import AUTO, FirstStage
-from solvers.soc.soc import WARM_START
-from solvers.soc.subgraph import split_graph
 
 SIZES = st.integers(2, 24)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
@@ -98,43 +89,9 @@ def test_the_averaged_start_is_the_central_one(
     assert driver.network.ledger.rounds == 3
 
 
-def test_no_averaged_start_where_an_edge_has_no_tau() -> None:
-    graph = varied_graph(3, 12, 2)
-    tau = graph.tau.copy()
-    tau[-1] = 0.0
-    problem = PGOProblem(replace(graph, tau=tau))
-    assert not open_driver(problem, metis(graph, 3), InProcess()).can_average
-    in_space = varied_problem(3, 12, 3)
-    assert not open_driver(in_space, metis(in_space.graph, 3), InProcess()).can_average
-
-
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
 def test_the_chordal_start_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
     check_start(PGOProblem(graph), parts)
-
-
-@settings(max_examples=examples(30))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
-def test_poses_from_elsewhere_are_taken_as_they_are(
-    seed: int, n: int, d: int, partitioner: Partitioner
-) -> None:
-    problem = varied_problem(seed, n, d)
-    given_poses = random_poses(n, d, seed)
-    other = random_poses(n, d, seed + 1)
-    driver = driver_at(problem, partitioner(problem.graph, seed), given_poses)
-    assert driver.current.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
-    driver.save_poses()
-    driver.set_poses(other)
-    driver.restore_poses()
-    poses, Lambda = collect(driver)
-    np.testing.assert_array_equal(poses.R, given_poses.R)
-    np.testing.assert_array_equal(poses.t, given_poses.t)
-    assert driver.current.objective == pytest.approx(problem.objective(given_poses), rel=1e-12)
-    scale = float(problem.M.diagonal().max())
-    np.testing.assert_allclose(Lambda, multipliers(problem, poses), rtol=0, atol=1e-11 * scale)
-    assert driver.network.ledger.rounds == 0
-    with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
-        driver.set_poses(Poses(given_poses.R[1:], given_poses.t[1:]))
 
 
 def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> None:
@@ -235,70 +192,6 @@ def lower(g: int, width: int) -> tuple[int]:
     return (width * g * (width * g + 1) // 2,)
 
 
-@pytest.mark.parametrize("noise", [MILD_NOISE, LOUD_NOISE])
-@pytest.mark.parametrize(("d", "soc"), [(2, AUTO), (2, WARM_START), (3, AUTO)])
-def test_what_crosses_has_the_size_of_the_separators(
-    d: int, soc: FirstStage, noise: NoiseModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    eliminate_all(monkeypatch)
-    solution, engine = solved(7, 40, d, metis, noise, soc)
-    graph = solution.problem.graph
-    parts = solution.robots
-    tangent = d + tangent_dimension(d)
-    assert parts is not None
-    memory = 40
-    seen = set()
-    for share in split_graph(graph, parts):
-        part = share.part
-        if part is None:
-            continue
-        g = len(part.boundary)
-        inside = len(part.interior)
-        assert inside not in (0, g)
-        sides = ((1, 1), (1, d), (d, d), (d + 1, d), (tangent, 1))
-        any_side = {(width * g, k) for width, k in sides}
-        allowed = {
-            "schur": {lower(g, 1), lower(g, d), lower(g, d + 1), lower(g, tangent)},
-            "diagonal": {(d * g,), ((d + 1) * g,), (tangent * g,)},
-            "b": any_side,
-            "x": any_side,
-            "force": {((d + 1) * g, d)},
-            "norms": {(inside,)},
-            "measured_at": {(d * g, d)},
-            "scale": {(inside,)},
-            **{name: {((d + 1) * g,)} for name in ("fixed", "sizes")},
-            **{name: {((d + 1) * g, d)} for name in ("point", "product", "error")},
-            "coefficients": {(k,) for k in range(memory + 1)},
-            "sums": {(k,) for k in range(2 * memory + 2)},
-        }
-        sums = allowed["sums"]
-        values = {  # of orders that take or give one array
-            "describe": {((d + 1) * g,)},
-            "project": any_side,
-            "turn_by": {(g, 1)},
-            "set_translations": {(g, d)},
-            "evaluate_trial": {(g, d)},
-            "solve": any_side | sums,
-            "cost": {(d * g, d), ()},
-            "finish": {(d * g, d)},
-            "agree": {()},
-            "move_proof": any_side | {()},
-        }
-        for order, sent, got in engine.log:
-            if order == "result":
-                continue
-            for record in (sent[share.robot], got[share.robot]):
-                for name, value in arrays_in(record):
-                    plain = values.get(order, {()}) if name == "value" else {()}
-                    assert np.shape(value) in allowed.get(name, plain), (order, name)
-                    seen.add(name)
-    assert {"schur", "b", "x", "value", "force"} <= seen
-    if any(stage.name == "SOC" for stage in solution.stages):
-        assert {"sums", "coefficients", "norms", "scale"} <= seen
-    else:
-        assert solution.stages[0].name == "averaged start"
-
-
 @settings(max_examples=examples(15))
 @example(seed=234, n=20, d=3, noise=LOUD_NOISE, partitioner=contiguous)  # terms go back to the best
 @given(seed=SEEDS, n=st.integers(6, 24), d=DIMENSIONS, noise=NOISES, partitioner=PARTITIONERS)
@@ -332,20 +225,3 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
         if name not in ("norms", "scale")
     ]
     assert not np.isin(secrets, np.concatenate(sent)).any()
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_threads_change_no_bit(d: int) -> None:
-    graph = varied_graph(3, 30, d)
-    first, second = (
-        solve(graph, robots=Robots(partition(graph, 4), engine=InProcess(threads)))
-        for threads in (1, 3)
-    )
-    np.testing.assert_array_equal(first.poses.R, second.poses.R)
-    np.testing.assert_array_equal(first.poses.t, second.poses.t)
-    assert first.lower_bound == second.lower_bound
-
-
-def test_the_number_of_threads_is_checked() -> None:
-    with pytest.raises(SettingError, match="threads must be at least 1, got 0"):
-        InProcess(0)

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, informed, varied_graph
 from hypothesis import given, settings, strategies as st
-from robots import driver_at, eliminate_all
 
 import solvers
 from pgo_models import NoiseModel, PGOProblem, Verdict, Weighting
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.graphs.scenes import circle
-from pgo_models.problem.excess import Tangent
-from pgo_models.problem.initialization import chordal_start
 from solvers import Checkpoint, Coupling
-from solvers.distributed.interface import Interface
-from solvers.distributed.lower_bound import prove_with_eta
-from solvers.network.counted_pool import Count
 from solvers.riemannian.polish import polish
 
 QUIET = NoiseModel(0.02, 0.02)
@@ -133,58 +124,6 @@ def test_robots_go_on_until_the_tangent_is_as_sharp_as_in_one_place(seed: int) -
     )
     assert shared.gap <= 4.0 * central.gap
     assert shared.stages[-1].status is solvers.Status.CONVERGED
-
-
-def test_robots_count_the_constants_of_their_tangents_and_their_errors(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    problem = of_file(3, 12, 3, coupled=False)
-    eta = 1e3 * float(abs(problem.tangent_at(chordal_start(problem.convex_part)).M).max())
-    values = []
-    with closing(driver_at(problem, partition(problem.graph, 3), None)) as driver:
-        driver.choose_cost(final=True)
-        driver.describe(Count.OFF)
-        for constant in ((1e9, 0.0), (2e9, 0.0), (2e9, 1e3)):
-            monkeypatch.setattr(Tangent, "constant", constant)
-            found = prove_with_eta(driver, eta)
-            assert found is not None
-            values.append(found.value)
-        robots = len(driver.robots_with_edges)
-    assert values[1] - values[0] == pytest.approx(1e9 * robots, rel=1e-6)
-    assert values[1] - values[2] == pytest.approx(1e3 * robots, rel=1e-6)
-
-
-@pytest.mark.parametrize("eta", [0.0, 1e6])
-def test_the_driver_s_rounding_is_a_share_of_at_least_its_diagonal(
-    eta: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    eliminate_all(monkeypatch)
-    problem = of_file(3, 12, 3, coupled=True)
-    seen = []
-    rounding = Interface.rounding
-
-    def noted(self: Interface, sizes: Any, own: Any, diagonal: Array) -> Array:
-        seen.append(diagonal.copy())
-        return rounding(self, sizes, own, diagonal)
-
-    monkeypatch.setattr(Interface, "rounding", noted)
-    with closing(
-        driver_at(
-            problem,
-            partition(problem.graph, 3),
-            polish(problem, chordal_start(problem.convex_part)),
-        )
-    ) as driver:
-        driver.choose_cost(final=True)
-        driver.describe(Count.OFF)
-        for scale in (1.0, -1.0):
-            driver.current = replace(driver.current, force=scale * driver.current.force)
-            prove_with_eta(driver, eta)
-            least = driver.diagonal.copy()
-            least[driver.rotation_rows] += (
-                (eta * np.eye(3) - driver.current.multipliers).diagonal(axis1=1, axis2=2).ravel()
-            )
-            assert (seen[-1] >= least).all()
 
 
 def test_without_a_driver_chi2_is_refused() -> None:

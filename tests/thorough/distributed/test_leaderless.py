@@ -31,7 +31,6 @@ from solvers import (
     Coupling,
     Faults,
     InProcess,
-    MultiplierPenalty,
     PaperSOC,
     Pipeline,
     Robots,
@@ -46,12 +45,10 @@ from solvers.distributed.robots_alone import (
 )
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
-from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.ledger import DRIVER
 from solvers.pipeline import solve
 from solvers.result import Record
 from solvers.riemannian.polish import polish
-from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.recursion_block import Rotations
 
 TOLERANCE = 1e-6
@@ -145,31 +142,6 @@ def test_sums_go_along_a_tree_of_robots_and_nothing_to_a_driver() -> None:
     for place, robot in enumerate(order[1:].tolist(), start=1):
         assert parents[robot] in order[:place]
         assert {(robot, parents[robot]), (parents[robot], robot)} & joined
-
-
-def test_what_is_gathered_adds_up_on_the_way_and_what_is_summed_does_not() -> None:
-    for count, expected in ((Count.ALL_REDUCE, [0, 3, 3, 3]), (Count.GATHER, [0, 9, 3, 3])):
-        pool = CountedPool(InProcess().open(lambda number: number, range(4)), 4)
-        pool.tree = np.array([0, 1, 2, 3]), np.array([0, 0, 1, 1])
-        pool.ask(lambda worker, request: np.zeros(3), [1.0] * 4, count)
-        sent = 8 * (np.array(expected) + np.array([1, 2, 0, 0]))
-        np.testing.assert_array_equal(pool.ledger.bytes_sent, sent)
-
-
-def test_the_penalties_are_taken_anew_at_the_poses_agreed_on() -> None:
-    problem = varied_problem(5, 20, 3)
-    parts = metis(problem.graph, 5)
-    engine = Recording()
-    soc = SOC(
-        robots=parts,
-        penalty=MultiplierPenalty(stall_window=2, stall_ratio=1e-9),
-        tolerance=TOLERANCE,
-    )
-    solution = solve(problem, Pipeline(soc=soc), robots=alone(parts, engine=engine))
-    assert engine.times(ConsensusRobot.begin_here) == 2 + engine.times(ConsensusRobot.travel) == 3
-    assert solution.status is Status.CONVERGED
-    best = problem.objective(polish(problem, chordal_start(problem)))
-    assert solution.objective == pytest.approx(best, rel=1e-4)
 
 
 def test_given_poses_are_the_start_and_stay_where_nothing_is_better() -> None:

@@ -18,17 +18,12 @@ import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, PGOError, PoseGraph, Poses, Verdict
 from pgo_models.certificates.certificate import BoundSource, certify_at
-from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, NO_FIT, Fit
-from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
 from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.scenes import observe
 from solvers import Coupling, Robots
-from solvers.distributed import (
-    robots_with_files,
-)
 from solvers.solves.folder_solve import FolderSolution, solve_folder
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
@@ -292,15 +287,6 @@ def test_what_no_edge_between_robots_ties_together_is_named(what: str, tmp_path:
     write_g2o_folder(loose, tmp_path)
     with pytest.raises(GraphError, match=f"the {what} fall into 4 parts"):
         solve_folder(tmp_path)
-
-
-@pytest.mark.parametrize("fits", [(FITS_WITHOUT_EDGES, NO_FIT), (NO_FIT, FITS_WITHOUT_EDGES)])
-def test_the_cost_is_exact_where_the_part_of_every_robot_is(fits: tuple[Fit, Fit]) -> None:
-    first, second = fits
-    parts = [ObjectiveRounding(1.0, 0.25, first), ObjectiveRounding(2.0, 0.5, second)]
-    assert robots_with_files._sum_of_roundings(parts) == ObjectiveRounding(3.0, 0.75, NO_FIT)
-    same = [replace(part, fit=FITS_WITHOUT_EDGES) for part in parts]
-    assert robots_with_files._sum_of_roundings(same).fit.is_to_rounding
 
 
 # What crosses.

@@ -14,9 +14,6 @@ import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, PoseGraph
 from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
-from solvers.distributed import own_revision
-from solvers.distributed.own_files import strongest_neighbours
-from solvers.distributed.robots.own_consistency import AgreeingCounts
 
 
 def world_in_files(
@@ -94,29 +91,6 @@ def test_thresholds_follow_errors_that_are_smaller_than_the_matrices_claim(tmp_p
     )
     kept = edges_of(read_g2o(tmp_path / "out", trust_folder=True))
     assert kept == edges_of(graph.without_edges(is_wrong))
-
-
-def test_robots_begin_with_the_pairs_that_agree_most() -> None:
-    agreeing = {(0, 1): 7, (0, 2): 1, (1, 2): 5, (1, 3): 3, (2, 3): 4}
-    counts = []
-    for robot in range(4):
-        others = {a + b - robot: num for (a, b), num in agreeing.items() if robot in (a, b)}
-        counts.append(AgreeingCounts(np.array(list(others)), np.array(list(others.values()))))
-    strongest = [np.sort(part).tolist() for part in strongest_neighbours(counts)]
-    assert strongest == [[1], [0, 2], [1, 3], [2]]
-    alone = AgreeingCounts(np.zeros(0, dtype=int), np.zeros(0, dtype=int))
-    assert [part.tolist() for part in strongest_neighbours([alone])] == [[]]
-
-
-def test_links_hold_robots_together_that_thresholds_leave_apart() -> None:
-    links = [
-        own_revision.Links(np.array([[0, 1], [0, 2]]), np.array([0.5, 9.0])),
-        own_revision.Links(np.array([[1, 2], [1, 3]]), np.array([4.0, 1e6])),
-        own_revision.Links(np.zeros((0, 2), dtype=int), np.zeros(0)),
-        own_revision.Links(np.array([[0, 3]]), np.array([1e5])),
-    ]
-    held = own_revision.holding(links)
-    assert [part.tolist() for part in held] == [[True, False], [True, False], [], [True]]
 
 
 def test_a_team_that_keeps_its_measurements_does_the_same(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Algorithm 1 of the paper by robots: the iterates of one place, in one exchange each."""
 
-from dataclasses import replace
 from itertools import islice, pairwise
 
 import numpy as np
@@ -19,7 +18,6 @@ from solvers.distributed.driver import collect
 from solvers.distributed.paper import PaperByRobots
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import iterate
-from solvers.soc.paper_robot import PaperReply, PaperRobot
 from solvers.soc.penalty import BoydPenalty, PenaltyRule
 
 # FISTA takes long where rho is small beside the weights.
@@ -68,33 +66,6 @@ def test_iterates_are_those_of_one_place(
         np.testing.assert_allclose(collect(driver)[0].R, expected.omega, rtol=0, atol=1e-5)
 
 
-@given(seed=SEEDS, n=st.integers(3, 14), d=DIMENSIONS)
-def test_the_cost_of_an_iterate_is_that_of_its_rotations(seed: int, n: int, d: int) -> None:
-    problem = pgo.PGOProblem(varied_graph(seed, n, d))
-    robots = partition(problem.graph, 3)
-    method = PaperByRobots(PaperSOC())
-    driver = open_driver(problem, robots, InProcess())
-    driver.set_poses(spanning_tree_start(problem.graph))
-    for state in islice(iterate(method, driver), 4):
-        method.finish(driver, state)
-        rows = np.swapaxes(collect(driver)[0].R, 1, 2).reshape(-1, d)
-        expected = np.sum(rows * (problem.L @ rows))
-        assert method.measure(driver, state).objective == pytest.approx(
-            expected, rel=1e-9, abs=1e-9 * problem.L.diagonal().sum()
-        )
-
-
-def test_a_state_is_a_value() -> None:
-    problem = pgo.PGOProblem(pgo.load(ROBOTS))
-    method = PaperByRobots(PaperSOC(penalty=BoydPenalty()))
-    driver = open_driver(problem, partition(problem.graph, 4), InProcess())
-    driver.set_poses(spanning_tree_start(problem.graph))
-    states = list(islice(iterate(method, driver), 6))
-    again = method.step(driver, states[2])
-    assert again.dual_residual == states[3].dual_residual
-    np.testing.assert_array_equal(again.squares, states[3].squares)
-
-
 def test_an_iteration_is_one_exchange_of_R_between_neighbours() -> None:
     """Nine numbers a pose that a neighbour holds, with an all-reduce of five sums for rho."""
     problem = pgo.PGOProblem(pgo.load(ROBOTS))
@@ -116,16 +87,6 @@ def test_an_iteration_is_one_exchange_of_R_between_neighbours() -> None:
         assert after.messages - before.messages == links + 2 * len(layouts)
         sent = (after.bytes_sent - before.bytes_sent).tolist()
         assert sent == [8 * (9 * count + 5) for count in num_sent]
-    replies = [
-        answer[1]
-        for _, _, answers in engine.log
-        for answer in answers
-        if isinstance(answer, tuple) and isinstance(answer[-1], PaperReply)
-    ]
-    assert engine.times(PaperRobot.step) == len(replies) / 4 == 3
-    for reply, layout in zip(replies, layouts * 3, strict=True):
-        for robot, rows in reply.rows.items():
-            assert rows.shape == (3 * len(layout.sent[robot]), 3)
 
 
 def test_a_solve_by_robots_ends_where_one_place_does() -> None:
@@ -148,17 +109,6 @@ def test_robots_with_files_of_their_own_run_it_from_the_chordal_start() -> None:
     found = solvers.solve_folder(ROBOTS, solvers.Pipeline(soc=PaperSOC()))
     assert found.certificate.is_certified
     assert [stage.name for stage in found.stages] == ["chordal start", "PaperSOC", "Newton"]
-
-
-def test_iterates_that_are_not_finite_end_the_run() -> None:
-    problem = pgo.PGOProblem(pgo.load(ROBOTS))
-    method = PaperByRobots(PaperSOC())
-    driver = open_driver(problem, partition(problem.graph, 4), InProcess())
-    driver.set_poses(spanning_tree_start(problem.graph))
-    state = method.init(driver, None)
-    broken = method.step(driver, replace(state, squares=np.full(3, np.nan)))
-    assert np.isnan(method.measure(driver, broken).dual_residual)
-    assert driver.network.ledger.rounds == 2
 
 
 class OwnBackEnd:

@@ -87,8 +87,7 @@ def test_the_solution_is_the_central_one(
     assert central.ledger is central.robots is None
 
 
-@pytest.mark.parametrize("given_start", [False, True])
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize(("d", "given_start"), [(2, False), (3, True)])
 @pytest.mark.parametrize(
     "pipeline",
     [

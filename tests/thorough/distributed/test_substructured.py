@@ -1,6 +1,5 @@
 """SOC by driver and robots takes the steps of JOINT, for every partition and penalty rule."""
 
-from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -12,12 +11,9 @@ from robots import (
     BACKENDS,
     PARTITIONERS,
     Partitioner,
-    contiguous,
     corner_cases,
     driver_at,
     metis,
-    scattered,
-    singletons,
 )
 
 from pgo_models import NoiseModel, PGOProblem, PoseGraph
@@ -25,7 +21,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import rotation_scale
-from solvers import SOC, BalancedPenalty, Coupling, FixedPenalty, MultiplierPenalty, Status
+from solvers import SOC, BalancedPenalty, Coupling, MultiplierPenalty, Status
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
 from solvers.loop import iterate, run
@@ -91,10 +87,6 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[
     return central[-1].refreshes, central[-1].raises
 
 
-def small_penalty(problem: PGOProblem) -> FixedPenalty:
-    return FixedPenalty(1e-3 * float(np.median(rotation_scale(problem))))
-
-
 @settings(max_examples=examples(40))
 @given(
     seed=SEEDS,
@@ -132,17 +124,6 @@ def test_the_iterates_of_corner_cases(graph: PoseGraph, parts: Partition) -> Non
     check(PGOProblem(graph), parts, SOC(), 10)
 
 
-@pytest.mark.parametrize("partitioner", [contiguous, metis, scattered, singletons])
-@pytest.mark.parametrize("d", [2, 3])
-def test_every_change_of_the_penalty_is_the_central_one(d: int, partitioner: Partitioner) -> None:
-    problem = varied_problem(5, 20, d, LOUD_NOISE)
-    parts = partitioner(problem.graph, 5)
-    assert check(problem, parts, SOC(penalty=STALLED), 12) == (1, 0)
-    assert check(problem, parts, SOC(penalty=BalancedPenalty(scale=100.0)), 12)[0] >= 1
-    raised = check(problem, parts, SOC(penalty=small_penalty(problem), acceleration=None), 40)[1]
-    assert raised >= 1
-
-
 @pytest.mark.parametrize("d", [2, 3])
 def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
     problem = varied_problem(1, 30, d)
@@ -162,32 +143,3 @@ def test_a_long_accelerated_run_ends_where_joint_ends(d: int) -> None:
     excess = distributed.history.objective[1:] - central.history.objective[1:]
     assert (excess >= -1e-12 * central.objective).all()
     assert excess[-1] <= 10 * SOC.tolerance * central.objective
-
-
-@pytest.mark.parametrize("k", [1, 4, 7])
-def test_a_run_can_be_finished_at_any_of_its_states(k: int) -> None:
-    # Where a run ends at its limit, it is the best one.
-    problem = varied_problem(2, 20, 3, LOUD_NOISE)
-    soc = SOC(penalty=STALLED)
-    central, distributed, driver = pairs(problem, metis(problem.graph, 3), soc, 7)
-    SubstructuredSOC(soc).finish(driver, distributed[k])
-    poses, _ = collect(driver)
-    np.testing.assert_allclose(poses.R, soc.poses(problem, central[k]).R, rtol=0, atol=1e-7)
-
-
-def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind() -> None:
-    problem = varied_problem(0, 12, 3)
-    driver = driver_at(problem, metis(problem.graph, 2), None)
-    start = driver.current.objective
-    method = SubstructuredSOC()
-    state = method.init(driver, None)
-    spoiled = replace(state, block=replace(state.block, s=np.full_like(state.block.s, np.nan)))
-    broken = method.step(driver, spoiled)
-    assert broken.k == 1
-    measurement = method.measure(driver, broken)
-    assert np.isnan(
-        [measurement.objective, measurement.primal_residual, measurement.dual_residual]
-    ).all()
-    assert method.converged(broken, measurement) is None
-    method.finish(driver, state)
-    assert driver.current.objective == pytest.approx(start, rel=1e-12)

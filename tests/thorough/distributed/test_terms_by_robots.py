@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import LOUD_NOISE, SEEDS, varied_graph
-from hypothesis import example, given, settings, strategies as st
-from robots import PARTITIONERS, Partitioner, contiguous, driver_at, graph_of, metis
+from hypothesis import given, settings, strategies as st
+from robots import PARTITIONERS, Partitioner, driver_at, metis
 
 from pgo_models import PGOProblem, Poses, Weighting
 from pgo_models.certificates.dual_variables import multipliers
@@ -18,7 +18,7 @@ from pgo_models.graphs.partitioning import Partition, partition
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.relaxations.rotation_hull import matrices_at
 from solvers import Status, SweptScene
-from solvers.distributed import handedness, lower_bound as robots_bound
+from solvers.distributed import handedness
 from solvers.distributed.driver import Driver
 from solvers.distributed.lower_bound import (
     best_bound_with_terms as best_bound_by_robots,
@@ -88,18 +88,6 @@ def test_terms_that_are_handed_out_add_up_to_those_of_the_whole_graph(
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
-def test_robots_with_edges_between_the_same_poses_share_the_terms() -> None:
-    graph = graph_of([(0, 1), (1, 2), (2, 3), (1, 2), (2, 1), (3, 0), (0, 2), (2, 0)], 3)
-    problem = PGOProblem(graph)
-    poses = stationary(problem)
-    Pi = random_multipliers(0, len(distinct_pairs(graph)))
-    expected = matrix_of(problem, central_terms(problem, poses, Pi))
-    for number in (1, 2, 4):
-        driver = driver_with_terms(problem, partition(graph, number), poses, Pi)
-        found = matrix_of(problem, collected_terms(driver))
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-
-
 @settings(max_examples=examples(20))
 @given(seed=SEEDS, n=SIZES, partitioner=PARTITIONERS)
 def test_the_bound_with_terms_is_the_central_one(
@@ -122,20 +110,6 @@ def test_the_bound_with_terms_is_the_central_one(
         # what an eta costs, grounded at another pose, is another figure
         return
     assert found.value == pytest.approx(central.value, rel=1e-9, abs=allowed)
-
-
-def test_a_bound_with_terms_and_an_eta_names_the_terms(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, poses = loose(0, 12)
-    Pi = 1e-3 * random_multipliers(0, len(distinct_pairs(problem.graph)))
-    driver = driver_with_terms(problem, partition(problem.graph, 3), poses, Pi)
-    less_terms = handedness.return_to_best(driver)
-    # as where S_r less the terms is not definite without an eta
-    monkeypatch.setattr(robots_bound, "_bound_with_terms", lambda *_: None)
-    found = best_bound_by_robots(driver, 1e-6, less_terms)
-    assert found.value > 0.0
-    assert found.eta > 0.0
-    assert found.terms is not None
-    assert found.terms.num_pairs == collected_terms(driver).num_pairs
 
 
 def test_the_loss_of_every_robot_is_taken_off_the_form_with_eta(
@@ -171,21 +145,6 @@ def ascents(
     handedness.begin_without_terms(driver)
     by_robots = run(ascent, handedness.RobotsPoint.first(driver, ascent.num_eigenvalues))
     return central, by_robots, driver
-
-
-@settings(max_examples=examples(10))
-@given(seed=SEEDS, n=SIZES, partitioner=PARTITIONERS)
-@example(seed=908, n=3, partitioner=contiguous)  # a shift at an eigenvalue
-def test_an_ascent_begins_at_the_same_eigenvalues(
-    seed: int, n: int, partitioner: Partitioner
-) -> None:
-    problem, poses = loose(seed, n)
-    no_step = HandednessAscent(max_iterations=0, num_eigenvalues=4)
-    parts = partitioner(problem.graph, seed)
-    central, by_robots, _ = ascents(problem, parts, poses, no_step)
-    expected = central.state.smallest
-    scale = abs(expected) + 1e-6 * central.state.point.scale
-    assert by_robots.state.smallest == pytest.approx(expected, abs=1e-2 * scale)
 
 
 @pytest.mark.parametrize(("scene", "degrees"), [(SweptScene.CIRCLE, 70), (SweptScene.GRID, 60)])

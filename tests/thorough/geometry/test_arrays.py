@@ -5,16 +5,13 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, SIZES, varied_graph
-from hypothesis import given, strategies as st
-from hypothesis.extra.numpy import arrays
+from hypothesis import given
 from scipy.sparse import issparse
 
 from pgo_models import (
-    BregmanProblem,
     PartitionMethod,
     PGOError,
     PGOProblem,
@@ -22,20 +19,8 @@ from pgo_models import (
     Poses,
     partition,
 )
-from pgo_models.convex.bregman import BregmanPoint
-from pgo_models.convex.orthogonality import OrthogonalPoint
-from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.arrays import (
-    block_norms,
-    inner_products,
-    read_only,
-    real_array,
-    whole_array,
-    whole_number,
-)
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import grid
-from pgo_models.relaxations.low_rank import lifted_point
 
 GRAPH = grid(np.random.default_rng(0))
 FIELDS = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information", "ids", "robot", "fixed")
@@ -126,89 +111,6 @@ def test_what_a_problem_keeps_cannot_be_changed(name: str) -> None:
             assert_cannot_be_written(array)
 
 
-def test_what_the_convex_models_hold_is_theirs() -> None:
-    x = cp.Variable(3)
-    K = np.ones((1, 3))
-    f = np.ones(1)
-    copies = np.eye(3)
-    problem = BregmanProblem(cp.sum_squares(x), x, K, f)
-    point = BregmanPoint(K[0], f)
-    orthogonal = OrthogonalPoint((copies,), (copies,))
-    Y = np.swapaxes(GRAPH.truth.R, 1, 2).copy()
-    lifted = lifted_point(PGOProblem(GRAPH), Y)
-    K[...] = 7.0
-    f[...] = 7.0
-    copies[...] = 7.0
-    Y[...] = 7.0
-    np.testing.assert_array_equal(problem.K.toarray(), np.ones((1, 3)))
-    np.testing.assert_array_equal(lifted.Y, np.swapaxes(GRAPH.truth.R, 1, 2))
-    held = (problem.K.data, problem.f, point.x, point.lam, *orthogonal.copies, *orthogonal.normals)
-    for array in (*held, lifted.Y, lifted.Lambda, lifted.gradient):
-        assert (array != 7.0).all()
-        assert_cannot_be_written(array)
-
-
-def test_only_an_array_that_nobody_else_can_write_to_is_taken_as_it_is() -> None:
-    mine = read_only(np.arange(3.0))
-    assert real_array(mine, "x") is mine
-    theirs = np.arange(6.0)
-    window = theirs[:3]
-    window.flags.writeable = False  # what it is a window of can still be written to
-    held = real_array(window, "x")
-    theirs[...] = 9.0
-    np.testing.assert_array_equal(held, mine)
-    assert real_array(mine.astype(np.float32), "x").dtype == np.float64
-    counted = read_only(np.arange(3))
-    assert whole_array(counted, "x") is counted
-
-
-@given(values=arrays(np.int64, st.integers(0, 5)))
-def test_whole_numbers_stay_what_they_are(values: np.ndarray) -> None:
-    np.testing.assert_array_equal(whole_array(values, "x"), values)
-    small = values % 2**53
-    np.testing.assert_array_equal(whole_array(small.astype(float), "x"), small)
-    np.testing.assert_array_equal(whole_array(small.astype(np.uint64), "x"), small)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ([0, 0.5], "x has 0.5 among them"),
-        ([1.0, np.nan], "x has nan among them"),
-        ([np.inf], "x has inf among them"),
-        ([2.0**53], r"x has 9007199254740992\.0 among them"),
-        ([-(2.0**53)], r"x has -9007199254740992\.0 among them"),
-        (np.array([2**63], dtype=np.uint64), "x has 9223372036854775808 among them"),
-        ([2**70], r"x must be .* numbers, got type object"),
-        ([True, False], "x must be whole numbers, got type bool"),
-        ([1 + 0j], "x must be whole numbers, got type complex128"),
-        (["1"], "x must be whole numbers, got type <U1"),
-        (3, "x is the number 3; give an array"),
-        ([[1], [1, 2]], "x is no array"),
-    ],
-)
-def test_what_is_no_whole_number_is_refused(values: object, message: str) -> None:
-    with pytest.raises(GraphError, match=message):
-        whole_array(values, "x")
-
-
-def test_floats_below_2_to_the_53_are_whole_numbers() -> None:
-    largest = 2**53 - 1
-    np.testing.assert_array_equal(
-        whole_array([float(largest), -float(largest)], "x"), [largest, -largest]
-    )
-
-
-@pytest.mark.parametrize("value", [True, np.True_, 2.5, 2.0, "2", None, np.array([1, 2]), 1j])
-def test_what_is_no_count_is_refused(value: object) -> None:
-    with pytest.raises(SettingError, match=r"x is .*; give a whole number"):
-        whole_number(value, "x", SettingError)
-
-
-def test_integers_of_any_kind_are_counts() -> None:
-    assert [whole_number(value, "x") for value in (3, np.int32(3), np.array(3))] == [3, 3, 3]
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -248,14 +150,3 @@ def test_integers_of_any_kind_are_counts() -> None:
 def test_nothing_is_cast_silently(make: Callable[[], object], message: str) -> None:
     with pytest.raises(PGOError, match=message):
         make()
-
-
-@pytest.mark.parametrize("shape", [(0, 3), (0, 2, 2), (5, 1), (5, 3), (5, 3, 2)])
-def test_inner_products_of_blocks(shape: tuple[int, ...]) -> None:
-    """There may be no blocks, as where a robot has no edge of its own."""
-    rng = np.random.default_rng(0)
-    A, B = rng.standard_normal((2, *shape))
-    expected = [float(np.vdot(a, b)) for a, b in zip(A, B, strict=True)]
-    np.testing.assert_allclose(inner_products(A, B), expected, rtol=1e-13, atol=1e-15)
-    norms = [float(np.linalg.norm(a)) for a in A]
-    np.testing.assert_allclose(block_norms(A), norms, rtol=1e-13, atol=0)

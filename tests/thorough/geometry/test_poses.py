@@ -61,12 +61,6 @@ def test_what_is_no_pose_is_refused(R: Array, t: Array, message: str) -> None:
         Poses(R, t)
 
 
-def test_identity_and_emptiness() -> None:
-    poses = Poses.identity(4, 3)
-    assert (poses.num_poses, poses.d, repr(poses)) == (4, 3, "Poses(n=4, d=3)")
-    assert Poses(np.zeros((0, 2, 2)), np.zeros((0, 2))).num_poses == 0
-
-
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS, exponent=st.floats(-13.5, -6.5))
 def test_what_is_a_rotation_only_nearly_is_projected(
     seed: int, n: int, d: int, exponent: float
@@ -90,14 +84,6 @@ def test_rotations_to_rounding_are_held_as_they_are(seed: int, n: int, d: int) -
     np.testing.assert_array_equal(Poses(mixed, np.zeros((n, d))).R[1:], R[1:])
     held = Poses(mixed, np.zeros((n, d)))
     np.testing.assert_array_equal(Poses(held.R, held.t).R, held.R)
-
-
-def test_many_motions_leave_rotations_to_rounding() -> None:
-    rng = np.random.default_rng(0)
-    poses = random_poses(50, 3, rng)
-    for _ in range(200):
-        poses = poses.moved(*random_motion(3, rng))
-    assert orthogonality_error(poses.R).max() <= TO_ROUNDING
 
 
 @given(seed=SEEDS, n=COUNTS, d=DIMENSIONS)
@@ -135,11 +121,6 @@ def test_gauge_puts_a_pose_at_the_origin(seed: int, n: int, d: int, data: st.Dat
     np.testing.assert_allclose(fixed.R[at], np.eye(d), rtol=0, atol=ROUNDING)
     np.testing.assert_allclose(fixed.t[at], np.zeros(d), rtol=0, atol=ROUNDING)
     assert_same(poses.moved(*random_motion(d, rng)).with_gauge_at(at), fixed)
-
-
-def test_the_gauge_is_at_pose_0_unless_another_is_named() -> None:
-    poses = random_poses(3, 3, np.random.default_rng(0))
-    assert_same(poses.with_gauge_at(), poses.with_gauge_at(0))
 
 
 @pytest.mark.parametrize(("ratio", "positions_decide"), [(1.1e-9, True), (0.9e-9, False)])
@@ -229,12 +210,6 @@ def test_sizes_must_agree() -> None:
     for step in (0, 2):
         with pytest.raises(GraphError, match=f"step is {step}"):
             relative_pose_error(Poses.identity(2, 3), Poses.identity(2, 3), step=step)
-
-
-def test_indexing() -> None:
-    poses = random_poses(5, 3, np.random.default_rng(0))
-    np.testing.assert_array_equal(poses[1:3].t, poses.t[1:3])
-    np.testing.assert_array_equal(poses[np.array([4, 0])].R, poses.R[[4, 0]])
 
 
 @given(seed=SEEDS, n=st.integers(1, 6), d=DIMENSIONS)

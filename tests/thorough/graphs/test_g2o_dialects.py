@@ -12,7 +12,6 @@ from pgo_models import Chi2Convention, PoseGraph, Poses, Reading
 from pgo_models.errors import FileFormatError, GraphWarning
 from pgo_models.geometry.rotations import Array, exp_map, log_map, random_rotations
 from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
-from pgo_models.graphs.g2o_dialects import landmark_shift
 from pgo_models.graphs.g2o_rows import numbers_of
 from pgo_models.graphs.residuals import chi2
 
@@ -196,17 +195,6 @@ def test_tags_keep_poses_and_landmarks_of_one_id_apart(folder: Path) -> None:
     np.testing.assert_array_equal(again.pose_ids, graph.pose_ids)
     poses = read_g2o_poses(folder / "written.g2o", graph)
     np.testing.assert_array_equal(poses.t, graph.initial.t)
-
-
-@given(
-    poses=st.lists(st.integers(-(2**40), 2**40), min_size=1),
-    landmarks=st.lists(st.integers(-(2**40), 2**40), min_size=1),
-)
-def test_shifted_landmarks_have_no_id_of_a_pose(poses: list[int], landmarks: list[int]) -> None:
-    shift = landmark_shift(np.array(poses), np.array(landmarks))
-    assert set(str(shift)) == {"0", "1"}
-    assert not {landmark + shift for landmark in landmarks} & set(poses)
-    assert len({landmark + shift for landmark in landmarks}) == len(set(landmarks))
 
 
 def test_ids_without_room_for_landmarks_are_refused(folder: Path) -> None:

@@ -162,18 +162,6 @@ def test_large_ids_are_exact(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_lines(path).edge_ids, [ids, [-5, 7]])
 
 
-def test_information_is_the_upper_triangle_by_rows(tmp_path: Path) -> None:
-    found = read_lines(write(tmp_path, "EDGE_SE2 0 1 1 2 0.5 10 2 3 40 5 60"))
-    np.testing.assert_array_equal(
-        information_of(2, found.edges)[0], [[10, 2, 3], [2, 40, 5], [3, 5, 60]]
-    )
-
-
-def test_coupling_blocks_may_be_anything(tmp_path: Path) -> None:
-    path = write(tmp_path, "EDGE_SE2 0 1 1 2 0.5 1 0 -100 1 0 1")
-    assert np.linalg.eigvalsh(information_of(2, read_lines(path).edges))[0, 0] < 0
-
-
 def test_what_is_just_no_fault_is_read(tmp_path: Path) -> None:
     # Two pivots above the level at which a block counts as singular, and a short quaternion with a
     # direction.

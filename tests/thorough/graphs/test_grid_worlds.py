@@ -47,34 +47,6 @@ def test_a_world_is_connected_and_walked(
     assert (np.einsum("ma,ma->m", truth.R[i][:, :, 0], truth.R[j][:, :, 0]) >= 0).all()
 
 
-@given(seed=SEEDS, num_robots=ROBOTS, poses=POSES, d=DIMENSIONS)
-def test_with_probability_one_all_that_see_each_other_are_linked(
-    seed: int, num_robots: int, poses: int, d: int
-) -> None:
-    graph = grid_world(
-        num_robots, poses, np.random.default_rng(seed), d=d, loop_closure_probability=1.0
-    )
-    assert graph.truth is not None
-    distance = np.linalg.norm(graph.truth.t[:, None] - graph.truth.t, axis=2)
-    linked = np.zeros(distance.shape, dtype=bool)
-    linked[graph.i, graph.j] = True
-    near = np.triu(distance <= 1.0, 1)
-    assert linked[near].all()
-    # What is linked and apart are the meetings: fewer than there are robots, and between robots.
-    far = np.argwhere(linked & ~near)
-    assert len(far) < num_robots
-    assert (graph.robots[far[:, 0]] != graph.robots[far[:, 1]]).all()
-
-
-@given(seed=SEEDS, num_robots=ROBOTS, d=DIMENSIONS)
-def test_with_probability_zero_the_world_is_a_tree(seed: int, num_robots: int, d: int) -> None:
-    graph = grid_world(
-        num_robots, 10, np.random.default_rng(seed), d=d, loop_closure_probability=0.0
-    )
-    assert graph.num_edges == graph.num_poses - 1
-    assert graph.is_connected
-
-
 @pytest.mark.parametrize("d", [2, 3])
 def test_loop_closures_come_with_their_probability(d: int) -> None:
     def count(probability: float) -> int:

@@ -156,14 +156,6 @@ def test_unit_weights() -> None:
     assert graph.information is None
 
 
-@pytest.mark.parametrize("name", ["initial", "truth"])
-def test_its_table_says_what_came_with_it(name: str) -> None:
-    bare = path_graph(4)
-    given = dataclasses.replace(path_graph(4), **{name: Poses.identity(4, 2)})
-    assert bare._repr_html_().count("none") == 2
-    assert given._repr_html_().count("none") == given._repr_html_().count("with the graph") == 1
-
-
 def test_with_robots() -> None:
     graph = path_graph(4).with_robots(np.array([1, 1, 0, 0]))
     assert graph.num_robots == 2

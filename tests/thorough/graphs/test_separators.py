@@ -1,10 +1,8 @@
-from itertools import combinations
-
 import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, strategies as st
-from robots import PARTITIONERS, Partitioner, graph_of, one_robot, singletons, star
+from robots import PARTITIONERS, Partitioner, one_robot
 
 from pgo_models import PartitionMethod, PoseGraph
 from pgo_models.errors import SettingError
@@ -18,16 +16,6 @@ SIZES = st.integers(2, 40)
 def cut_pairs(parts: Partition, graph: PoseGraph) -> set[tuple[int, int]]:
     pairs = zip(graph.i.tolist(), graph.j.tolist(), strict=True)
     return {(i, j) for i, j in pairs if parts.robot[i] != parts.robot[j]}
-
-
-def smallest_cover(pairs: set[tuple[int, int]]) -> int:
-    """Size of the smallest vertex cover, by trying all."""
-    poses = sorted({pose for pair in pairs for pose in pair})
-    for size in range(len(poses) + 1):
-        for chosen in combinations(poses, size):
-            if all(i in chosen or j in chosen for i, j in pairs):
-                return size
-    raise AssertionError
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
@@ -46,28 +34,6 @@ def test_a_cover_covers_and_no_pose_of_it_is_superfluous(
         )
     assert set(cover) <= set(parts.separators(graph).tolist())
     assert vertex_cover(parts, graph).tolist() == cover
-
-
-@given(seed=SEEDS, n=st.integers(2, 9), partitioner=PARTITIONERS)
-def test_on_few_poses_a_cover_is_at_most_twice_the_smallest(
-    seed: int, n: int, partitioner: Partitioner
-) -> None:
-    graph = varied_graph(seed, n, 2)
-    parts = partitioner(graph, seed)
-    smallest = smallest_cover(cut_pairs(parts, graph))
-    assert smallest <= len(vertex_cover(parts, graph)) <= 2 * smallest
-
-
-@pytest.mark.parametrize("center", [0, 3, 6])
-def test_a_star_is_covered_by_its_center(center: int) -> None:
-    graph, parts = star(center, 2)
-    assert vertex_cover(parts, graph).tolist() == [center]
-
-
-@pytest.mark.parametrize("n", range(2, 12))
-def test_on_a_path_the_greedy_cover_is_a_smallest_one(n: int) -> None:
-    graph = graph_of([(k, k + 1) for k in range(n - 1)], 2)
-    assert len(vertex_cover(singletons(graph, 0), graph)) == n // 2
 
 
 def test_robots_that_share_no_edge_need_no_cover() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +17,7 @@ from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.jrl import read_jrl
 from pgo_models.graphs.written_digits import (
-    WrittenDigits,
     digits_of,
-    most_digits,
-    written_errors,
 )
 
 ROUNDING_FORMATS = [f"%.{digits}{kind}" for digits in (8, 9, 10, 12) for kind in "fg"]
@@ -59,44 +55,6 @@ def test_few_digits_and_those_of_doubles_say_nothing(form: str) -> None:
     assert not digits_of(printed(numbers, form)).are_of_format
 
 
-@pytest.mark.parametrize("numbers", [[], [0.0, 0.0], [1.0, -3.0, 1e6], [0.5, 1.57, 100.25]])
-def test_short_numbers_say_nothing(numbers: list[float]) -> None:
-    assert not digits_of(np.array(numbers)).are_of_format
-
-
-@pytest.mark.parametrize("number", [1.0 / 3.0, np.pi / 2.0, np.pi * 1e-12, 4e-324])
-def test_one_number_with_all_its_digits_is_enough_to_say_nothing(number: float) -> None:
-    assert not digits_of(np.array([1.0, 1.570796327, number])).are_of_format
-
-
-@pytest.mark.parametrize("number", [1e-200, 1e300])
-def test_numbers_of_any_size_are_taken(number: float) -> None:
-    assert digits_of(np.array([1.0, 1.570796327, number])).significant == 10
-
-
-def test_one_number_in_nine_digits_is_enough_to_tell_those_of_all() -> None:
-    numbers = np.array([1.0, 0.0, 1.570796327])
-    assert digits_of(numbers) == WrittenDigits(9, 10)
-    np.testing.assert_allclose(digits_of(numbers).units(numbers), 1e-9, rtol=1e-12)
-
-
-def test_decimals_are_counted_where_numbers_are_long() -> None:
-    """12 decimals of kilometres have more digits than doubles keep of most numbers."""
-    numbers = printed(np.array([1234.567890123456, -0.123456789012, 5678.9]), "%.12f")
-    digits = digits_of(numbers)
-    assert digits.are_of_format
-    np.testing.assert_allclose(digits.units(numbers), 1e-12, rtol=1e-3)
-
-
-def test_mixed_formats_are_read_as_the_most_precise_of_them() -> None:
-    positions = printed(1e3 * np.random.default_rng(0).standard_normal(100), "%.2f")
-    turns = printed(np.random.default_rng(1).uniform(-1.0, 1.0, 100), "%.9f")
-    digits = digits_of(np.concatenate([positions, turns]))
-    assert (digits.units(positions) < 1e-2).all()
-    assert (digits.units(turns) <= 1e-9 * (1.0 + 1e-9)).all()
-    assert most_digits([digits_of(positions), digits_of(turns)]) == digits
-
-
 @pytest.mark.parametrize("d", [2, 3])
 def test_errors_of_measurements_bound_what_writing_them_changes(d: int, tmp_path: Path) -> None:
     graph = pgo.random_geometric(30, np.random.default_rng(d), d=d)
@@ -112,16 +70,6 @@ def test_errors_of_measurements_bound_what_writing_them_changes(d: int, tmp_path
         assert (of_R <= read.written_error[:, 1] + rounding).all()
         assert (of_t > 0.5 * read.written_error[:, 0]).any()
         assert (of_R > 0.3 * read.written_error[:, 1]).any()
-
-
-def test_units_are_halved_and_turned_into_norms() -> None:
-    digits = WrittenDigits(9, 9)
-    planar = written_errors(np.array([[0.5, -0.25, 0.75]]), digits)
-    spatial = written_errors(np.array([[0.5, 0.25, 0.75, 0.5, 0.5, 0.5, 0.5]]), digits)
-    half = 0.5e-9
-    np.testing.assert_allclose(planar, [[half * 2**0.5, half * 2**0.5]], rtol=1e-12)
-    np.testing.assert_allclose(spatial, [[half * 3**0.5, 2**0.5 * 2 * half * 2]], rtol=1e-12)
-    assert written_errors(np.ones((4, 3)), WrittenDigits(22, 17)) is None
 
 
 def test_errors_go_with_the_edges() -> None:
@@ -191,13 +139,3 @@ def test_files_in_json_have_digits(tmp_path: Path) -> None:
     read = read_jrl(path)
     assert read.written_error is not None
     np.testing.assert_allclose(read.written_error, 0.5e-9 * 2**0.5, rtol=1e-9)
-
-
-@given(st.integers(-(10**9), 10**9), st.integers(7, 12))
-@settings(max_examples=examples(60))
-def test_a_decimal_is_a_multiple_of_its_unit(numerator: int, decimals: int) -> None:
-    """As doubles, decimals are off by their rounding alone, whatever their size."""
-    exact = Fraction(numerator, 10**decimals)
-    digits = digits_of(np.array([float(exact)]))
-    assert digits.decimals <= decimals
-    assert digits.significant <= 10

@@ -26,7 +26,6 @@ from pgo_models.errors import (
     SettingError,
 )
 from pgo_models.figures import rounded_up
-from pgo_models.graphs.partitioning import Partition
 from solvers import RayEngine
 from solvers.cli import app as cli
 from solvers.distributed.robots import recursion
@@ -227,23 +226,6 @@ def test_errors_can_be_sent(error):
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-@pytest.mark.parametrize(
-    ("robots", "wanted", "groups"), [(1, None, 1), (2, None, 2), (5, None, 2), (5, 3, 3), (3, 7, 3)]
-)
-def test_robots_are_dealt_among_actors_by_size(robots, wanted, groups, graph):
-    sizes = [40, 2, 3, 5, 10][:robots]
-    parts = Partition(np.repeat(np.arange(robots), [*sizes[:-1], 60 - sum(sizes[:-1])]), graph)
-    shares = split_graph(graph, parts)
-    place = ray_engine._RayPlace(
-        ray, partial(Agent, backend=None), shares, RayEngine(actors=wanted), False
-    )
-    assert sorted(robot for group in place.groups for robot in group) == list(range(robots))
-    assert len(place.groups) == groups
-    assert all(place.groups)
-    if robots == 5:
-        assert not any({0, 4} <= {*group} for group in place.groups)  # the two largest
-
-
 def test_actors_are_started_once_for_many_solves(graph, robots, sent):
     settings = pipeline(solvers.Coupling.SUBSTRUCTURED, robots)
     expected = solvers.solve(graph, settings, robots=robots)
@@ -336,21 +318,6 @@ def test_a_ray_that_does_not_keep_to_the_loopback_is_refused(monkeypatch):
     with pytest.raises(EngineError, match=r"would listen at 192\.0\.2\.2, not on the loopback"):
         connect()
     assert stopped == [True]
-
-
-def test_names_of_a_module_are_replaced_for_a_while_where_it_has_them():
-    module = type(sys)("module")
-    module.one = 1
-
-    def fail():
-        with ray_engine._replaced(vars(module), {"one": 2, "two": 2}):
-            assert module.one == 2
-            assert not hasattr(module, "two")
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert module.one == 1
 
 
 def test_without_ray_the_extra_is_named(monkeypatch, capsys):

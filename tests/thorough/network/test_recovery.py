@@ -1,5 +1,4 @@
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -16,7 +15,7 @@ from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
 from solvers.distributed.substructured import SubstructuredSOC
 from solvers.loop import iterate
-from solvers.network.messages import obey, restore, take_snapshot
+from solvers.network.messages import obey
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
 from solvers.soc.soc import WARM_START
 from solvers.soc.subgraph import split_graph
@@ -137,77 +136,6 @@ def test_a_run_that_goes_on_from_a_checkpoint_can_lose_robots(orders, tmp_path):
     assert second.opened[0].place.lost > 3
     np.testing.assert_array_equal(solution.poses.t, expected.poses.t)
     assert solution.lower_bound == expected.lower_bound
-
-
-class Obeyed:
-    """Orders that write down what they are and answer with the number of the robot."""
-
-    def __init__(self, monkeypatch):
-        self.log = []
-        monkeypatch.setattr(Agent, "snapshot", lambda agent: self.note("snapshot", agent, None))
-        monkeypatch.setattr(
-            Agent, "restore", lambda agent, snapshot: self.note("restore", agent, snapshot) and None
-        )
-
-    def note(self, name, agent, request):
-        self.log.append((name, request))
-        return {"of": np.int64(agent.subgraph.robot)}
-
-    def order(self, name):
-        return partial(self.note, name)
-
-
-def test_a_snapshot_and_a_restore_take_the_place_of_the_orders_before(monkeypatch):
-    obeyed = Obeyed(monkeypatch)
-    graph = varied_graph(5, 24, 2)
-    place = Leaky(split_graph(graph, partition(graph, 2)), set())
-    place.start(range(2))
-    pool = RecoveringPool(place, Recovery())
-    pool.ask(obeyed.order("one"), [0] * 2)
-    for order, requests, kept in (
-        (take_snapshot, [None] * 2, {"of": 1}),
-        (restore, [{"earlier": 0}, {"earlier": 1}], {"earlier": 1}),
-    ):
-        pool.ask(order, requests)
-        pool.ask(obeyed.order("two"), [0] * 2)
-        obeyed.log.clear()
-        place.losses = {place.count + 2}  # robot 1, before it obeys
-        pool.ask(obeyed.order("three"), [0] * 2)
-        assert obeyed.log == [("three", 0), ("restore", kept), ("two", 0), ("three", 0)]
-
-
-def test_what_is_kept_for_a_robot_is_bounded():
-    graph = varied_graph(3, 30, 2)
-    engine = LeakyEngine(recovery=Recovery(orders_between_snapshots=5))
-    solvers.solve(graph, robots=solvers.Robots(3, engine=engine))
-    assert len(engine.opened[0]._log) < 5
-
-
-def test_a_snapshot_is_taken_after_so_many_orders(monkeypatch):
-    obeyed = Obeyed(monkeypatch)
-    place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 1)), set())
-    place.start([0])
-    pool = RecoveringPool(place, Recovery(orders_between_snapshots=3))
-    for _ in range(7):
-        pool.ask(obeyed.order("go"), [None])
-        assert len(pool._log) < 3
-    assert [name for name, _ in obeyed.log] == [
-        *3 * ["go"],
-        "snapshot",
-        *3 * ["go"],
-        "snapshot",
-        "go",
-    ]
-
-
-def test_of_two_refusals_the_first_robots_is_told():
-    def refuse(agent, request):
-        raise NotPositiveDefiniteError(f"robot {agent.subgraph.robot}")
-
-    place = Leaky(split_graph(varied_graph(5, 24, 2), partition(varied_graph(5, 24, 2), 2)), set())
-    place.start(range(2))
-    with pytest.raises(NotPositiveDefiniteError, match="robot 0"):
-        RecoveringPool(place, Recovery()).ask(refuse, [None] * 2)
 
 
 def test_a_robot_that_is_lost_again_and_again_ends_the_run():

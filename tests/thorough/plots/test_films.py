@@ -10,7 +10,7 @@ import pytest
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.plots.films import MOST_BYTES, MOST_FRAMES, frames_to_show
+from pgo_models.plots.films import MOST_BYTES, MOST_FRAMES
 from pgo_models.plots.pages import save_page
 
 pytest.importorskip("plotly")
@@ -57,13 +57,6 @@ def test_a_frame_draws_every_edge_at_the_poses_of_its_iterate(d: int) -> None:
         )
 
 
-def test_the_description_of_a_film_says_of_what_stands_still_that_it_stays() -> None:
-    graph = pgo.load("grid")
-    best = solvers.solve(graph).poses
-    film = solvers.film(graph, [solvers.Newton()], start=best)
-    assert " stays at " in film.layout.meta["description"]
-
-
 def test_films_of_large_graphs_stay_small_and_keep_their_paths_and_ends() -> None:
     graph = pgo.grid_world(2, 3000, np.random.default_rng(0), d=3)
     film = pgo.animate_poses(graph, [graph.truth] * 60)
@@ -75,14 +68,6 @@ def test_films_of_large_graphs_stay_small_and_keep_their_paths_and_ends() -> Non
         path = drawn(trace)
         np.testing.assert_allclose(path[0], own[0], rtol=0, atol=0.1)
         assert len(path) > 100
-
-
-def test_early_iterates_are_shown_more_densely() -> None:
-    assert frames_to_show(3) == [0, 1, 2]
-    shown = np.array(frames_to_show(1000))
-    assert (shown[0], shown[-1]) == (0, 999)
-    assert len(shown) <= MOST_FRAMES
-    assert (np.diff(shown[4:]) >= np.diff(shown[3:-1])).all()
 
 
 @pytest.mark.parametrize(

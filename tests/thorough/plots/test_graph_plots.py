@@ -20,7 +20,7 @@ from pgo_models.plots.graph_plots import (
 from pgo_models.plots.matrix_plots import plot_sparsity, plot_spectrum
 from pgo_models.plots.style import save_figure
 from solvers.reporting.comparison_plots import plot_efforts
-from solvers.reporting.convergence_plots import Curve, Effort, plot_convergence
+from solvers.reporting.convergence_plots import Curve, plot_convergence
 
 pytest.importorskip("matplotlib")
 
@@ -91,16 +91,6 @@ def test_errors_to_the_truth_are_those_after_alignment(d):
     )
 
 
-def test_errors_share_an_axis_that_counts_poses():
-    graph = pgo.grid_world(1, 4, np.random.default_rng(0), d=2)
-    figure = plot_against_truth(graph, graph.initial)
-    _, above, below = figure.axes
-    assert above.get_shared_x_axes().joined(above, below)
-    figure.canvas.draw()
-    assert not any(label.get_visible() for label in above.get_xticklabels())
-    assert all(tick == round(tick) for tick in below.get_xticks())
-
-
 def test_a_large_graph_is_drawn_as_paths_and_some_of_its_edges():
     graph = pgo.grid_world(3, 40, np.random.default_rng(0), d=2)
     kind = edge_kinds(graph, graph.truth)
@@ -130,15 +120,6 @@ def test_a_solution_by_robots_shows_them_and_marks_misfits():
     texts = [text.get_text() for text in legend.get_texts()]
     assert texts[:3] == ["robot 0", "robot 1", "robot 2"]
     assert any(text.startswith("misfit") for text in texts)
-
-
-def test_a_method_has_the_same_colour_beside_whatever_others():
-    curve = Curve("SOC", solvers.run(solvers.SOC(), pgo.load("grid")).history, 97.0)
-    names = [replace(curve, name=name, place=place) for place, name in enumerate("abcdefghij")]
-    lines = [plot_efforts(shown, [Effort.SECONDS]).axes[0].lines for shown in (names, names[4:])]
-    colours = [[line.get_color() for line in drawn] for drawn in lines]
-    assert len(set(colours[0])) == 10
-    assert colours[0][4:] == colours[1]
 
 
 def test_without_a_truth_one_line_says_so():
@@ -171,11 +152,6 @@ def test_figures_are_a_column_wide_and_readable_there(tmp_path):
             text for text in figure.findobj(Text) if text.get_text() and text.get_fontsize() < 7
         ]
         assert not small
-
-
-def test_a_figure_shows_itself_in_a_notebook():
-    graph = pgo.circle(np.random.default_rng(0))
-    assert pgo.plot_graph(graph, graph.truth)._repr_png_().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])

@@ -39,15 +39,6 @@ def test_every_edge_and_pose_is_drawn_once(d):
     assert named[0] == "pose 0, robot 0"
 
 
-def test_positions_are_drawn_to_seven_digits():
-    graph = pgo.circle(np.random.default_rng(0))
-    far = graph.truth.moved(np.eye(3), np.array([1000.0, 0.0, 0.0]))
-    (dots,) = [
-        trace for trace in pgo.explore_graph(graph, far).data if trace.name == "edges and poses"
-    ][1:]
-    np.testing.assert_allclose(np.asarray(dots.x), far.t[:, 0], rtol=1e-7, atol=0)
-
-
 def test_a_misfit_says_how_bad_it_is():
     graph = pgo.circle(np.random.default_rng(0))
     graph = graph.with_weights(np.where(np.arange(300) == 5, 1e3, 1.0) * graph.kappa, graph.tau)

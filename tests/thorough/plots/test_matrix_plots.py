@@ -1,14 +1,11 @@
 import numpy as np
 import pytest
-from scipy.sparse import diags_array, tril
 
 import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel
 from pgo_models.errors import SettingError
 from pgo_models.plots.matrix_plots import (
-    factor_of_M,
-    plot_sparsity,
     plot_spectrum,
     smallest_eigenvalues,
 )
@@ -51,24 +48,6 @@ def test_a_count_out_of_range_is_refused(count):
         smallest_eigenvalues(problem, certificate.Lambda, count)
 
 
-def test_the_factors_pattern_is_that_of_an_elimination():
-    problem = pgo.PGOProblem(pgo.grid(np.random.default_rng(0)))
-    L, order = factor_of_M(problem)
-    filled = np.zeros((problem.side, problem.side), dtype=bool)
-    M = problem.M.tocoo()
-    place = np.argsort(order)
-    filled[place[M.row], place[M.col]] = True
-    for k in range(problem.side):
-        below = np.flatnonzero(filled[:, k] & (np.arange(problem.side) > k))
-        filled[np.ix_(below, below)] = True
-    stored = np.zeros_like(filled)
-    stored[L.indices, np.repeat(np.arange(problem.side), np.diff(L.indptr))] = True
-    assert (stored >= np.tril(filled)).all()
-    assert not np.triu(stored, 1).any()
-    doubled = problem.M + diags_array(problem.M.diagonal())
-    np.testing.assert_allclose((L @ L.T).toarray(), doubled[order][:, order].toarray(), atol=1e-9)
-
-
 def test_the_spectrum_is_drawn_by_sign_and_with_the_proofs_eta():
     pytest.importorskip("matplotlib")
     problem, certificate = certificate_of(pgo.circle(np.random.default_rng(0)))
@@ -99,13 +78,3 @@ def test_the_spectrum_of_a_proof_with_terms_is_that_of_the_matrix_less_them():
     (axes,) = plot_spectrum(problem, certificate, 9).axes
     (_, negative) = (line.get_xdata() for line in axes.lines)
     assert (negative <= 3).all()  # rounding of the three zeros of a common turn
-
-
-def test_the_sparsity_counts_entries():
-    pytest.importorskip("matplotlib")
-    problem = pgo.PGOProblem(pgo.sphere(np.random.default_rng(0)))
-    figure = plot_sparsity(problem)
-    L, _ = factor_of_M(problem)
-    assert f"{problem.M.nnz:,} entries" in figure.axes[0].get_title()
-    assert f"{L.nnz:,} entries" in figure.axes[1].get_title()
-    assert f"{L.nnz - tril(problem.M).nnz:,} entries" in figure.get_supxlabel()

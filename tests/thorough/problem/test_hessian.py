@@ -94,19 +94,6 @@ def test_gauss_newton_is_newton_where_edges_fit(seed: int, n: int, d: int) -> No
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_it_is_symmetric_and_its_pattern_is_the_graph_s(seed: int, n: int, d: int) -> None:
-    problem = varied_problem(seed, n, d)
-    poses = random_poses(n, d, seed)
-    hessian = riemannian_hessian(problem.at(poses), multipliers(problem, poses))
-    dense = hessian.toarray()
-    np.testing.assert_allclose(dense, dense.T, rtol=0, atol=1e-13 * np.abs(dense).max())
-    assert hessian.shape == (TangentLayout(n, d).side,) * 2
-    other = riemannian_hessian(problem.at(Poses.identity(n, d)), None)
-    np.testing.assert_array_equal(hessian.indptr, other.indptr)
-    np.testing.assert_array_equal(hessian.indices, other.indices)
-
-
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_rigid_motions_are_in_the_null_space_at_stationary_points(
     seed: int, n: int, d: int
 ) -> None:
@@ -151,17 +138,3 @@ def test_double_cross_is_its_definition_in_the_plane(seed: int, n: int) -> None:
     K = double_cross(A, B)
     assert K.shape == (n, 1, 1)
     np.testing.assert_allclose(K[:, 0, 0], expected, rtol=0, atol=1e-13)
-
-
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_the_layout_joins_and_splits(seed: int, n: int, d: int) -> None:
-    layout = TangentLayout(n, d)
-    w, v = move(np.random.default_rng(seed), n, d)
-    step = layout.join(w, v)
-    assert step.shape == (layout.side,)
-    again_w, again_v = layout.split(step)
-    np.testing.assert_array_equal(again_w, w)
-    np.testing.assert_array_equal(again_v, v)
-    every = np.arange(n)
-    np.testing.assert_array_equal(step[layout.translations(every)], v)
-    np.testing.assert_array_equal(step[layout.rotations(every)], w)

@@ -11,10 +11,6 @@ from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order, 
 WORLD = pgo.grid_world(4, 40, np.random.default_rng(0), d=3)
 
 
-def test_rows_of_a_pose_stand_together_in_the_order_of_the_poses() -> None:
-    assert row_order(np.array([2, 0, 1]), 1, 2).tolist() == [2, 7, 8, 0, 3, 4, 1, 5, 6]
-
-
 def test_a_dissected_world_in_space_fills_less() -> None:
     pytest.importorskip("cvxopt")
     pytest.importorskip("pymetis")

@@ -21,11 +21,8 @@ from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
 from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.precisions import extreme_weight
 from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.relaxations.solve_sdp import solve_relaxation
-from solvers.distributed.checkpoint import run_fingerprint
 
 OPTIMUM = REFERENCE["certified_optimum_of_rotations"]
 OF_GTSAM = OPTIMUM["of_gtsam"]
@@ -179,18 +176,6 @@ def test_translations_that_are_given_change_nothing(seed: int, d: int, spread: f
         assert one.lower_bound == other.lower_bound <= exact_rotation_cost(graph, one.poses)
 
 
-def test_the_weight_to_blame_is_one_of_a_rotation() -> None:
-    graph = varied_graph(1, 9, 3)
-    tau = graph.tau.copy()
-    tau[0] = 1e30
-    far = replace(graph, tau=tau)
-    assert extreme_weight(far)[2].startswith("tau of edge")
-    assert extreme_weight(far, has_translations=False)[2].startswith("kappa of edge")
-    solution = solved(averaging(far))
-    assert solution.is_certified
-    assert solution.note == ""
-
-
 @pytest.mark.parametrize("d", [2, 3])
 def test_rotations_that_fit_every_edge_are_exact(d: int) -> None:
     graph = varied_graph(3, 10, d)
@@ -273,17 +258,6 @@ def test_robots_find_and_prove_the_same(seed: int, n: int, d: int, robots: int) 
         assert shared.lower_bound <= exact_rotation_cost(graph, central.poses)
         assert shared.lower_bound == pytest.approx(central.lower_bound, rel=1e-8)
         np.testing.assert_array_equal(shared.poses.t, 0.0)
-
-
-def test_a_checkpoint_of_poses_is_not_one_of_rotations() -> None:
-    # With unit weights the padding is tau.
-    graph = varied_graph(5, 8, 3).unit_weights()
-    robots = partition(graph, 2)
-    marks = [
-        run_fingerprint(PGOProblem(graph, weighting=weighting), robots, None, None)
-        for weighting in (Weighting.ISOTROPIC, Weighting.ROTATIONS)
-    ]
-    assert marks[0] != marks[1]
 
 
 @pytest.mark.parametrize("form", [RelaxationForm.PRIMAL, RelaxationForm.DUAL])

@@ -4,7 +4,7 @@ from graphs import SEEDS
 from hypothesis import given, strategies as st
 from scipy.sparse import csc_array
 
-from pgo_models.problem.cholesky import CholeskyBackend, analyze, factorize, lower_factor
+from pgo_models.problem.cholesky import CholeskyBackend, factorize, lower_factor
 from pgo_models.problem.selected_inversion import selected_inverse
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
@@ -73,19 +73,3 @@ def test_it_goes_along_chains_of_thousands(backend: CholeskyBackend, arms: int) 
     np.testing.assert_allclose(
         found[picked], factorize(A, backend).solve(unit)[picked, np.arange(4)], rtol=1e-10, atol=0
     )
-
-
-@BACKENDS
-def test_entries_of_a_factor_leave_the_analysis_as_it_was(
-    backend: CholeskyBackend,
-) -> None:
-    A = definite(0, 30, 0.1)
-    analysis = analyze(A, backend)
-    kept = analysis.factorize(A)
-    analysis.lower_factor(A)
-    b = np.random.default_rng(0).standard_normal(30)
-    again = analysis.factorize(A)
-    analysis.lower_factor(A)
-    np.testing.assert_array_equal(again.solve(b), kept.solve(b))
-    for factor in (kept, again, analysis.factorize(A)):
-        np.testing.assert_allclose(A @ factor.solve(b), b, rtol=0, atol=1e-12)

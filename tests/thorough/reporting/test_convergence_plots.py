@@ -8,7 +8,6 @@ from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.graphs.published_results import PublishedRun
 from solvers import Measurement
-from solvers.reporting.comparison_plots import plot_efforts
 from solvers.reporting.convergence_plots import Curve, Effort, explore_convergence, plot_convergence
 from solvers.result import History, Record
 
@@ -33,20 +32,6 @@ def test_the_gap_is_held_against_the_bound():
     assert gap.tolist() == [relative_gap(value, 9.5) for value in records.objective]
 
 
-@pytest.mark.parametrize("label", ["rounds", "num_bytes"])
-def test_communication_has_an_entry_for_every_record(label):
-    with pytest.raises(SettingError, match=f"{label} of x has 3 entries for 6 records"):
-        Curve("x", history(6), 9.5, **{label: np.arange(3.0)})
-
-
-def test_efforts_are_what_was_counted():
-    curve = Curve("x", history(4), 9.5, rounds=np.arange(4) * 2.0, num_bytes=np.arange(4) * 800.0)
-    assert curve.effort(Effort.ITERATIONS).tolist() == [0, 1, 2, 3]
-    assert curve.effort(Effort.SECONDS).tolist() == [0, 0.25, 0.5, 0.75]
-    assert curve.effort(Effort.ROUNDS).tolist() == [0, 2, 4, 6]
-    assert curve.effort(Effort.BYTES).tolist() == [0, 800, 1600, 2400]
-
-
 @pytest.mark.parametrize("effort", [Effort.ROUNDS, Effort.BYTES])
 def test_an_effort_that_was_not_counted_is_refused(effort):
     with pytest.raises(SettingError, match=f"no count of {effort.value.split()[0]}"):
@@ -69,14 +54,6 @@ def test_stages_follow_each_other_and_what_has_no_logarithm_is_left_out():
     assert len(above.lines) == 4
 
 
-def test_the_papers_mark_is_a_star_where_it_is_near_and_a_line_where_it_is_far():
-    near = plot_convergence([("SOC", history(12))], 10.0, PAPER).axes[1].lines[-1]
-    assert (near.get_xdata()[0], near.get_ydata()[0]) == (20, PAPER.gap)
-    far = plot_convergence([("SOC", history(3))], 10.0, PAPER).axes[1].lines[-1]
-    assert list(far.get_ydata()) == [PAPER.gap] * 2
-    assert "after 20" in far.get_label()
-
-
 def test_both_pictures_show_the_same_numbers():
     stages = [("SOC", history(6)), ("Newton", history(3, 0.01))]
     drawn = plot_convergence(stages, 9.0, PAPER)
@@ -93,23 +70,6 @@ def test_both_pictures_show_the_same_numbers():
 def test_a_run_without_records_is_refused(picture):
     with pytest.raises(SettingError, match="no stage has a record"):
         picture([("start", History())], 1.0)
-
-
-@pytest.mark.parametrize("effort", [Effort.ITERATIONS, Effort.SECONDS])
-def test_methods_are_told_apart_by_more_than_colour(effort):
-    figure = plot_efforts(
-        [Curve(name, history(9, factor), 9.5) for name, factor in (("a", 0.5), ("b", 0.3))],
-        [effort],
-    )
-    first, second = figure.axes[0].lines
-    assert first.get_color() != second.get_color()
-    assert first.get_marker() != second.get_marker()
-    assert (
-        (figure.axes[0].get_xscale() == "linear")
-        == (effort is Effort.ITERATIONS)
-        == (0 in first.get_xdata())
-    )
-    assert effort.value in figure.axes[0].get_xlabel()
 
 
 def test_without_plotly_one_line_names_the_extra(monkeypatch):

@@ -17,9 +17,8 @@ from pgo_models.figures import rounded_up
 from solvers.cli import app as cli
 from solvers.network.ledger import Ledger, Traffic
 from solvers.reporting.edge_fit import EdgeFit, fit_sentence, judge_edges
-from solvers.reporting.fit_plots import explore_fit
 from solvers.reporting.report import report_page
-from solvers.reporting.report_text import advice, headline, meaning, percent
+from solvers.reporting.report_text import advice, headline, meaning
 
 pytest.importorskip("plotly")
 
@@ -93,22 +92,6 @@ def test_a_solve_by_robots_shows_their_communication():
     assert f"{solved.ledger.rounds} rounds" in page.text
 
 
-def test_robots_of_the_solve_are_shown_where_the_graph_names_none():
-    graph = pgo.load("sphere")
-    soc = solvers.SOC(robots=pgo.partition(graph, 3))
-    page = Page(report_page(solvers.solve(graph, solvers.Pipeline(soc=soc))))
-    assert [row[1] for row in page.tables["robots"][1:]] == ["17", "17", "16"]
-    assert "contiguous in time" in page.text
-
-
-def test_more_robots_than_can_be_read_are_cut_to_the_costliest():
-    graph = pgo.random_geometric(250, np.random.default_rng(0))
-    solution = solvers.solve(graph.with_robots(np.arange(250)))
-    page = Page(report_page(solution))
-    assert len(page.tables["robots"]) == 1 + 200
-    assert "Shown are the 200 with the largest share of F." in page.text
-
-
 def test_communication_is_shown_when_it_was_counted(solution):
     count = solution.problem.graph.num_robots
     ring = np.arange(count)
@@ -125,14 +108,6 @@ def test_communication_is_shown_when_it_was_counted(solution):
     ):
         assert [int(row[head.index(name)].replace(",", "")) for row in rows] == expected.tolist()
     assert "bytes sent" not in Page(report_page(solution)).tables["robots"][0]
-
-
-def test_settings_and_versions_are_on_the_page(solution, page):
-    newton = next(
-        stage.method for stage in solution.stages if isinstance(stage.method, solvers.Newton)
-    )
-    assert f"tolerance {newton.tolerance}" in page.text
-    assert f"numpy {np.__version__}" in page.text
 
 
 @pytest.mark.parametrize(
@@ -265,18 +240,6 @@ def options_of(command):
     ]
 
 
-def test_a_gap_that_was_nearly_reached_is_offered(solution):
-    fit = EdgeFit("F", solution.edge_residuals)
-    nearly = replace(with_gap(solution.certificate, 3e-9), wanted_gap=1e-12)
-    commands = [
-        piece.command
-        for piece in advice(
-            solution.problem.graph, nearly, solvers.Status.CONVERGED, fit, "x y.g2o"
-        )
-    ]
-    assert "pgo solve x y.g2o --gap 1e-08" in commands
-
-
 def test_what_the_edges_say_together_is_said(solution):
     residuals = replace(
         solution.edge_residuals, allowed=np.full(212, np.inf), scale=1.0, overall=1.0
@@ -325,32 +288,6 @@ def test_what_is_exact_to_the_digits_of_a_file_is_reported_as_that(tmp_path):
     assert "Certified: the poses fit every measurement as closely as its numbers" in page.text
     assert "no more than what the last digits of the measurements make of it" in page.text
     assert "Ask for a tighter proof" not in page.text
-
-
-@pytest.mark.parametrize(
-    ("share", "text"),
-    [
-        (0.0, "0 %"),
-        (1.0, "100 %"),
-        (0.123456, "13 %"),
-        (2.0**-10, "0.098 %"),
-        (4.51e-3, "0.46 %"),
-        (1.21e-14, "1.3e-12 %"),
-    ],
-)
-def test_percentages_have_two_digits_and_are_rounded_up(share, text):
-    assert percent(share) == text
-
-
-def test_the_histogram_counts_every_edge(solution):
-    residuals = solution.edge_residuals
-    for shown, misfits in ((residuals, 0), (replace(residuals, allowed=0.5 * residuals.cost), 212)):
-        bars = {
-            trace.name: sum(trace.y) for trace in explore_fit(shown, 3).data if trace.type == "bar"
-        }
-        assert (bars.get("misfits", 0), sum(bars.values())) == (misfits, 212)
-    (curve,) = [trace for trace in explore_fit(residuals, 3).data if trace.type == "scatter"]
-    assert sum(value or 0.0 for value in curve.y) == pytest.approx(212, rel=0.01)
 
 
 def test_a_map_without_absent_robots_is_first_advised_to_have_them():

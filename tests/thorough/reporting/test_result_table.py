@@ -7,7 +7,7 @@ import pytest
 
 from pgo_models import PGOError
 from pgo_models.errors import SettingError
-from solvers.reporting.result_table import ResultTable, TablePart, check_table_format, gap_percent
+from solvers.reporting.result_table import ResultTable, TablePart, check_table_format
 
 HEADS = ("graph", "F", "remark")
 ROWS = (("grid", "97.01", "a | b [bold]"), ("rim", "-", "not here; " + "get it " * 40))
@@ -95,15 +95,3 @@ def test_another_suffix_is_refused(tmp_path):
 def test_a_place_that_cannot_be_written_is_said(tmp_path):
     with pytest.raises(PGOError, match="cannot write"):
         TABLE.save(tmp_path / "no" / "table.md")
-
-
-def test_a_row_has_a_cell_for_every_head():
-    with pytest.raises(SettingError, match="has 2 cells for 3 heads"):
-        TablePart(HEADS, (("a", "b"),))
-
-
-@pytest.mark.parametrize(
-    ("gap", "text"), [(0.0, "0"), (0.5, "50"), (0.123456, "13"), (3.11e-9, "3.2e-07")]
-)
-def test_gaps_are_in_percent_rounded_up(gap, text):
-    assert gap_percent(gap) == text

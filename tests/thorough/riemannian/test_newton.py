@@ -16,8 +16,8 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem, Poses
-from pgo_models.errors import GraphError, SettingError
+from pgo_models import PGOProblem
+from pgo_models.errors import SettingError
 from pgo_models.graphs.scenes import grid
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
@@ -111,41 +111,6 @@ def test_a_tolerance_below_rounding_stalls_and_says_so() -> None:
     assert result.status.is_success
     assert result.iterations < Newton.max_iterations
     assert relative_decrement(problem, result.poses) <= STATIONARY_DECREMENT
-
-
-def test_the_default_start_is_the_chordal_one() -> None:
-    problem = varied_problem(0, 8, 3)
-    state = Newton().init(problem, None)
-    np.testing.assert_array_equal(state.polish.poses.R, chordal_start(problem).R)
-    assert state.k == 0
-
-
-def test_a_state_tells_of_its_poses() -> None:
-    problem = varied_problem(0, 8, 3)
-    newton = Newton()
-    state = newton.step(problem, newton.init(problem, random_poses(8, 3, 0)))
-    measurement = newton.measure(problem, state)
-    poses = newton.poses(problem, state)
-    assert state.k == 1
-    assert measurement.objective == problem.objective(poses)
-    assert measurement.primal_residual == 0.0
-    # The decrement is that of the poses of the state, with the matrix of the step.
-    assert measurement.dual_residual > 0
-
-
-def test_gauss_newton_is_newton_with_another_matrix() -> None:
-    method = gauss_newton(7)
-    assert method == Newton(max_iterations=7, second_order=False, secants=False)
-    problem = varied_problem(0, 8, 3)
-    state = method.init(problem, None)
-    for _ in range(3):
-        state = method.step(problem, state)
-        assert not state.polish.is_newton
-
-
-def test_the_start_must_fit() -> None:
-    with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
-        Newton().init(varied_problem(0, 5, 3), Poses.identity(4, 3))
 
 
 @pytest.mark.parametrize(

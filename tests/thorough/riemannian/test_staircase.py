@@ -56,16 +56,6 @@ def test_the_published_optimum_is_reached_and_proven(
     assert 0 <= result.objective - result.state.bound.lower_bound <= DEFAULT_GAP * result.objective
 
 
-@pytest.mark.parametrize("name", ["smallGrid3D", "intel"])
-def test_random_rotations_are_as_good_a_start(
-    name: str, benchmark_problem: Callable[[str], PGOProblem]
-) -> None:
-    problem = benchmark_problem(name)
-    result = run(Staircase(), problem, random_poses(problem.num_poses, problem.d, 0))
-    assert result.status is Status.CONVERGED
-    np.testing.assert_allclose(result.objective, OPTIMUM[name], rtol=1e-8, atol=0.5e-9)
-
-
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("n", [20, 50])
 def test_it_climbs_out_of_a_wound_ring_where_descent_stays(n: int, d: int) -> None:
@@ -158,15 +148,6 @@ def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:
         result = run(Staircase(), problem, start)
         assert result.status.is_success
         assert result.objective <= 1e-15
-
-
-def test_a_step_after_the_last_changes_nothing() -> None:
-    problem, wound = wound_ring(12, 2)
-    solver = Staircase()
-    state = run(solver, problem, wound).state
-    following = solver.step(problem, state)
-    assert following.k == state.k + 1
-    assert following.point is state.point
 
 
 @pytest.mark.parametrize(

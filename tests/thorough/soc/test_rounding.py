@@ -13,9 +13,7 @@ from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import iterate, run
 from solvers.network.ledger import DRIVER
-from solvers.network.messages import count_bytes
-from solvers.soc.anderson import AndersonShare
-from solvers.soc.rounding import PartOfSums, RowChange, ShortNumbers
+from solvers.soc.rounding import RowChange
 
 BYTES = st.sampled_from([1, 2])
 
@@ -46,56 +44,6 @@ def test_subnormal_changes_do_not_wrap_around():
         assert change is not None
         arrived = change.added_to(np.zeros((4, 3)))
         assert ((arrived >= 0.0) & (arrived <= 2.0 * largest)).all()
-
-
-def test_no_change_and_what_is_not_finite():
-    change = RowChange.of(np.zeros((8, 3)), 2)
-    assert change is not None
-    np.testing.assert_array_equal(change.added_to(np.ones((8, 3))), np.ones((8, 3)))
-    for value in (np.inf, np.nan):
-        assert RowChange.of(np.full((8, 3), value), 2) is None
-
-
-@given(seed=SEEDS, k=st.integers(0, 8), exponent=st.integers(-300, 140))
-def test_sums_of_any_size_have_the_digits_of_float32(seed, k, exponent):
-    rng = np.random.default_rng(seed)
-    sums = 10.0**exponent * rng.standard_normal(1 + k)
-    sums[0] = abs(sums[0])
-    part = PartOfSums.of(sums, 2)
-    np.testing.assert_allclose(part.sums, sums, rtol=1e-7)
-    assert part.sums[0] == sums[0]
-    assert count_bytes(part) == 8 + 4 * k
-    np.testing.assert_allclose(PartOfSums.of(sums, 8).sums, sums, rtol=1e-15)
-    with np.errstate(all="raise"):
-        none = PartOfSums.of(np.zeros(1 + k), 2)
-        PartOfSums.of(np.array([5e-324, 1.0]), 2)
-    np.testing.assert_array_equal(none.sums, 0.0)
-
-
-@given(seed=SEEDS, q=st.integers(0, 8), exponent=st.integers(-37, 37))
-def test_coefficients_of_any_size_have_two_digits(seed, q, exponent):
-    exact = 10.0**exponent * np.random.default_rng(seed).standard_normal(q)
-    short = ShortNumbers.of(exact)
-    np.testing.assert_allclose(short.numbers, exact, rtol=1 / 128)
-    assert count_bytes(short) == 2 * q
-    np.testing.assert_array_equal(ShortNumbers.of(np.zeros(3)).numbers, 0.0)
-    powers = np.array([1.0, -0.5, 2.0, 0.99999, -0.99999])
-    np.testing.assert_allclose(ShortNumbers.of(powers).numbers, powers, rtol=1 / 128)
-
-
-@pytest.mark.parametrize("rows", [4, 2000])
-def test_all_who_have_a_row_extrapolate_it_to_the_same_bits(rows):
-    rng = np.random.default_rng(rows)
-    whole = AndersonShare()
-    some = AndersonShare()
-    chosen = rng.permutation(rows)[: rows // 4]
-    for k in range(30):
-        image = rng.standard_normal((rows, 3))
-        whole = whole.after(np.zeros(0), image, 20)
-        some = some.after(np.zeros(0), image[chosen], 20)
-        gamma = rng.standard_normal(min(k, 20)).astype(np.float32)
-        expected = whole.extrapolated(gamma)[0][chosen]
-        np.testing.assert_array_equal(some.extrapolated(gamma)[0], expected)
 
 
 @given(seed=SEEDS, d=DIMENSIONS, partitioner=PARTITIONERS, num_bytes=BYTES)

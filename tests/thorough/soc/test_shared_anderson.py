@@ -106,19 +106,6 @@ def test_parties_take_the_steps_that_one_would_take(
     np.testing.assert_allclose(parties.sums.gram, alone.gram, rtol=1e-9, atol=1e-9)
 
 
-def test_restarts_and_a_full_memory_do_occur() -> None:
-    rng = np.random.default_rng(0)
-    rule = Anderson(memory=4, restart_ratio=3.0)
-    parties = Parties(rng, 20, 3)
-    lengths = []
-    for _ in range(60):
-        residual = np.exp(rng.normal(0.0, 0.7)) * rng.standard_normal((20, 3))
-        parties.extrapolate(rule, residual, rng.standard_normal((20, 3)))
-        lengths.append(len(parties.shares[0].residual_differences))
-    assert parties.restarts >= 2
-    assert lengths.count(4) >= 5
-
-
 @settings(max_examples=examples(30))
 @given(seed=SEEDS, side=st.integers(2, 20), number=st.integers(1, 5))
 def test_a_contraction_is_solved_together_as_alone(seed: int, side: int, number: int) -> None:
@@ -132,21 +119,3 @@ def test_a_contraction_is_solved_together_as_alone(seed: int, side: int, number:
         image = fixed + T @ (s - fixed)
         s = parties.extrapolate(Anderson(memory=5), image - s, image)
     np.testing.assert_allclose(s, fixed, rtol=0, atol=1e-6 * np.linalg.norm(fixed))
-
-
-def test_what_was_is_left_alone() -> None:
-    rng = np.random.default_rng(0)
-    share = AndersonShare()
-    for _ in range(5):
-        kept = (share.residual_differences, share.image_differences, share.residual, share.image)
-        _, following = share.observe(rng.standard_normal((4, 2)), rng.standard_normal((4, 2)), 3)
-        assert (
-            share.residual_differences,
-            share.image_differences,
-            share.residual,
-            share.image,
-        ) == kept
-        image = following.image.copy()
-        following.extrapolated(np.ones(len(following.image_differences)))
-        np.testing.assert_array_equal(following.image, image)
-        share = following

@@ -1,4 +1,4 @@
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice, pairwise
 
 import numpy as np
@@ -32,9 +32,7 @@ from pgo_models.problem.stationarity import rotation_scale
 from solvers import SOC, Coupling, FixedPenalty, Measurement, PaperSOC, Status
 from solvers.loop import iterate, run
 from solvers.riemannian.polish import polish, relative_decrement
-from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
-from solvers.soc.consensus import ConsensusState
-from solvers.soc.joint import SOCState
+from solvers.soc.anderson import Anderson
 
 SIZES = st.integers(3, 12)
 METHODS = st.sampled_from(
@@ -53,29 +51,6 @@ def fixed_penalty(problem: PGOProblem) -> FixedPenalty:
 
 
 # The recursion, literally.
-
-
-@pytest.mark.parametrize("alpha", [0.7, 1.0, 1.6])
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_joint_is_algorithm_one_with_translations(alpha: float, seed: int, n: int, d: int) -> None:
-    problem = varied_problem(seed, n, d)
-    rule = fixed_penalty(problem)
-    soc = SOC(penalty=rule, alpha=alpha, acceleration=None)
-    start = chordal_start(problem)
-    D = np.concatenate([np.zeros(n), np.full(d * n, rule.rho)])
-    K = problem.M.toarray() + 0.5 * np.diag(D)
-    omega = stack_transposes(start.R)
-    B = np.zeros((d * n, d))
-    for state in islice(iterate(soc, problem, start), 1, 12):
-        X = np.linalg.lstsq(
-            K, 0.5 * D[:, None] * np.concatenate([np.zeros((n, d)), omega - B]), rcond=1e-14
-        )[0]
-        x = alpha * X[n:] + (1 - alpha) * omega  # (a)
-        omega = stack_transposes(project_by_svd(unstack_transposes(x + B)))  # (b)
-        B = B + x - omega  # (c)
-        np.testing.assert_allclose(stack_transposes(state.omega), omega, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(stack_transposes(state.x), X[n:], rtol=0, atol=1e-8)
-        np.testing.assert_allclose(stack_transposes(state.B), B, rtol=0, atol=1e-8)
 
 
 @dataclass
@@ -220,69 +195,6 @@ def test_what_a_state_says_of_itself(seed: int, n: int, d: int, accelerated: boo
 
 @settings(max_examples=examples(40))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
-def test_anderson_per_robot_sums_nothing_over_the_robots(
-    seed: int, n: int, d: int, method: PartitionMethod
-) -> None:
-    problem = PGOProblem(varied_graph(seed, n, d, LOUD_NOISE))
-    robots = robots_of(problem, seed, method)
-    soc = SOC(robots=robots, acceleration=Anderson(per_robot=True), local_passes=1)
-    plain = replace(soc, acceleration=None)
-    start = chordal_start(problem)
-    state = soc.init(problem, start)
-    known = [(AndersonShare(), AndersonSums())] * robots.num_robots
-    for _ in range(4):
-        image = with_settings(plain, state)  # the same robots, without acceleration
-        following = soc.step(problem, state)
-        for a, (before, after) in enumerate(zip(image.robots, following.robots, strict=True)):
-            moved, _ = before.solve(None)
-            x = moved.state.ahead[1].x
-            residual = np.sqrt(before.block.rho)[:, None] * (x - before.block.omega)
-            share, sums = known[a]
-            observed, share = share.observe(residual, x + before.block.B, Anderson().memory)
-            gamma, sums = sums.coefficients(Anderson(), observed)
-            s, share = share.extrapolated(gamma)
-            known[a] = share, sums
-            np.testing.assert_allclose(after.block.s, s, rtol=0, atol=1e-12 * (1 + np.abs(s).max()))
-        state = following
-
-
-@pytest.mark.parametrize("alone", [True, False])
-def test_one_robot_accelerates_the_same_whether_alone_or_together(alone: bool) -> None:
-    problem = varied_problem(3, 12, 3, LOUD_NOISE)
-    states, plain = (
-        list(islice(iterate(SOC(acceleration=acceleration), problem), 12))
-        for acceleration in (Anderson(per_robot=alone), None)
-    )
-    expected = list(islice(iterate(SOC(), problem), 12))
-    for state, expected_state in zip(states, expected, strict=True):
-        np.testing.assert_array_equal(state.omega, expected_state.omega)
-    assert np.abs(states[-1].omega - plain[-1].omega).max() > 1e-9
-
-
-def with_settings(soc: SOC, state: ConsensusState) -> ConsensusState:
-    """State whose robots have other settings."""
-    robots = [
-        replace(
-            robot,
-            state=replace(robot.state, block=replace(robot.block, settings=soc.step_settings)),
-        )
-        for robot in state.robots
-    ]
-    return replace(state, robots=tuple(robots))
-
-
-def test_without_noise_state_zero_is_a_fixed_point() -> None:
-    graph = exact_graph(0, 8, 3)
-    problem = PGOProblem(graph)
-    assert graph.truth is not None
-    for robots in (None, partition(graph, 3)):
-        states = list(islice(iterate(SOC(robots=robots), problem, graph.truth), 4))
-        for state in states[1:]:
-            np.testing.assert_allclose(state.omega, states[0].omega, rtol=0, atol=1e-8)
-
-
-@settings(max_examples=examples(40))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, method=METHODS)
 def test_graphs_without_noise_end_at_zero(
     seed: int, n: int, d: int, method: PartitionMethod
 ) -> None:
@@ -295,30 +207,6 @@ def test_graphs_without_noise_end_at_zero(
 
 
 # Endings and settings.
-
-
-def spoiled(state: SOCState | ConsensusState) -> SOCState | ConsensusState:
-    if isinstance(state, SOCState):
-        return replace(state, B=np.full_like(state.B, np.inf))
-    robot = state.robots[0]
-    block = replace(robot.block, s=np.full_like(robot.block.s, np.inf))
-    return replace(
-        state, robots=(replace(robot, state=replace(robot.state, block=block)), *state.robots[1:])
-    )
-
-
-@pytest.mark.parametrize("robots", [1, 3])
-def test_an_iterate_that_is_not_finite_is_said_to_be(robots: int) -> None:
-    problem = varied_problem(0, 8, 3)
-    soc = SOC(robots=partition(problem.graph, robots))
-    state = soc.init(problem, None)
-    broken = soc.step(problem, spoiled(state))
-    assert broken.k == 1
-    measurement = soc.measure(problem, broken)
-    assert np.isnan(
-        [measurement.objective, measurement.primal_residual, measurement.dual_residual]
-    ).all()
-    assert soc.converged(broken, measurement) is None
 
 
 def test_the_refreshed_multiplier_is_the_stationary_one() -> None:

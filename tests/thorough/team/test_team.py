@@ -13,7 +13,6 @@ import pytest
 from budget import examples
 from graphs import informed
 from networks import KEY, Network, give_edge, robots_of
-from robots import share
 from wrong_edges import spoiled
 
 import pgo_models as pgo
@@ -67,18 +66,6 @@ def assert_is_the_optimum(
         np.array([poses[k][1] for k in sorted(poses)]),
     )
     assert problem.objective(together) == pytest.approx(best.objective, rel=1e-6)
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_robots_have_the_certified_optimum_of_all_their_measurements(d: int) -> None:
-    graph = world(d)
-    network = Network(robots_of(graph, 3), np.random.default_rng(0))
-    network.run(60.0)
-    assert network.is_settled
-    assert_is_the_optimum(network.robots, graph)
-    for robot in network.robots.values():
-        assert robot.covered == ("r0", "r1", "r2")
-        assert robot.absent == ()
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -206,17 +193,6 @@ def test_a_robot_that_begins_anew_before_it_has_heard_the_outcome_gets_its_poses
         network.wait(0.02)
     network.robots["r2"] = solvers.Robot.load(robots["r2"].save(), KEY, patience=5.0, retry=0.3)
     network.run(100.0)
-    assert network.is_settled
-    assert_is_the_optimum(network.robots, graph)
-
-
-def test_robots_that_hold_fronts_for_the_one_that_drives_are_not_all_asked_at_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    share(monkeypatch)
-    graph = world(n=60)
-    network = Network(robots_of(graph, 6), np.random.default_rng(0))
-    network.run(60.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
 
