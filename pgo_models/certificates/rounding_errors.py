@@ -95,7 +95,7 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     count = most_entries + d + 2
     G_error = terms.G_error + gamma(count) * terms.G_size
     product, product_error = terms.complete_half_gradient(
-        problem,
+        problem.incidence,
         gamma(count),
         A.T @ rows_of_blocks(terms.G),
         abs(A).T @ rows_of_blocks(G_error),
@@ -200,7 +200,9 @@ def matrix_errors(problem: PGOProblem, diagonal: Array) -> Array:
     of_rotations = float(orthogonality_error(graph.R_ij).max())
     relative_error = of_terms + of_rotations + d * gamma(d + 2)
     # v^T E v <= sum_a v_a^2 (E u)_a / u_a for any positive u; here 1 / u_a = u_a diagonal_a.
-    E_u = problem.weights.entry_errors(problem, u, relative_error)
+    E_u = problem.weights.entry_errors(
+        problem.plain_residual_matrix, problem.incidence, u, relative_error
+    )
     of_blocks = 4 * d * UNIT_ROUNDOFF
     return np.asarray(OUTWARD * (E_u * u + of_blocks))
 
@@ -264,7 +266,7 @@ def rounding_of(at: EvaluatedPoses) -> ObjectiveRounding:
     quadratic = errors.cost(problem)
     F = float(np.sum(np.abs(w) * inner_products(residuals, residuals)))
     error = quadratic + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * F
-    for of_cost in problem.weights.value_errors(problem, poses, e_t, e_R):
+    for of_cost in problem.weights.value_errors(at.point, poses.orthogonality_error, e_t, e_R):
         error += of_cost
     roundings = edge_roundings(problem, poses)
     fit = fit_at(at, roundings)

@@ -18,23 +18,24 @@ and the d rows of every edge that follow give U^T delta_R, with w = kappa. Where
 `EdgeCost` is a cost without any other part: F (equation (16) of the paper) for W = kappa
 I, or chi2 where it is quadratic in the poses. Costs with another part are subclasses
 (`pgo_models.problem.information_costs`): they override the methods below and call them for the
-quadratic part. A cost does not hold the graph; the problem is passed to the methods that need it.
+quadratic part. A cost is arrays with a value, gradients, blocks and errors. It knows neither the
+graph nor the problem: it is evaluated at an `EdgePoint`, and the problem sums over the edges.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, unstack_transposes
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.cholesky import CholeskyFactor
-from pgo_models.problem.edge_problem import EdgeProblem
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, gamma
-from pgo_models.problem.incidence import blocks_of_rows, rows_of_blocks
+from pgo_models.problem.incidence import Incidence, blocks_of_rows, rows_of_blocks
 from pgo_models.problem.rotation_weights import RotationWeights, ScaledIdentities
 
 
@@ -54,7 +55,7 @@ class EdgeTerms:
 
     def complete_half_gradient(
         self,
-        problem: EdgeProblem,
+        incidence: Incidence,
         relative_error: float,
         half_gradient: Array,
         half_gradient_error: Array,
@@ -157,67 +158,52 @@ class EdgeCost:
         """The constant that a quadratic cost adds to tr(X^T M X), and a bound on its error."""
         return 0.0, 0.0
 
-    def minorant(self, problem: EdgeProblem, X: Array, residuals: Array) -> "EdgeCost":
-        """A quadratic cost that is at most this one everywhere and equal to it at X, (N, d).
+    def minorant(self, point: "EdgePoint") -> "EdgeCost":
+        """A quadratic cost that is at most this one everywhere and equal to it at a point.
 
-        The residuals are A X. Of a quadratic cost it is the cost itself.
+        Of a quadratic cost it is the cost itself.
         """
         return self
 
     # Value and gradient.
 
-    def value(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
-        """Sum of the costs at X, (N, d), with residuals A X, ((d + 1) m, d).
-
-        The problem is the one of this cost: its residual matrix comes with the weights w.
-        """
-        _, w = problem.residual_matrix
-        weighted_squares = w[:, None] * residuals**2
+    def value(self, point: "EdgePoint") -> float:
+        """Sum of the costs at a point."""
+        weighted_squares = point.w[:, None] * point.residuals**2
         # numpy sums in pairs: the result is off by a few dozen roundings, not by one an edge.
         return float(np.sum(weighted_squares))
 
-    def value_at_contact(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
-        """Value at the X where this cost, a `minorant`, touches the one that it was made of."""
-        return self.value(problem, X, residuals)
+    def value_at_contact(self, point: "EdgePoint") -> float:
+        """Value at the point where this cost, a `minorant`, touches the one it was made of."""
+        return self.value(point)
 
-    def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
+    def edge_values(self, point: "EdgePoint") -> Array:
         """Cost of every edge, (m,)."""
-        m = problem.graph.num_edges
-        _, w = problem.residual_matrix
-        row_costs = w * inner_products(residuals, residuals)
+        m = len(self.tau)
+        row_costs = point.w * inner_products(point.residuals, point.residuals)
         translation_costs = row_costs[:m]
-        rotation_costs = row_costs[m:].reshape(m, problem.d).sum(axis=1)
+        rotation_costs = row_costs[m:].reshape(m, -1).sum(axis=1)
         return np.asarray(translation_costs + rotation_costs)
 
-    def half_gradient(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
-        """Half the gradient in X of a quadratic cost, M X = A^T diag(w) A X, (N, d)."""
-        _, w = problem.residual_matrix
-        weighted = w[:, None] * residuals
-        return np.asarray(problem.residual_adjoint @ weighted)
+    def edge_gradients(self, point: "EdgePoint") -> tuple[Array, Array | None]:
+        """Half the gradient of a quadratic cost in the residuals, and in P_i = R_i^T beside them.
 
-    def edge_products(self, graph: PoseGraph, X: Array, residuals: Array) -> Array:
-        """Z = delta R_i, (m, d + 1, d): the residuals of every edge in the frame of pose i."""
-        delta = self.residual_blocks(residuals)
-        R = np.ascontiguousarray(unstack_transposes(X[graph.num_poses :]))
-        R_i = R[graph.i]
-        return np.asarray(delta @ R_i)
+        The first is diag(w) A X, ((d + 1) m, d), in the rows of A. The second has shape (m, d, d);
+        None stands for zeros. A^T of the first, and the second in the rows of R_i^T, are M X.
+        """
+        return point.w[:, None] * point.residuals, None
 
-    def translation_factor(self, problem: EdgeProblem, poses: Poses) -> CholeskyFactor | None:
-        """Factor of the matrix of the translations, where that depends on the rotations.
+    def translation_matrices(self, R_i: Array) -> Array | None:
+        """Matrices of the edges, (m, d, d), of which the translations' matrix is the Laplacian.
 
-        Of a quadratic cost it does not, and the problem has the factor.
+        None where they do not depend on the rotations R_i, (m, d, d), as of a quadratic cost.
         """
         return None
 
-    def best_translations(
-        self, problem: EdgeProblem, poses: Poses, factor: CholeskyFactor | None = None
-    ) -> Poses:
-        """Poses with the translations of least cost for their rotations.
-
-        The factor is `translation_factor`, of these poses unless given.
-        """
-        t = problem.recover_translations(poses.R)
-        return poses.with_translations(t)
+    def translation_gradients(self, point: "EdgePoint") -> Array:
+        """Half the gradient of every edge in t_j, (m, d), which is minus that in t_i."""
+        m = len(self.tau)
+        return self.tau[:, None] * point.residuals[:m]
 
     # Matrices: rows of A and blocks of M.
 
@@ -288,12 +274,12 @@ class EdgeCost:
         diagonal_i += R_W_Rt
         return translation_coupling, diagonal_i, rotation_coupling, W
 
-    def added_curvatures(self, graph: PoseGraph, poses: Poses) -> Sequence[Array]:
+    def added_curvatures(self, R_i: Array, R_j: Array, difference: Array) -> Sequence[Array]:
         """Second derivatives of the parts of the cost that are not quadratic in X, (m, k, k) each.
 
         Edge (i, j) has the unknowns (v_i, v_j, w_i, w_j) of the moves t <- t + v and R <- R
-        exp([w]_x) of its two poses. The matrices are in the first k of these numbers. The sequence
-        is empty for a quadratic cost.
+        exp([w]_x) of its two poses, R_i and R_j, (m, d, d), with the difference t_j - t_i, (m, d).
+        The matrices are in the first k of these numbers. A quadratic cost has none.
         """
         return ()
 
@@ -372,13 +358,15 @@ class EdgeCost:
         G_error[:, 1:] += of_product
         return EdgeTerms(value, value_error, G, G_error, G_size)
 
-    def entry_errors(self, problem: EdgeProblem, u: Array, relative_error: float) -> Array:
+    def entry_errors(
+        self, A: csr_array, incidence: Incidence, u: Array, relative_error: float
+    ) -> Array:
         """The vector E u, (N,): E, (N, N), bounds the errors of the stored entries of M.
 
         The vector u, (N,), is positive, and E bounds the errors entry by entry.
 
         Here A has delta_R in its rotation rows, not U^T delta_R
-        (`EdgeProblem.plain_residual_matrix`), so that M = A^T D A with D = diag(tau, W), block by
+        (`PGOProblem.plain_residual_matrix`), so that M = A^T D A with D = diag(tau, W), block by
         block. The absolute values of the terms that an entry of M is a sum of add up to at most
         that entry of |A|^T |D| |A|. Every term is off by at most `relative_error` of itself. The
         error of W, at most e in every entry of W, adds |A|^T e 1 1^T |A|, 1 the vector of ones in
@@ -386,7 +374,7 @@ class EdgeCost:
 
             E = relative_error |A|^T |D| |A| + |A|^T e 1 1^T |A|.
         """
-        A = abs(problem.plain_residual_matrix)
+        A = abs(A)
         A_u = blocks_of_rows((A @ u)[:, None], len(self.tau))
         weighted = self.apply_absolute_weights(A_u)
         E_u = relative_error * (A.T @ rows_of_blocks(weighted))[:, 0]
@@ -396,18 +384,15 @@ class EdgeCost:
         E_u += (A.T @ rows_of_blocks(of_W))[:, 0]
         return np.asarray(E_u)
 
-    def value_errors(
-        self, problem: EdgeProblem, poses: Poses, e_t: Array, e_R: float
-    ) -> list[float]:
+    def value_errors(self, point: "EdgePoint", slant: float, e_t: Array, e_R: float) -> list[float]:
         """Bounds on the errors of the value that `objective_rounding` does not count itself.
 
         There is one for each source of errors. A quadratic cost has one: the errors of W and of its
-        stored eigenvectors. The norms of the residuals at the poses are off by at most e_t, (m,),
-        and e_R; subclasses need these.
+        stored eigenvectors. The rotations are orthogonal up to `slant`, and the norms of the
+        residuals are off by at most e_t, (m,), and e_R; subclasses need these.
         """
         m = len(self.tau)
-        residuals = problem.residuals(poses.stacked())
-        return [self.rotation.error_of_rows(residuals[m:])]
+        return [self.rotation.error_of_rows(point.residuals[m:])]
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:
         """Whether the cost depends on delta_t, and whether it depends on delta_R, of every edge.
@@ -428,6 +413,29 @@ class EdgeCost:
         of_translations = self.tau * r_t**2
         of_rotations = self.rotation.norm_bound * r_R**2
         return float(np.sum(of_translations + of_rotations))
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePoint:
+    """A point X, (N, d), as the edges see it, of which the cost is `cost`."""
+
+    cost: EdgeCost
+    w: Array  # ((d + 1) m,): weights of the rows of A
+    residuals: Array  # ((d + 1) m, d): A X
+    P: Array  # (n, d, d): the rows of every R_i^T
+    i: IntArray  # (m,): where every edge begins
+
+    @cached_property
+    def R_i(self) -> Array:
+        """Rotation of the pose where every edge begins, (m, d, d)."""
+        R = np.ascontiguousarray(np.swapaxes(self.P, 1, 2))
+        return np.asarray(R[self.i])
+
+    @cached_property
+    def Z(self) -> Array:
+        """Z = delta R_i, (m, d + 1, d): the residuals of every edge in the frame of pose i."""
+        delta = self.cost.residual_blocks(self.residuals)
+        return np.asarray(delta @ self.R_i)
 
 
 def isotropic_cost(tau: Array, kappa: Array) -> EdgeCost:

@@ -142,7 +142,8 @@ def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
         (*block_entries(w_j, w_i), np.swapaxes(coupling_ww, 1, 2)),
         (*block_entries(w, w), diagonal_ww),
     ]
-    for curvature in problem.weights.added_curvatures(graph, poses):
+    difference = poses.t[graph.j] - poses.t[graph.i]
+    for curvature in problem.weights.added_curvatures(R_i, R_j, difference):
         blocks += _curvature_blocks(incidence, layout, curvature)
     return assemble(blocks, layout.side)
 

@@ -11,17 +11,15 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from pgo_models.geometry.arrays import block_norms, inner_products
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.cholesky import CholeskyFactor, factorize_damped
-from pgo_models.problem.edge_cost import EdgeCost, EdgeTerms
-from pgo_models.problem.edge_problem import EdgeProblem
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.edge_cost import EdgeCost, EdgePoint, EdgeTerms
 from pgo_models.problem.excess import Excess, Tangent
 from pgo_models.problem.floating_point import OUTWARD, PAIRWISE_SUM, UNIT_ROUNDOFF, gamma
-from pgo_models.problem.incidence import blocks_of_rows, rows_of_blocks
+from pgo_models.problem.incidence import Incidence, blocks_of_rows, rows_of_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,24 +62,21 @@ class ExcessCost(EdgeCost):
         """True: only chi2 has an excess."""
         return True
 
-    def minorant(self, problem: EdgeProblem, X: Array, residuals: Array) -> "TangentCost":
-        """The cost with the excess replaced by its tangent at X."""
-        Z = self.edge_products(problem.graph, X, residuals)
-        tangent = self.excess.tangent(Z)
+    def minorant(self, point: EdgePoint) -> "TangentCost":
+        """The cost with the excess replaced by its tangent at a point."""
+        tangent = self.excess.tangent(point.Z)
         return TangentCost(self.tau, self.rotation, tangent)
 
-    def value(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
-        """chi2 at X."""
-        Z = self.edge_products(problem.graph, X, residuals)
-        quadratic_part = super().value(problem, X, residuals)
-        excess, _ = self.excess.evaluate(Z)
+    def value(self, point: EdgePoint) -> float:
+        """chi2 at a point."""
+        quadratic_part = super().value(point)
+        excess, _ = self.excess.evaluate(point.Z)
         return quadratic_part + float(np.sum(excess))
 
-    def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
+    def edge_values(self, point: EdgePoint) -> Array:
         """chi2 of every edge, (m,)."""
-        Z = self.edge_products(problem.graph, X, residuals)
-        quadratic_part = super().edge_values(problem, X, residuals)
-        excess, _ = self.excess.evaluate(Z)
+        quadratic_part = super().edge_values(point)
+        excess, _ = self.excess.evaluate(point.Z)
         return quadratic_part + excess
 
     @cached_property
@@ -91,73 +86,48 @@ class ExcessCost(EdgeCost):
         J_tt = self.excess.J[:, :d, :d]
         return np.asarray(J_tt + self.tau[:, None, None] * np.eye(d))
 
-    def translation_factor(self, problem: EdgeProblem, poses: Poses) -> CholeskyFactor:
-        """Factor of the Laplacian with the matrices R_i (J_tt + tau I) R_i^T on its edges."""
-        R_i = poses.R[problem.graph.i]
-        edge_matrices = R_i @ self._frame_information @ np.swapaxes(R_i, 1, 2)
-        laplacian = problem.translation_matrix(edge_matrices)
-        return factorize_damped(problem.translation_information_analysis, laplacian)
+    def translation_matrices(self, R_i: Array) -> Array:
+        """The matrices R_i (J_tt + tau I) R_i^T, (m, d, d)."""
+        return np.asarray(R_i @ self._frame_information @ np.swapaxes(R_i, 1, 2))
 
-    def best_translations(
-        self, problem: EdgeProblem, poses: Poses, factor: CholeskyFactor | None = None
-    ) -> Poses:
-        """Poses with the translations of least chi2 for their rotations; t_0 does not change.
-
-        For given rotations chi2 is a quadratic function of the translations, whose half Hessian is
-        that of `translation_factor`. Edge (i, j) adds tau delta_t + R_i (J u)_t to the half
-        gradient at t_j and subtracts it at t_i. One step of Newton's method is exact.
-        """
-        graph = problem.graph
-        incidence = problem.incidence
-        d = problem.d
-        m = graph.num_edges
-        if factor is None:
-            factor = self.translation_factor(problem, poses)
-        X = poses.stacked()
-        residuals = problem.residuals(X)
-        Z = self.edge_products(graph, X, residuals)
-        u = self.excess.argument(Z)
+    def translation_gradients(self, point: EdgePoint) -> Array:
+        """Half gradient tau delta_t + R_i (J u)_t of every edge, (m, d)."""
+        u = self.excess.argument(point.Z)
+        d = point.residuals.shape[1]
         J_u_t = np.einsum("mab,mb->ma", self.excess.J[:, :d], u)
-        of_excess = np.einsum("mab,mb->ma", poses.R[graph.i], J_u_t)
-        of_edges = self.tau[:, None] * residuals[:m] + of_excess
-        half_gradient = incidence.ends @ of_edges - incidence.begins @ of_edges
-        step = factor.solve(half_gradient.ravel()).reshape(-1, d)
-        return poses.with_translations(poses.t - (step - step[0]))
+        of_excess = np.einsum("mab,mb->ma", point.R_i, J_u_t)
+        return np.asarray(super().translation_gradients(point) + of_excess)
 
-    def added_curvatures(self, graph: PoseGraph, poses: Poses) -> Sequence[Array]:
+    def added_curvatures(self, R_i: Array, R_j: Array, difference: Array) -> Sequence[Array]:
         """The Gauss-Newton matrix of the excess.
 
         The rest of the Hessian of the excess is that of its tangent, which is quadratic in X.
         """
-        difference = poses.t[graph.j] - poses.t[graph.i]
-        return (self.excess.curvature(poses.R[graph.i], poses.R[graph.j], difference),)
+        return (self.excess.curvature(R_i, R_j, difference),)
 
-    def value_errors(
-        self, problem: EdgeProblem, poses: Poses, e_t: Array, e_R: float
-    ) -> list[float]:
+    def value_errors(self, point: EdgePoint, slant: float, e_t: Array, e_R: float) -> list[float]:
         """Bounds on the errors of chi2 that `objective_rounding` does not count itself.
 
-        The residuals at the poses are off by at most e_t, (m,), and e_R in norm. With slant the
-        orthogonality error of the stored R_i, the first row of Z = delta R_i is off by at most e_t
-        + slant ||Z_t||, and the rotation rows likewise. An error e of Z changes the excess, a
-        convex quadratic function of Z with the half gradient C, by at most 2 <|C|, |e|> and its
-        quadratic form at e. The quadratic form is counted in `bound_of_norms`. The last bound is on
-        the rounding of the excess.
+        The residuals are off by at most e_t, (m,), and e_R in norm. With slant the orthogonality
+        error of the stored R_i and the rounding of the product, the first row of Z = delta R_i is
+        off by at most e_t + slant ||Z_t||, and the rotation rows likewise. An error e of Z changes
+        the excess, a convex quadratic function of Z with the half gradient C, by at most 2 <|C|,
+        |e|> and its quadratic form at e. The quadratic form is counted in `bound_of_norms`. The
+        last bound is on the rounding of the excess.
         """
-        d = problem.d
-        X = poses.stacked()
-        tangent = self.minorant(problem, X, problem.residuals(X)).tangent
+        d = point.residuals.shape[1]
+        tangent = self.minorant(point).tangent
         C = tangent.C
         C_norm_t = block_norms(C[:, 0])
         C_norm_R = block_norms(C[:, 1:])
         row_norms = np.sqrt(np.einsum("mab,mab->ma", tangent.Z, tangent.Z))
-        slant = poses.orthogonality_error + d * gamma(d + 2)
+        slant = slant + d * gamma(d + 2)
         error_t = e_t + slant * row_norms[:, 0]
         error_R = e_R + slant * np.einsum("ma->m", row_norms[:, 1:])
         summation_error = PAIRWISE_SUM * UNIT_ROUNDOFF * np.abs(tangent.value)
         rounding = tangent.value_error + summation_error
         return [
-            *super().value_errors(problem, poses, e_t, e_R),
+            *super().value_errors(point, slant, e_t, e_R),
             2.0 * float(np.sum(C_norm_t * error_t)),
             2.0 * float(np.sum(C_norm_R * error_R)),
             float(np.sum(rounding)),
@@ -195,7 +165,7 @@ class TangentTerms(EdgeTerms):
 
     def complete_half_gradient(
         self,
-        problem: EdgeProblem,
+        incidence: Incidence,
         relative_error: float,
         half_gradient: Array,
         half_gradient_error: Array,
@@ -205,8 +175,8 @@ class TangentTerms(EdgeTerms):
         `relative_error` bounds that of the sum over the edges of a pose. The addition to A^T G
         rounds once more. Both arrays are changed.
         """
-        n = problem.num_poses
-        at_beginning = problem.incidence.at_beginning
+        n = incidence.begins.shape[0]
+        at_beginning = incidence.at_beginning
         half_gradient[n:] += at_beginning(self.own)
         term_errors = self.own_error + relative_error * np.abs(self.own)
         half_gradient_error[n:] += at_beginning(term_errors)
@@ -257,38 +227,29 @@ class TangentCost(EdgeCost):
         """The constant of the tangent, and a bound on its rounding error."""
         return self.tangent.constant
 
-    def value(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
-        """The minorant at X."""
-        Z = self.edge_products(problem.graph, X, residuals)
-        quadratic_part = super().value(problem, X, residuals)
-        tangent = float(np.sum(self.tangent.values(Z)))
+    def value(self, point: EdgePoint) -> float:
+        """The minorant at a point."""
+        quadratic_part = super().value(point)
+        tangent = float(np.sum(self.tangent.values(point.Z)))
         return quadratic_part + tangent
 
-    def value_at_contact(self, problem: EdgeProblem, X: Array, residuals: Array) -> float:
-        """chi2 at the X of the tangent, which has the excess there."""
-        quadratic_part = super().value(problem, X, residuals)
+    def value_at_contact(self, point: EdgePoint) -> float:
+        """chi2 at the point of the tangent, which has the excess there."""
+        quadratic_part = super().value(point)
         return quadratic_part + float(np.sum(self.tangent.value))
 
-    def edge_values(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
+    def edge_values(self, point: EdgePoint) -> Array:
         """The minorant of every edge, (m,)."""
-        Z = self.edge_products(problem.graph, X, residuals)
-        quadratic_part = super().edge_values(problem, X, residuals)
-        return quadratic_part + self.tangent.values(Z)
+        quadratic_part = super().edge_values(point)
+        return quadratic_part + self.tangent.values(point.Z)
 
-    def half_gradient(self, problem: EdgeProblem, X: Array, residuals: Array) -> Array:
-        """M X, (N, d): A^T (diag(w) A X + C P_i), and C^T delta in the rows of P_i = R_i^T."""
-        n = problem.num_poses
-        d = problem.d
+    def edge_gradients(self, point: EdgePoint) -> tuple[Array, Array]:
+        """diag(w) A X + C P_i in the rows of A, and C^T delta, (m, d, d), in P_i = R_i^T."""
         C = self.tangent.C
-        P = X[n:].reshape(n, d, d)
-        P_i = P[problem.graph.i]
-        _, w = problem.residual_matrix
-        in_residuals = w[:, None] * residuals + self.residual_rows(C @ P_i)
-        half_gradient = problem.residual_adjoint @ in_residuals
-        delta = self.residual_blocks(residuals)
-        in_P_i = np.swapaxes(C, 1, 2) @ delta
-        half_gradient[n:] += problem.incidence.at_beginning(in_P_i)
-        return np.asarray(half_gradient)
+        P_i = point.P[point.i]
+        in_residuals = point.w[:, None] * point.residuals + self.residual_rows(C @ P_i)
+        delta = self.residual_blocks(point.residuals)
+        return in_residuals, np.swapaxes(C, 1, 2) @ delta
 
     def matrix_blocks(self, R_ij: Array, t_ij: Array) -> tuple[Array, Array, Array, Array]:
         """Blocks of M with those of 2 <C, delta R_i>, which is bilinear in the poses of the edge.
@@ -364,22 +325,24 @@ class TangentCost(EdgeCost):
             own_error=own_error,
         )
 
-    def entry_errors(self, problem: EdgeProblem, u: Array, relative_error: float) -> Array:
+    def entry_errors(
+        self, A: csr_array, incidence: Incidence, u: Array, relative_error: float
+    ) -> Array:
         """E u, (N,), with the terms |A|^T |C| and its transpose beside those of W.
 
         Every term is off by at most `relative_error` of itself.
         """
-        n = problem.num_poses
-        d = problem.d
-        A = abs(problem.plain_residual_matrix)
+        n = incidence.begins.shape[0]
+        d = self.tangent.C.shape[2]
+        A = abs(A)
         C_size = np.abs(self.tangent.C)
-        E_u = super().entry_errors(problem, u, relative_error)
+        E_u = super().entry_errors(A, incidence, u, relative_error)
         # |A|^T |C|: C couples the residuals with the rows of R_i^T.
         u_R = u[n:].reshape(n, d, 1)
-        C_u = C_size @ u_R[problem.graph.i]
+        C_u = C_size @ u_R[incidence.i]
         E_u += relative_error * (A.T @ rows_of_blocks(C_u))[:, 0]
         # Its transpose, |C|^T |A|.
         A_u = blocks_of_rows((A @ u)[:, None], len(self.tau))
         Ct_A_u = np.swapaxes(C_size, 1, 2) @ A_u
-        E_u[n:] += relative_error * problem.incidence.at_beginning(Ct_A_u)[:, 0]
+        E_u[n:] += relative_error * incidence.at_beginning(Ct_A_u)[:, 0]
         return E_u

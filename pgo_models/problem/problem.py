@@ -23,7 +23,7 @@ from pgo_models.problem.cholesky import (
     analyze,
     factorize_damped,
 )
-from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.edge_cost import EdgeCost, EdgePoint
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.right_costs import RightCosts
@@ -384,23 +384,38 @@ class PGOProblem(ReadOnly):
         """
         return np.asarray(self.residual_matrix[0] @ X)
 
-    def objective_stacked(self, X: Array, residuals: Array | None = None) -> float:
+    def point(self, X: Array) -> EdgePoint:
+        """Return X as the edges see it: what their cost is evaluated at.
+
+        Parameters
+        ----------
+        X : (N, d) array
+            Poses, stacked, or any other point.
+
+        Returns
+        -------
+        EdgePoint
+            Residuals, their weights, and rotations.
+        """
+        _, w = self.residual_matrix
+        d = self.d
+        P = X[self.num_poses :].reshape(self.num_poses, d, -1)
+        return EdgePoint(self.weights, w, self.residuals(X), P, self.graph.i)
+
+    def objective_stacked(self, X: Array) -> float:
         """Return the cost at any X, as a weighted sum of squares of residuals.
 
         Parameters
         ----------
         X : (N, d) array
             The point.
-        residuals : ((d+1) m, d) array, optional
-            A X, if it is known.
 
         Returns
         -------
         float
             F = tr(X^T M X), or chi2.
         """
-        residuals = self.residuals(X) if residuals is None else residuals
-        return self.weights.value(self, X, residuals)
+        return self.weights.value(self.point(X))
 
     def objective(self, poses: Poses) -> float:
         """Return the cost of poses: F (equation (16) of the paper, weighted), or chi2.
@@ -443,10 +458,9 @@ class PGOProblem(ReadOnly):
         (m,) array
             Their sum is the objective.
         """
-        here = self.at(poses)
-        return self.weights.edge_values(self, here.X, here.residuals)
+        return self.weights.edge_values(self.at(poses).point)
 
-    def apply_M(self, X: Array, residuals: Array | None = None) -> Array:
+    def apply_M(self, X: Array) -> Array:
         """Return M X = A^T (w A X) by way of the residuals.
 
         That is accurate where the edges fit, however large the translations are.
@@ -455,16 +469,33 @@ class PGOProblem(ReadOnly):
         ----------
         X : (N, d) array
             The point.
-        residuals : ((d+1) m, d) array, optional
-            A X, if it is known.
 
         Returns
         -------
         (N, d) array
             In the rows of X.
         """
-        residuals = self.residuals(X) if residuals is None else residuals
-        return self.weights.half_gradient(self, X, residuals)
+        return self.sum_gradients(*self.weights.edge_gradients(self.point(X)))
+
+    def sum_gradients(self, in_residuals: Array, in_P_i: Array | None) -> Array:
+        """Return the half gradient in X of edges with these (`EdgeCost.edge_gradients`).
+
+        Parameters
+        ----------
+        in_residuals : ((d + 1) m, d) array
+            Half gradients in the rows of A X.
+        in_P_i : (m, d, d) array or None
+            Half gradients in the rows of R_i^T beside them; None for zeros.
+
+        Returns
+        -------
+        (N, d) array
+            In the rows of X.
+        """
+        half_gradient = self.residual_adjoint @ in_residuals
+        if in_P_i is not None:
+            half_gradient[self.num_poses :] += self.incidence.at_beginning(in_P_i)
+        return np.asarray(half_gradient)
 
     def apply_Q(self, Y: Array) -> Array:
         """Return Q Y without forming Q: M applied to Y and its best translations.
@@ -579,10 +610,17 @@ class PGOProblem(ReadOnly):
         CholeskyFactor or None
             For `at_best_translations`; None of a quadratic cost, whose factor is kept.
         """
-        return self.weights.translation_factor(self, poses)
+        of_edges = self.weights.translation_matrices(poses.R[self.graph.i])
+        if of_edges is None:
+            return None
+        laplacian = self._translation_laplacian.matrix(of_edges)
+        return factorize_damped(self._translation_analysis, laplacian)
 
     def at_best_translations(self, poses: Poses, factor: CholeskyFactor | None = None) -> Poses:
         """Return the poses with the translations of least cost for their rotations.
+
+        For given rotations the cost is a quadratic function of the translations, so that one step
+        of Newton's method is exact.
 
         Parameters
         ----------
@@ -597,7 +635,17 @@ class PGOProblem(ReadOnly):
         Poses
             With the same rotations.
         """
-        return self.weights.best_translations(self, poses, factor)
+        if not self.has_translations:
+            return self.seen_poses(poses)
+        if self.is_quadratic:
+            return self.with_best_translations(poses.R)
+        if factor is None:
+            factor = self.translation_factor(poses)
+        assert factor is not None  # the cost is not quadratic
+        of_edges = self.weights.translation_gradients(self.point(poses.stacked()))
+        half_gradient = self.incidence.ends @ of_edges - self.incidence.begins @ of_edges
+        step = factor.solve(half_gradient.ravel()).reshape(-1, self.d)
+        return poses.with_translations(poses.t - (step - step[0]))
 
     def with_refined_translations(self, poses: Poses) -> Poses:
         """Return the poses after steps of iterative refinement of the translations.
@@ -715,23 +763,6 @@ class PGOProblem(ReadOnly):
         """Which edges begin and end at a pose."""
         return Incidence.of(self.graph)
 
-    def edge_products(self, residuals: Array, X: Array) -> Array:
-        """Return Z, the residual rows of every edge times R_i: residuals in the frame of pose i.
-
-        Parameters
-        ----------
-        residuals : ((d+1) m, d) array
-            A X.
-        X : (N, d) array
-            The point.
-
-        Returns
-        -------
-        (m, d + 1, d) array
-            Z.
-        """
-        return self.weights.edge_products(self.graph, X, residuals)
-
     @cached_property
     def _M_tt(self) -> csc_array:
         return self.M[: self.num_poses, : self.num_poses].tocsc()
@@ -752,29 +783,15 @@ class PGOProblem(ReadOnly):
 
     @cached_property
     def _translation_laplacian(self) -> matrices.BlockLaplacian:
+        """Laplacian of the translations, with the block of pose 0 doubled: so it is definite."""
         return matrices.BlockLaplacian.of(self.incidence, self.d)
 
-    def translation_matrix(self, of_edges: Array) -> csc_array:
-        """Return the matrix of the translations where chi2 is not quadratic.
-
-        Parameters
-        ----------
-        of_edges : (m, d, d) array
-            Information matrices of the edges, in world axes.
-
-        Returns
-        -------
-        (d n, d n) csc_array
-            Their Laplacian, with the diagonal block of pose 0 doubled, which makes it definite.
-        """
-        return self._translation_laplacian.matrix(of_edges)
-
     @cached_property
-    def translation_information_analysis(self) -> SymbolicCholesky:
-        """Symbolic factorisation of `translation_matrix`, whose pattern the graph alone gives."""
+    def _translation_analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of that Laplacian, whose pattern the graph alone gives."""
         ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
         order = row_order(self.pose_order, self.d)
-        return analyze(self.translation_matrix(ones), self.backend, order)
+        return analyze(self._translation_laplacian.matrix(ones), self.backend, order)
 
     @cached_property
     def _M_tR(self) -> csr_array:
@@ -817,9 +834,14 @@ class EvaluatedPoses(ReadOnly):
         return read_only(self.problem.seen_poses(self.poses).stacked())
 
     @cached_property
+    def point(self) -> EdgePoint:
+        """X as the edges see it."""
+        return self.problem.point(self.X)
+
+    @property
     def residuals(self) -> Array:
         """A X, ((d+1) m, d)."""
-        return read_only(self.problem.residuals(self.X))
+        return read_only(self.point.residuals)
 
     @cached_property
     def minorant(self) -> EdgeCost:
@@ -830,7 +852,7 @@ class EvaluatedPoses(ReadOnly):
         problem = self.problem
         if problem.is_quadratic:
             return problem.weights
-        return problem.weights.minorant(problem, self.X, self.residuals)
+        return problem.weights.minorant(self.point)
 
     @cached_property
     def tangent(self) -> PGOProblem:
@@ -843,15 +865,15 @@ class EvaluatedPoses(ReadOnly):
     @cached_property
     def value(self) -> float:
         """F, or chi2, of which the minorant has computed most."""
-        problem = self.problem
-        if problem.is_quadratic:
-            return problem.weights.value(problem, self.X, self.residuals)
-        return self.minorant.value_at_contact(problem, self.X, self.residuals)
+        if self.problem.is_quadratic:
+            return self.problem.weights.value(self.point)
+        return self.minorant.value_at_contact(self.point)
 
     @cached_property
     def half_gradient(self) -> Array:
         """M X, (N, d), half the gradient in X; for chi2 M is that of the tangent."""
-        return read_only(self.minorant.half_gradient(self.problem, self.X, self.residuals))
+        of_edges = self.minorant.edge_gradients(self.point)
+        return read_only(self.problem.sum_gradients(*of_edges))
 
     @property
     def riemannian_gradient(self) -> tuple[Array, Array]:

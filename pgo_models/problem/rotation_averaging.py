@@ -17,9 +17,7 @@ import numpy as np
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.edge_cost import EdgeCost
-from pgo_models.problem.edge_problem import EdgeProblem
 from pgo_models.problem.rotation_weights import RotationWeights, ScaledIdentities
 
 
@@ -98,12 +96,6 @@ class RotationAveraging(EdgeCost):
         if not poses.t.any():
             return poses
         return poses.with_translations(np.zeros_like(poses.t))
-
-    def best_translations(
-        self, problem: EdgeProblem, poses: Poses, factor: CholeskyFactor | None = None
-    ) -> Poses:
-        """The poses with zeros for translations."""
-        return self.seen_poses(poses)
 
     def is_seen(self) -> tuple[BoolArray, BoolArray]:
         """That the cost depends on no delta_t, and on which delta_R; (m,) each."""

@@ -329,7 +329,7 @@ def test_errors_of_chi2(d: int, coupled: bool) -> None:
         m = graph.num_edges
         level = 0.0
         error = 0.0
-        touched = excess.tangent(problem.edge_products(residuals, poses.stacked()))
+        touched = excess.tangent(problem.at(poses).point.Z)
         kappa = weights.rotation.row_weights(d).reshape(m, d)
         e_R = 2 * np.sqrt(d) * share + 2 * omega
         for e in range(m):
