@@ -1,4 +1,4 @@
-"""The place that every other is held against: a solve in one process, which has the whole graph."""
+"""A solve in one process, which has the graph. Other places are compared with this one."""
 
 from __future__ import annotations
 
@@ -266,11 +266,11 @@ class Here(Place):
 
     @property
     def has_poses(self) -> bool:
-        """Whether any poses were found."""
+        """Whether a start or a run has given poses."""
         return bool(self.monitor.poses_found)
 
     def salvage(self, ending: Ending) -> Attempt:
-        """The best poses found so far, or those along a spanning tree, with the bound F >= 0."""
+        """The cheapest poses so far, or those along a spanning tree, with the bound F >= 0."""
         candidates = self.monitor.poses_found or [spanning_tree_start(self.problem.graph)]
         poses = min(candidates, key=self.problem.objective)
         stage = ending(self.problem.objective(poses))

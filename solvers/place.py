@@ -113,7 +113,7 @@ class Traits:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """What an attempt to solve a graph has found so far.
+    """The state of an attempt to solve a graph.
 
     Parameters
     ----------
@@ -124,11 +124,11 @@ class Attempt:
     decrement : float
         Half the squared Newton decrement over the cost at the poses; inf where it was not measured.
     certificate : Certificate or None
-        That of the poses, once it was found.
+        That of the poses; None before the attempt has ended.
     dual_bound : DualBound or None
         Bound on the semidefinite relaxation that led to the poses, with its multipliers.
     failures : tuple of str
-        A sentence on every step that failed, and left the answer as it was.
+        A sentence on every step that failed. Such a step does not change the answer.
     hulls : HullState or None
         Where the relaxation with hulls of rotations was last solved.
     """
@@ -155,7 +155,7 @@ class Attempt:
 
     @property
     def has_certificate(self) -> bool:
-        """Whether the certificate has been found."""
+        """Whether there is a certificate, with which an attempt ends."""
         return self.certificate is not None
 
     @property

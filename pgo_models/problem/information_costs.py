@@ -160,8 +160,8 @@ class TangentTerms(EdgeTerms):
     P_i is R_i^T. The half gradient in P_i, for a fixed delta, is C^T delta.
     """
 
-    own: Array  # (m, d, d): C^T delta
-    own_error: Array  # bound on its error, entry by entry
+    in_P_i: Array  # (m, d, d): C^T delta
+    in_P_i_error: Array  # bound on its error, entry by entry
 
     def complete_half_gradient(
         self,
@@ -177,8 +177,8 @@ class TangentTerms(EdgeTerms):
         """
         n = incidence.begins.shape[0]
         at_beginning = incidence.at_beginning
-        half_gradient[n:] += at_beginning(self.own)
-        term_errors = self.own_error + relative_error * np.abs(self.own)
+        half_gradient[n:] += at_beginning(self.in_P_i)
+        term_errors = self.in_P_i_error + relative_error * np.abs(self.in_P_i)
         half_gradient_error[n:] += at_beginning(term_errors)
         half_gradient_error += UNIT_ROUNDOFF * np.abs(half_gradient)
         return half_gradient, half_gradient_error
@@ -313,16 +313,16 @@ class TangentCost(EdgeCost):
         G = C @ P_i
         G_error = gamma(d) * C_size @ np.swapaxes(P_size, 1, 2)
         # The half gradient in P_i, C^T delta.
-        own = np.swapaxes(C, 1, 2) @ delta
-        own_error = np.swapaxes(C_size, 1, 2) @ product_errors
+        in_P_i = np.swapaxes(C, 1, 2) @ delta
+        in_P_i_error = np.swapaxes(C_size, 1, 2) @ product_errors
         return TangentTerms(
             value=terms.value + (linear_part + constant),
             value_error=terms.value_error + value_error,
             G=terms.G + G,
             G_error=terms.G_error + G_error,
             G_size=terms.G_size + np.abs(G),
-            own=own,
-            own_error=own_error,
+            in_P_i=in_P_i,
+            in_P_i_error=in_P_i_error,
         )
 
     def entry_errors(

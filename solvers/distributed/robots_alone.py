@@ -200,9 +200,9 @@ def collect_copies(driver: Driver) -> Poses:
     """Poses that the robots agreed on, for the result; off the ledger."""
     R = np.empty((driver.num_poses, driver.d, driver.d))
     t = np.empty((driver.num_poses, driver.d))
-    for own in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
-        R[own.poses] = own.R
-        t[own.poses] = own.t
+    for answer in ask_all(RobotsOfDriver(driver), ConsensusRobot.own_poses, None, Count.OFF):
+        R[answer.poses] = answer.R
+        t[answer.poses] = answer.t
     return Poses(R, t)
 
 

@@ -15,11 +15,12 @@ from pgo_models.problem.weighting import Weighting
 def note_of(problem: PGOProblem, certificate: Certificate, lacks: str = "") -> str:
     """Note of a solution: absent robots, coupling left out, and what the certificate lacks.
 
-    The last is `lacks`, or unless given what `note_of_weights` and `note_of_tangent` say.
+    A weight or the translations may be the reason for a wide gap. What else the certificate lacks
+    is said by `lacks`.
     """
-    found = note_of_weights(problem.graph, certificate) or note_of_tangent(problem, certificate)
     absence = note_of_absence(len(problem.graph.absent))
-    return joined_notes(absence, note_of_coupling(problem), lacks or found)
+    reason = note_of_weights(problem.graph, certificate) or note_of_tangent(problem, certificate)
+    return joined_notes(absence, note_of_coupling(problem), reason, lacks)
 
 
 def joined_notes(*notes: str) -> str:
@@ -28,7 +29,7 @@ def joined_notes(*notes: str) -> str:
 
 
 def note_of_absence(num_absent: int) -> str:
-    """Sentence on what a solution holds for where edges name poses of absent robots, or ""."""
+    """Say for which graph a solution holds where robots are absent; "" where none are."""
     if num_absent == 0:
         return ""
     return (
@@ -38,15 +39,15 @@ def note_of_absence(num_absent: int) -> str:
 
 
 def verdict_suffix(num_absent: int) -> str:
-    """What a verdict says where edges name poses of absent robots, or ""."""
+    """What a verdict adds where robots are absent; "" where none are."""
     return "; this is of the files here alone, without absent robots" if num_absent else ""
 
 
 def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
-    """Sentence on a weight that is too far from the others for a bound, or "".
+    """Name a weight that is too far from the others for a bound; "" where there is none.
 
-    That is so where no bound was found, and beside this weight rounding hides more than the gap
-    that was asked for.
+    There is one where no bound is known, and rounding beside this weight hides more than the gap
+    asked for.
     """
     if certificate.verdict is not Verdict.TRIVIAL:
         return ""
@@ -57,10 +58,10 @@ def note_of_weights(graph: PoseGraph, certificate: Certificate) -> str:
 
 
 def note_of_tangent(problem: PGOProblem, certificate: Certificate) -> str:
-    """Sentence on translations whose information the bound on chi2 cannot keep, or "".
+    """Say which translations keep the bound on chi2 below its value; "" where none do.
 
-    That is so where the bound is one of smaller information matrices: the tangent keeps of every
-    I_tt its smallest eigenvalue, and the largest of them is beyond what could be proven.
+    The bound is then one of smaller information matrices. They cut the condition of every I_tt down
+    to a cap, and some edges have a larger one.
     """
     if certificate.is_certified or certificate.bound.cap == math.inf:
         return ""
@@ -80,7 +81,7 @@ def note_of_tangent(problem: PGOProblem, certificate: Certificate) -> str:
 
 
 def note_of_coupling(problem: PGOProblem) -> str:
-    """Sentence on the coupling blocks that chi2 leaves out, or ""."""
+    """Say how many coupling blocks chi2 leaves out; "" where it has all."""
     graph = problem.graph
     if problem.weighting is not Weighting.INFORMATION or graph.uncoupled is None:
         return ""

@@ -265,7 +265,7 @@ def certifies_by_terms(place: Place) -> bool:
 
 def certifies_in_complex_numbers(place: Place) -> bool:
     answer = place.solve(planar_lattice(4, 4, 0.5), weighting=Weighting.ISOTROPIC)
-    refuse_what_the_note_names(answer, "the relaxation with complex numbers")
+    refuse_what_the_note_names(answer, "complex numbers")
     return answer.certificate.bound.is_complex
 
 

@@ -63,7 +63,8 @@ def test_a_weight_is_not_named_where_it_is_not_the_cause() -> None:
     assert solvers.solve(weighted(grid, {5: 1e9, 9: 1e-15})).note == ""
     noisy = pgo.random_geometric(40, np.random.default_rng(0), noise=NoiseModel(0.5, 1.0))
     solution = solvers.solve(weighted(noisy, {3: 2e10}))
-    assert (solution.certificate.verdict, solution.note) == (Verdict.NOT_CERTIFIED, "")
+    assert solution.certificate.verdict is Verdict.NOT_CERTIFIED
+    assert "too far from others" not in solution.note
 
 
 def test_the_place_of_an_edge_is_that_of_its_own_line(tmp_path: Path) -> None:
