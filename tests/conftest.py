@@ -10,13 +10,11 @@ from browser import Browser, find_browser
 from budget import EXAMPLES, PROFILE
 from hypothesis import settings
 
-from pgo_models import PGOProblem, Poses, Weighting
-from pgo_models.graphs.g2o import read_g2o
+from pgo_models import PGOProblem, Poses, Weighting, chordal_start, read_g2o
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from pgo_models.problem.cholmod import import_cvxopt
-from pgo_models.problem.initialization import chordal_start
+from solvers import polish
 from solvers.cli import app as cli
-from solvers.riemannian.polish import polish
 
 # Speed is measured in benchmarks.
 settings.register_profile(

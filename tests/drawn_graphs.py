@@ -8,14 +8,8 @@ from pathlib import Path
 import numpy as np
 from graphs import LOUD_NOISE, exact_graph, informed, varied_graph
 
-from pgo_models import PoseGraph, Poses
-from pgo_models.geometry.rotations import (
-    Array,
-    project_to_rotations,
-    random_rotations,
-    tangent_dimension,
-)
-from pgo_models.graphs.g2o import write_g2o
+from pgo_models import PoseGraph, Poses, project_to_rotations, random_rotations, write_g2o
+from pgo_models.geometry.rotations import Array, tangent_dimension
 from pgo_models.graphs.g2o_rows import numbers_of
 from solvers import SweptScene
 from solvers.studies.tightness import noisy_scene

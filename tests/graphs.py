@@ -8,13 +8,23 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 
-from pgo_models import NoiseModel, PartitionMethod, PGOProblem, PoseGraph, Poses, Weighting
+from pgo_models import (
+    NoiseModel,
+    PartitionMethod,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Weighting,
+    chordal_start,
+    exp_map,
+    random_geometric,
+    random_rotations,
+)
 from pgo_models.certificates.rounding_errors import objective_rounding
-from pgo_models.geometry.rotations import Array, exp_map, random_rotations, tangent_dimension
+from pgo_models.geometry.rotations import Array, tangent_dimension
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.scenes import MILD_NOISE, observe, random_geometric
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from pgo_models.graphs.scenes import MILD_NOISE, observe
+from solvers import polish
 from solvers.studies.tightness import noisy_lattice
 
 EPS = float(np.finfo(float).eps)

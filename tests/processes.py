@@ -11,11 +11,10 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PGOError
+from pgo_models import PGOError, grid
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.scenes import grid
+from solvers import solve
 from solvers.network.messages import Idle
-from solvers.pipeline import solve
 
 _MEGABYTE = 2**20
 

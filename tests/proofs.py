@@ -4,8 +4,7 @@ import json
 from pathlib import Path
 
 import solvers
-from pgo_models import Certificate, PGOProblem, PoseGraph, Weighting
-from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models import Certificate, PGOProblem, PoseGraph, Weighting, read_g2o, write_g2o
 from pgo_models.verification.verify import Verification
 
 PLANE = "EDGE_SE2 0 1 1 0 0.1 4 0 0 4 0 9\nEDGE_SE2 1 2 1 0.2 0.3 4 1 0 5 0 9\n"

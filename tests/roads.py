@@ -6,8 +6,7 @@ import enum
 
 import numpy as np
 
-from pgo_models import PoseGraph, Poses
-from pgo_models.geometry.rotations import exp_map
+from pgo_models import PoseGraph, Poses, exp_map
 
 
 class Shape(enum.Enum):

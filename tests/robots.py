@@ -14,9 +14,9 @@ import pytest
 from graphs import MILD_NOISE
 from hypothesis import strategies as st
 
-from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses
-from pgo_models.geometry.rotations import Array, random_rotations
-from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses, partition, random_rotations
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend

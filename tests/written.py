@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models import PGOProblem, PoseGraph
+from pgo_models import PGOProblem, PoseGraph, chordal_start, partition
 from pgo_models.graphs.g2o_rows import numbers_of
-from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.pose_graph import isotropic_information
-from pgo_models.problem.initialization import chordal_start
 
 
 def written_text(graph: PoseGraph, form: str) -> str:

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pgo_models import NoiseModel, PoseGraph, Poses
-from pgo_models.geometry.rotations import BoolArray, exp_map, random_rotations
-from pgo_models.graphs.grid_worlds import grid_world
+from pgo_models import NoiseModel, PoseGraph, Poses, exp_map, grid_world, random_rotations
+from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.scenes import observe
 from solvers.robust.known import odometry
 

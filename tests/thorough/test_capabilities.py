@@ -20,9 +20,8 @@ from networks import KEY, Network, give_edge
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel, PGOError, PoseGraph, Weighting
+from pgo_models import NoiseModel, PGOError, PoseGraph, Weighting, victoria_park
 from pgo_models.graphs.g2o import write_g2o_folder
-from pgo_models.graphs.scenes import victoria_park
 from solvers import SweptScene
 from solvers.place import Automatic
 from solvers.riemannian.prefixes import GrowingStart

@@ -15,18 +15,27 @@ from graphs import exact_graph, informed, varied_graph
 
 import pgo_models as pgo
 import solvers
-from pgo_models import Certificate, NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
-from pgo_models.certificates.certificate import certify_at
-from pgo_models.certificates.proof_file import save_proof
+from pgo_models import (
+    Certificate,
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Verdict,
+    Weighting,
+    certify_at,
+    chi2,
+    exp_map,
+    read_g2o,
+    save_proof,
+    verify_proof,
+    write_g2o,
+)
 from pgo_models.errors import GraphError
-from pgo_models.geometry.rotations import exp_map, tangent_dimension
-from pgo_models.graphs.g2o import read_g2o, write_g2o, write_g2o_folder
-from pgo_models.graphs.residuals import chi2
+from pgo_models.geometry.rotations import tangent_dimension
+from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.scenes import observe
-from pgo_models.verification.verify import verify_proof
-from solvers import solve
-from solvers.growing import extend
-from solvers.solves.given_poses import certify
+from solvers import certify, extend, solve
 
 Call = Callable[..., tuple[int, str, str]]
 

@@ -36,11 +36,6 @@ def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
         read_text(tmp_path)
 
 
-@pytest.mark.parametrize("word", ["1", "-1.5e-3", "+.5", "0"])
-def test_finite_numbers(word: str) -> None:
-    assert finite_number("f", 1, word) == float(word)
-
-
 @pytest.mark.parametrize(
     "word", ["one", "1_000", "\u0661", "1,5", "0x10", "nan", "inf", "-Infinity", "1e999", "-1e101"]
 )
@@ -49,13 +44,6 @@ def test_other_words_are_refused_with_file_line_and_value(word: str) -> None:
         finite_number("f", 7, word)
     assert str(caught.value).startswith("f:7: ")
     assert word in str(caught.value)
-
-
-def test_table_skips_comments_and_keeps_lines(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text("# x y\n1 2\n\n  3\t4\r\n")
-    rows, lines = read_table(tmp_path / "a", 2)
-    np.testing.assert_array_equal(rows, [[1, 2], [3, 4]])
-    assert lines == [2, 4]
 
 
 @pytest.mark.parametrize(

@@ -19,19 +19,16 @@ from pgo_models import (
     PGOProblem,
     PoseGraph,
     Poses,
-    Verdict,
     Weighting,
+    exp_map,
+    grid,
+    load,
+    random_geometric,
 )
 from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.errors import GraphError
-from pgo_models.geometry.rotations import exp_map, orthogonality_error
-from pgo_models.graphs.datasets import load
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.scenes import grid, random_geometric
-from solvers import Status, growing as growing_solves
-from solvers.growing import extend, extended_partition, extended_poses
-from solvers.place import Attempt, Place
-from solvers.plan import solve_at
+from solvers import Status, extend
 
 
 def first_poses(graph: PoseGraph, count: int) -> PoseGraph:
@@ -90,49 +87,14 @@ def test_an_update_that_is_interrupted_is_not_followed_by_another_solve(
 ) -> None:
     graph = grid(np.random.default_rng(0))
     before = solvers.solve(first_poses(graph, 20))
-    updates: list[Attempt] = []
 
-    def interrupted(place: Place, settings: solvers.Pipeline, start: Poses | None) -> Attempt:
-        found = solve_at(place, settings, start)
-        wide = replace(found.proof, verdict=Verdict.NOT_CERTIFIED, gap=1.0)
-        updates.append(replace(found, status=Status.INTERRUPTED, certificate=wide))
-        return updates[-1]
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(growing_solves, "solve_at", interrupted)
+    monkeypatch.setattr(solvers.Newton, "step", interrupted)
     found = extend(before, graph)
-    assert len(updates) == 1
     assert found.status is Status.INTERRUPTED
-
-
-def test_known_rotations_stay_and_new_poses_are_where_exact_measurements_put_them() -> None:
-    graph = random_geometric(20, np.random.default_rng(0))
-    assert graph.truth is not None
-    i = graph.i
-    j = graph.j
-    (R, t) = (graph.truth.R, graph.truth.t)
-    back = np.swapaxes(R[i], 1, 2)
-    graph = replace(graph, R_ij=back @ R[j], t_ij=np.einsum("mab,mb->ma", back, t[j] - t[i]))
-    assert graph.truth is not None
-    # poses are told by their ids, not by their place
-    moved = graph.subgraph(np.random.default_rng(1).permutation(20))
-    known = first_poses(graph, 12)
-    start = extended_poses(PGOProblem(moved), known.pose_ids, graph.truth[np.arange(12)])
-    expected = graph.truth[moved.pose_ids]
-    # best ones, of pose 0 at 0
-    np.testing.assert_allclose(start.t, expected.t - expected.t[0], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(start.R, expected.R, rtol=0, atol=1e-8)
-    is_known = moved.pose_ids < 12
-    np.testing.assert_array_equal(start.R[is_known], expected.R[is_known])
-    assert (orthogonality_error(start.R) < 1e-12).all()
-
-
-def test_only_new_edges_start_from_the_poses_as_they_are() -> None:
-    graph = grid(np.random.default_rng(3))
-    fewer = graph.without_edges(np.arange(graph.num_edges) == graph.num_edges - 1)
-    before = solvers.solve(fewer)
-    start = extended_poses(PGOProblem(graph), fewer.pose_ids, before.poses)
-    np.testing.assert_array_equal(start.R, before.poses.R)
-    assert extend(before, graph).is_certified
+    assert [stage.name for stage in found.stages] == ["given start", "Newton"]
 
 
 def test_another_graph_is_refused() -> None:
@@ -176,22 +138,6 @@ def test_robots_and_their_account_go_on() -> None:
     assert extend(grown, graph).ledger.rounds > grown.ledger.rounds
 
 
-def test_a_new_pose_goes_to_the_robot_that_its_first_edge_joins_it_with() -> None:
-    e = np.eye(2)
-    i = np.array([0, 1, 2, 4, 0])
-    j = np.array([1, 2, 3, 3, 4])
-    chain = PoseGraph(
-        5, i, j, np.tile(e, (5, 1, 1)), np.ones((5, 2)), kappa=np.ones(5), tau=np.ones(5)
-    )
-    robots = Partition(np.array([0, 1, 1]), PartitionMethod.CONTIGUOUS)
-    grown = extended_partition(robots, np.arange(3), chain)
-    # Pose 3 is joined with pose 2; pose 4 with pose 0, and only then with pose 3.
-    assert grown.robot.tolist() == [0, 1, 1, 1, 0]
-    assert grown.method is PartitionMethod.CONTIGUOUS
-    with pytest.raises(GraphError, match="no edge joins"):
-        extended_partition(robots, np.arange(3), chain.without_edges(i > 1))
-
-
 def test_new_poses_go_to_the_robots_that_the_files_name() -> None:
     """Also those of a robot that comes later, whose letter is before those of others."""
     graph = load("robots")
@@ -200,28 +146,12 @@ def test_new_poses_go_to_the_robots_that_the_files_name() -> None:
         before = solvers.solve(first, robots=first.num_robots)
         assert before.robots is not None
         assert before.robots.method is PartitionMethod.GIVEN
-        grown = extended_partition(before.robots, first.pose_ids, graph)
+        grown = extend(before, graph).robots
+        assert grown is not None
         pairs = np.unique(np.stack([grown.robot, graph.robots]), axis=1)
         assert pairs.shape == (2, 4)
         np.testing.assert_array_equal(grown.robot[kept], before.robots.robot)
     assert extend(before, graph).is_certified
-
-
-def test_robots_that_the_files_do_not_name_take_their_neighbours() -> None:
-    graph = load("robots")
-    kept = np.flatnonzero(graph.robots < 3)
-    first = graph.subgraph(kept)
-    halves = Partition((np.arange(120) >= 60).astype(int), PartitionMethod.CONTIGUOUS)
-    unnamed = replace(graph, robot=None)
-    np.testing.assert_array_equal(
-        extended_partition(halves, first.pose_ids, graph).robot,
-        extended_partition(halves, first.pose_ids, unnamed).robot,
-    )
-    # Of two robots that one name stands for, neither is known to be the new one.
-    shared = Partition(np.array([0, 0, 1])[first.robots], PartitionMethod.GIVEN)
-    grown = extended_partition(shared, first.pose_ids, graph)
-    np.testing.assert_array_equal(grown.robot[:120], shared.robot)
-    assert grown.num_robots == 2
 
 
 def test_robots_can_be_given_and_a_further_one_joins() -> None:

@@ -50,10 +50,3 @@ def test_a_certificate_shows_the_same_as_it_prints():
     ] == str(certificate).splitlines()
     assert "best known F" in shown
     assert len(repr(certificate)) < 100
-
-
-def test_a_solution_shows_its_figures_and_stages():
-    solution = solvers.solve(pgo.circle(np.random.default_rng(0)))
-    shown = cells(solution._repr_html_())
-    assert solution.certificate.cost_text in shown
-    assert all(stage.name in shown for stage in solution.stages)

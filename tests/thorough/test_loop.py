@@ -9,8 +9,7 @@ from graphs import random_poses, varied_problem
 
 from pgo_models import PGOProblem, Poses
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
-from solvers import SOC, Measurement, Newton, Status
-from solvers.loop import iterate, run
+from solvers import SOC, Measurement, Newton, Status, iterate, run
 from solvers.result import Record
 
 
@@ -222,12 +221,6 @@ def test_convergence_comes_before_the_limits() -> None:
     assert result.status is Status.CONVERGED
 
 
-def test_it_is_silent_by_default(capfd: pytest.CaptureFixture[str]) -> None:
-    run(SOC(), PROBLEM)
-    run(Newton(), PROBLEM)
-    assert capfd.readouterr() == ("", "")
-
-
 @pytest.mark.parametrize("solver", [SOC(max_iterations=5), Newton()])
 def test_verbose_prints_the_history(
     solver: SOC | Newton, capsys: pytest.CaptureFixture[str]
@@ -243,23 +236,3 @@ def test_verbose_prints_the_history(
         result.history.objective, rel=1e-9
     )
     assert lines[-1].startswith(f"{result.status.name} after {result.iterations} iterations")
-
-
-def test_the_name_is_the_solver_s() -> None:
-    for solver, name in (
-        (SOC(max_iterations=0), "SOC"),
-        (Newton(max_iterations=0), "Newton"),
-        (Film(VALUES), "Film"),
-    ):
-        assert run(solver, PROBLEM, callback=stop).name == name
-
-
-def stop(state: object, record: Record) -> bool:
-    return True
-
-
-def test_the_same_settings_give_the_same_history() -> None:
-    one = run(SOC(max_iterations=8), PROBLEM)
-    other = run(SOC(max_iterations=8), PROBLEM)
-    np.testing.assert_array_equal(one.history.objective, other.history.objective)
-    np.testing.assert_array_equal(one.poses.R, other.poses.R)

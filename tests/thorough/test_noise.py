@@ -8,12 +8,11 @@ import pytest
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PoseGraph
+from pgo_models import PoseGraph, write_g2o
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.graphs.g2o import write_g2o
 from pgo_models.problem.initialization import spanning_tree
+from solvers import estimate_noise
 from solvers.robust.known import odometry
-from solvers.studies.noise import estimate_noise
 
 
 def noisy_walk(d: int, seed: int, closure_noise: float) -> PoseGraph:

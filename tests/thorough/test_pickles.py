@@ -27,13 +27,13 @@ from signals import sparse_signal
 
 import pgo_models as pgo
 import solvers
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.graphs.datasets import SE_SYNC
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.marginals import Marginals
-from solvers.loop import iterate, run
+from solvers import iterate, run
 from solvers.network.ledger import Traffic
 from solvers.reporting.edge_fit import judge_edges
 from solvers.soc.r_step import RotationStep, RSubproblem
@@ -296,16 +296,6 @@ def test_a_copied_state_goes_on_as_the_original_does(
     np.testing.assert_array_equal(
         solver.poses(problem, expected).R, other_solver.poses(other_problem, found).R
     )
-
-
-def test_a_factor_that_is_used_up_stays_so():
-    problem = pgo.PGOProblem(GRAPH, CholeskyBackend.CHOLMOD)
-    shifted = problem.with_pattern_of_M(problem.M.data.copy())
-    shifted.setdiag(shifted.diagonal() + 1.0)
-    first = problem.analysis.factorize(shifted)
-    problem.analysis.factorize(shifted, overwrite=first)
-    with pytest.raises(ValueError, match="overwritten by a later one"):
-        pickled(first).solve(np.ones(problem.side))
 
 
 def test_a_pool_of_processes_maps_solve():

@@ -9,9 +9,8 @@ from hypothesis import example, given, settings, strategies as st
 import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, Verdict, Weighting
-from pgo_models.certificates import definiteness
 from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource
-from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.graphs.trajectories import read_times
 from solvers import SweptScene
 from solvers.soc.soc import WARM_START_TOLERANCE
@@ -71,16 +70,6 @@ def test_without_an_estimate_pose_0_is_the_identity():
     solution = solvers.solve(replace(graph, initial=None))
     np.testing.assert_allclose(solution.poses.R[0], np.eye(3), rtol=0, atol=1e-12)
     np.testing.assert_allclose(solution.poses.t[0], 0, rtol=0, atol=1e-12)
-
-
-def test_newton_alone_and_the_papers_coupling_find_the_same_optimum():
-    problem = pgo.PGOProblem(pgo.grid(np.random.default_rng(0)))
-    expected = solvers.solve(problem).objective
-    alone = solvers.solve(problem, solvers.Pipeline(soc=None))
-    paper = solvers.solve(problem, solvers.Pipeline(soc=solvers.PaperSOC()))
-    np.testing.assert_allclose([alone.objective, paper.objective], expected, rtol=1e-10, atol=0)
-    assert [stage.name for stage in alone.stages] == ["chordal start", "Newton"]
-    assert [stage.name for stage in paper.stages] == ["spanning tree", "PaperSOC", "Newton"]
 
 
 def test_a_bad_start_is_rescued_by_the_second_try():
@@ -206,13 +195,6 @@ def test_settings_out_of_range_are_refused():
 def test_what_is_given_in_the_wrong_place_is_named_with_the_right_call(call, message):
     with pytest.raises(pgo.PGOError, match=message):
         call(pgo.PGOProblem(pgo.grid(np.random.default_rng(0))))
-
-
-def test_a_graph_is_as_good_as_its_problem():
-    graph = pgo.grid(np.random.default_rng(0))
-    one, other = (solvers.run(solvers.Newton(), given) for given in (graph, pgo.PGOProblem(graph)))
-    np.testing.assert_array_equal(one.poses.R, other.poses.R)
-    assert one.objective == other.objective
 
 
 @pytest.mark.parametrize("factor", [1 - 2e-7, 1 - 1e-10])
@@ -377,22 +359,6 @@ def test_times_go_along_and_are_written(tmp_path):
         replace(graph, times=times[1:])
 
 
-def test_where_rounding_alone_is_in_the_way_no_other_poses_are_looked_for(monkeypatch):
-    """As on planes of 360,000 poses: S_r has a factor, whose rounding may be more than what it is
-    definite by.
-    """
-    monkeypatch.setattr(definiteness, "ROUNDING_MULTIPLE", 1e16)
-    solution = solvers.solve(pgo.grid(np.random.default_rng(0)))
-    assert [stage.name for stage in solution.stages] == ["chordal start", "Newton"]
-    certificate = solution.certificate
-    assert (certificate.verdict, certificate.can_improve, certificate.lower_bound) == (
-        Verdict.TRIVIAL,
-        False,
-        0.0,
-    )
-    assert "definite in doubles" in str(certificate)
-
-
 @pytest.mark.parametrize(
     ("robots", "d", "seed"),
     [(None, 2, 5), (None, 2, 16), (None, 3, 4), (None, 3, 8), (2, 2, 5), (2, 2, 16), (2, 3, 8)],
@@ -403,20 +369,3 @@ def test_weights_too_far_apart_for_doubles_end_in_a_solution(robots, d, seed):
     assert solution.objective == problem.objective(solution.poses)
     assert solution.objective <= 1e18  # of poses, not of what overflowed
     assert solution.lower_bound <= solution.objective
-
-
-def test_a_matrix_without_a_factor_is_a_status(monkeypatch):
-    """Nothing is claimed of the poses then, and the best that were found are returned."""
-    problem = pgo.PGOProblem(spread_graph(0, 9, 3))
-
-    def refuse(*_):
-        raise NotPositiveDefiniteError("no")
-
-    monkeypatch.setattr("solvers.here.chordal_start", refuse)
-    solution = solvers.solve(problem, progress=False)
-    assert solution.status is solvers.Status.NOT_FACTORED
-    assert not solution.status.is_success
-    assert (solution.certificate.verdict, solution.lower_bound) == (Verdict.TRIVIAL, 0.0)
-    tree = problem.objective(pgo.spanning_tree_start(problem.graph))
-    assert solution.objective == pytest.approx(tree, rel=1e-6)
-    assert "has no Cholesky factor" in str(solution)

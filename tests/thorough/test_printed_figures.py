@@ -16,9 +16,8 @@ from pages import Page
 
 import pgo_models as pgo
 import solvers
-from solvers import BenchmarkMethod, ComparisonSettings
+from solvers import BenchmarkMethod, ComparisonSettings, compare_methods
 from solvers.reporting.report import report_page
-from solvers.studies.comparison import compare_methods
 
 GRAPHS = {
     **{name: pgo.load(name) for name in ("sphere", "circle", "grid", "robots")},

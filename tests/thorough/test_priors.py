@@ -13,13 +13,20 @@ from scipy.optimize import least_squares
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PoseGraph, Poses, Weighting
+from pgo_models import (
+    PoseGraph,
+    Poses,
+    Weighting,
+    chi2,
+    exp_map,
+    log_map,
+    read_g2o,
+    victoria_park,
+    write_g2o,
+)
 from pgo_models.errors import GraphError, GraphWarning, SettingError
-from pgo_models.geometry.rotations import exp_map, log_map, tangent_dimension
-from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.pose_graph import isotropic_information
-from pgo_models.graphs.residuals import chi2
-from pgo_models.graphs.scenes import victoria_park
 from solvers.cli.app import main
 
 

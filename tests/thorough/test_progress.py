@@ -1,14 +1,13 @@
 import sys
 from contextlib import suppress
 from dataclasses import replace
-from types import ModuleType, TracebackType
+from types import ModuleType
 
 import pytest
 
 import solvers
-from pgo_models import PGOProblem, Weighting
+from pgo_models import PGOProblem, Weighting, load
 from pgo_models.activity import Activity, doing
-from pgo_models.graphs.datasets import load
 from solvers import Measurement, Newton, Status
 from solvers.progress.line import Pace, StageLine, Table, is_shown
 from solvers.result import Record
@@ -70,52 +69,6 @@ def test_verbose_prints_a_header_a_row_an_iterate_and_the_ending(
     assert ending == f"CONVERGED after 2 iterations: {Status.CONVERGED.value}"
 
 
-def test_rows_of_a_run_by_robots_fill_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
-    measured = Measurement(
-        1.2345678905e-05, 1e-100, 1e-100, rounds=123456, all_reduces=1234567, num_bytes=999_999_000
-    )
-    with Table("SOC", verbose=True) as table:
-        for k in (0, 99_999):
-            table.row(Record(k, 9999.999, measured))
-    lines = capsys.readouterr().out.splitlines()[1:]
-    assert {len(line) for line in lines} == {80}
-    assert lines[-1].split() == [
-        *(
-            "99999",
-            "1.234567891e-05",
-            "1.00e-100",
-            "1.00e-100",
-            "9999.999",
-            "123456",
-            "1234567",
-            "999.999",
-        )
-    ]
-
-
-def test_a_run_that_goes_on_has_a_head_too(capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC", verbose=True) as table:
-        table.row(Record(7, 0.0, Measurement(1.0, 1e-3, 1e-3)))
-        table.row(Record(8, 0.0, Measurement(1.0, 1e-4, 1e-4)))
-    name, head, *rows = capsys.readouterr().out.splitlines()
-    assert (name, "primal" in head, len(rows)) == ("SOC", True, 2)
-
-
-def test_a_residual_that_is_not_yet_known_is_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC", verbose=True) as table:
-        table.row(Record(0, 0.0, Measurement(1.0, float("inf"), float("inf"))))
-        table.row(Record(1, 0.0, Measurement(float("nan"), float("nan"), float("nan"))))
-    rows = capsys.readouterr().out.splitlines()[2:]
-    assert rows[0].split() == ["0", "1", "-", "-", "0.000"]
-    assert rows[1].split() == ["1", "nan", "nan", "nan", "0.000"]
-
-
-def test_names_with_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC[bold]", verbose=True) as table:
-        table.row(RECORDS[0])
-    assert capsys.readouterr().out.splitlines()[0] == "SOC[bold]"
-
-
 def test_a_long_run_shows_a_bar_on_stderr_alone(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,16 +94,6 @@ def test_the_table_names_the_cost(capsys) -> None:
     graph = load("grid")
     solvers.run(Newton(), PGOProblem(graph, weighting=Weighting.ROTATIONS), verbose=True)
     assert "F(R)" in capsys.readouterr().out.splitlines()[1]
-
-
-@pytest.mark.parametrize("status", Status)
-def test_lines_are_not_wrapped(status: Status, capsys: pytest.CaptureFixture[str]) -> None:
-    with Table("SOC", verbose=True) as table:
-        table.end(status, 123_456)
-    assert (
-        capsys.readouterr().out.splitlines()[-1]
-        == f"{status.name} after 123456 iterations: {status.value}"
-    )
 
 
 def test_a_short_run_shows_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,26 +146,9 @@ def test_notebooks_show_no_bar_when_told_so_or_on_short_runs(
     assert notebook.outputs == []
 
 
-def test_the_table_is_lines_in_a_notebook_too(monkeypatch, capsys) -> None:
-    notebook = Notebook(monkeypatch)
-    shown(verbose=True, progress=None, elapsed=10.0)
-    assert len(capsys.readouterr().out.splitlines()) == 6
-    assert notebook.outputs == []
-
-
 def test_no_bar_is_shown_by_default_outside_notebooks(capsys: pytest.CaptureFixture[str]) -> None:
     shown(verbose=False, progress=None, elapsed=1e6)
     assert capsys.readouterr() == ("", "")
-
-
-def test_it_swallows_no_exception() -> None:
-    table = Table("SOC", verbose=False)
-    nothing: tuple[type[BaseException] | None, BaseException | None, TracebackType | None] = (
-        None,
-        None,
-        None,
-    )
-    assert table.__exit__(*nothing) is None
 
 
 OF_M = Activity("factorisation", 4 * 1000)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
-from pgo_models import NoiseModel, PoseGraph, Reading
-from pgo_models.graphs.g2o import write_g2o
-from solvers.studies.readings import compare_readings
+from pgo_models import NoiseModel, PoseGraph, Reading, write_g2o
+from solvers import compare_readings
 
 Change = Callable[[list[str]], list[str]]
 

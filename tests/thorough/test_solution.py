@@ -6,10 +6,10 @@ import pytest
 
 import pgo_models as pgo
 import solvers
+from pgo_models import read_kitti
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.precisions import isotropic_information
-from pgo_models.graphs.trajectories import read_kitti
 
 
 @pytest.fixture(scope="module")

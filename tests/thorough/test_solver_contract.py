@@ -6,25 +6,22 @@ import enum
 import importlib.util
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from itertools import islice, pairwise
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import pytest
 from budget import examples
 from every_solver import SOLVERS
-from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
+from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings, strategies as st
 from robots import metis, share, sparse_elimination
 from scipy.sparse import issparse
 
 import pgo_models
 import solvers
-from pgo_models import PGOProblem, Poses
+from pgo_models import PGOProblem, Poses, grid
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.rotations import orthogonality_error
-from pgo_models.graphs.scenes import grid
-from pgo_models.problem.cholesky import CholeskyBackend
 from solvers import (
     GNC,
     PCM,
@@ -41,22 +38,21 @@ from solvers import (
     Solver,
     Staircase,
     Status,
+    iterate,
+    run,
 )
 from solvers.distributed.asynchronous import AsynchronousSOC
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.driver import Driver
 from solvers.distributed.handedness import RobotsPoint, begin_without_terms
-from solvers.distributed.newton import SubstructuredNewton, model_at
+from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.robust import SharedGNC
 from solvers.distributed.staircase import SubstructuredStaircase
 from solvers.distributed.substructured import SubstructuredSOC
 from solvers.handedness.ascent import HandednessAscent
-from solvers.loop import Method, iterate, run
-from solvers.network.counted_pool import Count
+from solvers.loop import Method
 from solvers.network.engine import Engine
-from solvers.result import Record
-from solvers.riemannian.newton_step import ModelOrder
 from solvers.robust.gnc import GNCState
 from solvers.soc.anderson import Anderson
 
@@ -122,27 +118,6 @@ def test_a_step_leaves_its_state_alone(make: Make, seed: int, n: int, d: int) ->
 
 @EVERY
 @settings(max_examples=examples(10))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS, backend=st.sampled_from(CholeskyBackend))
-def test_a_list_of_states_is_a_film(
-    make: Make, seed: int, n: int, d: int, backend: CholeskyBackend
-) -> None:
-    # Stepping again from an old state gives the frame that followed it, whatever was done
-    # meanwhile.
-    problem = PGOProblem(varied_graph(seed, n, d), backend)
-    solver: Solver[Any] = make(problem)
-    film = list(islice(iterate(solver, problem, random_poses(n, d, seed)), 8))
-    for state, following in pairwise(film):
-        again = solver.step(problem, state)
-        np.testing.assert_array_equal(
-            solver.poses(problem, again).R, solver.poses(problem, following).R
-        )
-        one = solver.measure(problem, again)
-        other = solver.measure(problem, following)
-        assert one == other or np.isnan(one.objective)
-
-
-@EVERY
-@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_a_start_is_left_alone_and_is_state_zero(make: Make, seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
@@ -157,26 +132,6 @@ def test_a_start_is_left_alone_and_is_state_zero(make: Make, seed: int, n: int, 
 
 
 @EVERY
-@settings(max_examples=examples(10))
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_every_state_stands_for_feasible_poses_whose_F_is_measured(
-    make: Make, seed: int, n: int, d: int
-) -> None:
-    problem = varied_problem(seed, n, d)
-    solver: Solver[Any] = make(problem)
-    for k, state in enumerate(islice(iterate(solver, problem, random_poses(n, d, seed)), 6)):
-        assert state.k == k
-        poses = solver.poses(problem, state)
-        assert orthogonality_error(poses.R).max() <= 1e-12
-        expected = (
-            solver.init(problem, poses).objective
-            if isinstance(solver, GNC)
-            else problem.objective(poses)
-        )
-        assert solver.measure(problem, state).objective == pytest.approx(expected, rel=1e-14)
-
-
-@EVERY
 def test_a_converged_state_stays(make: Make) -> None:
     problem = PGOProblem(grid(np.random.default_rng(0)))
     solver = tight(make, problem)
@@ -188,19 +143,6 @@ def test_a_converged_state_stays(make: Make) -> None:
         poses = solver.poses(problem, state)
         np.testing.assert_allclose(poses.R, result.poses.R, rtol=0, atol=1e-6)
         assert problem.objective(poses) == pytest.approx(result.objective, rel=1e-6)
-
-
-@EVERY
-def test_a_warm_start_at_the_solution_ends_there(make: Make) -> None:
-    problem = PGOProblem(grid(np.random.default_rng(0)))
-    solver = tight(make, problem)
-    solution = run(solver, problem)
-    again = run(solver, problem, solution.poses)
-    assert again.status is Status.CONVERGED
-    assert again.objective == pytest.approx(solution.objective, rel=1e-6)
-    np.testing.assert_allclose(
-        again.poses.with_gauge_at(0).R, solution.poses.with_gauge_at(0).R, rtol=0, atol=1e-4
-    )
 
 
 def tight(make: Make, problem: PGOProblem) -> Solver[Any]:
@@ -250,41 +192,9 @@ def assert_best(result: Any) -> None:
 
 
 @EVERY
-@pytest.mark.parametrize("limit", [0, 1, 3])
-def test_max_iterations_is_reported(
-    make: Make, limit: int, problem: PGOProblem, start: Poses
-) -> None:
-    result = run(make(problem, max_iterations=limit), problem, start)
-    assert (result.status, result.iterations, len(result.history)) == (
-        Status.MAX_ITERATIONS,
-        limit,
-        limit + 1,
-    )
-    assert_best(result)
-
-
-@EVERY
 def test_the_time_limit_is_reported(make: Make, problem: PGOProblem, start: Poses) -> None:
     result = run(make(problem), problem, start, time_limit=1e-9)
     assert (result.status, result.iterations) == (Status.TIME_LIMIT, 0)
-    assert_best(result)
-
-
-@EVERY
-def test_a_stop_by_the_callback_is_reported(make: Make, problem: PGOProblem, start: Poses) -> None:
-    result = run(make(problem), problem, start, callback=lambda state, record: state.k == 2)
-    assert (result.status, result.iterations) == (Status.STOPPED, 2)
-    assert_best(result)
-
-
-@EVERY
-def test_control_c_in_a_callback_is_reported(make: Make, problem: PGOProblem, start: Poses) -> None:
-    def interrupt(state: Any, record: Record) -> None:
-        if state.k == 2:
-            raise KeyboardInterrupt
-
-    result = run(make(problem), problem, start, callback=interrupt)
-    assert (result.status, result.iterations, len(result.history)) == (Status.INTERRUPTED, 2, 3)
     assert_best(result)
 
 
@@ -500,47 +410,3 @@ def test_a_state_of_another_driver_is_refused() -> None:
         with pytest.raises(SettingError, match="not of a run with this driver; begin with"):
             method.step(other, resumed)
         assert method.step(other, method.init(other, resumed)).k == 1
-
-
-@IN_EVERY_PLACE
-def test_two_factors_at_a_time(place: Any) -> None:
-    # The second one leaves the first alone, whatever matrix it is of, and none holds the memory of
-    # one that is gone.
-    with driver_in(place) as driver:
-        first = model_at(driver, ModelOrder(second_order=False, damping=1.0))
-        assert first is not None
-        y, parts, energy = first.factor.solve(first.parts)
-        second = model_at(driver, ModelOrder(second_order=False, damping=0.1))
-        assert second is not None
-        assert not np.allclose(second.factor.solve(first.parts)[0], y, rtol=1e-2)
-        driver.adopt(driver.current.R)
-        again, parts_again, energy_again = first.factor.solve(first.parts)
-        np.testing.assert_array_equal(again, y)
-        assert_same(snapshot(parts_again), snapshot(parts))
-        assert energy_again == energy
-
-
-def test_fronts_forget_the_factors_that_nobody_holds() -> None:
-    with driver_in(fronts_with_driver) as driver:
-        fronts = driver.interface(1, 3).fronts
-        driver.adopt(driver.current.R)  # the factor of the translations stays
-        for _ in range(3):
-            model = model_at(driver, ModelOrder(second_order=False, damping=1.0))
-            assert all(len(front.factors) == 2 for front in fronts.held.values())
-            assert len(fronts.factors_in_use) == 2
-            del model
-
-
-def test_robots_forget_the_moments_of_states_that_are_gone() -> None:
-    with driver_in(fronts_with_driver) as driver:
-        method = SubstructuredSOC()
-        state = method.init(driver, None)
-        for _ in range(6):
-            state = method.step(driver, state)
-
-        def count(agent: Any, _: None) -> int:
-            return len(agent.moments)
-
-        # Those of the last state and of the one that it came from, whose step forgot all others.
-        robots = driver.network.ledger.num_robots
-        assert driver.network.ask(count, [None] * robots, Count.OFF) == [1] * robots

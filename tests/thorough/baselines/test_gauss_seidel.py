@@ -17,18 +17,24 @@ from graphs import (
 )
 from scipy.sparse.linalg import spsolve
 
-from pgo_models import PartitionMethod, PGOProblem, Poses
+from pgo_models import (
+    PartitionMethod,
+    PGOProblem,
+    Poses,
+    circle,
+    grid,
+    partition,
+    project_to_rotations,
+    random_geometric,
+    random_rotations,
+)
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import project_to_rotations, random_rotations, unstack_transposes
-from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import circle, grid, random_geometric
+from pgo_models.geometry.rotations import unstack_transposes
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
-from solvers import GaussSeidel, Status
+from solvers import GaussSeidel, Status, iterate, polish, run
 from solvers.baselines.gauss_seidel import DGSStage
 from solvers.baselines.sweep_order import schedule
-from solvers.loop import iterate, run
-from solvers.riemannian.polish import polish
 
 WANTED = 1e-8
 

@@ -20,15 +20,19 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import Chi2Convention, NoiseModel, PGOProblem, Poses, Weighting
+from pgo_models import (
+    Chi2Convention,
+    NoiseModel,
+    PGOProblem,
+    Poses,
+    Weighting,
+    chi2,
+    exp_map,
+    write_g2o,
+)
 from pgo_models.errors import GraphError, MissingExtraError, NotPositiveDefiniteError, SettingError
-from pgo_models.geometry.rotations import exp_map
-from pgo_models.graphs.g2o import write_g2o
-from pgo_models.graphs.residuals import chi2
-from solvers import Status
+from solvers import Status, certify, polish
 from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
-from solvers.riemannian.polish import polish
-from solvers.solves.given_poses import certify
 
 needs_gtsam = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"

@@ -15,11 +15,9 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import PGOProblem, Poses
+from pgo_models import PGOProblem, Poses, chordal_start, odometry_start, spanning_tree_start
 from pgo_models.errors import SettingError
-from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
-from solvers import LevenbergMarquardt, Status
-from solvers.loop import run
+from solvers import LevenbergMarquardt, Status, run
 
 ROUNDING = 1e-14
 STARTS: dict[str, Callable[[PGOProblem], Poses | None]] = {

@@ -1,4 +1,3 @@
-import inspect
 import json
 import re
 import shutil
@@ -9,15 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 
 import pgo_models as pgo
-import solvers
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import read_times
-from solvers.cli import app as cli, choices
 from solvers.distributed.forecast import forecast
-from solvers.soc.soc import WARM_START
 
 ROOT = Path(__file__).parents[3]
 PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]
@@ -85,15 +80,6 @@ def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
     assert re.search(r"^ *robots +4 *$", done.stdout, re.M)
 
 
-def test_solve_prints_cost_bound_and_gap_and_ends_with_0(pgo_command):
-    code, out, err = pgo_command("solve", "sphere")
-    assert (code, err) == (0, "")
-    cost = float(re.search(r"^F +(\S+)", out, re.M)[1])
-    bound = float(re.search(r"^lower bound +(\S+)", out, re.M)[1])
-    assert 0 <= cost - bound <= 1e-6 * cost
-    assert "CERTIFIED" in out
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -126,30 +112,6 @@ def test_every_way_to_solve_ends_at_the_same_optimum(options, pgo_command):
         for text in (out, pgo_command("solve", "circle")[1])
     ]
     np.testing.assert_allclose(costs[0], costs[1], rtol=1e-8, atol=0)
-
-
-def test_the_command_and_the_function_have_the_same_defaults():
-    joint, paper = (
-        choices.chosen_pipeline(method, None, None, 1e-6, None, None)
-        for method in (choices.FirstStage.JOINT, choices.FirstStage.PAPER)
-    )
-    default = WARM_START
-    assert (joint.soc.max_iterations, joint.soc.tolerance) == (
-        default.max_iterations,
-        default.tolerance,
-    )
-    assert (paper.soc.max_iterations, paper.soc.tolerance) == (
-        solvers.SOC.max_iterations,
-        solvers.SOC.tolerance,
-    )
-
-
-def test_unit_weights_give_the_papers_equation(pgo_command):
-    code, out, _ = pgo_command("solve", "circle", "--unit-weights")
-    assert code == 0
-    cost = float(re.search(r"^F +(\S+)", out, re.M)[1])
-    expected = solvers.solve(pgo.load("circle").unit_weights()).objective
-    np.testing.assert_allclose(cost, expected, rtol=1e-9, atol=0)
 
 
 def test_results_are_written_in_every_format(pgo_command, tmp_path):
@@ -363,13 +325,6 @@ def test_bad_files_end_with_1_and_one_line_without_a_traceback(
     assert "Traceback" not in err
 
 
-def test_info_names_the_components(pgo_command, tmp_path):
-    (tmp_path / "two.g2o").write_text(BAD_FILES["two components"])
-    code, out, _ = pgo_command("info", tmp_path / "two.g2o")
-    assert code == 0
-    assert "2 (sizes 2, 2)" in out
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -442,16 +397,6 @@ def test_a_start_the_graph_does_not_offer_is_refused(pgo_command, tmp_path):
     assert "no odometry from pose 0 to 1" in pgo_command("solve", path, "--start", "odometry")[2]
     assert "no VERTEX line" in pgo_command("solve", path, "--start", "file")[2]
     assert "no VERTEX line" in pgo_command("certify", path)[2]
-
-
-def test_help_explains_every_option(pgo_command):
-    for name, command in typer.main.get_command(cli.app).commands.items():
-        code, out, _ = pgo_command(name, "--help")
-        assert code == 0
-        for parameter in inspect.signature(command.callback, eval_str=True).parameters.values():
-            (option,) = parameter.annotation.__metadata__
-            assert option.help, (name, parameter.name)
-            assert all(word in out for word in option.param_decls or ())
 
 
 def test_robots_of_an_engine_factor(pgo_command):

@@ -11,8 +11,7 @@ import pytest
 from graphs import REFERENCE, informed
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, Weighting
-from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models import NoiseModel, PGOProblem, Weighting, read_g2o, write_g2o
 from pgo_models.graphs.precisions import proper_information
 
 Call = Callable[..., tuple[int, str, str]]
@@ -85,12 +84,6 @@ def test_the_advice_of_a_report_is_about_the_same_cost(
     assert (code, err) == (0, "")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert f"pgo certify {file} --estimate solved.g2o" in page
-
-
-def test_robots_do_it_too(pgo_command: Call, file: Path) -> None:
-    code, out, err = pgo_command("solve", file, "--information", "--robots", 3)
-    assert (code, err) == (0, "")
-    assert "rounds" in out
 
 
 @pytest.fixture

@@ -13,11 +13,9 @@ from commands import one_line
 from graphs import varied_graph
 
 import solvers
-from pgo_models import PGOProblem, Weighting
+from pgo_models import PGOProblem, Weighting, load, random_rotations, read_g2o, write_g2o
 from pgo_models.geometry.poses import absolute_rotation_error
-from pgo_models.geometry.rotations import random_rotations
-from pgo_models.graphs.datasets import load, locate
-from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.graphs.datasets import locate
 
 Call = Callable[..., tuple[int, str, str]]
 GRID = locate("grid")

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from wrong_edges import spoiled
 
-from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.grid_worlds import grid_world
+from pgo_models import grid_world, read_g2o, write_g2o
 
 Call = Callable[..., tuple[int, str, str]]
 WIDTH = 80

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
-from pgo_models import Reading
-from pgo_models.graphs.g2o import write_g2o
+from pgo_models import Reading, write_g2o
 
 CASES = Path(__file__).parents[2] / "cases"
 

@@ -16,12 +16,10 @@ import pytest
 from commands import ended, one_line, started
 
 import pgo_models as pgo
+from pgo_models import write_g2o
 from pgo_models.graphs import scenes
-from pgo_models.graphs.g2o import write_g2o
-from solvers import here, pipeline
 from solvers.cli import app as cli
 from solvers.cli.shell import command_to_type
-from solvers.distributed import robots_of_graph
 
 ROOT = Path(cli.__file__).parents[2]
 ENDLESS = [
@@ -69,26 +67,6 @@ def test_a_pipe_that_closes_gives_no_traceback_and_the_file_is_written(tmp_path)
     ending, _, err = ended(process)
     assert (ending, err) == (1, "")
     assert len((tmp_path / "x.tum").read_text().splitlines()) == 27
-
-
-def test_a_signal_between_the_loops_leaves_the_best_poses(monkeypatch):
-    def broken_off(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    graph = scenes.grid(np.random.default_rng(0))
-    whole = pipeline.solve(graph)
-    monkeypatch.setattr(here, "certify_at", broken_off)
-    solution = pipeline.solve(graph)
-    assert solution.status.name == "INTERRUPTED"
-    assert solution.objective == pytest.approx(whole.objective, rel=1e-12)
-    assert (solution.lower_bound, solution.certificate.verdict.name) == (0.0, "TRIVIAL")
-    monkeypatch.setattr(robots_of_graph, "best_bound_distributed", broken_off)
-    shared = pipeline.solve(graph, robots=3)
-    assert (shared.status.name, shared.lower_bound) == ("INTERRUPTED", 0.0)
-    assert shared.objective == pytest.approx(whole.objective, rel=1e-12)
-    monkeypatch.setattr(here, "chordal_start", broken_off)
-    with pytest.raises(KeyboardInterrupt):
-        pipeline.solve(graph)
 
 
 def test_one_file_that_cannot_be_written_does_not_keep_the_others(tmp_path):

@@ -9,7 +9,6 @@ import pytest
 import typer
 from commands import ROOT
 
-from solvers.cli import inputs
 from solvers.cli.app import COMMANDS, app
 
 PROGRAM = """
@@ -95,43 +94,3 @@ def test_the_list_of_commands_has_the_help_of_every_command(pgo_command):
         assert f"{name} {COMMANDS[name].short_help}" in listed
         shown = " ".join(pgo_command(name, "--help")[1].split())
         assert " ".join(COMMANDS[name].help.split()) in shown
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a terminal is opened as Linux has it")
-def test_a_short_solve_on_a_terminal_imports_no_lines_and_a_long_one_does():
-    import pty
-
-    def has_rich(large_file: int) -> bool:
-        program = (
-            "import sys\nfrom solvers.cli import inputs\nfrom solvers.cli.app import main\n"
-            f"inputs.LARGE_FILE = {large_file}\ntry:\n    main(['solve', 'sphere'])\n"
-            "except SystemExit:\n    print('rich.progress' in sys.modules)"
-        )
-        ours, of_command = pty.openpty()
-        finished = subprocess.run(
-            [sys.executable, "-c", program],
-            env={**os.environ, "PYTHONPATH": str(ROOT), "TERM": "xterm"},
-            stdout=subprocess.PIPE,
-            stderr=of_command,
-            text=True,
-            check=True,
-        )
-        os.close(ours)
-        os.close(of_command)
-        return finished.stdout.endswith("True\n")
-
-    assert has_rich(large_file=0)
-    assert not has_rich(large_file=inputs.LARGE_FILE)
-
-
-def test_what_may_take_long_to_read(tmp_path, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    small = tmp_path / "small.g2o"
-    small.write_text("VERTEX_SE2 0 0 0 0\n")
-    large = tmp_path / "large.g2o"
-    large.write_text("#" * inputs.LARGE_FILE)
-    assert not inputs.takes_long_to_read("sphere")
-    assert not inputs.takes_long_to_read(str(small))
-    assert inputs.takes_long_to_read(str(large))
-    assert inputs.takes_long_to_read(str(tmp_path))
-    assert inputs.takes_long_to_read("no-such-graph")

@@ -1,18 +1,10 @@
 import csv
-import inspect
 import json
-import sys
 
 import pytest
-import typer
 
 import pgo_models as pgo
 import solvers
-from solvers import BenchmarkSettings
-from solvers.cli import app as cli, study_commands
-from solvers.studies.paper_tables import ReproductionSettings
-
-PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]
 
 
 @pytest.fixture
@@ -94,19 +86,3 @@ def test_bad_input_is_one_line_and_nothing_is_run(arguments, message, pgo_comman
     assert err.count("\n") == 1
     assert message in err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_defaults_are_those_of_the_settings():
-    tables, compare = (
-        inspect.signature(f).parameters
-        for f in (study_commands.tables_command, study_commands.compare_command)
-    )
-    assert tables["seeds"].default == ReproductionSettings.num_seeds
-    assert tables["robots"].default == compare["robots"].default == BenchmarkSettings.num_robots
-    assert compare["time_limit"].default == BenchmarkSettings.time_limit
-
-
-def test_help_names_them():
-    names = set(typer.main.get_command(cli.app).commands)
-    assert {"tables", "compare"} <= names
-    assert isinstance(cli.app, typer.Typer)

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from shared_rotations import shared_rotation_step
 from signals import sparse_signal
 
-from pgo_models import BregmanProblem
+from pgo_models import BregmanProblem, grid, partition, random_rotations
 from pgo_models.convex.bregman import BregmanPoint
 from pgo_models.convex.bregman_examples import (
     differences,
@@ -18,13 +18,18 @@ from pgo_models.convex.bregman_examples import (
     total_variation_scale_space,
 )
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, random_rotations, stack_transposes
-from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import grid
+from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.problem.matrices import connection_laplacian
-from solvers import AlternatingBregman, Bregman, MethodOfMultipliers, Status, TwoLineBregman
+from solvers import (
+    AlternatingBregman,
+    Bregman,
+    MethodOfMultipliers,
+    Status,
+    TwoLineBregman,
+    iterate,
+    run,
+)
 from solvers.convex.bregman import feasibility_bound
-from solvers.loop import iterate, run
 
 EQUIVALENCE = 1e-7  # state by state, as the forms are stated in the paper
 # an interior-point iterate is accurate to the square root of its gap where J is flat

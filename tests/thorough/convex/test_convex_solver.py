@@ -18,17 +18,24 @@ from pgo_models import (
     PGOError,
     PGOProblem,
     RelaxationForm,
+    circle,
+    graph_qp,
+    solve_relaxation,
 )
 from pgo_models.convex.convex_solver import COLD, as_solver, check_convex, solve_compiled
-from pgo_models.convex.graph_subproblem import PoseVariables, graph_qp
+from pgo_models.convex.graph_subproblem import PoseVariables
 from pgo_models.convex.orthogonality_examples import procrustes
 from pgo_models.errors import SettingError
-from pgo_models.graphs.scenes import circle
-from pgo_models.relaxations.solve_sdp import solve_relaxation
-from solvers import SOC, CvxpyStep, OrthogonalSOC, Status, TwoLineBregman
-from solvers.convex.orthogonal import solve_orthogonal
-from solvers.loop import run
-from solvers.pipeline import solve
+from solvers import (
+    SOC,
+    CvxpyStep,
+    OrthogonalSOC,
+    Status,
+    TwoLineBregman,
+    run,
+    solve,
+    solve_orthogonal,
+)
 
 FINE_SCS = ConvexSolver("SCS", {"eps_abs": 1e-10, "eps_rel": 1e-10, "max_iters": 100_000})
 SOLVERS = ["CLARABEL", "SCS", "OSQP", FINE_SCS]

@@ -11,16 +11,34 @@ import pytest
 from graphs import varied_problem
 from scipy.optimize import Bounds, minimize
 
-from pgo_models import ModelChange, PGOError, PGOProblem, Poses, Verdict
-from pgo_models.convex.graph_subproblem import Changer, PoseVariables, graph_qp
+from pgo_models import (
+    ModelChange,
+    PGOError,
+    PGOProblem,
+    Poses,
+    Verdict,
+    chordal_start,
+    exp_map,
+    graph_qp,
+    log_map,
+    partition,
+)
+from pgo_models.convex.graph_subproblem import Changer, PoseVariables
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, exp_map, log_map
-from pgo_models.graphs.partitioning import partition
-from pgo_models.problem.initialization import chordal_start
-from solvers import SOC, Coupling, ExtendedSOC, MultiplierPenalty, Newton, Pipeline, RStep, Status
+from pgo_models.geometry.rotations import Array
+from solvers import (
+    SOC,
+    Coupling,
+    ExtendedSOC,
+    MultiplierPenalty,
+    Newton,
+    Pipeline,
+    RStep,
+    Status,
+    run,
+    solve,
+)
 from solvers.convex.extended_soc import ExtendedStep, with_priors
-from solvers.loop import run
-from solvers.pipeline import solve
 from solvers.result import Run
 from solvers.soc.joint import SOCState
 

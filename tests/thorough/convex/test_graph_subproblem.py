@@ -5,23 +5,15 @@ from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import ModelChange, PGOProblem
-from pgo_models.convex.graph_subproblem import (
-    Neighbours,
-    PoseVariables,
-    Unknowns,
-    graph_qp,
-    robot_qp,
-)
+from pgo_models import ModelChange, PGOProblem, graph_qp, partition
+from pgo_models.convex.graph_subproblem import Neighbours, PoseVariables, Unknowns, robot_qp
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes
-from pgo_models.graphs.partitioning import partition
 from solvers import PaperSOC, RStep
 from solvers.soc.paper import PaperState
 from solvers.soc.r_step import RSubproblem, prepare
 
 ACCURACY = 1e-8
-RHO = st.floats(0.1, 10.0)
 
 
 def drawn(seed: int, n: int, d: int) -> tuple[PGOProblem, Array, Array]:

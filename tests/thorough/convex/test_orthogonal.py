@@ -5,7 +5,6 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from graphs import polar_factor
-from hypothesis import strategies as st
 from orthogonal_models import one_norm_components
 
 from pgo_models import OrthogonalProblem
@@ -13,11 +12,8 @@ from pgo_models.convex.orthogonality import OrthogonalPoint
 from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, orthogonality_error
-from solvers import OrthogonalSOC, Status
-from solvers.convex.orthogonal import solve_orthogonal
-from solvers.loop import iterate, run
+from solvers import OrthogonalSOC, Status, iterate, run, solve_orthogonal
 
-SEEDS = st.integers(0, 2**32 - 1)
 TOLERANCE = OrthogonalSOC.tolerance
 BETTER = 100 * TOLERANCE  # residuals bound the error up to the conditioning of the problem
 

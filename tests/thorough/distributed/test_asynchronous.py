@@ -16,11 +16,9 @@ from robots import (
     metis,
 )
 
-from pgo_models import NoiseModel, PGOProblem
+from pgo_models import NoiseModel, PGOProblem, chordal_start, circle, grid, partition
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import circle, grid
-from pgo_models.problem.initialization import chordal_start
+from pgo_models.graphs.partitioning import Partition
 from solvers import (
     SOC,
     Coupling,
@@ -30,15 +28,16 @@ from solvers import (
     Pipeline,
     Robots,
     Status,
+    iterate,
+    polish,
+    run,
+    solve,
 )
 from solvers.distributed.asynchronous import AsynchronousSOC
 from solvers.distributed.consensus import RobotsOfDriver
 from solvers.distributed.driver import Driver
-from solvers.loop import iterate, run
 from solvers.network.counted_pool import Count
 from solvers.network.ledger import Ledger
-from solvers.pipeline import solve
-from solvers.riemannian.polish import polish
 from solvers.soc.consensus import LocalConsensus, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 

@@ -9,16 +9,23 @@ from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph
 from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    chordal_start,
+    multipliers,
+    prove_bound,
+)
 from pgo_models.certificates.certificate import DEFAULT_GAP
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import best_bound, prove_bound
+from pgo_models.certificates.lower_bound import best_bound
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
+from solvers import polish
 from solvers.distributed.driver import collect
 from solvers.distributed.lower_bound import best_bound_distributed, prove_with_eta
-from solvers.riemannian.polish import polish, relative_decrement
+from solvers.riemannian.polish import relative_decrement
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

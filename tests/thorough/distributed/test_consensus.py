@@ -20,13 +20,19 @@ from robots import (
     spoil,
 )
 
-from pgo_models import NoiseModel, PartitionMethod, PGOProblem, PoseGraph
+from pgo_models import (
+    NoiseModel,
+    PartitionMethod,
+    PGOProblem,
+    PoseGraph,
+    chordal_start,
+    grid,
+    partition,
+)
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import grid
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
 from solvers import (
     SOC,
     BalancedPenalty,
@@ -36,12 +42,13 @@ from solvers import (
     Robots,
     RStep,
     Status,
+    iterate,
+    run,
+    solve,
 )
 from solvers.distributed.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots import recursion
-from solvers.loop import iterate, run
-from solvers.pipeline import solve
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus import ConsensusState, LocalConsensus
 from solvers.soc.consensus_robot import ConsensusRobot

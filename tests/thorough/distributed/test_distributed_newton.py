@@ -18,17 +18,15 @@ from graphs import (
 from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses, chordal_start
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
-from solvers import Newton, Status
+from solvers import Newton, Status, iterate, run
 from solvers.distributed.driver import collect
 from solvers.distributed.newton import SubstructuredNewton
-from solvers.loop import iterate, run
 
 SIZES = st.integers(2, 20)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

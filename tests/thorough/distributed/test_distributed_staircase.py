@@ -13,14 +13,12 @@ from robots import PARTITIONERS, Partitioner, contiguous, metis, singletons
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel, PGOProblem
+from pgo_models import NoiseModel, PGOProblem, prove_bound
 from pgo_models.certificates.certificate import BoundSource
-from pgo_models.certificates.lower_bound import prove_bound
-from solvers import InProcess, Staircase, Status
+from solvers import InProcess, Staircase, Status, run
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.staircase import SubstructuredStaircase, round_lifted
-from solvers.loop import run
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 

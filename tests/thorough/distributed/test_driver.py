@@ -23,19 +23,23 @@ from robots import (
     driver_at,
 )
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    chordal_start,
+    grid,
+    multipliers,
+    partition,
+)
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import grid
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
-from solvers import InProcess, Pipeline, Robots, Solution
+from solvers import InProcess, Pipeline, Robots, Solution, solve
 from solvers.distributed.driver import collect
 from solvers.distributed.robots import current_poses, descent, recursion, start, translations
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.pipeline import solve
 from solvers.place import AUTO, FirstStage
 
 SIZES = st.integers(2, 24)

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from robots import Recording, arrays_in
 
-from pgo_models import PartitionMethod, PGOProblem, PoseGraph
-from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, grid_world, partition
+from pgo_models.graphs.partitioning import Partition
 from solvers.distributed import elimination_choice, forecast as forecasts
 from solvers.distributed.forecast import advice, forecast
 from solvers.distributed.robots import current_poses

@@ -10,15 +10,12 @@ import pytest
 from graphs import varied_graph
 from robots import Killed, share
 
-from pgo_models import PartitionMethod, PGOProblem, PoseGraph
-from pgo_models.graphs.partitioning import Partition, partition
-from solvers import Checkpoint, InProcess, Pipeline, Robots, Solution
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, partition
+from pgo_models.graphs.partitioning import Partition
+from solvers import Checkpoint, InProcess, Pipeline, Robots, Solution, solve
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.network.engine import Engine
 from solvers.network.ledger import DRIVER
-from solvers.pipeline import solve
-
-OFF = ("describe", "set_poses", "cost", "result", "take_front")
 
 
 @pytest.fixture

@@ -12,13 +12,10 @@ from graphs import DIMENSIONS, SEEDS, informed, varied_graph
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, Verdict, Weighting
+from pgo_models import NoiseModel, PGOProblem, Verdict, Weighting, circle, partition
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.precisions import proper_information
-from pgo_models.graphs.scenes import circle
-from solvers import Checkpoint, Coupling
-from solvers.riemannian.polish import polish
+from solvers import Checkpoint, Coupling, polish
 
 QUIET = NoiseModel(0.02, 0.02)
 

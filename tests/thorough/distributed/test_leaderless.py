@@ -19,12 +19,19 @@ from robots import (
     singletons,
 )
 
-from pgo_models import PGOProblem, Poses, Verdict, Weighting
+from pgo_models import (
+    PGOProblem,
+    Poses,
+    Verdict,
+    Weighting,
+    chordal_start,
+    grid,
+    project_to_rotations,
+    spanning_tree_start,
+)
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.rotations import project_to_rotations, unstack_transposes
+from pgo_models.geometry.rotations import unstack_transposes
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.scenes import grid
-from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from solvers import (
     SOC,
     Checkpoint,
@@ -35,6 +42,9 @@ from solvers import (
     Pipeline,
     Robots,
     Status,
+    polish,
+    run,
+    solve,
 )
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_alone import (
@@ -44,11 +54,8 @@ from solvers.distributed.robots_alone import (
     tree_traffic,
 )
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.loop import run
 from solvers.network.ledger import DRIVER
-from solvers.pipeline import solve
 from solvers.result import Record
-from solvers.riemannian.polish import polish
 from solvers.soc.recursion_block import Rotations
 
 TOLERANCE = 1e-6

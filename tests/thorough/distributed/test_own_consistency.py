@@ -13,10 +13,10 @@ from wrong_edges import joined_by, spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PoseGraph
+from pgo_models import PoseGraph, read_g2o
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
+from pgo_models.graphs.g2o import write_g2o_folder
 from solvers.distributed.own_files import open_files
 from solvers.distributed.robots.own_file import PlacedFile
 from solvers.robust.consistency import pairwise_consistent

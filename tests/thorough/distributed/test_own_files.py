@@ -16,15 +16,23 @@ from robots import PARTITIONERS, Partitioner
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel, PGOError, PoseGraph, Poses, Verdict
-from pgo_models.certificates.certificate import BoundSource, certify_at
+from pgo_models import (
+    NoiseModel,
+    PGOError,
+    PoseGraph,
+    Poses,
+    Verdict,
+    certify_at,
+    exp_map,
+    read_g2o,
+)
+from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FileFormatError, GraphError, SettingError
-from pgo_models.geometry.rotations import exp_map
-from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
+from pgo_models.graphs.g2o import write_g2o_folder
 from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.scenes import observe
-from solvers import Coupling, Robots
-from solvers.solves.folder_solve import FolderSolution, solve_folder
+from solvers import Coupling, Robots, solve_folder
+from solvers.solves.folder_solve import FolderSolution
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 LIMIT = 27.0  # MB beside the program itself

@@ -12,8 +12,8 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel, PoseGraph
-from pgo_models.graphs.g2o import read_g2o, write_g2o_folder
+from pgo_models import NoiseModel, PoseGraph, read_g2o
+from pgo_models.graphs.g2o import write_g2o_folder
 
 
 def world_in_files(

@@ -11,10 +11,8 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel
+from pgo_models import NoiseModel, chi2_thresholds, partition
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import partition
-from pgo_models.problem.thresholds import chi2_thresholds
 from solvers import GNC, Checkpoint
 from solvers.distributed.robots import current_poses
 from solvers.distributed.robots.agent import CLASSES, Agent, order_interior

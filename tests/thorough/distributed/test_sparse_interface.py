@@ -7,15 +7,13 @@ import pytest
 from graphs import varied_graph
 from robots import Recording, arrays_in, scattered, sparse_elimination
 
-from pgo_models import PartitionMethod, PGOProblem, PoseGraph
-from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.partitioning import Partition, partition
-from solvers import InProcess, Pipeline, Robots
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, grid_world, partition
+from pgo_models.graphs.partitioning import Partition
+from solvers import InProcess, Pipeline, Robots, solve
 from solvers.distributed.elimination_choice import CoverSystem, choose_elimination, leave_poses
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.robots_of_graph import open_driver
 from solvers.distributed.sparse_interface import SparseInterface
-from solvers.pipeline import solve
 from solvers.soc.subgraph import split_graph
 
 pytest.importorskip("cvxopt")

@@ -21,19 +21,35 @@ from graphs import (
 from hypothesis import given, settings, strategies as st
 from robots import BACKENDS, PARTITIONERS, Partitioner, metis, scattered
 
-from pgo_models import NoiseModel, PGOProblem, Poses
-from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    Poses,
+    chordal_start,
+    grid,
+    partition,
+    prove_bound,
+    read_g2o,
+    victoria_park,
+)
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import grid, victoria_park
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
-from solvers import SOC, Coupling, Faults, InProcess, Newton, Pipeline, Robots, Solution, Status
-from solvers.pipeline import solve
+from solvers import (
+    SOC,
+    Coupling,
+    Faults,
+    InProcess,
+    Newton,
+    Pipeline,
+    Robots,
+    Solution,
+    Status,
+    gauss_newton,
+    solve,
+)
 from solvers.place import AUTO
 from solvers.result import Record
-from solvers.riemannian.newton import gauss_newton
 from solvers.soc.anderson import Anderson
 from solvers.soc.soc import WARM_START
 

@@ -13,19 +13,35 @@ from hypothesis import given, settings
 from robots import metis, scattered
 from shared_gradients import dense_relative_gradient
 
-from pgo_models import NoiseModel, PartitionMethod, PGOProblem, PoseGraph, Poses
-from pgo_models.geometry.rotations import exp_map
-from pgo_models.graphs.partitioning import Partition, partition
+from pgo_models import (
+    NoiseModel,
+    PartitionMethod,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    chordal_start,
+    exp_map,
+    partition,
+)
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import observe
-from pgo_models.problem.initialization import chordal_start
-from solvers import SOC, Coupling, Faults, InProcess, Measurement, Pipeline, Robots, Status
+from solvers import (
+    SOC,
+    Coupling,
+    Faults,
+    InProcess,
+    Measurement,
+    Pipeline,
+    Robots,
+    Status,
+    polish,
+    run,
+    solve,
+)
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_alone import cheaper_end, collect_copies
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.loop import run
-from solvers.pipeline import solve
 from solvers.result import History, Outcome, Record
-from solvers.riemannian.polish import polish
 
 ROUNDING = 1e-6  # relative, of a gradient that is evaluated twice
 LOSSY = Faults(loss=0.2, max_delay=2, seed=1)

@@ -16,15 +16,13 @@ from robots import (
     metis,
 )
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, chordal_start
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import rotation_scale
-from solvers import SOC, BalancedPenalty, Coupling, MultiplierPenalty, Status
+from solvers import SOC, BalancedPenalty, Coupling, MultiplierPenalty, Status, iterate, run
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.substructured import SubstructuredSOC, SubstructuredState
-from solvers.loop import iterate, run
 from solvers.soc.anderson import Anderson
 from solvers.soc.joint import SOCState
 from solvers.soc.penalty import PenaltyRule

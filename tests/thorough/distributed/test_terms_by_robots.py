@@ -9,15 +9,13 @@ from graphs import LOUD_NOISE, SEEDS, varied_graph
 from hypothesis import given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner, driver_at, metis
 
-from pgo_models import PGOProblem, Poses, Weighting
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import PGOProblem, Poses, Weighting, chordal_start, multipliers, partition
 from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
 from pgo_models.certificates.lower_bound import best_bound_with_terms
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.problem.initialization import chordal_start
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.relaxations.rotation_hull import matrices_at
-from solvers import Status, SweptScene
+from solvers import Status, SweptScene, polish, run, solve
 from solvers.distributed import handedness
 from solvers.distributed.driver import Driver
 from solvers.distributed.lower_bound import (
@@ -27,11 +25,9 @@ from solvers.distributed.lower_bound import (
 from solvers.distributed.robots import handedness as robot_orders
 from solvers.handedness.ascent import AscentState, HandednessAscent
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
-from solvers.loop import Outcome, run
+from solvers.loop import Outcome
 from solvers.network.counted_pool import Count
 from solvers.network.messages import restore, take_snapshot
-from solvers.pipeline import solve
-from solvers.riemannian.polish import polish
 from solvers.studies.tightness import noisy_scene
 
 SIZES = st.integers(3, 12)

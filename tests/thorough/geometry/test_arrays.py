@@ -17,10 +17,10 @@ from pgo_models import (
     PGOProblem,
     PoseGraph,
     Poses,
+    grid,
     partition,
 )
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.scenes import grid
 
 GRAPH = grid(np.random.default_rng(0))
 FIELDS = ("i", "j", "R_ij", "t_ij", "kappa", "tau", "information", "ids", "robot", "fixed")

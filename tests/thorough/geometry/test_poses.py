@@ -2,15 +2,18 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from pgo_models import Poses
-from pgo_models.errors import GraphError
-from pgo_models.geometry.poses import absolute_trajectory_error, relative_pose_error
-from pgo_models.geometry.rotations import (
-    Array,
+from pgo_models import (
+    Poses,
+    absolute_trajectory_error,
     exp_map,
-    orthogonality_error,
     project_to_rotations,
     random_rotations,
+    relative_pose_error,
+)
+from pgo_models.errors import GraphError
+from pgo_models.geometry.rotations import (
+    Array,
+    orthogonality_error,
     tangent_dimension,
     unstack_transposes,
 )

@@ -3,16 +3,13 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
+from pgo_models import exp_map, log_map, project_to_rotations, random_rotations
 from pgo_models.geometry import rotations
 from pgo_models.geometry.rotations import (
     Array,
-    exp_map,
     hat,
-    log_map,
     orthogonality_error,
-    project_to_rotations,
     quaternions_from_rotations,
-    random_rotations,
     rotations_from_quaternions,
     tangent_dimension,
     vee,

@@ -11,12 +11,9 @@ import numpy as np
 import pytest
 
 import pgo_models
-from pgo_models import PGOError, PoseGraph
+from pgo_models import PGOError, PoseGraph, circle, load, read_g2o, write_tum
 from pgo_models.errors import DatasetError, FileFormatError
-from pgo_models.graphs.datasets import DATA_VARIABLE, SE_SYNC, Registry, known_datasets, load
-from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.scenes import circle
-from pgo_models.graphs.trajectories import write_tum
+from pgo_models.graphs.datasets import DATA_VARIABLE, SE_SYNC, Registry, known_datasets
 
 DATA = Path(pgo_models.__file__).parent.parent / "data"
 GRAPH = b"EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"

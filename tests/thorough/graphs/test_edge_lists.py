@@ -15,7 +15,7 @@ from pgo_models import NoiseModel
 from pgo_models.errors import GraphError
 
 nx = pytest.importorskip("networkx")
-pd = pytest.importorskip("pandas")
+pytest.importorskip("pandas")
 
 SMALL = NoiseModel(1e-3, 1e-3)
 

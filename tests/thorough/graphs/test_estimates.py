@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from pgo_models import PoseGraph, Poses
+from pgo_models import PoseGraph, Poses, random_geometric, write_g2o
 from pgo_models.errors import FileFormatError
-from pgo_models.graphs.g2o import read_g2o_poses, write_g2o
-from pgo_models.graphs.scenes import random_geometric
+from pgo_models.graphs.g2o import read_g2o_poses
 
 Call = Callable[..., tuple[int, str, str]]
 

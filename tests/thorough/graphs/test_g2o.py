@@ -5,14 +5,22 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOError, PGOProblem, PoseGraph, Poses, RotationWeight
+from pgo_models import (
+    PGOError,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    RotationWeight,
+    exp_map,
+    grid_world,
+    load,
+    random_geometric,
+    read_g2o,
+    write_g2o,
+)
 from pgo_models.errors import FileFormatError, GraphError, GraphWarning, SettingError
-from pgo_models.geometry.rotations import exp_map
-from pgo_models.graphs.datasets import load
-from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, symbol_ids, write_g2o, write_g2o_folder
-from pgo_models.graphs.grid_worlds import grid_world
+from pgo_models.graphs.g2o import read_g2o_poses, symbol_ids, write_g2o_folder
 from pgo_models.graphs.precisions import edge_precisions
-from pgo_models.graphs.scenes import random_geometric
 
 EPS = np.finfo(float).eps
 SEEDS = st.integers(0, 2**32 - 1)

@@ -8,12 +8,22 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, assert_says, random_poses
 from hypothesis import given, strategies as st
 
-from pgo_models import Chi2Convention, PoseGraph, Poses, Reading
+from pgo_models import (
+    Chi2Convention,
+    PoseGraph,
+    Poses,
+    Reading,
+    chi2,
+    exp_map,
+    log_map,
+    random_rotations,
+    read_g2o,
+    write_g2o,
+)
 from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.geometry.rotations import Array, exp_map, log_map, random_rotations
-from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.g2o import read_g2o_poses
 from pgo_models.graphs.g2o_rows import numbers_of
-from pgo_models.graphs.residuals import chi2
 
 ODOMETRY_2D = "EDGE_SE2 0 1 1 0 0 4 0 0 4 0 9"
 STEP = 1e-20  # imaginary: derivatives by complex steps have no cancellation

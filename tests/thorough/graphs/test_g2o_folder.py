@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
+from pgo_models import random_geometric, read_g2o, write_g2o
 from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.graphs.g2o import read_g2o, write_g2o, write_g2o_folder
-from pgo_models.graphs.scenes import random_geometric
-from solvers.solves.folder_solve import solve_folder
+from pgo_models.graphs.g2o import write_g2o_folder
+from solvers import solve_folder
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 DOORS: dict[str, Callable[[Path], object]] = {"whole": read_g2o, "own files": solve_folder}

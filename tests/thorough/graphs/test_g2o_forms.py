@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from graphs import assert_says
 
-from pgo_models import PoseGraph, Reading
+from pgo_models import PoseGraph, Reading, load, log_map, read_g2o, write_g2o
 from pgo_models.errors import FileFormatError, GraphWarning, SettingError
-from pgo_models.geometry.rotations import log_map
-from pgo_models.graphs.datasets import load
-from pgo_models.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
+from pgo_models.graphs.g2o import read_g2o_poses
 from pgo_models.graphs.g2o_tags import COMPLETE_TAGS, TAGS
 
 EDGE_2D = "EDGE_SE2 0 1 1 2 0.5 4 0 0 4 0 9"

@@ -7,13 +7,20 @@ import numpy as np
 import pytest
 from graphs import assert_says
 
-from pgo_models import Chi2Convention, PoseGraph, Poses
+from pgo_models import (
+    Chi2Convention,
+    PoseGraph,
+    Poses,
+    chi2,
+    grid,
+    load,
+    read_g2o,
+    victoria_park,
+    write_g2o,
+)
 from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.graphs.datasets import load
-from pgo_models.graphs.g2o import pose_names, read_g2o, read_g2o_poses, write_g2o, write_g2o_folder
+from pgo_models.graphs.g2o import pose_names, read_g2o_poses, write_g2o_folder
 from pgo_models.graphs.g2o_tags import TAGS
-from pgo_models.graphs.residuals import chi2
-from pgo_models.graphs.scenes import grid, victoria_park
 
 ODOMETRY_2D = "EDGE_SE2 0 1 1 0 0 4 0 0 4 0 9"
 ODOMETRY_3D = "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"

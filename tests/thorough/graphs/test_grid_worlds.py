@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from pgo_models import PoseGraph
+from pgo_models import PoseGraph, grid_world
 from pgo_models.errors import SettingError
-from pgo_models.graphs.grid_worlds import grid_world
 from pgo_models.graphs.scenes import MILD_NOISE
 
 SEEDS = st.integers(0, 2**32 - 1)

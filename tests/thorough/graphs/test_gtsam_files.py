@@ -9,9 +9,8 @@ import pytest
 from graphs import random_poses
 
 import pgo_models as pgo
-from pgo_models import Chi2Convention, PoseGraph, Poses, Reading
+from pgo_models import Chi2Convention, PoseGraph, Poses, Reading, chi2
 from pgo_models.errors import FileFormatError
-from pgo_models.graphs.residuals import chi2
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"

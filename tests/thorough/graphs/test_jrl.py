@@ -13,11 +13,11 @@ from graphs import DIMENSIONS, SEEDS, assert_says, informed
 from hypothesis import example, given, strategies as st
 
 import pgo_models as pgo
-from pgo_models import PoseGraph, Reading
+from pgo_models import PoseGraph, Reading, log_map, read_g2o, write_g2o
 from pgo_models.errors import FileFormatError, GraphWarning, SettingError
-from pgo_models.geometry.rotations import log_map, quaternions_from_rotations
+from pgo_models.geometry.rotations import quaternions_from_rotations
 from pgo_models.graphs.datasets import places_of_edges
-from pgo_models.graphs.g2o import read_g2o, symbol_ids, write_g2o
+from pgo_models.graphs.g2o import symbol_ids
 from pgo_models.graphs.jrl import read_jrl
 
 A0 = ord("a") << 56

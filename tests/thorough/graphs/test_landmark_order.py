@@ -5,12 +5,8 @@ import pytest
 
 import pgo_models as pgo
 import solvers
-from pgo_models import Poses
+from pgo_models import Poses, chi2, chi2_thresholds, spanning_tree_start, victoria_park
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.graphs.residuals import chi2
-from pgo_models.graphs.scenes import victoria_park
-from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.thresholds import chi2_thresholds
 
 ODOMETRY = "EDGE_SE2 {} {} 1 0 0.5 100 0 0 100 0 400"
 SIGHT = "EDGE_SE2_XY {} 1{} {} 25 0 25"

@@ -6,11 +6,8 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, strategies as st
 
-from pgo_models import PartitionMethod, PoseGraph
+from pgo_models import PartitionMethod, PoseGraph, grid, grid_world, partition, random_geometric
 from pgo_models.errors import MissingExtraError, SettingError
-from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import grid, random_geometric
 
 METHODS = st.sampled_from([PartitionMethod.CONTIGUOUS, PartitionMethod.METIS])
 
@@ -66,21 +63,6 @@ def test_cut_edges_and_separators(seed: int, n: int, share: float, method: Parti
     assert parts.separators(graph).tolist() == sorted({pose for edge in cut for pose in edge})
 
 
-def test_one_robot_owns_all() -> None:
-    graph = grid(np.random.default_rng(0))
-    for method in (PartitionMethod.CONTIGUOUS, PartitionMethod.METIS, None):
-        parts = partition(graph, 1, method)
-        assert parts.num_robots == 1
-        assert len(parts.separators(graph)) == 0
-
-
-def test_singletons_need_no_number() -> None:
-    graph = grid(np.random.default_rng(0))
-    parts = partition(graph, method=PartitionMethod.SINGLETONS)
-    np.testing.assert_array_equal(parts.robot, np.arange(27))
-    assert parts.cut_edges(graph).all()
-
-
 def test_robots_that_the_graph_names_are_the_default() -> None:
     graph = grid_world(3, 10, np.random.default_rng(0))
     for parts in (
@@ -124,11 +106,6 @@ def test_a_partition_of_another_graph_is_refused() -> None:
             SettingError, match=r"of 27 poses beside PoseGraph\(.*; give one robot for every pose"
         ):
             function(other)
-
-
-def test_it_prints_its_sizes() -> None:
-    parts = Partition(np.array([0, 0, 1]), PartitionMethod.CONTIGUOUS)
-    assert repr(parts) == "Partition(2 robots, 1 to 2 poses each, contiguous in time)"
 
 
 def test_repeated_edges_weigh_more() -> None:

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from pgo_models import PoseGraph, Poses
+from pgo_models import PoseGraph, Poses, random_geometric
 from pgo_models.errors import GraphError
-from pgo_models.graphs.scenes import random_geometric
 
 SEEDS = st.integers(0, 2**32 - 1)
 DIMENSIONS = st.sampled_from([2, 3])
@@ -19,15 +18,6 @@ def path_graph(n: int, d: int = 2) -> PoseGraph:
     return PoseGraph(
         n, i, i + 1, R, np.ones((n - 1, d)), np.ones(n - 1), np.ones(n - 1), name="path"
     )
-
-
-def test_defaults_and_properties() -> None:
-    graph = path_graph(4, 3)
-    assert (graph.d, graph.num_edges, graph.num_robots, graph.is_connected) == (3, 3, 1, True)
-    np.testing.assert_array_equal(graph.pose_ids, [0, 1, 2, 3])
-    np.testing.assert_array_equal(graph.robots, [0, 0, 0, 0])
-    assert repr(graph) == "PoseGraph('path', d=3, poses=4, edges=3, robots=1)"
-    graph.check_connected()
 
 
 @pytest.mark.parametrize(
@@ -147,16 +137,3 @@ def test_subgraph_of_everything_is_the_graph(backwards: bool) -> None:
     whole = graph.subgraph(np.arange(10))
     for name in ("i", "j", "R_ij", "t_ij", "kappa", "tau"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(graph, name))
-
-
-def test_unit_weights() -> None:
-    graph = random_geometric(10, np.random.default_rng(0)).unit_weights()
-    assert (graph.kappa == 1).all()
-    assert (graph.tau == 1).all()
-    assert graph.information is None
-
-
-def test_with_robots() -> None:
-    graph = path_graph(4).with_robots(np.array([1, 1, 0, 0]))
-    assert graph.num_robots == 2
-    np.testing.assert_array_equal(graph.robots, [1, 1, 0, 0])

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.graphs.g2o import edge_places, pose_names, symbol_ids, write_g2o
-from pgo_models.graphs.scenes import random_geometric
+from pgo_models import random_geometric, write_g2o
+from pgo_models.graphs.g2o import edge_places, pose_names, symbol_ids
 
 
 def test_symbols_are_named_by_letter_and_index_and_edges_by_their_line(tmp_path: Path) -> None:

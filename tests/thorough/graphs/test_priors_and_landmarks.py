@@ -8,9 +8,8 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem, PoseGraph, Poses
+from pgo_models import PGOProblem, PoseGraph, Poses, grid, victoria_park
 from pgo_models.errors import GraphError
-from pgo_models.graphs.scenes import grid, victoria_park
 from pgo_models.problem.hessian import riemannian_hessian
 
 

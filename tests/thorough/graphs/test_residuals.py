@@ -8,11 +8,11 @@ from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
 import pgo_models as pgo
-from pgo_models import Chi2Convention
+from pgo_models import Chi2Convention, chi2
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.precisions import isotropic_information
-from pgo_models.graphs.residuals import chi2, uncertain_edges
+from pgo_models.graphs.residuals import uncertain_edges
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))

@@ -12,14 +12,13 @@ from hypothesis import given, strategies as st
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PoseGraph
+from pgo_models import PoseGraph, edge_residuals
 from pgo_models.errors import GraphError
 from pgo_models.graphs.precisions import (
     indefinite_edges,
     is_semidefinite_exactly,
     proper_information,
 )
-from pgo_models.problem.thresholds import edge_residuals
 from solvers.robust.consistency import pairwise_consistent
 
 RANKS = st.integers(1, 6)

@@ -5,10 +5,9 @@ import pytest
 from hypothesis import given, strategies as st
 
 import pgo_models
-from pgo_models import PGOError, Poses
+from pgo_models import PGOError, Poses, exp_map, random_rotations, read_kitti, read_tum, write_tum
 from pgo_models.errors import FileFormatError, GraphError
-from pgo_models.geometry.rotations import exp_map, random_rotations
-from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum, write_kitti, write_tum
+from pgo_models.graphs.trajectories import read_times, write_kitti
 
 EPS = np.finfo(float).eps
 SEEDS = st.integers(0, 2**32 - 1)

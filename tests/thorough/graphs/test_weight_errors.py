@@ -14,13 +14,10 @@ from graphs import SEEDS
 from hypothesis import given, strategies as st
 
 import solvers
-from pgo_models import PGOProblem, Weighting
-from pgo_models.certificates.certificate import certify_at
+from pgo_models import PGOProblem, Weighting, certify_at, load, read_g2o, write_g2o
 from pgo_models.errors import FileFormatError
 from pgo_models.figures import scaled_above, scaled_below
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.datasets import load
-from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.g2o_tags import TAGS, Noise, Tag
 from pgo_models.graphs.precisions import edge_precisions
 from pgo_models.graphs.weight_errors import MOST, entry_error, inverse_error

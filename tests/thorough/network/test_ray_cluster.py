@@ -67,31 +67,6 @@ def test_without_an_address_all_listen_on_the_loopback_alone():
     assert set(addresses) <= {"0100007F", "0000000000000000FFFF00000100007F", "0" * 24 + "01000000"}
 
 
-OUTPUTS = {
-    "authentication": (
-        "[2026-01-01 W 1 1] gcs_client.cc:210: Failed\n"
-        "RuntimeError: Failed to connect to GCS. Last:\n"
-        "ray.exceptions.AuthenticationError: the token is missing\n\n"
-        "ConnectionError: Failed to connect to Ray\n",
-        "the token is missing; check",
-    ),
-    "version": (
-        "[2026-01-01 W 1 1] gcs_client.cc:210: slow\n"
-        "Traceback\n"
-        "RuntimeError: Version mismatch: started with:\n"
-        "    Ray: 2.9\nThis process:\n    Ray: 2.60\n",
-        "Version mismatch: started with: Ray: 2.9 This process: Ray: 2.60; check",
-    ),
-    "other": (
-        "[2026-01-01 W 1 1] rpc_client.h:153: first\n[2026-01-01 W 1 1] gcs_client.cc:210: last\n"
-        "ConnectionError: Failed to connect to Ray cluster at host:1\n",
-        "last; check",
-    ),
-    "none": ("", "no answer in 15 s; check"),
-    "long": ("ValueError: " + 100 * "word " + "\n", r"(word )+\.\.; check"),
-}
-
-
 @pytest.fixture
 def head(tmp_path):
     """A cluster with a token: its process, address and environment."""

@@ -7,14 +7,13 @@ from graphs import random_poses, varied_graph
 from robots import driver_at
 
 import solvers
-from pgo_models import PartitionMethod, PGOProblem
+from pgo_models import PartitionMethod, PGOProblem, partition
 from pgo_models.errors import EngineError, NotPositiveDefiniteError, SettingError
-from pgo_models.graphs.partitioning import partition
+from solvers import iterate
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.newton import SubstructuredNewton
 from solvers.distributed.robots.agent import Agent
 from solvers.distributed.substructured import SubstructuredSOC
-from solvers.loop import iterate
 from solvers.network.messages import obey
 from solvers.network.recovery import RecoveringPool, Recovery, RobotLostError
 from solvers.soc.soc import WARM_START

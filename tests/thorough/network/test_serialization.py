@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from graphs import SEEDS, random_poses
-from hypothesis import given, strategies as st
+from hypothesis import given
 
 from pgo_models import Poses
 from pgo_models.geometry.rotations import stack_transposes
@@ -14,8 +14,6 @@ from solvers.network.serialization import deserialize, serialize
 from solvers.result import Record
 from solvers.soc.anderson import AndersonShare
 from solvers.soc.recursion_block import Rotations, StepSettings, block_at
-
-PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 
 
 @given(seed=SEEDS)

@@ -281,15 +281,6 @@ def test_a_factor_that_goes_through_is_finite(
     assert (np.sqrt(L.multiply(L).sum(axis=1)) <= (1.0 + 1e-9) * np.sqrt(diagonal)).all()
 
 
-@BACKENDS
-def test_another_pattern_is_rejected(backend: CholeskyBackend) -> None:
-    diagonal = csc_array(np.eye(3))
-    full = dense_matrix(np.eye(3) + 1.0)
-    for pattern, matrix in ((diagonal, full), (full, diagonal), (diagonal, csc_array(np.eye(2)))):
-        with pytest.raises(ValueError, match="another sparsity pattern"):
-            analyze(pattern, backend).factorize(matrix)
-
-
 def test_superlu_is_the_default_without_cvxopt(monkeypatch: pytest.MonkeyPatch) -> None:
     assert default_backend() is CholeskyBackend.CHOLMOD
     monkeypatch.setitem(sys.modules, "cvxopt", None)

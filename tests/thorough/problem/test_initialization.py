@@ -16,15 +16,23 @@ from hypothesis import given, strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
-from pgo_models.certificates.certificate import certify_at
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    certify_at,
+    chordal_start,
+    grid_world,
+    odometry_start,
+    random_rotations,
+    spanning_tree_start,
+)
 from pgo_models.errors import GraphError, SettingError
-from pgo_models.geometry.rotations import random_rotations, unstack_transposes
-from pgo_models.graphs.grid_worlds import grid_world
+from pgo_models.geometry.rotations import unstack_transposes
 from pgo_models.graphs.scenes import MILD_NOISE, observe
-from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.matrices import residual_matrix
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 
 def chain(seed: int, n: int, d: int, noise: NoiseModel = MILD_NOISE) -> PoseGraph:

@@ -8,15 +8,13 @@ from graphs import DIMENSIONS, SEEDS, exact_graph, random_poses, varied_graph, v
 from hypothesis import given, settings, strategies as st
 from scipy.sparse import csc_array
 
-from pgo_models import PGOError, PGOProblem, PoseGraph, Poses
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import PGOError, PGOProblem, PoseGraph, Poses, chordal_start, log_map, multipliers
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
-from pgo_models.geometry.rotations import Array, hat, log_map
+from pgo_models.geometry.rotations import Array, hat
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.marginals import Marginals, write_covariances
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 needs_gtsam = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"

@@ -5,10 +5,9 @@ import pytest
 from graphs import DIMENSIONS, EPS, SEEDS, SIZES, random_poses, varied_graph
 from hypothesis import given
 
-from pgo_models import PoseGraph
+from pgo_models import PoseGraph, random_geometric
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import stack_transposes
-from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem.matrices import (
     connection_laplacian,
     joint_matrix,

@@ -14,15 +14,19 @@ from graphs import (
 from hypothesis import given, strategies as st
 from scipy.sparse import csc_array
 
-from pgo_models import PGOProblem, PoseGraph, Poses, Weighting
-from pgo_models.errors import GraphError, NotPositiveDefiniteError
-from pgo_models.geometry.rotations import (
+from pgo_models import (
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Weighting,
+    chordal_start,
+    random_geometric,
     random_rotations,
-    stack_transposes,
 )
-from pgo_models.graphs.scenes import random_geometric
+from pgo_models.errors import GraphError, NotPositiveDefiniteError
+from pgo_models.geometry.rotations import stack_transposes
 from pgo_models.problem.cholesky import factorize
-from pgo_models.problem.initialization import chordal_start, relaxed_rotations
+from pgo_models.problem.initialization import relaxed_rotations
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)

@@ -12,10 +12,9 @@ from graphs import DIMENSIONS, SEEDS, exact_graph, random_poses, varied_graph, v
 from hypothesis import given, strategies as st
 from shared_gradients import dense_relative_gradient
 
-from pgo_models import PGOProblem, Poses
-from pgo_models.problem.initialization import chordal_start
+from pgo_models import PGOProblem, Poses, chordal_start
 from pgo_models.problem.stationarity import gradient_squares, relative_gradient, relative_length
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 
 @given(seed=SEEDS, n=st.integers(2, 12), d=DIMENSIONS)

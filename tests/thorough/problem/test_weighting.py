@@ -9,16 +9,13 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, informed, random_poses, varied_graph
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem, Poses, Weighting
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import PGOProblem, Poses, Weighting, chi2, chordal_start, multipliers
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.precisions import are_definite, isotropic_information
-from pgo_models.graphs.residuals import chi2
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.information_costs import TangentCost
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 COUPLED = st.booleans()
 

@@ -7,8 +7,7 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import PGOProblem, multipliers
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import append_rank, project_to_tangent, retract
 from pgo_models.relaxations.low_rank import (

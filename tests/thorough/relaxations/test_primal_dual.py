@@ -17,23 +17,29 @@ from graphs import (
 )
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import ConvexSolver, PGOProblem, RelaxationForm, Verdict, Weighting
+from pgo_models import (
+    ConvexSolver,
+    PGOProblem,
+    RelaxationForm,
+    Verdict,
+    Weighting,
+    circle,
+    grid,
+    multipliers,
+    prove_bound,
+    read_g2o,
+    solve_relaxation,
+    sphere,
+)
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.errors import SettingError
-from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.relaxations.rounding import rank_report, round_gram
 from pgo_models.relaxations.solve_sdp import (
     DEFAULT_RELAXATION_GAP,
     RelaxationSolution,
     RelaxationStatus,
-    solve_relaxation,
 )
-from solvers import SweptScene
-from solvers.pipeline import solve
-from solvers.riemannian.polish import polish
+from solvers import SweptScene, polish, solve
 from solvers.studies.tightness import noisy_scene
 
 PLAIN_FORMS = [form for form in RelaxationForm if not form.has_hull]

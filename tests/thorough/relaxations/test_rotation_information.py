@@ -9,10 +9,9 @@ import pytest
 from graphs import informed
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, RelaxationForm, Weighting
+from pgo_models import NoiseModel, PGOProblem, RelaxationForm, Weighting, solve_relaxation
 from pgo_models.errors import SettingError
 from pgo_models.graphs.precisions import proper_information
-from pgo_models.relaxations.solve_sdp import solve_relaxation
 
 
 def rotations_informed(n: int) -> PGOProblem:

@@ -6,8 +6,7 @@ import math
 import pytest
 
 from pgo_models import PGOError
-from pgo_models.errors import SettingError
-from solvers.reporting.result_table import ResultTable, TablePart, check_table_format
+from solvers.reporting.result_table import ResultTable, TablePart
 
 HEADS = ("graph", "F", "remark")
 ROWS = (("grid", "97.01", "a | b [bold]"), ("rim", "-", "not here; " + "get it " * 40))
@@ -83,13 +82,6 @@ def test_every_format_is_written_whole(tmp_path):
         TABLE.save(tmp_path / f"table{suffix}")
         assert (tmp_path / f"table{suffix}").read_text(encoding="utf-8") == text
     assert len(list(tmp_path.iterdir())) == 3
-
-
-def test_another_suffix_is_refused(tmp_path):
-    with pytest.raises(SettingError, match=r"no table has suffix '.xlsx'; use .md, .csv or .json"):
-        check_table_format(tmp_path / "table.xlsx")
-    with pytest.raises(SettingError, match="no table has suffix ''"):
-        TABLE.save(tmp_path / "table")
 
 
 def test_a_place_that_cannot_be_written_is_said(tmp_path):

@@ -14,18 +14,12 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem, PoseGraph, Poses, Weighting
-from pgo_models.geometry.rotations import exp_map, tangent_dimension
+from pgo_models import PGOProblem, PoseGraph, Poses, Weighting, chordal_start, exp_map
+from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
-from solvers import Newton
-from solvers.riemannian.polish import (
-    polish,
-    relative_decrement,
-)
-
-ROUNDING = 1e-14  # the relative change of F that polish does not tell apart from none
+from solvers import Newton, polish
+from solvers.riemannian.polish import relative_decrement
 
 
 def pair(error_angle: float) -> PoseGraph:

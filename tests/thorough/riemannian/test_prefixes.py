@@ -7,17 +7,23 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, varied_graph
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Verdict,
+    Weighting,
+    read_g2o,
+    victoria_park,
+)
 from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.scenes import victoria_park
-from solvers import Status
-from solvers.loop import iterate
-from solvers.riemannian.prefixes import EntryTree, GrowingStart, _prefix_problem, entry_tree
+from solvers import Status, iterate
+from solvers.riemannian.prefixes import GrowingStart
 
 FIRST_ALONE = solvers.Pipeline(growing=None, second_try=False, staircase=None)
 GROWING = solvers.Pipeline(second_try=False, staircase=None)
@@ -30,76 +36,6 @@ def trees(
     rng = np.random.default_rng(seed)
     noise = NoiseModel(translation_std=0.05, rotation_std=rotation_std)
     return victoria_park(rng, num_poses=num_poses, noise=noise, reach=reach)
-
-
-def with_points_and_priors(seed: int, n: int, d: int, has_world: bool) -> PoseGraph:
-    """A graph with two landmarks, the first seen by late poses first, and perhaps priors."""
-    rng = np.random.default_rng(seed)
-    graph = varied_graph(seed, n, d)
-    for _ in range(2):
-        seen_from = rng.permutation(n)[:3]
-        graph = graph.with_landmark(seen_from, rng.standard_normal((3, d)), 5.0)
-    if has_world:
-        measured = np.sort(rng.permutation(n)[:2])
-        graph = graph.with_prior(measured, graph_poses(graph, rng)[measured], 2.0, 3.0)
-    return graph
-
-
-def graph_poses(graph: PoseGraph, rng: np.random.Generator) -> Poses:
-    """Random positions, and rotations of I."""
-    return Poses.of_points(rng.standard_normal((graph.num_poses, graph.d)))
-
-
-def tree_of(graph: PoseGraph) -> EntryTree:
-    tree = entry_tree(graph)
-    assert tree is not None
-    return tree
-
-
-@settings(max_examples=examples(30))
-@given(seed=SEEDS, n=st.integers(4, 15), d=DIMENSIONS, has_world=st.booleans())
-def test_every_prefix_is_connected_and_its_cost_is_that_of_its_edges(
-    seed: int, n: int, d: int, has_world: bool
-) -> None:
-    graph = with_points_and_priors(seed, n, d, has_world)
-    problem = PGOProblem(graph)
-    tree = tree_of(graph)
-    poses = tree.poses
-    costs = problem.edge_costs(poses)
-    for size in range(2, n + 1):
-        members = tree.members(size)
-        prefix = _prefix_problem(problem, members)  # raises unless it is connected
-        bodies = np.isin(members, graph.bodies).sum()
-        inside = np.isin(graph.i, members) & np.isin(graph.j, members)
-        assert bodies == size
-        np.testing.assert_allclose(
-            prefix.objective(poses[members]), costs[inside].sum(), rtol=1e-9, atol=1e-9
-        )
-    assert len(tree.members(n)) == graph.num_poses
-
-
-@settings(max_examples=examples(30))
-@given(seed=SEEDS, n=st.integers(4, 15), d=DIMENSIONS, has_world=st.booleans())
-def test_what_is_solved_stays_and_the_rest_follows_by_its_entry_edges(
-    seed: int, n: int, d: int, has_world: bool
-) -> None:
-    graph = with_points_and_priors(seed, n, d, has_world)
-    rng = np.random.default_rng(seed)
-    tree = tree_of(graph)
-    members = tree.members(int(rng.integers(1, n + 1)))
-    moved = tree.poses[members].moved_along(
-        rng.standard_normal((len(members), 1 if d == 2 else 3)),
-        rng.standard_normal((len(members), d)),
-    )
-    poses = tree.continued(members, moved)
-    np.testing.assert_array_equal(poses.t[members], moved.t)
-    np.testing.assert_array_equal(poses.R[members], moved.R)
-    new = np.setdiff1d(np.arange(graph.num_poses), members)
-    parent = tree.parent[new]
-    assert (tree.rank[parent] <= tree.rank[new]).all()
-    relative = relative_translations(poses, parent, new)
-    expected = relative_translations(tree.poses, parent, new)
-    np.testing.assert_allclose(relative, expected, rtol=0, atol=1e-9)
 
 
 def relative_translations(poses: Poses, i: Array, j: Array) -> Array:
@@ -123,14 +59,6 @@ def without_noise(graph: PoseGraph) -> PoseGraph:
     R_i = truth.R[graph.i]
     R_ij = np.swapaxes(R_i, 1, 2) @ truth.R[graph.j]
     return replace(graph, R_ij=R_ij, t_ij=relative_translations(truth, graph.i, graph.j))
-
-
-def test_a_landmark_enters_with_the_pose_that_saw_it_first() -> None:
-    graph = trees(0)
-    tree = tree_of(graph)
-    sights = graph.first_sights
-    np.testing.assert_array_equal(tree.rank[graph.j[sights]], graph.i[sights])
-    assert np.isin(graph.landmarks, tree.members(60)).sum() < len(graph.landmarks)
 
 
 @pytest.mark.parametrize("weighting", [Weighting.ISOTROPIC, Weighting.INFORMATION])
@@ -190,22 +118,6 @@ def test_a_start_that_grew_in_vain_leaves_robots_the_better_answer() -> None:
     cheapest = min(stage.objective for stage in solution.stages)
     assert solution.objective <= cheapest * (1 + 1e-9)
     assert not solution.is_certified
-
-
-def test_prefixes_that_miss_their_minimum_are_dropped() -> None:
-    """New poses come in ever smaller numbers then, and all poses are solved at last."""
-    problem = PGOProblem(trees(0))
-    course = []
-    run = solvers.run(
-        GrowingStart(growth=2.0),
-        problem,
-        callback=lambda state, record: course.append((state.num_solved, state.size)),
-    )
-    solved = [num_solved for num_solved, _ in course]
-    assert run.status is Status.CONVERGED
-    assert solved == sorted(solved)
-    assert solved[-1] == 200
-    assert len(set(solved)) < len(solved)  # a state that solved nothing
 
 
 def test_where_odometry_does_not_join_the_poses_it_is_left_out() -> None:

@@ -18,15 +18,11 @@ from graphs import (
 )
 from hypothesis import example, given, settings, strategies as st
 
-from pgo_models import PGOProblem, Verdict
-from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, certify_at, certify_with
-from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models import PGOProblem, Verdict, certify_at, prove_bound, solve_relaxation
+from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, certify_with
 from pgo_models.errors import SettingError
-from pgo_models.relaxations.solve_sdp import TOLERANCE, solve_relaxation
-from solvers import Newton, Staircase, Status, SweptScene
-from solvers.loop import run
-from solvers.riemannian.newton import gauss_newton
-from solvers.riemannian.polish import polish
+from pgo_models.relaxations.solve_sdp import TOLERANCE
+from solvers import Newton, Staircase, Status, SweptScene, gauss_newton, polish, run
 from solvers.riemannian.staircase import StaircaseState
 from solvers.studies.tightness import noisy_scene
 

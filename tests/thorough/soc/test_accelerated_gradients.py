@@ -8,11 +8,9 @@ import pytest
 from graphs import EPS, SEEDS
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem
+from pgo_models import PGOProblem, circle
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.scenes import circle
-from solvers import SOC, FixedPenalty, RStep
-from solvers.loop import run
+from solvers import SOC, FixedPenalty, RStep, run
 from solvers.soc.accelerated_gradients import minimize_with_fista, minimize_with_nesterov
 
 

@@ -9,16 +9,13 @@ from graphs import DIMENSIONS, SEEDS, varied_problem
 from hypothesis import given, settings, strategies as st
 from robots import PARTITIONERS, Partitioner
 
-from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses, chordal_start
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import rotation_scale
 from solvers import SOC, FixedPenalty, MultiplierPenalty
 from solvers.soc.consensus import ConsensusState, LocalConsensus
 from solvers.soc.penalty import first_penalties
 
-SIZES = st.integers(2, 14)
-RHO = 3.0
 FEWER = settings(max_examples=examples(40))  # each example splits a graph and starts a run
 
 

@@ -8,7 +8,15 @@ from budget import examples
 from graphs import DIMENSIONS, REFERENCE, SEEDS, random_poses, varied_problem
 from hypothesis import assume, given, settings, strategies as st
 
-from pgo_models import PartitionMethod, PGOProblem
+from pgo_models import (
+    PartitionMethod,
+    PGOProblem,
+    circle,
+    grid,
+    partition,
+    spanning_tree_start,
+    sphere,
+)
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import (
     Array,
@@ -16,9 +24,6 @@ from pgo_models.geometry.rotations import (
     project_by_svd,
     stack_transposes,
 )
-from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import circle, grid, sphere
-from pgo_models.problem.initialization import spanning_tree_start
 from solvers import (
     SOC,
     BalancedPenalty,
@@ -28,10 +33,11 @@ from solvers import (
     PaperSOC,
     RStep,
     Status,
+    gauss_newton,
+    iterate,
+    run,
+    solve,
 )
-from solvers.loop import iterate, run
-from solvers.pipeline import solve
-from solvers.riemannian.newton import gauss_newton
 from solvers.soc.paper import PaperStop
 from solvers.soc.penalty import BoydPenalty, first_penalties
 

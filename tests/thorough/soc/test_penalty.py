@@ -13,10 +13,8 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOError, PGOProblem
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import PGOError, PGOProblem, chordal_start, multipliers
 from pgo_models.errors import SettingError
-from pgo_models.problem.initialization import chordal_start
 from solvers import BalancedPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.penalty import BoydPenalty, first_penalties, rotation_scale
 

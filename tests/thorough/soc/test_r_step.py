@@ -6,14 +6,12 @@ from hypothesis import given, settings, strategies as st
 
 from pgo_models import PGOProblem, PoseGraph
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.scenes import circle, grid, sphere
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.stationarity import rotation_scale
 from solvers import RStep
 from solvers.soc.r_step import RSubproblem, prepare
 
 AGREEMENT = 1e-8  # the contract of the back ends
-SCENES = {"circle": circle, "grid": grid, "sphere": sphere}
 
 
 def subproblem_of(problem: PGOProblem, penalty: Array) -> RSubproblem:

@@ -8,10 +8,9 @@ from graphs import DIMENSIONS, SEEDS, varied_problem
 from hypothesis import assume, given, strategies as st
 from robots import PARTITIONERS, Partitioner, metis
 
-from solvers import SOC, InProcess, Status
+from solvers import SOC, InProcess, Status, iterate, run
 from solvers.distributed.consensus import ConsensusSOC
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.loop import iterate, run
 from solvers.network.ledger import DRIVER
 from solvers.soc.rounding import RowChange
 

@@ -4,17 +4,8 @@ from itertools import islice
 
 import numpy as np
 from graphs import varied_problem
-from hypothesis import strategies as st
 
-from solvers import SOC, FixedPenalty
-from solvers.loop import iterate
-
-MERITS = st.lists(st.floats(1e-12, 1e12), max_size=40).map(tuple)
-UNITS = st.integers(-20, 20).map(lambda exponent: 2.0**exponent)
-PATIENCE = 20
-# rho_i / m_i of three poses: so small that the safeguard may raise it, and large enough.
-SMALL = np.full(3, 3.9)
-ENOUGH = np.full(3, 4.0)
+from solvers import SOC, FixedPenalty, iterate
 
 
 def test_a_hopeless_penalty_is_doubled_twenty_times_and_no_more() -> None:

@@ -15,8 +15,15 @@ from graphs import (
 )
 from hypothesis import assume, given, settings, strategies as st
 
-from pgo_models import PartitionMethod, PGOProblem, PoseGraph
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import (
+    PartitionMethod,
+    PGOProblem,
+    PoseGraph,
+    chordal_start,
+    grid,
+    multipliers,
+    partition,
+)
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import (
     orthogonality_error,
@@ -24,14 +31,11 @@ from pgo_models.geometry.rotations import (
     stack_transposes,
     unstack_transposes,
 )
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import grid
-from pgo_models.problem.initialization import chordal_start
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.matrices import joint_matrix
 from pgo_models.problem.stationarity import rotation_scale
-from solvers import SOC, Coupling, FixedPenalty, Measurement, PaperSOC, Status
-from solvers.loop import iterate, run
-from solvers.riemannian.polish import polish, relative_decrement
+from solvers import SOC, Coupling, FixedPenalty, Measurement, PaperSOC, Status, iterate, polish, run
+from solvers.riemannian.polish import relative_decrement
 from solvers.soc.anderson import Anderson
 
 SIZES = st.integers(3, 12)

@@ -17,19 +17,34 @@ from graphs import (
 )
 from hypothesis import assume, example, given, settings, strategies as st
 
-from pgo_models import NoiseModel, PartitionMethod, PGOProblem, Poses
-from pgo_models.graphs.partitioning import Partition, partition
-from pgo_models.graphs.scenes import MILD_NOISE, grid
-from pgo_models.problem.initialization import chordal_start
+from pgo_models import (
+    NoiseModel,
+    PartitionMethod,
+    PGOProblem,
+    Poses,
+    chordal_start,
+    grid,
+    partition,
+)
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.scenes import MILD_NOISE
 from pgo_models.problem.stationarity import (
     gradient_squares,
     relative_gradient,
     rotation_squares,
 )
-from solvers import SOC, BalancedPenalty, Coupling, FixedPenalty, RStep, Status
-from solvers.loop import iterate, run
+from solvers import (
+    SOC,
+    BalancedPenalty,
+    Coupling,
+    FixedPenalty,
+    RStep,
+    Status,
+    iterate,
+    polish,
+    run,
+)
 from solvers.result import Record
-from solvers.riemannian.polish import polish
 from solvers.soc.anderson import Anderson
 
 SIZES = st.integers(3, 12)
@@ -94,10 +109,11 @@ def test_the_fixed_point_does_not_depend_on_the_acceleration(seed: int, n: int, 
     problem = varied_problem(seed, n, d)
     plain = SOC(acceleration=None, **TIGHT)
     relaxed = replace(plain, alpha=1.6)
-    # without acceleration it may creep: no rate is promised
-    for creeping in (plain, relaxed):
-        assume(run(creeping, problem).status is Status.CONVERGED)
-    assert_same_end(problem, [plain, relaxed, SOC(**TIGHT), SOC(alpha=1.6, **TIGHT)])
+    # Without acceleration it may creep: no rate is promised, and what converges ends there too.
+    unaccelerated = [
+        soc for soc in (plain, relaxed) if run(soc, problem).status is Status.CONVERGED
+    ]
+    assert_same_end(problem, [SOC(**TIGHT), SOC(alpha=1.6, **TIGHT), *unaccelerated])
 
 
 def gradient_beside_rotations(problem: PGOProblem, poses: Poses) -> float:

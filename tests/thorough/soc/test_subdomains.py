@@ -5,9 +5,7 @@ from budget import examples
 from graphs import SEEDS, varied_graph
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import PGOProblem, PoseGraph
-from pgo_models.graphs.grid_worlds import grid_world
-from pgo_models.graphs.partitioning import partition
+from pgo_models import PGOProblem, PoseGraph, grid_world, partition
 from solvers.distributed.elimination_choice import leave_poses
 from solvers.soc.subdomains import find_subdomains, poses_to_leave
 from solvers.soc.subgraph import split_graph

@@ -133,12 +133,6 @@ def test_settings_out_of_range_are_refused(wrong, message):
         BenchmarkSettings(**wrong)
 
 
-def test_robots_that_the_graph_names_keep_their_poses():
-    graph = pgo.load("robots")
-    assert (BenchmarkSettings(num_robots=4).robots(graph).robot == graph.robots).all()
-    assert BenchmarkSettings(num_robots=3).robots(graph).num_robots == 3
-
-
 def test_robots_are_at_most_one_a_pose_and_contiguous_without_metis(monkeypatch):
     graph = pgo.grid(np.random.default_rng(0))
     assert BenchmarkSettings(num_robots=99).robots(graph).num_robots <= 27

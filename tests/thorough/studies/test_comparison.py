@@ -10,13 +10,13 @@ from solvers import (
     BenchmarkMethod,
     BenchmarkSettings,
     ComparisonSettings,
+    LevenbergMarquardt,
     Measurement,
     compare_methods,
 )
 from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.result import History, Record
-from solvers.studies import comparison
 from solvers.studies.comparison import check_plot_format
 
 pytest.importorskip("matplotlib")
@@ -87,16 +87,12 @@ def test_a_method_that_cannot_be_run_leaves_its_reason():
 
 
 def test_ctrl_c_keeps_the_methods_that_are_done(monkeypatch):
-    true = comparison.run_benchmark
+    def interrupted(*_):
+        raise KeyboardInterrupt
 
-    def run_benchmark(contender, *rest):
-        if contender is BenchmarkMethod.NEWTON:
-            raise KeyboardInterrupt
-        return true(contender, *rest)
-
-    monkeypatch.setattr(comparison, "run_benchmark", run_benchmark)
+    monkeypatch.setattr(LevenbergMarquardt, "init", interrupted)
     settings = ComparisonSettings(
-        (BenchmarkMethod.STAIRCASE, BenchmarkMethod.NEWTON, BenchmarkMethod.JOINT)
+        (BenchmarkMethod.STAIRCASE, BenchmarkMethod.LEVENBERG_MARQUARDT, BenchmarkMethod.JOINT)
     )
     compared = compare_methods(pgo.grid(np.random.default_rng(1)), settings)
     assert not compared.is_complete

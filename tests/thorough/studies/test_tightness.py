@@ -4,8 +4,8 @@ import pytest
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.plots.curves import plot_tightness
-from solvers import SweptScene
-from solvers.studies.tightness import NoiseSweep, noise_sweep, noisy_scene
+from solvers import SweptScene, noise_sweep
+from solvers.studies.tightness import NoiseSweep, noisy_scene
 
 QUIET = np.deg2rad(10.0)
 LOUD = np.deg2rad(90.0)

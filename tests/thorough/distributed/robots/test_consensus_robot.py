@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
-import pytest
 from budget import examples
 from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph
 from hypothesis import example, given, settings, strategies as st
@@ -16,64 +15,21 @@ from robots import (
     arrays_in,
     bytes_of,
     contiguous,
-    metis,
     name_of,
-    scattered,
 )
 
-from pgo_models import NoiseModel, PoseGraph
-from pgo_models.geometry.rotations import Array, exp_map, tangent_dimension
-from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import grid
-from solvers import SOC, Coupling, MultiplierPenalty, Pipeline, Robots, Solution
+from pgo_models import NoiseModel, PoseGraph, exp_map, grid, partition
+from pgo_models.geometry.rotations import Array, tangent_dimension
+from solvers import SOC, Coupling, Pipeline, Robots, Solution, solve
 from solvers.distributed.robots import descent, handedness, start, translations
 from solvers.distributed.robots.agent import begin_copies
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.network.ledger import DRIVER
-from solvers.pipeline import solve
-from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.subgraph import middle_separator
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
-# anything counts as stalled after three steps
-STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)
 
-STAR = {  # to and from whoever sums up: settings, figures of all poses in no order, and sums
-    *(
-        "per_norm",
-        "per_scale",
-        "least",
-        "is_stationary",
-        "alpha",
-        "memory",
-        "local_passes",
-        "bytes_per_number",
-        "per_robot",
-    ),
-    *(
-        "regularization",
-        "restart_ratio",
-        "translation",
-        "rotation",
-        "factor",
-        "size",
-        "ratio",
-    ),
-    *(
-        "mantissas",
-        "exponents",
-        "coefficients",
-        "is_best",
-        "first",
-        "ratios",
-        "squares",
-        "gradient",
-        "cost",
-        "rotations",
-        "value",
-    ),
-}
 Copies = ConsensusRobot
 ROUNDS = (  # orders that are, or end, a round
     *(
@@ -98,9 +54,6 @@ ROUNDS = (  # orders that are, or end, a round
         Copies.back_at_best,
     ),
 )
-# with the driver, at the cover
-ENDS = ("begin_copies", "finish_copies")
-POSES = ("R", "t", "in_cover")
 ALL_REDUCES = (
     *(
         Copies.travel,
@@ -226,55 +179,6 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
         == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(descent.move) + 2
     )
     assert solution.ledger.all_reduces == 3 + 1 + stage.iterations
-
-
-@pytest.mark.parametrize("per_robot", [False, True])
-@pytest.mark.parametrize("partitioner", [metis, scattered])
-@pytest.mark.parametrize("d", [2, 3])
-def test_neighbours_send_rows_of_common_poses_and_sums_go_to_all(
-    d: int, partitioner: Partitioner, per_robot: bool
-) -> None:
-    soc = SOC(
-        acceleration=Anderson(memory=5, per_robot=per_robot), max_iterations=8, penalty=STALLED
-    )
-    solution, engine = solved(7, 24, d, partitioner, LOUD_NOISE, Recording(), soc)
-    parts = solution.robots
-    assert parts is not None
-    seen = set()
-    for share in engine.shares:
-        common = dict(share.common)
-        for order, down, up in engine.log:
-            if not order.startswith("ConsensusRobot.") and order not in ENDS:
-                continue
-            for message, is_sent in ((down[share.robot], False), (up[share.robot], True)):
-                for name, value in arrays_in(message):
-                    kind, between, other = name.partition(">")
-                    if not between:
-                        assert name in (STAR if order not in ENDS else POSES), (order, name)
-                        if name in ("mantissas", "exponents", "ratios", "squares"):
-                            assert np.size(value) <= (2 if per_robot else 6)
-                        if name == "value" and order.endswith("travel"):
-                            assert np.size(value) <= 3 + d
-                        continue
-                    poses = common[int(other)]
-                    owner = share.robot if is_sent else int(other)
-                    known = int((share.owner[poses] == owner).sum())
-                    rows = {((d + 1) * len(poses), d), ((d + 1) * known, d)}
-                    allowed = {
-                        "force": rows,
-                        "rows": rows,
-                        "multiples": rows,
-                        "units": {(2,)},
-                        "value": rows,
-                        "of_own": {(known, 1 + (d + 1) + d * d)},
-                    }
-                    assert np.shape(value) in allowed[kind], (order, name)
-                    seen.add(kind)
-    # Robots that accelerate alone send their rows in full.
-    assert seen == {"value", "of_own"} | (
-        {"force", "rows"} if per_robot else {"multiples", "units"}
-    )
-    assert engine.times(begin_copies) == 2
 
 
 def measured_twice(graph: PoseGraph, rng: np.random.Generator) -> PoseGraph:

@@ -28,18 +28,24 @@ from robots import (
     star,
 )
 
-from pgo_models import NoiseModel, PGOProblem, Poses, Weighting
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import pose_rows, prove_bound
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    Poses,
+    Weighting,
+    chordal_start,
+    multipliers,
+    prove_bound,
+)
+from pgo_models.certificates.lower_bound import pose_rows
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import gamma
 from pgo_models.problem.information_costs import TangentCost
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import columns_of
+from solvers import polish
 from solvers.distributed import lower_bound as distributed_bound
 from solvers.distributed.driver import collect
-from solvers.distributed.interface import Interface
 from solvers.distributed.lower_bound import (
     InterfaceProof,
     best_bound_distributed,
@@ -48,7 +54,6 @@ from solvers.distributed.lower_bound import (
 )
 from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.records import ProofStep, RightHandSide
-from solvers.riemannian.polish import polish
 
 
 @settings(max_examples=examples(12))
@@ -261,28 +266,3 @@ def test_every_term_of_the_errors_of_a_driver_s_sums_is_there() -> None:
         error += 1e-15 * abs(own) + gamma(len(parts) + 2.0) * 2.0 * abs(own)
         assert sums.quadratic >= enough * np.sum(error**2 / slack[:, None]) > 0.0
         assert sums.value_error >= enough * (blocks.value_error + u * abs(sums.value)) > 0.0
-
-
-def test_every_term_of_the_errors_of_a_driver_s_elimination_is_there(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    u = 2.0**-53
-    enough = 1.0 - 1e-12
-    problem = PGOProblem(varied_graph(3, 16, 3))
-    poses = polish(problem, chordal_start(problem))
-    with closing(driver_at(problem, contiguous(problem.graph, 3), poses)) as driver:
-        Lambda = driver.current.multipliers
-        monkeypatch.setattr(
-            Interface, "rounding", lambda self, sizes, own, diagonal: 0.0 * diagonal
-        )
-        found = distributed_bound.eliminate_S(driver, None, 1.0, 1e-13)
-        assert found is not None
-        diagonal = driver.diagonal.copy()
-        rows = driver.rotation_rows
-        diagonal[rows] += np.maximum(1.0 - np.einsum("naa->na", Lambda).ravel(), 0.0)
-        assert (found.slack <= (1e-13 - 8 * u) * diagonal * (1.0 + 1e-12)).all()
-        monkeypatch.undo()
-        bound = prove_with_eta(driver, 1.0)
-        assert bound is not None
-        size = sum(map(abs, found.traces)) + driver.num_poses * driver.d
-        assert bound.rounding >= enough * 4 * u * size

@@ -25,9 +25,8 @@ from roads import road
 from robots import interface_of, matrix_of_schur, sparse_interface_of
 from scipy.sparse import csc_array, csr_array
 
-from pgo_models import PGOProblem
+from pgo_models import PGOProblem, partition
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.partitioning import partition
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
     CholeskyFactor,

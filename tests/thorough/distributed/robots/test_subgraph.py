@@ -3,7 +3,7 @@ import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_graph, varied_problem
 from hypothesis import given, settings, strategies as st
-from robots import PARTITIONERS, Partitioner, complete, corner_cases, star
+from robots import PARTITIONERS, Partitioner
 
 from pgo_models import PoseGraph, Poses
 from pgo_models.graphs.partitioning import Partition
@@ -69,11 +69,6 @@ def test_edges_are_counted_once_and_interiors_are_private(
     check_shares(graph, partitioner(graph, seed))
 
 
-@pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
-def test_corner_cases_are_shared_out_alike(graph: PoseGraph, parts: Partition) -> None:
-    check_shares(graph, parts)
-
-
 @settings(max_examples=examples(50))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, partitioner=PARTITIONERS)
 def test_the_costs_of_the_parts_add_up(seed: int, n: int, d: int, partitioner: Partitioner) -> None:
@@ -85,25 +80,3 @@ def test_the_costs_of_the_parts_add_up(seed: int, n: int, d: int, partitioner: P
             at = subgraph.part.poses
             total += subgraph.part.problem.objective(Poses(poses.R[at], poses.t[at]))
     assert total == pytest.approx(problem.objective(poses), rel=1e-12)
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_a_pose_that_covers_all_its_edges_leaves_its_robot_nothing_to_count(d: int) -> None:
-    for center in (0, 6):
-        subgraphs = split_graph(*star(center, d))
-        assert [subgraph.part is None for subgraph in subgraphs] == [a == center for a in range(7)]
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_between_two_poses_of_the_cover_the_owner_of_the_first_end_counts(d: int) -> None:
-    graph, parts = complete(d)
-    without_interior = [
-        subgraph
-        for subgraph in split_graph(graph, parts)
-        if subgraph.part is not None and not subgraph.part.interior.size
-    ]
-    assert without_interior
-    for subgraph in without_interior:
-        assert subgraph.part is not None
-        first = subgraph.part.poses[subgraph.part.problem.graph.i]
-        np.testing.assert_array_equal(first, subgraph.robot)
