@@ -19,7 +19,7 @@ from solvers.robust.fixes import agreeing_fixes, is_fix
 from solvers.robust.known import odometry
 from solvers.robust.rejection import Rejection
 
-CASES = Path(__file__).parent.parent / "cases"
+CASES = Path(__file__).parents[2] / "cases"
 
 
 def solved(graph: pgo.PoseGraph) -> tuple[Solution, Rejection]:

@@ -14,7 +14,7 @@ from pgo_models.graphs.scenes import NoiseModel
 from solvers.robust.known import odometry
 from solvers.robust.rejection import Rejection
 
-CASES = Path(__file__).parent.parent / "cases"
+CASES = Path(__file__).parents[2] / "cases"
 
 
 def world(seed: int, claim: float) -> pgo.PoseGraph:
