@@ -62,7 +62,7 @@ class AskedRobots(Protocol):
 
     @property
     def num_robots(self) -> int:
-        """How many there are."""
+        """Number of robots."""
 
     def begin(self, is_first: bool) -> list[Rows]:
         """Let all robots start at given poses, or at their own; return what each of them sends."""
@@ -83,7 +83,7 @@ def ask_all(robots: AskedRobots, order: Order[Q, A], request: Q, count: Count) -
 class ConsensusState(SharedSteps):
     """Iterate k: the sums that all robots know, and the robots, who have x, omega, B and rho.
 
-    In one process the state shows these of all poses.
+    In one process its properties give x, omega, B and rho of all poses.
 
     Parameters
     ----------
@@ -139,9 +139,9 @@ class ConsensusState(SharedSteps):
 class Consensus:
     """The recursion by robots, from the poses that they begin at.
 
-    An iteration is one exchange: a round between neighbours, and with it one all-reduce, of the
-    residuals and, for the next iterate, the sums of the acceleration, of which only the merit is
-    left where every robot accelerates alone.
+    An iteration takes one exchange between neighbours and one all-reduce. The all-reduce sums the
+    squared residuals of this iterate and the products of the acceleration for the next one. Where
+    every robot accelerates alone, only the merit is summed in place of the products.
     """
 
     soc: SOCSettings  # its coupling and robots are not used
@@ -180,10 +180,10 @@ class Consensus:
         if not math.isfinite(merit):
             return state.broken()
         gamma, anderson = state.sums.coefficients(self._common_acceleration, state.ahead)
-        told: Array | ShortNumbers | None = gamma
+        sent_gamma: Array | ShortNumbers | None = gamma
         if gamma is not None and self.soc.bytes_per_number < WHOLE:
-            told = ShortNumbers.of(gamma)
-        agreement = Agreement(told, state.is_best(merit))
+            sent_gamma = ShortNumbers.of(gamma)
+        agreement = Agreement(sent_gamma, state.is_best(merit))
         orders = [(agreement, rows) for rows in state.rows]
         # (b) projection and (c) Bregman update, and (a) of the next iteration
         answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)
@@ -327,7 +327,7 @@ class LocalRobots:
 
     @property
     def num_robots(self) -> int:
-        """How many there are."""
+        """Number of robots."""
         return len(self.robots)
 
     def begin(self, is_first: bool) -> list[Rows]:
@@ -358,7 +358,7 @@ class LocalConsensus:
 
     @property
     def max_iterations(self) -> int:
-        """The iterations of a run at most, those of `soc`."""
+        """Limit on the iterations of a run, from `soc`."""
         return self.soc.max_iterations
 
     def init(self, problem: PGOProblem, start: Poses) -> ConsensusState:
@@ -380,7 +380,7 @@ class LocalConsensus:
         return replace(following, robots=local.robots)
 
     def measure(self, problem: PGOProblem, state: ConsensusState) -> Measurement:
-        """As of `Consensus.measure`."""
+        """F and the residuals of `Consensus.measure`."""
         return Consensus(self.soc).measure(state)
 
     def poses(self, problem: PGOProblem, state: ConsensusState) -> Poses:
@@ -402,8 +402,8 @@ def _owned(values: Sequence[Array], robots: Sequence[ConsensusRobot]) -> Array:
     poses = []
     values_of_owners = []
     for robot, values_of_robot in zip(robots, values, strict=True):
-        own = robot.layout.own
-        poses.append(robot.layout.subgraph.poses[own])
-        values_of_owners.append(values_of_robot[own])
+        own_poses = robot.layout.own_poses
+        poses.append(robot.layout.subgraph.poses[own_poses])
+        values_of_owners.append(values_of_robot[own_poses])
     order = np.argsort(np.concatenate(poses))
     return np.concatenate(values_of_owners)[order]

@@ -1,9 +1,10 @@
 """One robot of the CONSENSUS coupling: its own poses, copies of separators, and its part of SOC.
 
-An edge between two robots counts half with each. Robots send their neighbours rows of the poses
-that both hold, and what the owner of a pose knows of it; such messages are mappings from the number
-of the receiver. Most methods are orders: an order takes a request and returns the robot after it
-and the answer; the robot before it is left alone. `solvers.soc.consensus` calls the orders in turn.
+An edge between two robots counts half with each. Two neighbours send each other rows of the poses
+that both hold, and the owner of a pose sends its penalty. A message to the neighbours is a mapping
+from the receiver's number. Most methods are orders. An order takes a request, and returns the robot
+after it with the answer; the robot before it does not change. `solvers.soc.consensus` calls the
+orders in turn.
 """
 
 from __future__ import annotations
@@ -66,8 +67,8 @@ class ConsensusRobot:
         X = layout.with_rows_of_others(self.state.X.copy(), rows)
         Lambda = layout.multipliers(X)
         following = self._with(X=X, Lambda=Lambda, diagonal=layout.diagonal)
-        norms = multiplier_norms(Lambda[layout.own])
-        return following, norms / following._scale[layout.own]
+        norms = multiplier_norms(Lambda[layout.own_poses])
+        return following, norms / following._scale[layout.own_poses]
 
     def penalize(
         self, order: PenaltyOrder
@@ -89,8 +90,8 @@ class ConsensusRobot:
         no_poses = np.zeros(0, dtype=np.int64)
         messages = {}
         for robot, rows in sent.items():
-            own = layout.sent.get(robot, no_poses)
-            messages[robot] = copies.NeighbourMessage(of_poses[own], rows)
+            common = layout.sent.get(robot, no_poses)
+            messages[robot] = copies.NeighbourMessage(of_poses[common], rows)
         return self._with(rho=rho, pull=pull, force=force, settings=order.settings), messages
 
     def stiffness(
@@ -111,7 +112,7 @@ class ConsensusRobot:
             diagonal[theirs] = of_poses[:, 1 : d + 2]
             pull[theirs] = of_poses[:, d + 2 :]
         for robot, rows in layout.common.items():
-            total_force[rows] += _taken(messages[robot].force, np.zeros((len(rows), d)))
+            total_force[rows] += _updated_rows(messages[robot].force, np.zeros((len(rows), d)))
         separators = layout.separators
         half_scale = 0.5 * diagonal[separators, 0] / num_copies[separators]
         penalty = np.concatenate([np.zeros(n), np.repeat(rho / num_copies, d)])
@@ -131,7 +132,7 @@ class ConsensusRobot:
         n = layout.problem.num_poses
         d = layout.problem.d
         held = layout.held
-        own = layout.own
+        own_poses = layout.own_poses
         floor = separators.rotation * self._scale
         rho = np.where(layout.subgraph.copies > 1, np.maximum(state.rho, floor), state.rho)
         if state.settings.rotations is Rotations.RELAXED:
@@ -156,10 +157,10 @@ class ConsensusRobot:
             received={},
             ahead=None,
         )
-        rotations = float(rotation_squares(layout.whole)[own].sum())
+        rotations = float(rotation_squares(layout.full_problem)[own_poses].sum())
         stationarity = replace(following.stationarity(None)[1], rotations=rotations)
-        size = d * float(rho[own].sum())
-        reply = copies.InitReply(size, (rho / self._scale)[own], stationarity)
+        size = d * float(rho[own_poses].sum())
+        reply = copies.InitReply(size, (rho / self._scale)[own_poses], stationarity)
         return following._prepared(), reply
 
     # The recursion.
@@ -251,7 +252,7 @@ class ConsensusRobot:
             known = self.state.received.get(robot)
             if known is None:
                 known = copies.ReceivedRows(before.omega[self.layout.common[robot]])
-            share = known.share.after(np.zeros((0, 0)), _taken(message, known.s), memory)
+            share = known.share.after(np.zeros((0, 0)), _updated_rows(message, known.s), memory)
             rows[robot], share = share.extrapolated(agreement.gamma)
             received[robot] = copies.ReceivedRows(rows[robot], share)
         return self._with(X=X, block=block, sums=own_sums, received=received), rows
@@ -349,10 +350,10 @@ class ConsensusRobot:
         return Poses(self.omega, X[: self.layout.problem.num_poses])
 
     def own_poses(self, _: None) -> tuple[ConsensusRobot, copies.OwnPoses]:
-        """The poses that the robot owns, for the result."""
-        own = self.layout.own
-        poses = self.poses[own]
-        return self, copies.OwnPoses(self.layout.subgraph.poses[own], poses.R, poses.t)
+        """Poses that the robot owns, with their numbers in the whole graph."""
+        positions = self.layout.own_poses
+        poses = self.poses[positions]
+        return self, copies.OwnPoses(self.layout.subgraph.poses[positions], poses.R, poses.t)
 
     def held_rows(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Rows of the own poses, for every neighbour that holds copies of them."""
@@ -365,13 +366,13 @@ class ConsensusRobot:
         return self, self._stationarity_at(Poses(unstack_transposes(X[n:]), X[:n]))
 
     def stationarity(self, _: None) -> tuple[ConsensusRobot, copies.Stationarity]:
-        """How stationary the own poses are beside the robot's copies, and its part of F."""
+        """The robot's part of F, and of the squared gradient on own poses beside its copies."""
         return self, self._stationarity_at(self.poses)
 
     # What the orders share.
 
     def restored(self, state: copies.CopiesState) -> ConsensusRobot:
-        """The robot with a state that orders left elsewhere."""
+        """The robot with the state of a checkpoint or of another process."""
         robot = replace(self, state=state)
         return robot if state.block is None else robot._prepared()
 
@@ -380,9 +381,9 @@ class ConsensusRobot:
         return replace(self, state=replace(self.state, **changes))  # type: ignore[arg-type]
 
     def _stationarity_at(self, poses: Poses) -> copies.Stationarity:
-        problem = self.layout.whole
+        problem = self.layout.full_problem
         cost = float(problem.edge_costs(poses)[self.layout.subgraph.is_counted].sum())
-        gradient = float(gradient_squares(problem, poses)[self.layout.own].sum())
+        gradient = float(gradient_squares(problem, poses)[self.layout.own_poses].sum())
         return copies.Stationarity(gradient, cost)
 
     def _sending(self, block: RecursionBlock) -> tuple[ConsensusRobot, copies.Rows]:
@@ -397,8 +398,8 @@ class ConsensusRobot:
         """The robot's shares of the penalties of its rows, (rows,), with rho of all poses."""
         of_translations = translation * self.state.diagonal[:, 0]
         of_rotations = np.repeat(rho, self.layout.problem.d)
-        whole = np.concatenate([of_translations, of_rotations])
-        return np.where(self.layout.held[:, 0], whole / self.layout.copies[:, 0], 0.0)
+        penalties = np.concatenate([of_translations, of_rotations])
+        return np.where(self.layout.held[:, 0], penalties / self.layout.copies[:, 0], 0.0)
 
     def _prepared(self) -> ConsensusRobot:
         subproblem = self.layout.subproblem(self.block.rho)
@@ -447,6 +448,6 @@ class ConsensusRobot:
         return omega
 
 
-def _taken(message: Array | RowChange, known: Array) -> Array:
-    """Rows that a neighbour sent, from what it took for known."""
+def _updated_rows(message: Array | RowChange, known: Array) -> Array:
+    """Rows of a neighbour, from its message and the rows that the message may change."""
     return message.added_to(known) if isinstance(message, RowChange) else message

@@ -91,7 +91,7 @@ class RescaleCopies:
 
 @dataclass(frozen=True, eq=False)
 class SolveReply:
-    """What step (a) gives."""
+    """Answer to an order to solve step (a)."""
 
     part: PartOfSums  # of this robot, for the acceleration
     rows: Messages  # of s for every neighbour, before the extrapolation that all do together
@@ -155,13 +155,13 @@ class CopyLayout:
         return PartProblem(graph, self.backend, self.subgraph.weights.scaled(halved))
 
     @cached_property
-    def whole(self) -> PartProblem:
+    def full_problem(self) -> PartProblem:
         """The cost of the robot's edges in full; they include all edges of its own poses."""
         return PartProblem(self.subgraph.graph, self.backend, self.subgraph.weights)
 
     @cached_property
-    def own(self) -> IntArray:
-        """Poses that the robot owns."""
+    def own_poses(self) -> IntArray:
+        """Positions of the poses that the robot owns among those that it holds, ascending."""
         return np.flatnonzero(self.subgraph.is_own)
 
     @cached_property
@@ -199,7 +199,7 @@ class CopyLayout:
 
     @cached_property
     def common_among_shared(self) -> Mapping[int, IntArray]:
-        """Where, among `shared`, the rows are that are held in common with every neighbour."""
+        """Positions in `shared` of the rows in common with every neighbour."""
         position = np.full(len(self.copies), -1)
         position[self.shared] = np.arange(len(self.shared))
         return {robot: position[rows] for robot, rows in self.common.items()}
@@ -221,7 +221,7 @@ class CopyLayout:
         return self._common_poses_owned_by({other: other for other, _ in self.subgraph.common})
 
     def _common_poses_owned_by(self, owners: Mapping[int, int]) -> Mapping[int, IntArray]:
-        """Of the poses in common with every neighbour those that its entry of `owners` owns."""
+        """Poses in common with every neighbour, of those only the poses of `owners[neighbour]`."""
         chosen = {}
         for neighbour, poses in self.subgraph.common:
             owned = poses[self.subgraph.owner[poses] == owners[neighbour]]
@@ -235,23 +235,23 @@ class CopyLayout:
 
     @cached_property
     def diagonal(self) -> Array:
-        """Diagonal of M, (n_a, d + 1), of every pose its translation first; right for own poses."""
+        """Diagonal of M, (n_a, d + 1), with the translation in column 0; exact for own poses."""
         n = self.problem.num_poses
-        diagonal = self.whole.M.data[self.whole.diagonal_positions]
+        diagonal = self.full_problem.M.data[self.full_problem.diagonal_positions]
         of_rotations = diagonal[n:].reshape(n, self.problem.d)
         return np.concatenate([diagonal[:n, None], of_rotations], axis=1)
 
     def multipliers(self, X: Array) -> Array:
-        """Lambda, (n_a, d, d), at X, (rows, d); right for own poses."""
+        """Lambda, (n_a, d, d), at X, (rows, d); exact for own poses."""
         n = self.problem.num_poses
-        return multipliers(self.whole, Poses(unstack_transposes(X[n:]), X[:n]))
+        return multipliers(self.full_problem, Poses(unstack_transposes(X[n:]), X[:n]))
 
     def rows_of_own_poses(self, X: Array) -> Rows:
         """Rows of X, (rows, d), of own poses, for every neighbour that holds copies of them."""
         return {robot: X[self.rows(mine)] for robot, mine in self.sent.items()}
 
     def with_rows_of_others(self, X: Array, rows: Rows) -> Array:
-        """X, (rows, d), which is changed, with the rows that the owners of other poses sent."""
+        """Write the rows that the owners of other poses sent into X, (rows, d), and return it."""
         for robot, theirs in self.received.items():
             X[self.rows(theirs)] = rows[robot]
         return X

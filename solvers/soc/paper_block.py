@@ -127,12 +127,12 @@ class Blocks:
         # Zeros keep the full block of every pose in the pattern.
         full_blocks = rotation_columns(np.arange(len(poses)), 0, d)
         zeros = *block_entries(full_blocks, full_blocks), np.zeros((len(poses), d, d))
-        own = assemble([(product.row, product.col, product.data), zeros], len(chosen))
+        L_own = assemble([(product.row, product.col, product.data), zeros], len(chosen))
         L = problem.L[chosen]
-        entries = own.tocoo()
+        entries = L_own.tocoo()
         own_in_L = csr_array((entries.data, (entries.row, chosen[entries.col])), shape=L.shape)
-        analysis = analyze(own, problem.backend)
-        return cls(A_own, w_own, own, (L - own_in_L).tocsr(), analysis, d, problem.backend)
+        analysis = analyze(L_own, problem.backend)
+        return cls(A_own, w_own, L_own, (L - own_in_L).tocsr(), analysis, d, problem.backend)
 
     def prepared(self, rho: float, back_end: BackEnd) -> RotationStep:
         """Step (a) with a penalty, by a back end."""
@@ -151,7 +151,7 @@ class Blocks:
         return last.with_R(unstack_transposes(step_a.solve(shift)))  # (a) R-step, (b), (c)
 
     def pull(self, R: Array, known: Array) -> Array:
-        """Rows of L R, (dq, d): of own R, beside those of all poses, (n, d, d)."""
+        """Rows of L R, (dq, d), with `R` of own poses and `known`, (n, d, d), of the others."""
         return np.asarray(self.own @ stack_transposes(R) + self.between @ stack_transposes(known))
 
 

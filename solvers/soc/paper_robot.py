@@ -146,21 +146,23 @@ class PaperRobot:
     ) -> tuple[PaperRobot, tuple[PaperLast, PaperReply]]:
         """Take the neighbours' R of the iterate that was ahead, and do the steps of the next one.
 
-        The order has rho of the next one: that of the last was known when its steps were done.
+        The order has rho of the next iterate. The steps of the last one have used the rho before.
         """
         penalty, rows = order
         assert self.state.penalty is not None
         rho = self.state.penalty.rho
         last = self._completed(rows)
-        own = last.of(self.layout.own)
-        gradient = 2.0 * self._blocks.pull(own.R, last.R) + rho * stack_transposes(own.B)
-        told = PaperLast(float(norm(gradient) ** 2), self._cost_at(last.omega))
+        own_iterate = last.of(self.layout.own_poses)
+        gradient = 2.0 * self._blocks.pull(own_iterate.R, last.R) + rho * stack_transposes(
+            own_iterate.B
+        )
+        last_figures = PaperLast(float(norm(gradient) ** 2), self._cost_at(last.omega))
         factor = penalty.rho / rho
         following = self._with(last=last.with_scaled_penalty(factor), penalty=penalty)
         if factor != 1.0:
             following = following._prepared()
         following, reply = following._with_next()
-        return following, (told, reply)
+        return following, (last_figures, reply)
 
     @property
     def omega(self) -> Array:
@@ -169,7 +171,7 @@ class PaperRobot:
         return self.state.last.omega
 
     def restored(self, state: PaperCopies) -> PaperRobot:
-        """The robot with a state that orders left elsewhere."""
+        """The robot with the state of a checkpoint or of another process."""
         robot = replace(self, state=state)
         return robot if state.penalty is None else robot._prepared()
 
@@ -178,15 +180,19 @@ class PaperRobot:
         return replace(self, state=replace(self.state, **changes))  # type: ignore[arg-type]
 
     def _completed(self, rows: Rows) -> PaperIterate:
-        """The iterate that was ahead, with the neighbours' poses: of these R has arrived."""
+        """The iterate that was ahead, completed by the R that the neighbours have sent."""
         state = self.state
         assert state.last is not None
         assert state.ahead is not None
-        own = self.layout.own
+        own_poses = self.layout.own_poses
         R = state.last.R.copy()
         omega = state.last.omega.copy()
         B = state.last.B.copy()
-        R[own], omega[own], B[own] = state.ahead.R, state.ahead.omega, state.ahead.B
+        R[own_poses], omega[own_poses], B[own_poses] = (
+            state.ahead.R,
+            state.ahead.omega,
+            state.ahead.B,
+        )
         for robot, theirs in self.layout.received.items():
             arrived = state.last.of(theirs).with_R(unstack_transposes(rows[robot]))
             R[theirs], omega[theirs], B[theirs] = arrived.R, arrived.omega, arrived.B
@@ -198,17 +204,17 @@ class PaperRobot:
         assert self.step_a is not None
         assert state.penalty is not None
         assert state.last is not None
-        own = state.last.of(self.layout.own)
-        ahead = self._blocks.iteration(self.step_a, state.penalty.rho, own, state.last.R)
+        own_iterate = state.last.of(self.layout.own_poses)
+        ahead = self._blocks.iteration(self.step_a, state.penalty.rho, own_iterate, state.last.R)
         primal = norm(ahead.omega - ahead.R) ** 2
-        change = norm(ahead.omega - own.omega) ** 2
+        change = norm(ahead.omega - own_iterate.omega) ** 2
         squares = np.array([primal, change, ahead.p_res_square])
         return self._with(ahead=ahead), PaperReply(squares, self._sent(ahead.R))
 
     def _cost_at(self, R: Array) -> float:
         """<R, L R> over own rows, from R of the robot's and its neighbours' poses, (n_a, d, d)."""
-        own = R[self.layout.own]
-        return inner(stack_transposes(own), self._blocks.pull(own, R))
+        own_R = R[self.layout.own_poses]
+        return inner(stack_transposes(own_R), self._blocks.pull(own_R, R))
 
     @property
     def _R_of_start(self) -> Array:
@@ -234,11 +240,11 @@ class PaperRobot:
         graph = layout.subgraph.graph
         is_own = layout.subgraph.is_own
         is_cut = ~(is_own[graph.i] & is_own[graph.j])
-        return Blocks.of(layout.whole, is_cut, layout.own)
+        return Blocks.of(layout.full_problem, is_cut, layout.own_poses)
 
     @property
     def _norms_and_scale(self) -> tuple[Array, Array]:
         """||Lambda_i||_2 and m_i of own poses, at the start."""
-        own = self.layout.own
-        norms = multiplier_norms(self.layout.multipliers(self.state.X)[own])
-        return norms, np.asarray(self.layout.diagonal[own, 1:].mean(axis=1))
+        own_poses = self.layout.own_poses
+        norms = multiplier_norms(self.layout.multipliers(self.state.X)[own_poses])
+        return norms, np.asarray(self.layout.diagonal[own_poses, 1:].mean(axis=1))

@@ -20,6 +20,7 @@ from solvers.soc.anderson import AndersonSums
 from solvers.soc.penalty import MultiplierPenalty, PenaltyRule
 from solvers.soc.separator_stiffness import is_recheck_due
 
+# Doublings of rho in a run. Together they multiply it by 1e6.
 MAX_RAISES = 20
 # The recursion has diverged when the merit is so many times the smallest one.
 _DIVERGED = 10.0
@@ -116,7 +117,7 @@ class Steps(Summarised):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SharedSteps(Steps):
-    """The same where the rows of the recursion are spread over robots: what all of them know."""
+    """Steps of a recursion whose rows are spread over robots: what all robots know."""
 
     ratio: Array  # (n,): rho_i / m_i of all poses, in no order
     size: float  # ||omega||_rho

@@ -19,8 +19,8 @@ from solvers.soc.recursion_block import StepSettings
 from solvers.soc.rounding import WHOLE
 from solvers.soc.safeguard import Steps
 
-# The default `separator_penalty`: this times the square root of the translation penalty, but no
-# more than the maximum.
+# The default `separator_penalty` is this times the square root of the translation penalty, but no
+# more than the maximum. `SOC` says why.
 _SEPARATOR_PENALTY = 0.7
 _MAX_SEPARATOR_PENALTY = 0.3
 

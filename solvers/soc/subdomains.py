@@ -91,7 +91,7 @@ def poses_to_leave(graph: PoseGraph, is_boundary: BoolArray, most_coupled: int) 
     neighbours = graph.adjacency.indices.tolist()
     # Cliques that eliminated poses have left, with the pose of each that is eliminated next.
     cliques: dict[int, list[set[int]]] = {}
-    left = np.zeros(graph.num_poses, dtype=bool)
+    is_for_driver = np.zeros(graph.num_poses, dtype=bool)
     for now, pose in enumerate(order.tolist()):
         joined = cliques.pop(pose, [])
         coupled = {
@@ -103,14 +103,14 @@ def poses_to_leave(graph: PoseGraph, is_boundary: BoolArray, most_coupled: int) 
         coupled.discard(pose)
         passed_on = [coupled]
         if len(coupled) > most_coupled:
-            left[pose] = True
+            is_for_driver[pose] = True
             turns[pose] = -1
             passed_on = joined
         for clique in passed_on:
             following = [turns[other] for other in clique if turns[other] > now]
             if following:
                 cliques.setdefault(int(order[min(following)]), []).append(clique)
-    return left
+    return is_for_driver
 
 
 def _places(poses: IntArray, num_poses: int) -> IntArray:

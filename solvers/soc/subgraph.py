@@ -140,18 +140,18 @@ class Subgraph:
         is_boundary = part.in_cover >= 0
         return part.poses[poses_to_leave(part.problem.graph, is_boundary, most_coupled)]
 
-    def held_cover(self, left: IntArray) -> IntArray:
-        """Numbers of its poses in the cover, ascending, with those that it leaves to the driver."""
-        return np.union1d(self.poses[self.in_cover >= 0], left)
+    def held_cover(self, poses_of_driver: IntArray) -> IntArray:
+        """Poses of the robot in the cover, ascending, with those that it leaves to the driver."""
+        return np.union1d(self.poses[self.in_cover >= 0], poses_of_driver)
 
-    def with_larger_cover(self, left: IntArray, positions: IntArray) -> Subgraph:
+    def with_larger_cover(self, poses_of_driver: IntArray, positions: IntArray) -> Subgraph:
         """The subgraph when the driver solves for the poses that robots leave to it, too.
 
-        `left` are those of this robot, `positions` where `held_cover(left)` are in the new cover.
-        Every edge is counted by the robot that counted it before.
+        `poses_of_driver` are poses of this robot. `positions` says where the new cover has the
+        poses of `held_cover`. Every edge is counted by the robot that counted it before.
         """
         in_cover = np.full(len(self.poses), -1)
-        in_cover[np.searchsorted(self.poses, self.held_cover(left))] = positions
+        in_cover[np.searchsorted(self.poses, self.held_cover(poses_of_driver))] = positions
         return replace(self, in_cover=in_cover, is_sparse=True)
 
     @cached_property
@@ -415,10 +415,12 @@ def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int)
     by_robot = holds.tocsc()
     copies = np.diff(holds.indptr)
     placements = []
-    for number, own in enumerate(np.split(by_robot.indices, by_robot.indptr[1:-1])):
-        own.sort()
-        common = _poses_in_common(holds[own].tocsc(), number)
-        placements.append(Placement(poses[own], in_cover[own], copies[own], common))
+    for number, held_poses in enumerate(np.split(by_robot.indices, by_robot.indptr[1:-1])):
+        held_poses.sort()
+        common = _poses_in_common(holds[held_poses].tocsc(), number)
+        placements.append(
+            Placement(poses[held_poses], in_cover[held_poses], copies[held_poses], common)
+        )
     return placements
 
 
