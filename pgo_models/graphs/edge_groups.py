@@ -75,5 +75,5 @@ class EdgeGroups:
         """Groups without the edges that are not chosen, (m,), where some are left."""
         stays = chosen[self.edges]
         sizes = np.bincount(self.group_of[stays], minlength=len(self))
-        left = sizes > 0
-        return EdgeGroups(self.edges[stays], sizes[left], self.names[left])
+        has_edges = sizes > 0
+        return EdgeGroups(self.edges[stays], sizes[has_edges], self.names[has_edges])

@@ -528,18 +528,18 @@ def _natural_order(file: Path) -> list[tuple[int, str]]:
 
 
 def _files_of_robots(files: list[G2OLines]) -> list[G2OLines]:
-    """All files but that of the whole graph, if there is one, which a GraphWarning names."""
+    """Files of single robots. A GraphWarning names the file of the whole graph, if there is one."""
     most_edges = max(len(file.edges) for file in files)
     if len(files) < 3 or most_edges == 0:
         return files
-    for whole in files:
-        if len(whole.edges) < most_edges:
+    for candidate in files:
+        if len(candidate.edges) < most_edges:
             continue
-        others = [file for file in files if file is not whole]
-        if _is_whole_graph(whole, others):
+        others = [file for file in files if file is not candidate]
+        if _is_whole_graph(candidate, others):
             warnings.warn(
-                f"{whole.path}: left out, it repeats the edges of the other {len(others)} files; "
-                "remove it",
+                f"{candidate.path}: left out, it repeats the edges of the other "
+                f"{len(others)} files; remove it",
                 GraphWarning,
                 stacklevel=3,
             )
@@ -547,20 +547,20 @@ def _files_of_robots(files: list[G2OLines]) -> list[G2OLines]:
     return files
 
 
-def _is_whole_graph(whole: G2OLines, others: list[G2OLines]) -> bool:
+def _is_whole_graph(candidate: G2OLines, others: list[G2OLines]) -> bool:
     """Whether a file is the whole graph: it has the edges of all other files, and is no robot's.
 
     The edges alone are no proof. If every edge of the graph touches a pose of one robot, as in a
     star with this robot in the middle, the file of this robot has all edges, too. The ids and the
     VERTEX lines then tell the two cases apart.
     """
-    if not _may_have_edges_of(whole, others):
+    if not _may_have_edges_of(candidate, others):
         return False
     edge_ids, edges = _joined_edges(others)
-    if not _are_same_measurements(whole.d, whole.edges, edges):
+    if not _are_same_measurements(candidate.d, candidate.edges, edges):
         return False
     # The files of robots use the same ids for the same poses. A file with other ids is no robot's.
-    id_pairs = np.unique(whole.edge_ids, axis=0)
+    id_pairs = np.unique(candidate.edge_ids, axis=0)
     id_pairs_of_others = np.unique(edge_ids, axis=0)
     if not np.array_equal(id_pairs, id_pairs_of_others):
         return True
@@ -573,7 +573,7 @@ def _is_whole_graph(whole: G2OLines, others: list[G2OLines]) -> bool:
     # The file of a robot has VERTEX lines of poses that no other robot owns. The whole graph has
     # those of the other files alone. Without VERTEX lines the file counts as a robot's.
     others_ids = np.concatenate([file.vertex_ids for file in others])
-    repeats_others = np.isin(whole.vertex_ids, others_ids)
+    repeats_others = np.isin(candidate.vertex_ids, others_ids)
     return len(repeats_others) > 0 and bool(repeats_others.all())
 
 
@@ -589,15 +589,15 @@ def _exact_columns(d: int, num_columns: int) -> IntArray:
     return np.asarray(np.r_[:d, num_measured:num_columns])
 
 
-def _may_have_edges_of(whole: G2OLines, others: list[G2OLines]) -> bool:
+def _may_have_edges_of(candidate: G2OLines, others: list[G2OLines]) -> bool:
     """Whether a file has the first edge of every other file: a quick test before the full one."""
-    columns = _exact_columns(whole.d, whole.edges.shape[1])
+    columns = _exact_columns(candidate.d, candidate.edges.shape[1])
     for file in others:
-        if file.d != whole.d:
+        if file.d != candidate.d:
             return False
         if len(file.edges):
             first_edge = file.edges[0, columns]
-            is_equal = whole.edges[:, columns] == first_edge
+            is_equal = candidate.edges[:, columns] == first_edge
             if not is_equal.all(axis=1).any():
                 return False
     return True

@@ -1,7 +1,7 @@
-"""What g2o files leave open line by line: decided, or put into common axes, with all lines in view.
+"""What a single line of a g2o file leaves open, and all lines of the file decide.
 
-The order of the matrix on lines in the plane, sensors that are not at their poses, and ids that
-stand for a pose and a landmark.
+Three things are open: the order of the matrix on lines in the plane, the frame of a sensor that is
+not at its pose, and an id that stands for a pose and a landmark.
 """
 
 import enum
@@ -99,15 +99,15 @@ def _have_minors(matrices: Array) -> bool:
 def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> tuple[Array, Array]:
     """EDGE rows, measured by sensors that are not at their poses, in the frames of the poses.
 
-    Returned with the errors, (n,), of their information matrices (`weight_errors`).
+    The errors, (n,), of the information matrices (`weight_errors`) are returned with the rows.
 
-    With the poses O of the sensors in the frames of x_i and x_j, and one of them the identity where
-    a tag has one offset, the measurement is Z of (x_i O_i)^-1 x_j O_j (`computeError` of g2o's
-    edges with offsets), so that x_i^-1 x_j is O_i Z O_j^-1. A point z is O_i z.
+    O_i and O_j are the poses of the sensors in the frames of x_i and x_j. A tag with one offset has
+    O_i = I. The measurement Z is one of (x_i O_i)^-1 x_j O_j (`computeError` of g2o's edges with
+    offsets), so that O_i Z O_j^-1 is one of x_i^-1 x_j. A point z becomes O_i z.
 
-    The information of a point is turned with it. That of a pose becomes A^T I A, where A takes an
-    error of x_i^-1 x_j to that of Z: e = O_j^-1 e' O_j. For a sensor beside its pose x_j this A is
-    of first order in the rotation error; otherwise it is exact.
+    The information of a point is turned with it. The information of a pose becomes A^T I A. Here A
+    takes an error e' of x_i^-1 x_j to the error e = O_j^-1 e' O_j of Z. It is exact where the
+    sensor is at its pose x_j, and of first order in the rotation error elsewhere.
     """
     d = kind.d
     Z = Poses(*poses_of(d, rows))
@@ -133,8 +133,8 @@ def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> tupl
         sizes[:, :d, d:] = np.linalg.norm(second.t, axis=1)[:, None, None]
         sizes[:, d:, :d] = 0.0
     information = A.mT @ information @ A
-    own = information[:, :side, :side]
-    error = entry_error(own, congruence_error(sizes, of_sensor))
+    of_pose = information[:, :side, :side]
+    error = entry_error(of_pose, congruence_error(sizes, of_sensor))
     triangle = np.triu_indices(information.shape[1])
     turned = np.concatenate([numbers_of(measured.R, measured.t), information[:, *triangle]], axis=1)
     return turned, error
@@ -165,7 +165,7 @@ def _adjoint_of_inverse(poses: Poses) -> Array:
 
 
 def landmark_shift(poses: IntArray, landmarks: IntArray) -> int:
-    """Return what is added to the ids of landmarks, so that none is that of a pose.
+    """Return the number that is added to the ids of landmarks to keep them apart from poses.
 
     It is the least power of ten that puts them above all poses: landmark 7 becomes 1007. 0 where
     ids of 64 bits have no room for that.

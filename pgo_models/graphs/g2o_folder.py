@@ -131,11 +131,11 @@ def _check_kinds(files: Sequence[G2OLines]) -> None:
 def placed_poses(file: G2OLines) -> Rows:
     """VERTEX lines of a file, without those of neighbours.
 
-    Where all ids are GTSAM symbols, the letter names the robot that owns a pose, and the file is
-    that of the letter on most lines. What it says of another letter's pose is an estimate of a
-    neighbour, maybe in a frame of its own, and the file of that neighbour says where the pose is.
-    Other ids name no robot, and two files that place one differently may speak of two poses. (No
-    public folder known has two VERTEX lines of a pose.)
+    The letter of a GTSAM symbol names the robot that owns a pose. If all ids are symbols, the file
+    belongs to the letter on most lines. Its lines of other letters are estimates of neighbours,
+    maybe in another frame, and the files of these neighbours place the poses. Other ids name no
+    robot. Two files that place one of them differently may mean two poses. (No public folder known
+    has two VERTEX lines of a pose.)
     """
     _, t = poses_of(file.d, file.vertices)
     extent = float(np.ptp(t, axis=0).max()) if len(t) else 0.0
@@ -298,9 +298,9 @@ def _pairs_of_rows(lines: _Joined) -> tuple[IntArray, IntArray]:
     earlier = [np.zeros(0, dtype=np.int64)]
     later = [np.zeros(0, dtype=np.int64)]
     for step in range(1, most):
-        found = np.flatnonzero(edge[step:] == edge[:-step])
-        earlier.append(found)
-        later.append(found + step)
+        first = np.flatnonzero(edge[step:] == edge[:-step])
+        earlier.append(first)
+        later.append(first + step)
     return np.concatenate(earlier), np.concatenate(later)
 
 

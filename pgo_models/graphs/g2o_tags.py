@@ -1,19 +1,21 @@
-"""The tags of g2o files, as g2o, GTSAM, TORO and iSAM write them, and what stands on their lines.
+"""The tags of g2o files, and what stands on their lines.
 
-Besides them, those of packages that extend g2o: Vertigo and hdl_graph_slam.
+The tags are those of g2o, GTSAM, TORO and iSAM, and of two packages that extend g2o: Vertigo and
+hdl_graph_slam. Numbers are brought into the order of EDGE_SE2 and EDGE_SE3:QUAT. The sources are
 
-Numbers are brought into the order of EDGE_SE2 and EDGE_SE3:QUAT.
-
-Sources: `types_slam2d.cpp`, `types_slam3d.cpp` and every `read` and `computeError` there, in g2o
-(Kuemmerle et al. 2011). Errors are of (measurement)^-1 x, so that the information of a prior is in
-the frame that was measured, that of a position in the frame of the world, and that of a landmark in
-the frame of the pose. TORO's page (Grisetti et al. 2007), except that its code and GTSAM take the
-first vertex of an edge for the one that observes. `load2D` of GTSAM, for ODOMETRY, LANDMARK and BR.
-`Loader.cpp` of iSAM (Kaess et al. 2012), whose matrices are upper triangular square roots U of the
-information U^T U, by rows, and which takes the identity where EDGE3 has none. Vertigo (Suenderhauf
-& Protzel 2012), for switches. `edge_se3_priorquat.hpp` of hdl_graph_slam (Koide et al. 2019), whose
-error is the difference of the vector parts of two quaternions: to first order half the rotation
-vector, like that of EDGE_SE3:QUAT.
+- g2o (Kuemmerle et al. 2011): `types_slam2d.cpp`, `types_slam3d.cpp`, and every `read` and
+  `computeError` there. Errors are of (measurement)^-1 x. So the information of a prior is in the
+  measured frame, that of a position in the frame of the world, that of a landmark in the frame of
+  the pose.
+- TORO: its page (Grisetti et al. 2007). Its code and GTSAM differ from the page: they take the
+  first vertex of an edge for the one that observes.
+- GTSAM: `load2D`, for ODOMETRY, LANDMARK and BR.
+- iSAM (Kaess et al. 2012): `Loader.cpp`. Its matrices are upper triangular square roots U of the
+  information U^T U, by rows. EDGE3 without a matrix has the identity.
+- Vertigo (Suenderhauf & Protzel 2012): switches.
+- hdl_graph_slam (Koide et al. 2019): `edge_se3_priorquat.hpp`. Its error is the difference of the
+  vector parts of two quaternions. To first order this is half the rotation vector, like the error
+  of EDGE_SE3:QUAT.
 """
 
 import enum

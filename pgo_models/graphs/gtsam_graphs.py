@@ -279,7 +279,7 @@ def _report_unreadable(unreadable: dict[str, list[int]], skip_unknown: bool) -> 
 
 
 def _letters(ids: IntArray) -> list[int]:
-    """Codes of the letters of the keys that are symbols, each of which names a robot."""
+    """Codes of the letters in the top bytes of the keys. Each letter names a robot."""
     named = ids[ids != WORLD_ID]
     codes = np.unique(named >> 56).tolist()
     return [int(code) for code in codes if code > 0]

@@ -423,8 +423,8 @@ def _as_whole_numbers(matrix: Array) -> list[list[int]]:
     common = max(denominator for row in fractions for _, denominator in row)
     rows = []
     for row in fractions:
-        whole = [numerator * (common // denominator) for numerator, denominator in row]
-        rows.append(whole)
+        integers = [numerator * (common // denominator) for numerator, denominator in row]
+        rows.append(integers)
     return rows
 
 

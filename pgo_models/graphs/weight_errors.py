@@ -25,7 +25,7 @@ from pgo_models.graphs.precisions import are_definite, trace_of_inverse
 SINGULAR = 1e-15
 # Above this no weights are known: reading refuses the line.
 MOST = 2.0**-5
-_UNIT_ROUNDOFF = 2.0**-53
+_UNIT_ROUNDOFF = 2.0**-53  # relative error of a rounded double
 _OUTWARD = 1.0 + 2.0**-30  # for the rounding of the bounds themselves
 _OF_DAMAGED_LINES = np.errstate(all="ignore")  # whose numbers overflow: nothing is known of them
 

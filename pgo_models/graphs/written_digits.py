@@ -30,7 +30,6 @@ MOST_DECIMALS = 13
 MOST_SIGNIFICANT = 14
 _ALL_DECIMALS = 22  # powers of ten up to this one are doubles
 _ALL_SIGNIFICANT = 17  # so many tell any two doubles apart
-_FEW = 256
 _SAME = 2.0 * np.finfo(float).eps  # relative rounding of a multiple of a unit, as computed
 
 
@@ -138,7 +137,8 @@ def _have_significant(numbers: Array, significant: int) -> bool:
 
 def _first_and_rest(numbers: Array) -> tuple[Array, Array]:
     """A few numbers, which mostly settle that more digits are needed, and the others."""
-    return numbers[:_FEW], numbers[_FEW:]
+    num_first = 256
+    return numbers[:num_first], numbers[num_first:]
 
 
 def _are_multiples(numbers: Array, units: Array) -> bool:
