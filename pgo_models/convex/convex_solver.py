@@ -43,10 +43,9 @@ _WHY = {
 class HoldsModel(ReadOnly):
     """Base of frozen objects with cvxpy variables, which can be pickled and copied.
 
-    A pickle or a deep copy has their problems as posed, not compiled. cvxpy tells variables apart
-    by numbers, which it counts anew in every process. Where an object comes out of a pickle,
-    counting goes on from where it was in the process that wrote it, so that no two variables have
-    the same number.
+    A pickle or a deep copy has their problems as posed, not compiled. cvxpy numbers its variables,
+    anew in every process. An object that comes out of a pickle raises the count of this process
+    to that of the process that wrote it, so that no two variables have the same number.
     """
 
     def __getstate__(self) -> dict[str, object]:

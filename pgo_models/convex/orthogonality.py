@@ -177,8 +177,8 @@ class OrthogonalProblem(HoldsModel):
                 named.append((f"{argument}[{position}]", variable, constraint))
         for position, (variable, nonzeros) in enumerate(self.sparse):
             named.append((f"sparse[{position}]", variable, Sparse(nonzeros)))
-        for position, (variable, own) in enumerate(self.sets):
-            named.append((f"sets[{position}]", variable, own))
+        for position, (variable, constraint_set) in enumerate(self.sets):
+            named.append((f"sets[{position}]", variable, constraint_set))
         if not named:
             raise SettingError(
                 "no variable is named; a convex problem is solved by problem.solve()"

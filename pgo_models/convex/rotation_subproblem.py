@@ -19,7 +19,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import check_shape
 from pgo_models.geometry.rotations import Array
 
-TOLERANCE = 1e-12
+TOLERANCE = 1e-12  # well below the 1e-8 to which the back ends of step (a) agree
 
 
 @dataclass(frozen=True, eq=False)

@@ -196,9 +196,10 @@ def model_of(state: SOCState) -> GraphQP:
 def moved_to_terms(model: GraphQP, poses: Poses) -> Poses:
     """Poses moved as a whole, where that lowers the added terms or meets the constraints.
 
-    At V poses + s the terms are convex in (V, s), without V in SO(d): first V and s are free and V
-    is projected, then s is found for this V. Directions of V that no term or constraint determines
-    are held near a small multiple of I, which the projection completes to a rotation.
+    At V poses + s the terms are convex in (V, s) as long as V need not be in SO(d). So first V and
+    s are both free, and V is projected; then s is computed for this V. Some directions of V may be
+    determined by no term and no constraint. They are held near a small multiple of I, which the
+    projection completes to a rotation.
     """
     change = model.change
     X = model.variables.X

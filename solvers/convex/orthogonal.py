@@ -38,8 +38,8 @@ from solvers.soc.anderson import over_relax
 _MAX_PROBES = 12
 _NEAR = 0.1
 _FAINT = 1e-6
-# Residuals are balanced every so many iterations. Later rho is only raised, so that the recursion
-# can settle.
+# Residuals are balanced every `_BALANCE_EVERY` iterations, when one is `_BALANCE_RATIO` times the
+# other. After `_BALANCE_UNTIL` iterations rho is only raised, so that the recursion can settle.
 _BALANCE_EVERY = 5
 _BALANCE_UNTIL = 500
 _BALANCE_RATIO = 10.0
@@ -319,8 +319,12 @@ class OrthogonalSolution(Summarised):
         return f"OrthogonalSolution({self.status.name}, {kkt}, {len(self.objectives)} starts)"
 
     def __str__(self) -> str:
-        found = [J for J in self.objectives if not math.isnan(J)]
-        ends = f", which end from {min(found):.6g} to {max(found):.6g}" if found else ""
+        finite_objectives = [J for J in self.objectives if not math.isnan(J)]
+        ends = (
+            f", which end from {min(finite_objectives):.6g} to {max(finite_objectives):.6g}"
+            if finite_objectives
+            else ""
+        )
         lines = [
             f"status       {self.status.name}: {self.status.value}",
             f"J            {self.objective:.10g}, the least of {len(self.objectives)} starts{ends}",
