@@ -1,6 +1,6 @@
 """Errors and results of a command, explained by lines of its graph's file.
 
-A weight that is too far from the others, which cannot be factored or leaves no bound, is named by
+A weight too far from the others makes the factorisation fail or leaves no bound. It is named by
 file and line, and so are edges that do not fit.
 """
 

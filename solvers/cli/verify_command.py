@@ -9,7 +9,7 @@ from pgo_models.graphs.datasets import locate
 from solvers.cli.options import SkipUnknownOption
 from solvers.cli.shell import DONE, JsonOption, QuietOption, save_then_show, wrapped
 
-NOT_VERIFIED = 3
+NOT_VERIFIED = 3  # exit code, as of a solve without a certificate
 _INDENT = 13  # columns of the labels of a verification
 
 

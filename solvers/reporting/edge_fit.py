@@ -197,17 +197,19 @@ def judge_edges(problem: PGOProblem, poses: Poses) -> EdgeFit:
     >>> judge_edges(PGOProblem(graph), graph.truth).cost
     'F'
     """
-    own = edge_residuals(problem, poses)
+    residuals = edge_residuals(problem, poses)
     if problem.weighting is not Weighting.ISOTROPIC or problem.graph.information is None:
-        return EdgeFit(problem.cost_name, own)
+        return EdgeFit(problem.cost_name, residuals)
     is_indefinite = indefinite_edges(problem.graph)
     if is_indefinite.any():
-        return EdgeFit("F", own, no_chi2=text_of_indefinite(problem.graph, is_indefinite))
-    whole = PGOProblem(problem.graph, problem.backend, Weighting.INFORMATION)
-    chi2 = whole.objective(poses)
-    if abs(chi2 - own.cost.sum()) <= _SAME_COST * chi2:
-        return EdgeFit("F", own)
-    return EdgeFit("chi2", edge_residuals(whole, poses), _lowered(whole, poses, chi2))
+        return EdgeFit("F", residuals, no_chi2=text_of_indefinite(problem.graph, is_indefinite))
+    problem_in_chi2 = PGOProblem(problem.graph, problem.backend, Weighting.INFORMATION)
+    chi2 = problem_in_chi2.objective(poses)
+    if abs(chi2 - residuals.cost.sum()) <= _SAME_COST * chi2:
+        return EdgeFit("F", residuals)
+    return EdgeFit(
+        "chi2", edge_residuals(problem_in_chi2, poses), _lowered(problem_in_chi2, poses, chi2)
+    )
 
 
 def _for_own_cost(solve: str) -> str:
@@ -242,19 +244,19 @@ def _times_expected(overall: float) -> str:
     return "as large as expected" if ratio == "1" else f"{ratio} times as large as expected"
 
 
-def _lowered(whole: PGOProblem, poses: Poses, chi2: float) -> EdgeResiduals | None:
+def _lowered(problem: PGOProblem, poses: Poses, chi2: float) -> EdgeResiduals | None:
     """Residuals in chi2 at poses that cost clearly less; None if one factorisation finds none.
 
     If the edges do not fit there either, more factorisations show whether they fit at the minimum.
     """
     try:
-        better = polish(whole, poses, max_steps=1)
-        if not chi2 > _CLEARLY_LOWER * whole.objective(better):
+        better = polish(problem, poses, max_steps=1)
+        if not chi2 > _CLEARLY_LOWER * problem.objective(better):
             return None
-        residuals = edge_residuals(whole, better)
+        residuals = edge_residuals(problem, better)
         if not residuals.is_doubtful:
             return residuals
-        return edge_residuals(whole, polish(whole, better, max_steps=_POLISHING_STEPS))
+        return edge_residuals(problem, polish(problem, better, max_steps=_POLISHING_STEPS))
     except NotPositiveDefiniteError:
         return None
 

@@ -30,7 +30,7 @@ S = TypeVar("S")
 _SOC = SOC(tolerance=1e-3)
 _MOST_ITERATES = 200  # of each method
 _LEAST_SHARE = 1e-14  # of the cost: what is drawn of a distance that is lost in rounding
-_MOST_FRAMES = 16
+_MOST_FRAMES = 16  # of a film, each with all poses: a page of a large graph stays small
 _PICTURE = [0.38, 1.0]  # heights of the picture and of the curves below it
 _CURVES = [0.0, 0.24]
 

@@ -14,7 +14,7 @@ from solvers.reporting.convergence_plots import LOGARITHMIC
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-_BARS_PER_DECADE = 8
+_BARS_PER_DECADE = 8  # a bar is a factor of 10^(1/8) = 1.33 wide
 # Powers of ten at which the first and the last bar end; errors beyond are in these bars.
 _SMALLEST_POWER = -3
 _LARGEST_POWER = 2

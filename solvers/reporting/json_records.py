@@ -14,9 +14,9 @@ from solvers.result import Stage
 def certificate_json(certificate: Certificate) -> dict[str, object]:
     """What `.json` files hold of a certificate; None stands for what is not known.
 
-    That is eta where none was proved, the error of the objective where no bound on it is known, and
-    the stationarity where it was not measured. `exact_to` is the largest residual of an edge over
-    what it measures, where the verdict is EXACT.
+    Three entries may be None: `eta` if no shift was proved, `objective_error` if no bound on it is
+    known, and `stationarity` if it was not measured. `exact_to` is the largest residual of an edge
+    over what it measures, where the verdict is EXACT.
     """
     return {
         "lower_bound": certificate.lower_bound,

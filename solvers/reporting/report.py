@@ -41,6 +41,7 @@ from solvers.reporting.report_text import (
 from solvers.reporting.versions import installed_versions
 from solvers.soc.soc import SOC
 
+# Rows of the tables of edges and of robots: the page of a large graph stays short.
 _WORST_EDGES = 100
 _MOST_ROBOTS = 200
 _PAGE_SUFFIXES = (".html", ".htm")

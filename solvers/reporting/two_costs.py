@@ -38,7 +38,7 @@ def both_costs(problem: PGOProblem, poses: Poses) -> dict[str, float | str | Non
 
 
 def other_cost(problem: PGOProblem, poses: Poses) -> Facts:
-    """What a summary says of the cost that is not bounded, where it is another."""
+    """Line of a summary on the cost that has no bound; empty if it equals the bounded one."""
     costs = both_costs(problem, poses)
     other = costs["chi2"]
     other_weighting = Weighting.INFORMATION
