@@ -11,7 +11,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.summaries import Summarised
 
 DRIVER = -1  # the driver's number as a sender or receiver; robots are 0, 1, ..
-BYTES_PER_NUMBER = 8
+BYTES_PER_NUMBER = 8  # of a double
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,9 @@
 """Moments: what workers hold between two orders, to which they can return.
 
 An order changes a worker. The state of a method by robots is a value all the same: it has a moment,
-and the workers keep what they held then for as long as the moment is alive. They are told with the
-next order what to keep and where to return to, which takes no message of its own. What they hold is
-made of values that successive moments share, so that keeping it takes little memory.
+and the workers keep what they held then for as long as the moment is alive. The next order tells
+them what to keep and where to return to, so that this takes no message of its own. Successive
+moments share most of their values, so that keeping them takes little memory.
 """
 
 from collections.abc import Callable
@@ -74,7 +74,7 @@ class Moments:
             self._returned_to = moment.number
 
     def before_order(self) -> Recall | None:
-        """Return what the workers have to be told with the order that changes them next."""
+        """Return the recall that goes with the next order; None when there is nothing to tell."""
         self._current = None
         if self._kept is None and self._returned_to is None:
             return None

@@ -43,9 +43,9 @@ T = TypeVar("T")
 if TYPE_CHECKING:
     from ray import ObjectRef
 
-_SECONDS_TO_ANSWER = 3.0
-_SECONDS_TO_JOIN = 15.0
-_SECONDS_TO_COME_BACK = 10.0
+_SECONDS_TO_ANSWER = 3.0  # of a cluster that is asked whether it is alive
+_SECONDS_TO_JOIN = 15.0  # starting Python with Ray, and three tries of Ray, a second apart
+_SECONDS_TO_COME_BACK = 10.0  # of a cluster that does not answer, before its actors are given up
 # Ray reads this environment when it starts. Linear algebra has one thread, since the robots are the
 # parallel part, and Ray sends no usage statistics.
 _ENVIRONMENT = {

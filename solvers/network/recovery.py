@@ -33,7 +33,7 @@ class RobotLostError(EngineError):
 
 
 class RobotGroups(Protocol[T]):
-    """A place where groups of robots run, each of which can be lost as a whole.
+    """A place where groups of robots run. A group is lost with all its robots.
 
     T is the type of a ticket, which stands for an order under way.
     """

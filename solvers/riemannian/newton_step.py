@@ -22,7 +22,7 @@ STATIONARY_FOR_TANGENTS = 1e-16
 SMALL_DECREMENT = 1e-9  # decrement that a Newton step squares
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
 SUFFICIENT = 1e-4  # Armijo's constant
-HALVINGS = 40  # of a move, at most
+HALVINGS = 40  # of a move, at most: what is left of it is then 2^-40
 # damping, as a share of the diagonal: the least one, its growth, and the largest one
 DAMPING_START = 1e-8
 DAMPING_GROWTH = 10.0
@@ -58,7 +58,7 @@ class NewtonModel(Protocol):
 
     @property
     def order(self) -> ModelOrder:
-        """Which matrix H is."""
+        """The order that H was factored by: Newton's matrix, a shifted or a damped one."""
 
     @property
     def objective(self) -> float:
@@ -78,7 +78,7 @@ class Trial(Protocol):
 
     @property
     def objective(self) -> float:
-        """F there."""
+        """F at the trial point."""
 
 
 M = TypeVar("M", bound=NewtonModel)
@@ -111,8 +111,8 @@ class StepRules:
 
     `tolerance` is the decrement at which a point is stationary. `second_order` asks for the
     Hessian, not for its Gauss-Newton part. `first_shift`, of S, is where shifts begin; None stands
-    for the damped Gauss-Newton matrix where the Hessian is not positive definite. `enough` is the
-    decrement at which a factor serves no further move, where that is above the tolerance.
+    for the damped Gauss-Newton matrix where the Hessian is not positive definite. Below the
+    decrement `enough` a factor serves no further move; it matters only above the tolerance.
     """
 
     tolerance: float
@@ -276,5 +276,5 @@ def scaled_decrement(square: float, objective: float, rounding_level: float) -> 
     It is 0 where what is left, or F, is not positive: F that comes out as zero, or chi2 below zero,
     is nothing but rounding.
     """
-    left = 0.5 * square - rounding_level
-    return left / objective if left > 0.0 and objective > 0.0 else 0.0
+    decrease = 0.5 * square - rounding_level
+    return decrease / objective if decrease > 0.0 and objective > 0.0 else 0.0

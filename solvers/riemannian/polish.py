@@ -1,9 +1,9 @@
 """Polish: from given poses to the stationary point nearby, by damped Riemannian Newton.
 
 The rules are those of `newton_step`; here is its algebra in one place, with sparse Cholesky. One
-factorisation serves several moves. After the first, the factored matrix is the one that L-BFGS
-begins with (Nocedal & Wright 2006, algorithm 7.4), which learns from every move what has changed:
-sphere2500 needs one factorisation where moves with the factor alone need two.
+factorisation serves several moves. After the first move the factored matrix is the initial matrix
+of L-BFGS (Nocedal & Wright 2006, algorithm 7.4), and L-BFGS learns from every move how the Hessian
+changes: sphere2500 needs one factorisation where moves with the factor alone need two.
 """
 
 from dataclasses import dataclass, replace

@@ -166,13 +166,13 @@ class GrowingStart:
     """Poses to start from, by solving prefixes of a graph that grow.
 
     The poses have to be joined by odometry: every one has an edge to an earlier one. A landmark
-    enters with the pose that saw it first, where that sees it. Priors of positions alone count when
-    all poses are there.
+    enters with the pose that saw it first, at the measured place. Priors of positions alone count
+    when all poses are there.
 
-    A prefix is accepted where Newton reaches its global minimum. Where it does not, a prefix with
-    half as many new poses takes its place. Where even a prefix with hardly any new poses does not,
-    as with wrong edges or a relaxation that is not tight, it is accepted all the same, and so are
-    those that follow it until one reaches its global minimum again.
+    A prefix is accepted if Newton reaches its global minimum. Otherwise a prefix with half as many
+    new poses takes its place. With wrong edges, or a relaxation that is not tight, even a prefix
+    with hardly any new poses may fail. It is accepted all the same, and so are the next ones until
+    one reaches its global minimum again.
 
     Parameters
     ----------

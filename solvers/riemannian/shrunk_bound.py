@@ -28,7 +28,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
-BISECTIONS = 5
+BISECTIONS = 5  # of the range of log(cap), which is then known to 1/32 of that range
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """The part of a robot in a solve of its team, and the orders that robots with own files lack.
 
-Where a team shares its measurements, the robot that drives asks for the lines of the others, solves
-their graph in one place, and tells every robot what is its own.
+A team may share its measurements. The robot that drives then asks the others for their lines,
+solves the whole graph in one place, and sends every robot its own poses.
 """
 
 from __future__ import annotations
@@ -53,20 +53,20 @@ class OwnAnswer:
     def of(cls, solution: Solution, robot: int) -> OwnAnswer:
         """Return the answer for one robot of the graph that was solved."""
         graph = solution.problem.graph
-        whole = graph if solution.robust is None else solution.robust.problem.graph
-        own = np.flatnonzero(graph.robots == robot)
-        own = own[own != graph.world] if graph.world is not None else own
+        all_edges = graph if solution.robust is None else solution.robust.problem.graph
+        own_poses = np.flatnonzero(graph.robots == robot)
+        own_poses = own_poses[own_poses != graph.world] if graph.world is not None else own_poses
         rejected = np.zeros((0, 2), dtype=np.int64)
         if solution.robust is not None:
-            touches = (whole.robots[whole.i] == robot) | (whole.robots[whole.j] == robot)
+            ends = np.stack([all_edges.i, all_edges.j], axis=1)
+            touches = (all_edges.robots[ends] == robot).any(axis=1)
             chosen = solution.robust.rejected & touches
-            ids = whole.pose_ids
-            rejected = np.stack([ids[whole.i[chosen]], ids[whole.j[chosen]]], axis=1)
+            rejected = all_edges.pose_ids[ends[chosen]]
         try:
-            covariances: Array | None = solution.marginals()[own]
+            covariances: Array | None = solution.marginals()[own_poses]
         except PGOError:
             covariances = None
-        return cls(graph.pose_ids[own], solution.poses[own], covariances, rejected)
+        return cls(graph.pose_ids[own_poses], solution.poses[own_poses], covariances, rejected)
 
 
 class TeamAgent(FileAgent):
@@ -83,7 +83,7 @@ class TeamAgent(FileAgent):
         return parse_lines(self.path, [self.text])
 
     def take(self, answer: OwnAnswer) -> None:
-        """Keep what the robot that drives has found."""
+        """Keep the answer that the driving robot has sent."""
         self._told = answer
 
     @property
@@ -93,9 +93,9 @@ class TeamAgent(FileAgent):
             return self._told
         if self.record.answer is None:
             return None
-        own = np.flatnonzero(self.record.subgraph.is_own)
-        ids = self.record.joined.graph.pose_ids[own]
-        return OwnAnswer(ids, self.record.answer[own], None, self.record.joined.rejected)
+        own_poses = np.flatnonzero(self.record.subgraph.is_own)
+        ids = self.record.joined.graph.pose_ids[own_poses]
+        return OwnAnswer(ids, self.record.answer[own_poses], None, self.record.joined.rejected)
 
 
 def give_measurements(agent: TeamAgent, _: None) -> str:

@@ -2,8 +2,8 @@
 
 The page of a solve (`solvers.plan`) asks robots and waits. Here it runs in a coroutine of the
 package greenlet: where it would wait, it stops, and goes on when the last answer is there. So the
-robot that drives has neither threads nor sockets, and the page is the one of every other place. A
-team that shares its measurements has the robot that drives solve alone, with all that `solve` can.
+robot that drives has neither threads nor sockets, and the page is the one of every other place. In
+a team that shares its measurements the driving robot solves alone, with all options of `solve`.
 """
 
 from __future__ import annotations

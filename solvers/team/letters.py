@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from solvers.network.messages import Token, count_bytes
 
-DRIVER_PLACE = 0
+DRIVER_PLACE = 0  # the first robot of a solve drives it; its messages need no letters
 
 
 class LetterName(NamedTuple):
@@ -64,16 +64,16 @@ class Letters:
         missing = set()
 
         def put(messages: Mapping[int, Any], _: int) -> Mapping[int, Any]:
-            whole = {}
+            completed = {}
             for sender, message in messages.items():
-                whole[sender] = message
+                completed[sender] = message
                 if isinstance(message, Token):
                     name = LetterName(message.sender, message.call)
                     if name in self.received:
-                        whole[sender] = self.received[name][message.number]
+                        completed[sender] = self.received[name][message.number]
                     else:
                         missing.add(name)
-            return whole
+            return completed
 
         return _with_mappings(request, _numbered(put)), missing
 

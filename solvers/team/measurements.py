@@ -90,9 +90,10 @@ class Measurements:
         """VERTEX lines of poses and landmarks, and all lines but those of VERTEX as they are."""
         d = poses.d
         is_landmark = np.isin(ids, parse_lines(Path("measurements"), [self.text()]).landmarks)
-        own = poses[~is_landmark]
+        robot_poses = poses[~is_landmark]
+        numbers = numbers_of(robot_poses.R, robot_poses.t)
         vertices = [
-            *lines_of(_VERTEX_TAGS[d], ids[~is_landmark, None], numbers_of(own.R, own.t)),
+            *lines_of(_VERTEX_TAGS[d], ids[~is_landmark, None], numbers),
             *lines_of(_LANDMARK_TAGS[d], ids[is_landmark, None], poses.t[is_landmark]),
         ]
         others = [line for line in self.lines if not _is_of_vertex(line)]

@@ -143,7 +143,7 @@ class TeamOutcome:
 
     @property
     def text(self) -> str:
-        """What is proven, and of which robots, in a line."""
+        """One line: the verdict, the gap, and the robots that it covers."""
         if self.certificate is None:
             return self.note
         names = ", ".join(self.covered)

@@ -51,13 +51,13 @@ from solvers.team.messages import (
 )
 from solvers.team.wire import WireError, opened, packed, records_of_rooms, sealed, unpacked
 
-PATIENCE = 10.0  # seconds
-RETRY = 1.0
+PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
+RETRY = 1.0  # seconds after which a message without an answer is sent again
 # Patiences after which a robot that is there, and has not answered, is waited for no more.
 _MOST_PATIENCES = 10.0
 # Share of its patience after which a robot says again that it is there.
 _SHARE_OF_PATIENCE = 0.25
-_FEWEST_KEY_BYTES = 16
+_FEWEST_KEY_BYTES = 16  # 128 bits, which nobody can guess
 
 
 class Message(NamedTuple):

@@ -28,8 +28,8 @@ from pgo_models.errors import PGOError
 from solvers.network.serialization import deserialize, serialize
 
 _MARK = b"PGO1"  # the last character is the version
-_SEAL_BYTES = 32
-_LENGTH_BYTES = 4
+_SEAL_BYTES = 32  # of HMAC-SHA256
+_LENGTH_BYTES = 4  # of the length of the description, which precedes it
 _LEVEL = 1  # of the compression: numbers hardly shrink, trees do
 # A message may not unpack to more: whoever has the key could else fill the memory of the others.
 MOST_BYTES = 1 << 30
@@ -79,32 +79,32 @@ class Order:
         module, _, path = self.name.partition(":")
         if not module.startswith(_MODULES_OF_ORDERS):
             raise WireError(f"{self.name!r:.80} is no order")
-        found: Any = importlib.import_module(module)
+        function: Any = importlib.import_module(module)
         for part in path.split("."):
             if part.startswith("_"):
                 raise WireError(f"{self.name!r:.80} is no order")
-            found = getattr(found, part, None)
-        if not inspect.isfunction(found) or found.__module__ != module:
+            function = getattr(function, part, None)
+        if not inspect.isfunction(function) or function.__module__ != module:
             raise WireError(f"{self.name!r:.80} is no order")
         given = [
             value.function() if isinstance(value, Order) else value for value in self.arguments
         ]
-        return partial(found, *given) if given else found
+        return partial(function, *given) if given else function
 
 
 @cache
 def records_of_rooms() -> tuple[type, ...]:
     """Dataclasses, named tuples and enums of the rooms whose records are sent."""
-    found: dict[str, type] = {}
+    records: dict[str, type] = {}
     for room in _ROOMS:
         package = importlib.import_module(room)
         within = pkgutil.iter_modules(getattr(package, "__path__", []), f"{room}.")
         for module in [room, *(inside.name for inside in within)]:
             for name, value in vars(importlib.import_module(module)).items():
                 if inspect.isclass(value) and value.__module__ == module and _is_record(value):
-                    assert name not in found, f"two records are called {name}"
-                    found[name] = value
-    return tuple(found.values())
+                    assert name not in records, f"two records are called {name}"
+                    records[name] = value
+    return tuple(records.values())
 
 
 def _is_record(value: type) -> bool:
