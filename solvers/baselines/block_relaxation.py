@@ -149,6 +149,6 @@ def _diagonal_blocks(H_rows: csr_array, rows: IntArray, robot_of_row: IntArray) 
     position[rows] = np.arange(len(rows))
     entries = H_rows.tocoo()
     is_same_robot = robot_of_row[rows[entries.row]] == robot_of_row[entries.col]
-    own = is_same_robot & (position[entries.col] >= 0)
-    positions = entries.row[own], position[entries.col[own]]
-    return coo_array((entries.data[own], positions), shape=(len(rows), len(rows))).tocsc()
+    is_in_block = is_same_robot & (position[entries.col] >= 0)
+    positions = entries.row[is_in_block], position[entries.col[is_in_block]]
+    return coo_array((entries.data[is_in_block], positions), shape=(len(rows), len(rows))).tocsc()

@@ -27,6 +27,7 @@ from solvers.riemannian.newton_step import scaled_decrement
 
 _SMALLEST_FACTOR = 1.0 / 3.0  # on the damping, after a step that the model predicted well
 _GROWTH = 2.0  # of the damping after a refused step; it doubles with each refusal in a row
+# Shares of the diagonal. Less damping changes no digit of the matrix; more leaves no step.
 _MIN_DAMPING = 1e-15
 _MAX_DAMPING = 1e15
 _TRUSTED_DAMPING = 1e-4  # above it the decrement is that of the damping, not of F

@@ -33,6 +33,8 @@ _ACCURACY = 1e-3  # of sparse eigenvalues, relative to their distance from the s
 _ROOM = 0.25  # of the smallest eigenvalue: how far below it the shift is put
 _LEAST_ROOM = 1e-9  # of the largest entry of M: the least such distance
 _GROWTH = 2.0  # of that distance, until the shifted matrix is positive definite
+# The distances of so many shifts span a factor of 2^60, from the least distance to far beyond the
+# largest eigenvalue.
 _MOST_SHIFTS = 60
 
 
@@ -148,14 +150,14 @@ class HandedMatrix:
         rows_i = matrices.rotation_columns(self.i, n, 3)
         rows_j = matrices.rotation_columns(self.j, n, 3)
         pairs = [(rows_i, rows_i), (rows_i, rows_j), (rows_j, rows_i), (rows_j, rows_j)]
-        found = [
+        positions = [
             matrices.entry_positions(self.problem.M, *matrices.block_entries(*pair))
             for pair in pairs
         ]
         # no block of pose r
         at_r = np.stack([self.i == self.ground, self.j == self.ground])
         counts = [~at_r[0], ~at_r.any(axis=0), ~at_r.any(axis=0), ~at_r[1]]
-        return np.stack(found), np.stack(counts).astype(float)[:, :, None, None]
+        return np.stack(positions), np.stack(counts).astype(float)[:, :, None, None]
 
     def sparse(self, P: Array, shift: float) -> csc_array:
         """S_r less the terms and shift blockdiag(0, I), (N, N)."""
@@ -201,9 +203,9 @@ class HandedMatrix:
         shift, factor = self.factor_below(P, expected)
 
         def invert(vectors: Array) -> Array:
-            whole = np.zeros((self.problem.side, *vectors.shape[1:]))
-            whole[n:].reshape(n, 3, -1)[self.free] = vectors.reshape(len(self.free), 3, -1)
-            solved = factor.solve(whole)[n:].reshape(n, 3, -1)[self.free]
+            padded = np.zeros((self.problem.side, *vectors.shape[1:]))
+            padded[n:].reshape(n, 3, -1)[self.free] = vectors.reshape(len(self.free), 3, -1)
+            solved = factor.solve(padded)[n:].reshape(n, 3, -1)[self.free]
             return solved.reshape(vectors.shape)
 
         side = 3 * len(self.free)
@@ -216,9 +218,9 @@ class HandedMatrix:
 
 
 def shifts_below(expected: float, scale: float) -> Iterator[float]:
-    """Shifts to try, ever farther below a smallest eigenvalue of a matrix with entries of a scale.
+    """Shifts to try below the smallest eigenvalue of a matrix, each farther away than the last.
 
-    It may be about `expected`.
+    `expected` is an estimate of that eigenvalue, and `scale` the size of the largest entries.
     """
     distance = max(_ROOM * abs(expected), _LEAST_ROOM * scale)
     for _ in range(_MOST_SHIFTS):

@@ -50,7 +50,6 @@ from solvers.riemannian.trust_region import Precision, first_radius, trust_regio
 _SHIFT = 1e-6
 # Size of the numbers beyond the first column at the start: a way out of a saddle point.
 _AWAY = 0.1
-_SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +90,12 @@ class ComplexCost:
             except NotPositiveDefiniteError:
                 return None
 
-        found = smallest_eta(attempt, _SHIFT * mean, below=mean / _SHIFT)
-        if found is None:
+        smallest = smallest_eta(attempt, _SHIFT * mean, below=mean / _SHIFT)
+        if smallest is None:
             raise NotPositiveDefiniteError("no shift makes the matrix of the relaxation definite")
         of_t = slice(None, 2 * n)
         of_r = slice(2 * n, None)
-        return cls(problem, M[of_r, of_r].tocsr(), M[of_t, of_r].tocsr(), found[1])
+        return cls(problem, M[of_r, of_r].tocsr(), M[of_t, of_r].tocsr(), smallest[1])
 
     @property
     def rounding_level(self) -> float:
@@ -196,7 +195,7 @@ class ComplexRelaxation:
         poses = start if start is not None else chordal_start(problem.convex_part)
         ground = problem.at_best_translations(poses)
         n = problem.num_poses
-        rng = np.random.default_rng(_SEED)
+        rng = np.random.default_rng(0)  # fixed, so that every run is the same
         rows = _AWAY * rng.standard_normal((n, 2, self.columns))
         rows[:, :, 0] = poses.R[:, :, 0]  # a and b of (a, -b; b, a)
         lengths = np.linalg.norm(rows, axis=(1, 2), keepdims=True)

@@ -67,7 +67,7 @@ _MOST_STEPS = 30  # of the trust region, in an iteration
 _MOST_PRODUCTS = 60  # with the Hessian, in a step of it
 _MOST_CLIMBS = 2  # in an iteration
 _FALLEN = 0.75  # share of the last violation above which rho grows
-_GROWTH = 1.5
+_GROWTH = 1.5  # of rho then
 _MOST_PENALTY = 4.0  # of the mean diagonal entry: beyond, L is hard to minimise
 _NEGLIGIBLE = 1e-6  # share of n below which the square of a column of Y counts as zero
 _WINDOW = 8  # iterations, of which
@@ -205,10 +205,10 @@ class HullState:
 class HullLagrangian:
     """Augmented Lagrangian of the relaxation with hulls of rotations, on a low-rank factor.
 
-    `primal_residual` is how far the smallest eigenvalue of all A_e is below zero, `dual_residual`
-    the relative distance of f from the cost of the rounded poses. The run ends as CONVERGED where
-    that is within the tolerance, or the bound within the gap, and as STALLED where the bound rises
-    no more.
+    `primal_residual` is how far the smallest eigenvalue of all A_e is below zero. `dual_residual`
+    is the relative distance of f from the cost of the rounded poses. The run ends as CONVERGED if
+    the dual residual is within the tolerance, or the bound within the gap. It ends as STALLED if
+    the bound rises no more.
 
     Parameters
     ----------
@@ -320,13 +320,13 @@ class HullLagrangian:
         if state.k == 0 or state.bound is None:
             return None
         best = state.bounds[-1]
-        left = state.objective - best
-        if state.closeness <= self.tolerance or left <= self.gap * state.objective:
+        difference = state.objective - best
+        if state.closeness <= self.tolerance or difference <= self.gap * state.objective:
             return Status.CONVERGED
         if len(state.bounds) <= _WINDOW or state.closeness <= 10.0 * self.tolerance:
             return None
         rise = best - state.bounds[-1 - _WINDOW]
-        return None if rise > _LEAST_RISE * left else Status.STALLED
+        return None if rise > _LEAST_RISE * difference else Status.STALLED
 
     def _without_negligible_columns(self, Y: Array) -> Array:
         """Y turned so that its columns are orthogonal, without those that are about zero.

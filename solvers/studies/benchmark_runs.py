@@ -36,6 +36,7 @@ from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSe
 FAILURES = (PGOError, np.linalg.LinAlgError, MemoryError)
 Callback = Callable[[Any, Record], None]
 StageRecords = tuple[StageRecord, ...]
+# Limits of runs without a budget of rounds, far beyond those that converge.
 _MOST_SWEEPS = 20_000
 _MOST_PAPER_ITERATIONS = 5_000
 _SECOND_STAGE_TOLERANCE = 1e-6  # relative decrement, below which Gauss-Newton converges slowly

@@ -38,7 +38,7 @@ from solvers.request import Pipeline
 from solvers.riemannian.polish import polish
 from solvers.robust.known import odometry
 
-_MOST_ROUNDS = 50
+_MOST_ROUNDS = 50  # of the fixed-point iteration; without convergence nothing is known
 _SETTLED = 1e-4  # largest relative change of a scale in the last round
 _LEAST_REDUNDANCY = 2.0  # r_k below which a scale is not known
 _FARTHEST = 1e12  # factor on weights beyond which a kind of edges has no noise
