@@ -45,7 +45,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting, name_of_cost
 
-DEFAULT_GAP = 1e-6
+DEFAULT_GAP = 1e-6  # relative gap up to which a solution counts as certified, unless given
 
 
 class Verdict(enum.Enum):
@@ -297,7 +297,7 @@ class Certificate(ReadOnly):
 
     @property
     def verdict_text(self) -> str:
-        """The verdict as it is printed, which says where it is of rotations alone."""
+        """The verdict as printed; a verdict on rotations alone says `rotations`."""
         subject = "" if self.has_translations else "rotations "
         return f"{self.verdict.name}: {subject}{self._verdict_sentence}"
 
@@ -324,11 +324,11 @@ class Certificate(ReadOnly):
         shift = f", eta = {rounded_up(self.eta, 3)}" if self.eta > 0 else ""
         cap = f", conditions cut to {self.bound.cap:.3g}" if self.bound.cap < math.inf else ""
         rounding = rounded_up(self.bound.rounding, 2)
-        less = f"less {rounding} for rounding"
+        subtracted = f"less {rounding} for rounding"
         if self.weights_error > 0.0:
-            less += f" and {rounded_up(self.weights_error, 2)} of it for that of the weights"
+            subtracted += f" and {rounded_up(self.weights_error, 2)} of it for that of the weights"
         numbers = ", with rotations as complex numbers" if self.bound.is_complex else ""
-        return f"proved {form}{numbers}{shift}{cap}{self._terms_text}, {less}"
+        return f"proved {form}{numbers}{shift}{cap}{self._terms_text}, {subtracted}"
 
     @property
     def _terms_text(self) -> str:

@@ -39,6 +39,7 @@ SOFT_SHARE = 1.0 / 32.0  # share of the softest energy that such a margin may ta
 ROUNDING_MULTIPLE = 2.125
 # The rounding of a SuperLU factor is known once it is there, and hardly changes with the margin.
 ATTEMPTS = 3
+# Bisections of log(eta) in a step of ETA_GROWTH leave a factor of 10^(1/8) = 1.33.
 ETA_GROWTH = 10.0
 ETA_BISECTIONS = 3
 # of diagonal entries: nothing that counts underflows
@@ -88,9 +89,11 @@ class StoredMatrix:
         """Factor of the matrix less shares, (N,), of the diagonal; None where there is none."""
         data = self.stored.data.copy()
         data[self.diagonal_positions] -= margin * self.diagonal
-        less = csc_array((data, self.stored.indices, self.stored.indptr), shape=self.stored.shape)
-        less.has_canonical_format = True
-        return _factor(self.analysis, less)
+        reduced = csc_array(
+            (data, self.stored.indices, self.stored.indptr), shape=self.stored.shape
+        )
+        reduced.has_canonical_format = True
+        return _factor(self.analysis, reduced)
 
 
 def prove_definite(
@@ -227,14 +230,14 @@ def smallest_eta(
     below: float = math.inf,
     too_small: float | None = None,
 ) -> tuple[float, T] | None:
-    """Smallest shift eta found for which `attempt` does not give None, and what it gives.
+    """A shift eta near the smallest for which `attempt` succeeds, and the value of `attempt`.
 
-    The result is None when no such eta is `below` the limit.
+    An attempt fails when its value is None. The result is None when no eta `below` the limit
+    succeeds.
 
-    Eta grows from the one given by factors of ten until it is large enough. The last step is then
-    bisected, to within a third of the smallest eta that would do. An eta of zero cannot grow, so
-    that nothing but zero is tried. `too_small` is an eta below the first for which there is known
-    to be none.
+    Eta grows from the one given by factors of ten until an attempt succeeds. The last step is then
+    bisected, to within a third of the smallest such eta. An eta of zero cannot grow, so that
+    nothing but zero is tried. `too_small` is an eta below the first that is known to fail.
     """
     most = ETA_BISECTIONS + 1
     if 0.0 < eta < below < math.inf:

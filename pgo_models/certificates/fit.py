@@ -125,8 +125,8 @@ class EdgeErrors:
         translation = np.maximum(self.translation, other.translation)
         return EdgeErrors(translation, np.maximum(self.rotation, other.rotation))
 
-    def less(self, other: "EdgeErrors") -> "EdgeErrors":
-        """The errors less others, and not below zero."""
+    def minus(self, other: "EdgeErrors") -> "EdgeErrors":
+        """The errors minus others, and not below zero."""
         translation = np.maximum(self.translation - other.translation, 0.0)
         return EdgeErrors(translation, np.maximum(self.rotation - other.rotation, 0.0))
 
@@ -209,7 +209,7 @@ def fit_at(at: EvaluatedPoses, rounding: EdgeErrors) -> Fit:
     residuals = _residual_norms(problem, poses)
     is_to_rounding = _is_to_rounding(problem, residuals, rounding)
     of_digits = None if written is None else written.with_levers(problem).not_below_median()
-    allowed = sizes.times(_BILLIONTH).less(rounding)
+    allowed = sizes.times(_BILLIONTH).minus(rounding)
     if of_digits is not None:
         allowed = allowed.at_least(of_digits.times(_HALF_UNITS))
     allowed = EdgeErrors(allowed.translation + of_frame, allowed.rotation)
@@ -231,10 +231,10 @@ def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:
         sum tau ||r_t||^2 + kappa ||r_R||_F^2 <= sum tau e_t^2 + kappa e_R^2,
         ||r_t|| <= 8 sqrt(m) e_t  and  ||r_R||_F <= 8 sqrt(m) e_R  of every edge.
 
-    The first alone says nothing of light edges where there is a heavy one, whose error outweighs
-    all that they cost; by the second no edge takes much more than the errors of m edges like
-    itself, 8 being for what a solve adds to the rounding of one residual. Neither condition changes
-    with the unit of the weights.
+    The first condition alone says nothing of light edges beside a heavy one: the error of the heavy
+    edge outweighs all that they cost. By the second condition no edge takes much more than the
+    errors of m edges like itself. The factor 8 covers what a solve adds to the rounding of one
+    residual. Neither condition changes with the unit of the weights.
 
     The error of a computed residual together with the distance of the stored R from rotations is at
     most e_t and e_R: that of r_t is (2 + d^1.5) u, and (2 d + 3) u is in e_t; that of r_R is

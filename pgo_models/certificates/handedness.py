@@ -13,7 +13,7 @@ For rotations E = T^T R_i^T R_j is one, too. Where it has the unit quaternion (w
 So the cost less such terms is nowhere above the cost on rotations, and a bound on it is a bound on
 the cost. With T = R_i^T R_j at some poses B X is zero there: value, gradient and multipliers stay
 what they are, and the terms change S alone, by -B^T W B. W has the eigenvalues (sum of the other
-two of P - the one) / 8, of which one can be negative: there S gains, in the two other directions it
+two of P - the one) / 8. One of them can be negative: in its direction S gains, in the other two it
 loses.
 
 P >= 0 is what the convex hull of SO(3) adds to the relaxation edge by edge (Saunderson, Parrilo &
@@ -102,9 +102,9 @@ class HandednessTerms(ReadOnly):
         Let T be off by D from the nearest rotation, ||D||_F <= slant and ||T^T T - I||_F <= slant.
         Then the term of T is off by tr(W (T^T T - I)) and 2 tr(W R_j^T R_i D) from that of the
         rotation. As a rotation does not change ||D||_F, that is 3 slant ||W||_F at most
-        (Cauchy-Schwarz). The P that belongs to the stored W is 4 (tr(W) I - W), off by a few
-        roundings from the P that is stored, whose smallest eigenvalue, where it is negative, is a
-        bound on v^T P v, |v| <= 1.
+        (Cauchy-Schwarz). The P that belongs to the stored W is 4 (tr(W) I - W). The stored P
+        differs from it by a few roundings. A negative smallest eigenvalue of the stored P is a
+        bound on v^T P v, |v| <= 1; one that is not negative bounds it by 0.
         """
         slant = orthogonality_error(self.T) + 3.0 * gamma(5.0)
         W_size = np.linalg.norm(self.W, axis=(1, 2))

@@ -94,7 +94,7 @@ from pgo_models.summaries import Summarised
 _ETA_SHARE = 0.5
 # First margin of the form with eta alone, as a share of the diagonal.
 UNGROUNDED_MARGIN = 1e-11
-MOST_MOVES = 3
+MOST_MOVES = 3  # of X', each of which solves with the factor of the proof once
 # Stop moving X' once the remaining loss to G_r is below this share of the value of the bound ..
 SETTLED = 1e-13
 # .. or below this share of the loss that is counted with the rounding of G_r: moving again would
@@ -318,12 +318,12 @@ def best_bound_with_terms(
 
     What rounding can make of the terms (`HandednessTerms.loss`) is subtracted.
     """
-    found = best_bound(terms.taken_off(problem), Lambda, poses, gap, objective)
+    bound_of_rest = best_bound(terms.taken_off(problem), Lambda, poses, gap, objective)
     lost = terms.loss()
-    value = math.nextafter(found.value - lost, -math.inf)
+    value = math.nextafter(bound_of_rest.value - lost, -math.inf)
     if not value > 0.0:
         return NO_BOUND
-    return replace(found, value=value, rounding=found.rounding + lost, terms=terms)
+    return replace(bound_of_rest, value=value, rounding=bound_of_rest.rounding + lost, terms=terms)
 
 
 def search_forms(
@@ -621,7 +621,7 @@ def _moved(
 def bound_from(terms: list[float], rounding: float, eta: float, is_grounded: bool) -> LowerBound:
     """Bound from terms: their sum less what rounding can take, rounded down.
 
-    It is 0, which is trivial, where that is nan or negative.
+    A sum that is nan or negative gives the trivial bound 0.
     """
     total = exact_sum([*terms, -rounding])
     value = math.nextafter(total, -math.inf)

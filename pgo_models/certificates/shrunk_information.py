@@ -35,10 +35,10 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
 
     The condition of their I_tt is at most `cap`, and their W is convex.
 
-    Coupling blocks are taken out first, with what they can take from the others: with C = I_tt^-1/2
-    I_tr I_rr^-1/2, I >= (1 - ||C||) blockdiag(I_tt, I_rr), or a smaller share where rounding hides
-    that. Edges whose coupled matrix is only semidefinite, where that share is zero, are left out:
-    they cost zero or more. A GraphError where rounding hides it for every share.
+    Coupling blocks are removed first. With C = I_tt^-1/2 I_tr I_rr^-1/2 the rest keeps the share
+    1 - ||C||, since I >= (1 - ||C||) blockdiag(I_tt, I_rr). Rounding may ask for a smaller share.
+    An edge whose coupled matrix is only semidefinite has a share of zero. It is left out, since it
+    costs zero or more. A GraphError if rounding hides the inequality for every share.
     """
     information = proper_information(graph)
     d = graph.d

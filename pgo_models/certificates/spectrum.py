@@ -87,8 +87,8 @@ def rotation_inverse(problem: PGOProblem, factor: CholeskyFactor) -> LinearOpera
     side = problem.num_poses * problem.d
 
     def invert(vectors: Array) -> Array:
-        whole = np.zeros((problem.side, *vectors.shape[1:]))
-        whole[n:] = vectors
-        return factor.solve(whole)[n:]
+        padded = np.zeros((problem.side, *vectors.shape[1:]))
+        padded[n:] = vectors
+        return factor.solve(padded)[n:]
 
     return LinearOperator((side, side), matvec=invert, matmat=invert, dtype=float)

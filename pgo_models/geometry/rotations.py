@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 # The polar iteration converges quadratically: a last change below this leaves an error below 1e-15.
+# Where so many iterations are not enough, the SVD is used.
 _POLAR_TOLERANCE = 1e-8
 _POLAR_ITERATIONS = 10
 # Below this determinant, of a matrix scaled to Frobenius norm sqrt(3), the SVD is used.

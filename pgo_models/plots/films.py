@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 Trace = dict[str, object]  # a plotly trace is plain data
 
-MOST_BYTES = 300_000
-MOST_FRAMES = 24
+MOST_BYTES = 300_000  # of a film in a page, which stays quick to open with a few of them
+MOST_FRAMES = 24  # six seconds at `_FRAME_MILLISECONDS`
 _BYTES_OF_LINES = 0.85 * MOST_BYTES  # the rest is for the layout and for other traces
 _SHARE_OF_PATHS = 0.7  # of these
 _FRAME_MILLISECONDS = 250
@@ -290,9 +290,9 @@ def _lines_of_robots(graph: PoseGraph, ends: IntArray) -> list[tuple[str, str, I
     robot_i, robot_j = graph.robots[ends].T
     lines = []
     for robot in range(graph.num_robots):
-        own = ends[(robot_i == robot) & (robot_j == robot)]
-        if len(own):
-            lines.append((f"robot {robot}", COLOURS[robot % len(COLOURS)], own))
+        inside = ends[(robot_i == robot) & (robot_j == robot)]
+        if len(inside):
+            lines.append((f"robot {robot}", COLOURS[robot % len(COLOURS)], inside))
     between = ends[robot_i != robot_j]
     if len(between):
         lines.append(("between robots", QUIET_COLOUR, between))

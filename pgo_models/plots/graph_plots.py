@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # Kinds of edges, in the order in which they are drawn: a landmark that is seen, one robot's own
 # edges, those between robots, and the two kinds of marked edges.
 SIGHTING, OWN, BETWEEN, UNCERTAIN, MISFIT = range(5)
-NOT_DRAWN = -1
+NOT_DRAWN = -1  # kind of priors: below those that are drawn
 _WIDTHS = np.array([0.15, 0.6, 0.5, 0.5, 1.8])  # points, of every kind
 KIND_LABELS = {
     SIGHTING: "a landmark seen",
@@ -38,7 +38,7 @@ KIND_LABELS = {
     MISFIT: "misfit: costs more than its information allows",
 }
 MOST_LINES = 40_000  # of a figure
-_MOST_ELLIPSES = 100
+_MOST_ELLIPSES = 100  # more of them hide the map
 _ELLIPSE_POINTS = 49  # the first is the last
 _ZOOM = 0.82  # leaves room for the labels of axes in space, which the layout does not see
 _MOST_NAMED_ROBOTS = len(COLOURS)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Trace = dict[str, object]  # a plotly trace is plain data
 
-_MOST_NAMED_ROBOTS = 12
+_MOST_NAMED_ROBOTS = 12  # in the legend
 MOST_DOTS = 20_000  # poses that show their names
 _MOST_LINES_BEFORE = 10_000  # lines between the poses before
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMN_INCHES = 3.4  # a column of a two-column paper
-LETTER_POINTS = 8.0
-SMALL_POINTS = 7.0
-DOTS_PER_INCH = 200
+LETTER_POINTS = 8.0  # of titles and labels, as of the captions of such a paper
+SMALL_POINTS = 7.0  # of ticks and legends
+DOTS_PER_INCH = 200  # of a .png
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 # Okabe & Ito 2008: readers with any of the common colour blindnesses can distinguish them.

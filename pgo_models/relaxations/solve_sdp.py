@@ -29,6 +29,7 @@ from pgo_models.relaxations.primal_dual import (
 from pgo_models.relaxations.rounding import RankReport
 from pgo_models.summaries import Summarised
 
+# The verdict allows for what interior points leave; the tolerance of the solver is far below it.
 DEFAULT_RELAXATION_GAP = 1e-5
 TOLERANCE = 1e-10
 # Sides up to which the dense primal is solved by SCS, which decomposes its cone at every iteration:

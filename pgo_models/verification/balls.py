@@ -1,6 +1,6 @@
 """Small matrices of balls (`arb`) and of rational numbers (`fmpq`), of which the verifier is made.
 
-This is the one place that imports python-flint, so that the error names the extra that brings it.
+Only this file imports python-flint. If it is not installed, the error names the extra to install.
 """
 
 from collections.abc import Iterable, Sequence
@@ -145,12 +145,12 @@ def plane_rotation(theta: arb | fmpq) -> arb_mat:
 
 def angles_rotation(roll: fmpq, pitch: fmpq, yaw: fmpq) -> arb_mat:
     """Rotation by roll about x, then by pitch about y, then by yaw about z."""
-    one = identity(1)
+    unturned_axis = identity(1)
     swap_y_and_z = arb_mat([[1, 0, 0], [0, 0, 1], [0, 1, 0]])
-    about_x = blocks_on_diagonal(one, plane_rotation(roll))
-    about_z_by_minus_pitch = blocks_on_diagonal(plane_rotation(-pitch), one)
+    about_x = blocks_on_diagonal(unturned_axis, plane_rotation(roll))
+    about_z_by_minus_pitch = blocks_on_diagonal(plane_rotation(-pitch), unturned_axis)
     about_y = swap_y_and_z * about_z_by_minus_pitch * swap_y_and_z
-    about_z = blocks_on_diagonal(plane_rotation(yaw), one)
+    about_z = blocks_on_diagonal(plane_rotation(yaw), unturned_axis)
     return about_z * about_y * about_x
 
 

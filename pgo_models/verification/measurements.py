@@ -91,7 +91,7 @@ TORO_TRIANGLE = (0, 1, 4, 2, 5, 3)
 WRITTEN_FILE = "verify the proof of the file that pgo solve --out one.g2o writes"
 WORLD = 2**63  # the pose that priors are measured from; ids have 64 bits, with a sign
 NUMBER = re.compile(r"([+-]?)(\d*)\.?(\d*)(?:[eE]([+-]?\d{1,3}))?", re.ASCII)
-LONGEST_WORD = 1000
+LONGEST_WORD = 1000  # characters of a number; the time to read one grows with their square
 GZIP = b"\x1f\x8b"  # first bytes of a file that is compressed by gzip
 
 
@@ -350,8 +350,8 @@ def exact_number(path: Path, line: int, word: str) -> fmpq:
     if parts is None or not (parts[2] or parts[3]):
         problem = f"{word[:40]!r} is no finite number; correct or remove the line"
         raise FileFormatError(path, line, problem)
-    sign, whole, fraction, exponent = parts.groups(default="0")
-    digits = int(f"{sign}{whole}{fraction}")
+    sign, integer, fraction, exponent = parts.groups(default="0")
+    digits = int(f"{sign}{integer}{fraction}")
     power = int(exponent) - len(fraction)
     if power >= 0:
         return fmpq(digits * 10**power)

@@ -34,7 +34,7 @@ FACTORS = {
     "PriorFactorPoint2": Tag(2, num_ids=1, is_point=True, to_landmark=True, has_covariance=True),
     "PriorFactorPoint3": Tag(3, num_ids=1, is_point=True, to_landmark=True, has_covariance=True),
 }
-TRANSLATION_FIRST = (3, 4, 5, 0, 1, 2)
+TRANSLATION_FIRST = (3, 4, 5, 0, 1, 2)  # GTSAM's order in space is rotation, translation
 ASYMMETRY = fmpq(1, 10**9)  # of a covariance matrix, relative to its largest entry
 
 
@@ -71,7 +71,9 @@ def logs(path: Path) -> Iterator[list[Any]]:
         )
         robots = sorted(log["measurements"].items())
         for _, entries in robots:
-            yield [one for entry in entries for one in entry.get("measurements", [])]
+            yield [
+                measurement for entry in entries for measurement in entry.get("measurements", [])
+            ]
     except FileFormatError:
         raise
     except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as error:
@@ -105,8 +107,8 @@ def read_factor(path: Path, number: int, tag: Tag, measurement: dict[str, Any]) 
         measured = [*numbers(path, number, translation, 3), *xyz, w]
     else:
         names = ["x", "y", "z"][: tag.d] if tag.is_point else ["x", "y", "theta"]
-        found = [entry(path, number, value, name) for name in names]
-        measured = numbers(path, number, found, len(names))
+        coordinates = [entry(path, number, value, name) for name in names]
+        measured = numbers(path, number, coordinates, len(names))
     if tag.num_measured == 7 and not any(measured[3:]):
         raise FileFormatError(path, number, "zero quaternion; it is no rotation")
     covariance = read_covariance(path, number, tag, measurement)
@@ -117,10 +119,10 @@ def read_factor(path: Path, number: int, tag: Tag, measurement: dict[str, Any]) 
 def read_covariance(path: Path, number: int, tag: Tag, measurement: dict[str, Any]) -> list[fmpq]:
     """Upper triangle of the covariance matrix of a measurement, translation first."""
     side = tag.side
-    found = numbers(path, number, entry(path, number, measurement, "covariance"), side * side)
+    entries = numbers(path, number, entry(path, number, measurement, "covariance"), side * side)
     places = TRANSLATION_FIRST if side == 6 else range(side)
-    C = [[found[a * side + b] for b in places] for a in places]
-    most = ASYMMETRY * max(map(abs, found))
+    C = [[entries[a * side + b] for b in places] for a in places]
+    most = ASYMMETRY * max(map(abs, entries))
     if any(abs(C[a][b] - C[b][a]) > most for a in range(side) for b in range(a)):
         raise FileFormatError(path, number, "covariance is not symmetric; correct or remove it")
     return [C[a][b] for a in range(side) for b in range(a, side)]

@@ -149,7 +149,7 @@ PRECISIONS = (128, 512, 2048, 8192)
 CLAIM_SLACK = 1e-9
 FARTHEST = 8  # the largest squared Frobenius norm of the difference of two rotations
 NO_ROTATION = 1e-6  # entries that far from those of the rotation made of them are a mistake
-DIGITS = 20
+DIGITS = 20  # of balls, as printed: more than doubles have
 
 
 @dataclass(frozen=True, eq=False)
