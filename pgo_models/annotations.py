@@ -203,7 +203,7 @@ def _array(value: object, number: type[np.generic]) -> object:
 
 
 def _kind_of(number: type[np.generic]) -> tuple[str, str]:
-    return next(found for kind, found in _ARRAYS.items() if issubclass(number, kind))
+    return next(words for kind, words in _ARRAYS.items() if issubclass(number, kind))
 
 
 def _concrete(number: type[np.generic]) -> type[np.generic]:

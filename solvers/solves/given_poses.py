@@ -154,11 +154,11 @@ def _by_complex_numbers(problem: PGOProblem, poses: Poses, certificate: Certific
     finished: Outcome[ComplexState] = RunMonitor().run(method, problem, certificate.poses)
     gap = certificate.wanted_gap
     candidates = certificates_of_relaxation(problem, method, finished.state, gap)
-    found = max(candidates, key=lambda known: known.lower_bound)
-    if found.lower_bound <= certificate.lower_bound:
+    best = max(candidates, key=lambda known: known.lower_bound)
+    if best.lower_bound <= certificate.lower_bound:
         return certificate
-    found = replace(found, stationarity=certificate.stationarity, source=BoundSource.COMPLEX)
-    return judge(problem, poses, found)
+    best = replace(best, stationarity=certificate.stationarity, source=BoundSource.COMPLEX)
+    return judge(problem, poses, best)
 
 
 def _by_terms(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Certificate:
@@ -171,7 +171,7 @@ def _by_terms(problem: PGOProblem, poses: Poses, certificate: Certificate) -> Ce
     ground = problem.at_best_translations(certificate.poses)
     at_bound = replace(certificate, objective=certificate.poses_objective)
     terms, _ = HandednessSearch().run(problem, ground, RunMonitor())
-    found = with_terms(problem, at_bound, terms, ground)
-    if found is at_bound:
+    certificate_with_terms = with_terms(problem, at_bound, terms, ground)
+    if certificate_with_terms is at_bound:
         return certificate
-    return judge(problem, poses, replace(found, source=certificate.source))
+    return judge(problem, poses, replace(certificate_with_terms, source=certificate.source))
