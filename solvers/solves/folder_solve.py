@@ -326,8 +326,8 @@ class _Answer:
     rejected_by: str = FolderSolution.rejected_by
 
     @property
-    def found(self) -> str:
-        """Name of the poses that the robots have found, as a start."""
+    def name_of_poses(self) -> str:
+        """Name of the robots' poses, for the stage that starts at them."""
         return self.place.begins_at or "poses found before GNC"
 
 
@@ -363,7 +363,7 @@ def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
         is_first = False
     if not (answer.best.proof.is_certified or answer.best.is_out_of_time):
         answer = replace(answer, place=replace(answer.place, is_on_the_way=False))
-        answer = _solved_from(answer, answer.found, replace(pipeline, soc=None))
+        answer = _solved_from(answer, answer.name_of_poses, replace(pipeline, soc=None))
     return answer
 
 
@@ -372,7 +372,7 @@ def _after_pass(answer: _Answer, job: Pass, pipeline: Pipeline) -> _Answer:
     revision = revised(answer.opened, job, answer.place.monitor)
     answer.place.table.add(revision.stage)
     place = replace(answer.place, driver=revision.opened.driver)
-    start = "poses of GNC" if revision.is_better else answer.found
+    start = "poses of GNC" if revision.is_better else answer.name_of_poses
     answer = replace(answer, opened=revision.opened, place=place)
     if revision.is_better:
         answer = replace(answer, rejected_by="the map of the others contradicts")
