@@ -26,6 +26,8 @@ _SHRINKING = (9.0, 3.0, 1.0, 1.0, 1.0)
 # are wrong, are found from 10 trees of 32.
 _MOST_TREES = 31
 _LEAST_TREES = 2
+# Scale of the errors below which they are rounding: a tree fits all its edges.
+_LEAST_SCALE = 1e-12
 # Trees times edges: some seconds on a large graph.
 _MOST_WORK = 30_000
 
@@ -37,7 +39,7 @@ def best_by_agreement(sets: EdgeSets) -> Fit:
     """
     best = _best_at_scale(sets)
     scale = threshold_scale(best.error_scale)
-    if scale >= sets.scale:
+    if not _LEAST_SCALE <= scale < sets.scale:
         return best
     scaled = replace(sets, allowed=sets.allowed * (scale / sets.scale), scale=scale)
     return min(best, _best_at_scale(scaled), key=scaled.cost)
