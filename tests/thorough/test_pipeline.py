@@ -149,11 +149,6 @@ def test_a_disconnected_graph_is_refused_with_its_components_named():
         solvers.solve(graph)
 
 
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(SettingError, match="gap must be positive"):
-        solvers.Pipeline(gap=0.0)
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -212,19 +207,6 @@ def test_poses_that_are_nearly_rotations_are_not_below_the_optimum(factor):
     assert problem.objective(problem.with_best_translations(shrunk)) >= optimum.objective * (
         1 - 1e-14
     )
-
-
-@pytest.mark.parametrize("robots", [None, 3])
-def test_a_gap_beyond_doubles_is_not_looked_for_in_other_poses(robots):
-    graph = pgo.circle(np.random.default_rng(0))
-    solution = solvers.solve(graph, solvers.Pipeline(gap=1e-18), robots=robots)
-    by_soc = ["SOC"] if robots else []  # a small graph in one place is left to Newton
-    assert [stage.name for stage in solution.stages] == ["chordal start", *by_soc, "Newton"]
-    assert (solution.certificate.verdict, solution.certificate.is_best_in_doubles) == (
-        Verdict.NOT_CERTIFIED,
-        True,
-    )
-    assert solution.gap < 1e-13
 
 
 UNITS = {

@@ -22,16 +22,6 @@ from solvers import Bregman, Status, run
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def test_values_are_stacked_row_by_row_in_the_order_named() -> None:
-    u = cp.Variable((2, 2))
-    v = cp.Variable(3)
-    problem = BregmanProblem(cp.sum_squares(u) + cp.norm1(v), (u, v), np.zeros((1, 7)), [0.0])
-    x = problem.stacked([np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([5.0, 6.0, 7.0])])
-    np.testing.assert_array_equal(x, np.arange(1.0, 8.0))
-    np.testing.assert_array_equal(problem.unstacked(x)[0], [[1.0, 2.0], [3.0, 4.0]])
-    assert problem.objective(x) == pytest.approx(30.0 + 18.0, rel=1e-14)
-
-
 @pytest.mark.parametrize(
     ("J", "message"),
     [

@@ -147,12 +147,6 @@ def test_wrong_points_are_refused() -> None:
         problem.check_point(OrthogonalPoint((2.0 * np.eye(3, 2),), (np.zeros((3, 2)),)))
 
 
-def test_maximising_a_concave_function_minimises_its_negative() -> None:
-    x = cp.Variable(3)
-    problem = OrthogonalProblem(cp.Problem(cp.Maximize(x[0] - cp.sum_squares(x))), unit_columns=[x])
-    assert problem.objective([np.array([1.0, 0.0, 0.0])]) == 0.0
-
-
 @settings(max_examples=examples(20), deadline=None)
 @given(seed=SEEDS, rho=st.sampled_from([0.1, 1.0, 30.0]))
 def test_split_problem_gives_the_gradient(seed: int, rho: float) -> None:

@@ -112,12 +112,6 @@ def test_edits_keep_what_they_do_not_touch():
     np.testing.assert_array_equal(copied.bodies, named.bodies)
 
 
-def test_new_edges_have_information_where_the_others_have():
-    graph = replace(chain(), information=np.tile(np.diag([1.0, 1, 1, 2, 2, 2]), (3, 1, 1)))
-    more = graph.with_position_prior(np.array([1]), np.ones((1, 3)), 5.0)
-    np.testing.assert_array_equal(more.information[-1].diagonal(), [5, 5, 5, 0, 0, 0])
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -1,5 +1,4 @@
 import json
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +8,8 @@ from hypothesis import given
 
 from pgo_models import Poses
 from pgo_models.geometry.rotations import stack_transposes
-from solvers import Measurement, Status
+from solvers import Status
 from solvers.network.serialization import deserialize, serialize
-from solvers.result import Record
 from solvers.soc.anderson import AndersonShare
 from solvers.soc.recursion_block import Rotations, StepSettings, block_at
 
@@ -30,14 +28,6 @@ def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(see
     np.testing.assert_array_equal(restored["poses"][0].t, poses.t)
     restored["block"].omega[:] = 0.0
     assert block.omega.any()
-
-
-def test_enums_and_nested_classes_come_back():
-    record = Record(3, 0.5, Measurement(2.0, math.inf, 0.1, rounds=7))
-    assert deserialize(serialize((record, Status.STALLED)), (Record, Measurement, Status)) == (
-        record,
-        Status.STALLED,
-    )
 
 
 def test_only_arrays_of_plain_numbers_and_one_text_are_made():

@@ -10,7 +10,7 @@ from graphs import DIMENSIONS, SEEDS, informed, random_poses, varied_graph
 from hypothesis import given, strategies as st
 
 from pgo_models import PGOProblem, Poses, Weighting, chi2, chordal_start, multipliers
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.precisions import are_definite, isotropic_information
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
@@ -135,11 +135,6 @@ def test_matrices_beyond_double_precision_are_refused_by_name() -> None:
     problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
     with pytest.raises(GraphError, match=r"edge 2 .* spans more orders of magnitude"):
         problem.objective(random_poses(6, 2, 0))
-
-
-def test_a_weighting_is_asked_for() -> None:
-    with pytest.raises(SettingError, match=r"must be Weighting\.OWN or Weighting\.ISOTROPIC or"):
-        PGOProblem(varied_graph(0, 3, 2), weighting="informed")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("d", [2, 3])

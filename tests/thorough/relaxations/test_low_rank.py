@@ -110,21 +110,6 @@ def test_rotations_that_were_lifted_and_turned_are_rounded_back(
     np.testing.assert_allclose(by_gram.with_gauge_at(0).R, expected, rtol=0, atol=1e-6)
 
 
-def test_rotations_are_their_own_rounding_and_reflections_are_turned_over() -> None:
-    problem = varied_problem(0, 5, 3)
-    R = random_poses(5, 3, 0).R
-    Y = np.swapaxes(R, 1, 2)
-    np.testing.assert_array_equal(round_factor(problem, Y)[0].R, R)
-    turned_over = round_factor(problem, -Y)[0]
-    np.testing.assert_allclose(turned_over.with_gauge_at(0).R, R[0].T @ R, rtol=0, atol=1e-12)
-
-
-def test_a_factor_of_higher_rank_is_reported() -> None:
-    problem, Y, _ = drawn(0, 8, 3, 2)
-    report = round_factor(problem, Y)[1]
-    assert (report.rank, report.is_tight) == (5, False)
-
-
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, extra=EXTRA)
 def test_gradient_and_hessian_of_lifted_poses_are_the_derivatives(
     seed: int, n: int, d: int, extra: int

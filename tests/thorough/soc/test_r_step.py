@@ -36,7 +36,7 @@ def largest_difference(solutions: list[Array]) -> float:
 
 @pytest.mark.parametrize("back_end", [RStep.FACTORIZED, RStep.FISTA, RStep.NESTEROV])
 @pytest.mark.parametrize("backend", CholeskyBackend)
-@settings(max_examples=examples(40))
+@settings(max_examples=examples(10))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, translations=st.booleans())
 def test_the_solution_satisfies_the_normal_equations(
     back_end: RStep, backend: CholeskyBackend, seed: int, n: int, d: int, translations: bool
@@ -56,7 +56,7 @@ def test_the_solution_satisfies_the_normal_equations(
             np.testing.assert_allclose(X[0], 0.0, rtol=0, atol=1e-12)
 
 
-@settings(max_examples=examples(25))
+@settings(max_examples=examples(15))
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS, translations=st.booleans())
 def test_the_back_ends_agree_on_random_graphs(
     seed: int, n: int, d: int, translations: bool

@@ -264,7 +264,7 @@ def test_acceleration_per_robot_reaches_the_gap(
 
 
 @pytest.mark.parametrize("accelerated", [True, False])
-@pytest.mark.parametrize("rho", [0.01, 0.1, 1.0, 10.0, 30.0])
+@pytest.mark.parametrize("rho", [0.01, 1.0, 30.0])
 def test_a_penalty_far_too_small_is_caught(
     rho: float, accelerated: bool, benchmark_problem: Callable[[str], PGOProblem]
 ) -> None:
@@ -278,7 +278,7 @@ def test_a_penalty_far_too_small_is_caught(
 
 
 @pytest.mark.parametrize("accelerated", [True, False])
-@pytest.mark.parametrize("rho", [1e5, 1e6, 1e8])
+@pytest.mark.parametrize("rho", [1e5, 1e8])
 def test_a_penalty_far_too_large_is_not_taken_for_convergence(
     rho: float, accelerated: bool, benchmark_problem: Callable[[str], PGOProblem]
 ) -> None:
