@@ -137,10 +137,10 @@ def closed_form_terms(problem: PGOProblem, poses: Poses) -> HandednessTerms | No
 
     An edge with the weights W and E = R_ij^T R_i^T R_j at the poses adds sym(W E) to S where R_j
     moves. Let it have the eigenvalues h_1 < 0 < h_2 <= h_3, as the indefinite W of chi2 has. With
-    the eigenvector u of h_1, P = p u u^T raises h_1 by p / 8 and lowers the others by as much. Of
-    the range from p / 8 = -h_1, where h_1 becomes zero, to (h_2 - h_1) / 2, where it meets h_2, the
-    middle is taken: zero on many edges in a row leaves S singular. Where h_2 < -h_1, h_2 is all
-    that can be taken.
+    the eigenvector u of h_1, P = p u u^T raises h_1 by p / 8 and lowers the others by as much. At
+    p / 8 = -h_1 the first becomes zero; at p / 8 = (h_2 - h_1) / 2 it meets the second. The middle
+    of this range is taken, since zeros on many edges in a row leave S singular. If h_2 < -h_1, no
+    more than p / 8 = h_2 can be taken.
     """
     graph = problem.graph
     turns = ~np.isin(graph.j, graph.landmarks)

@@ -531,7 +531,7 @@ class ProofPoint(Protocol):
 
     @property
     def quadratic(self) -> float:
-        """The same with the error of G_r."""
+        """Bound on the loss tr(G_r^T S_r^-1 G_r), with the error of G_r."""
 
 
 P = TypeVar("P", bound=ProofPoint)

@@ -1,11 +1,13 @@
 """Smaller information matrices, whose chi2 is below that of the file and easier to bound.
 
-For I' <= I the cost is below chi2 at all poses, so that a bound on it is one on chi2. Two things
-stand in the way of the tangent at the minimum of chi2. Where the largest eigenvalue of I_rr is
-above the sum of the others, W is indefinite, and a reflection, which the relaxation cannot tell
-from a rotation, costs less than nothing: the largest eigenvalue of I'_rr is at most the second and
-half the smallest. And the tangent leaves of I_tt but its smallest eigenvalue: those of I'_tt are at
-most `cap` times that. `solvers.riemannian.shrunk_bound` seeks the cap.
+For I' <= I the cost is below chi2 at all poses, so that a bound on it is one on chi2. Two
+properties of I can leave the tangent at the minimum of chi2 without a bound.
+
+- The largest eigenvalue of I_rr may exceed the sum of the others. Then W is indefinite, and a
+  reflection has a negative cost, and the relaxation cannot tell it from a rotation. So the
+  largest eigenvalue of I'_rr is at most the second one plus half the smallest.
+- The tangent keeps the smallest eigenvalue of I_tt alone. So the eigenvalues of I'_tt are at most
+  `cap` times the smallest one. `solvers.riemannian.shrunk_bound` seeks the cap.
 """
 
 from collections.abc import Callable

@@ -240,9 +240,9 @@ def _rows_of_rotations(numbers: Array) -> Array:
 def _cartesian(numbers: Array) -> Array:
     """Points (x, y) and the triangles of their information, (n, 5), of points in polar coordinates.
 
-    A row has bearing, range and their standard deviations. To first order the error of the point is
-    that of the range along the line of sight, and range times that of the bearing across it. The
-    information is therefore R(bearing) diag(1 / std_range^2, 1 / (range std_bearing)^2)
+    A row has bearing, range and their standard deviations. To first order the point errs along the
+    line of sight by the error of the range, and across it by the range times that of the bearing.
+    The information is therefore R(bearing) diag(1 / std_range^2, 1 / (range std_bearing)^2)
     R(bearing)^T, in the axes of the pose. This is an approximation: the exact density is bent.
     """
     to_pose, precisions = _polar_precisions(numbers)

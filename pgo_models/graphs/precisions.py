@@ -321,8 +321,8 @@ def extreme_weight(graph: PoseGraph, has_translations: bool = True) -> tuple[flo
     Where rotations alone are the unknowns, tau is no weight.
 
     Rounding beside the heaviest edge hides the lighter edges that alone hold a part of the graph.
-    The lightest such edge is the lightest one of a maximum spanning tree. Of the heaviest and this
-    edge, the one farther from the median is to blame.
+    The lightest such edge is the lightest one of a maximum spanning tree. To blame is the heaviest
+    edge or this one, whichever is farther from the median.
     """
     extremes = []
     for kind in ("kappa", "tau") if has_translations else ("kappa",):

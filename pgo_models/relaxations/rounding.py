@@ -1,6 +1,7 @@
-"""From a solution of the semidefinite relaxation, Z or its factor Y, to rotations.
+"""Rotations from a solution of the semidefinite relaxation, Z or its factor Y.
 
-And how far the solution is from rank d, which it has exactly when the relaxation is tight.
+The report tells how far the solution is from rank d. The rank is d exactly if the relaxation is
+tight.
 """
 
 from dataclasses import dataclass

@@ -71,7 +71,7 @@ def warn_of_weights(
 def places_of_edges(graph: str, dropped: Dropped, num_edges: int) -> tuple[str, ...]:
     """`file:line` of every edge; empty if the graph cannot be read again.
 
-    That is so of a pipe, and of a file that has changed.
+    A pipe cannot be read again, and a file may have changed.
     """
     try:
         if not _can_be_read_again(graph):

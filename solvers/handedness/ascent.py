@@ -48,8 +48,8 @@ class AscentPoint(Protocol):
     def ascended(self, weights: Array, rise: float) -> Self:
         """Return the point after a step along the derivative, (q,) weights of the eigenvectors.
 
-        It is so long that the weighted mean of the eigenvalues, if it were linear, would gain
-        `rise`, and leads back to P >= 0.
+        The weighted mean of the eigenvalues would gain `rise` if it were linear in the step. The
+        point is projected to P >= 0.
         """
 
 

@@ -252,8 +252,8 @@ def backtrack(algebra: NewtonAlgebra[M, T], model: M) -> T | None:
 def is_low_enough(model: NewtonModel, objective: float, length: float) -> bool:
     """Whether F after a move is low enough for its slope (Armijo).
 
-    Of the full move it is enough that F rises by no more than rounding: there F cannot tell whether
-    the move helps, and the decrement decides in `newton_step`.
+    The full move is accepted also where F rises by no more than rounding: F cannot tell then
+    whether the move helps, and the decrement decides in `newton_step`.
     """
     if objective <= model.objective - SUFFICIENT * length * model.square:
         return True

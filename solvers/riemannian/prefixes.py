@@ -146,10 +146,10 @@ def _first_prior_of_rotation(graph: PoseGraph, rank: IntArray) -> IntArray:
 class PrefixState:
     """State k: poses of the whole graph after k prefixes have been tried.
 
-    The ranks 0 .. `num_solved` - 1 are solved, and the others continue them by odometry. `size` is
-    that of the next prefix, and `share` how many of its poses are new, as a share of `num_solved`.
-    `is_at_minimum` says whether those that are solved are at the global minimum of their prefix, so
-    that the next prefix is dropped if it is not.
+    The ranks 0 .. `num_solved` - 1 are solved, and the others continue them by odometry. The next
+    prefix has `size` poses; `share` is the number of new ones over `num_solved`. `is_at_minimum`
+    says whether the solved poses are at the global minimum of their prefix. If they are, and the
+    next prefix misses its own, that prefix is dropped.
     """
 
     k: int

@@ -137,7 +137,7 @@ class TeamOutcome:
     def is_certified(self) -> bool:
         """Whether the gap is within the one asked for, and nothing speaks against the edges kept.
 
-        It is so of the robots that are covered.
+        This holds for the robots in `covered`.
         """
         return self.is_held and self.certificate is not None and self.certificate.is_certified
 
