@@ -327,7 +327,7 @@ def _measured_sizes(problem: PGOProblem) -> EdgeErrors:
 
 
 def _residual_norms(problem: PGOProblem, poses: Poses) -> EdgeErrors:
-    """Norms of the residuals at poses."""
+    """||t_j - t_i - R_i t_ij|| and ||R_j - R_i R_ij||_F of every edge, (m,) each."""
     graph = problem.graph
     t = poses.t
     R = poses.R

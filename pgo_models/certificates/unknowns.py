@@ -111,7 +111,7 @@ class RowUnknowns(Unknowns):
         return False
 
     def starting_point(self, X: Array) -> Array:
-        """X' as it is."""
+        """X': its rows are the unknowns."""
         return X
 
     def prove_definite(self, Lambda: Array, eta: float, X: Array) -> DefiniteProof | None:

@@ -132,7 +132,7 @@ class Rotations(Orthonormal):
     """
 
     def check_shape(self, shape: tuple[int, ...], name: str) -> None:
-        """Square."""
+        """Raise a SettingError unless the shape is square."""
         if len(shape) != 2 or shape[0] != shape[1]:
             raise SettingError(
                 f"{name} has shape {shape}; "

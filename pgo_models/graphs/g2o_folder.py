@@ -45,7 +45,7 @@ class Rows:
     scale: float
 
     def some(self, chosen: IntArray | BoolArray | slice) -> Rows:
-        """Some of the lines."""
+        """The chosen lines, by numbers, a mask or a slice."""
         return Rows(
             self.path,
             self.lines[chosen],

@@ -190,7 +190,7 @@ class Source:
             self.unknown[shown_tag] = (count + len(numbers), first)
 
     def _take_fixed(self, numbers: list[int], lines: list[str]) -> None:
-        """Take FIX lines."""
+        """Collect the ids on FIX lines, and the problems of words that are no id."""
         for number, line in zip(numbers, lines, strict=True):
             for word in line.split()[1:]:
                 try:

@@ -107,7 +107,7 @@ class RelaxationSolution(Summarised):
 
     @property
     def poses(self) -> Poses:
-        """The rounded poses."""
+        """Poses that `rounding` makes of the solution; the certificate judges them."""
         return self.certificate.poses
 
     @property

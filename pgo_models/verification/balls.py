@@ -22,7 +22,7 @@ Number = TypeVar("Number", arb, fmpq, float)
 
 
 def identity(side: int) -> arb_mat:
-    """The identity."""
+    """Identity matrix, (side, side), exact."""
     return diagonal([fmpq(1)] * side)
 
 

@@ -49,7 +49,7 @@ class Resolution:
     sizes: arb = field(default_factory=arb)
 
     def add_edge(self, edge: Edge, X: dict[int, arb_mat]) -> None:
-        """Add an edge."""
+        """Add what doubles cannot tell of the residuals of an edge at X."""
         w_t, w_R = self._weights(edge)
         X_i = X[edge.i]
         X_j = X[edge.j]

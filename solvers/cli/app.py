@@ -43,7 +43,7 @@ class CommandOfModule:
         return self.help.partition("\n\n")[0]
 
     def imported(self, name: str) -> Any:  # noqa: ANN401 - a command of click, which typer carries or imports
-        """The command, from its module."""
+        """Import the module of a command, and make the command of its function."""
         module, _, function = self.place.partition(":")
         command = getattr(import_module(module), function)
         app = typer.Typer(add_completion=False, rich_markup_mode=None)

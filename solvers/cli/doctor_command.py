@@ -38,7 +38,6 @@ def doctor_command(
 
 
 def _record(comparison: ReadingComparison) -> dict[str, object]:
-    """The comparison for JSON."""
     fits = (comparison.written, *comparison.others)
     return {
         "cost": comparison.cost_name,

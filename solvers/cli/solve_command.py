@@ -321,7 +321,7 @@ class StageOptions:
 
     @property
     def wrong_edges(self) -> "GNC | PCM | None":
-        """How wrong edges are found."""
+        """Method that --robust and --known ask for; None for a plain solve."""
         return choices.chosen_robust(self.robust, self.known)
 
     def check_robust(self) -> None:
@@ -396,7 +396,7 @@ class RobotOptions:
 
     @property
     def checkpoint(self) -> Checkpoint | None:
-        """The checkpoint of --resume."""
+        """Checkpoint of the file that --resume names; None without it."""
         if self.resume is None:
             return None
         return Checkpoint(self.resume)

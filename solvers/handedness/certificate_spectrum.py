@@ -121,7 +121,7 @@ class HandedMatrix:
         return Q
 
     def dense(self, P: Array) -> Array:
-        """The matrix, (3 (n - 1), 3 (n - 1))."""
+        """Q less the terms with P, without pose r, (3 (n - 1), 3 (n - 1))."""
         ii, ij, jj = self.term_blocks(P)
         blocks = self._Q_r.copy()
         np.subtract.at(blocks, (self.i, self.i), ii)

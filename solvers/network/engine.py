@@ -35,7 +35,7 @@ class WorkerPool(Protocol):
         """
 
     def close(self) -> None:
-        """Close the pool."""
+        """End the robots; the pool takes no more orders."""
 
 
 class Engine(Protocol):

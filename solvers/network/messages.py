@@ -69,7 +69,7 @@ def restore(worker: Worker, snapshot: Snapshot) -> None:
 
 
 def snapshot_bytes(snapshots: Sequence[Snapshot]) -> int:
-    """Payload of snapshots in bytes."""
+    """Bytes of all arrays of the snapshots."""
     return sum(array.nbytes for snapshot in snapshots for array in snapshot.values())
 
 

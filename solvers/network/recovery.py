@@ -176,7 +176,6 @@ class RecoveringPool(Generic[T]):
 
 
 def _chosen(requests: Sequence[Any], robots: Sequence[int]) -> list[Any]:
-    """Requests of some robots."""
     return [requests[robot] for robot in robots]
 
 

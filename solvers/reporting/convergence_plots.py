@@ -69,7 +69,7 @@ class Curve:
         return np.array(gaps)
 
     def counts(self, effort: Effort) -> bool:
-        """Whether this effort was counted."""
+        """Whether the run has figures of this effort."""
         return self._efforts[effort] is not None
 
     def effort(self, effort: Effort) -> Array:

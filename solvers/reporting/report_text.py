@@ -54,7 +54,7 @@ class Solved(Protocol):
 
     @property
     def poses(self) -> Poses:
-        """The answer."""
+        """Poses of the solution, (n)."""
 
     @property
     def certificate(self) -> Certificate:

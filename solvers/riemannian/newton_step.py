@@ -49,7 +49,7 @@ class ModelOrder:
 
     @property
     def is_newton(self) -> bool:
-        """Whether it is the Hessian."""
+        """Whether the matrix is the Hessian, neither shifted nor Gauss-Newton."""
         return self.second_order and not self.eta
 
 
@@ -266,7 +266,7 @@ def reached_rounding(before: float, after: float, is_newton_step: bool) -> bool:
 
 
 def decrement_of(model: NewtonModel) -> float:
-    """Return the `scaled_decrement` of a model."""
+    """Relative decrease of F that the quadratic model promises (`scaled_decrement`)."""
     return scaled_decrement(model.square, model.objective, model.rounding_level)
 
 

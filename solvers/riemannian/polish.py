@@ -55,7 +55,7 @@ class PolishState(NewtonFigures):
 
     @property
     def poses(self) -> Poses:
-        """The poses."""
+        """Current poses, (n)."""
         return self.here.poses
 
 
@@ -67,12 +67,12 @@ class PolishTrial:
 
     @property
     def poses(self) -> Poses:
-        """The poses."""
+        """Poses after the move, (n)."""
         return self.here.poses
 
     @property
     def objective(self) -> float:
-        """F there."""
+        """F after the move."""
         return self.here.value
 
 
@@ -98,7 +98,7 @@ class Secant:
 
     @classmethod
     def of(cls, move: Array, change: Array) -> "Secant":
-        """Secant of a move and the change of g."""
+        """Pair of a move s and the change y of g along it, with s^T y, for L-BFGS."""
         return cls(move, change, inner(move, change))
 
 

@@ -90,7 +90,7 @@ class PaperState(Summarised):
 
     @property
     def rho(self) -> float:
-        """The penalty."""
+        """ADMM penalty, the same for all poses."""
         return self.penalty.rho
 
 

@@ -141,7 +141,6 @@ class _Budget:
 def _one_run(
     solver: Solver[Any], name: str, problem: PGOProblem, budget: _Budget, start: Poses | None
 ) -> BenchmarkRun:
-    """Run of a solver with one stage."""
     result = budget.run(solver, problem, start)
     return _run_of(result, StageRecord(name, result.status, result.history))
 

@@ -532,7 +532,7 @@ class Robot:
         self._take(sender, envelope.message, now)
 
     def _take(self, sender: str, message: object, now: float) -> None:
-        """Take a message of the team."""
+        """Update what is known of the team by a message, or obey the order in it."""
         if isinstance(message, Hello):
             self._revisions[sender] = max(message.revision, self._revisions.get(sender, 0))
             self._learn_term(message.term)
