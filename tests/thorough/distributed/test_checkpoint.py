@@ -1,3 +1,4 @@
+import hashlib
 import io
 import os
 import signal
@@ -280,6 +281,18 @@ def content(path):
 def test_a_checkpoint_holds_no_pickle(broken_off):
     with content(broken_off[1]) as file:
         assert {file[name].dtype.kind for name in file.files} <= set("fiUb")
+
+
+def test_a_whole_file_of_another_version_is_refused(broken_off):
+    graph, path = broken_off
+    with content(path) as file:
+        arrays = {name: file[name] for name in file.files if not name.startswith("run")}
+    rest = io.BytesIO()
+    np.savez(rest, allow_pickle=False, **arrays)
+    digest = hashlib.sha256(rest.getvalue()).hexdigest().encode()
+    path.write_bytes(b"\n".join((path.read_bytes().split(b"\n")[0], digest, rest.getvalue())))
+    with pytest.raises(FileFormatError, match="a checkpoint of another version of this package"):
+        solvers.solve(graph, robots=solvers.Robots(3, checkpoint=Checkpoint(path)))
 
 
 def test_a_checkpoint_that_cannot_be_written_or_removed_loses_no_result(tmp_path, caplog):
