@@ -138,7 +138,8 @@ def prove_stored(
     """Proof that the exact matrix behind a stored one is definite, or None.
 
     The share `first_margin` of the diagonal is subtracted, or more where rounding needs more; where
-    the matrix is not definite with it, what rounding needs and no more. `turned`, (N, k), are moves
+    the matrix is not definite with it, what rounding needs, and then what lies halfway between the
+    two in orders of magnitude, if the matrix is definite with that. `turned`, (N, k), are moves
     that leave F almost as it is, as a turn of all poses but those left out. S holds them only
     weakly: their energy is small, and a margin that rounding does not need is to take little of it.
     """
@@ -146,7 +147,13 @@ def prove_stored(
         softest = _soft_margin(matrix.stored, matrix.free_diagonal, turned)
         first_margin = min(first_margin, softest)
     proof = _prove_with_margin(matrix, first_margin)
-    return proof if proof is not None else _prove_with_margin(matrix, 0.0)
+    if proof is not None:
+        return proof
+    least = _prove_with_margin(matrix, 0.0)
+    if least is None:
+        return None
+    share = float(np.max(least.slack / matrix.diagonal))
+    return _prove_with_margin(matrix, math.sqrt(first_margin * share)) or least
 
 
 def _prove_with_margin(matrix: StoredMatrix, least_margin: float) -> DefiniteProof | None:
