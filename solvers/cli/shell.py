@@ -14,6 +14,7 @@ import tempfile
 import textwrap
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
@@ -152,11 +153,13 @@ def save_then_show(
 
     `targets` are paths, and functions that write a result there. With `record` its JSON is printed
     instead, and with `quiet` nothing. Raises a PGOError at the end, which names the files that
-    could not be written.
+    could not be written. An error of another kind, a defect of its writer, comes out after all the
+    rest is done.
     """
     written: list[Path] = []
     failures: list[str] = []
-    for path, save in targets:
+
+    def write(path: Path, save: Callable[[Path], object]) -> None:
         try:
             save(path)
             written.append(path)
@@ -164,12 +167,20 @@ def save_then_show(
             reason = getattr(error, "strerror", None) or str(error) or "there is not enough memory"
             is_named = str(path) in reason
             failures.append(reason if is_named else f"cannot write {path}: {reason}")
-    if record is not None:
-        typer.echo(json.dumps(record(), indent=1, allow_nan=False))
-    elif not quiet:
-        show()
-        for path in written:
-            typer.echo(printable(f"written: {path}"))
-    sys.stdout.flush()
+
+    def print_result() -> None:
+        if record is not None:
+            typer.echo(json.dumps(record(), indent=1, allow_nan=False))
+        elif not quiet:
+            show()
+            for path in written:
+                typer.echo(printable(f"written: {path}"))
+        sys.stdout.flush()
+
+    # The stack calls all its entries, the last one first, even if one of them raises an error.
+    with ExitStack() as stack:
+        stack.callback(print_result)
+        for path, save in reversed(targets):
+            stack.callback(write, path, save)
     if failures:
         raise PGOError("; ".join(failures))

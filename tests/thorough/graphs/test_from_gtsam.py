@@ -118,11 +118,14 @@ def test_landmarks_are_read_from_bearings_and_ranges() -> None:
     landmark = int(gtsam.symbol("l", 1))
     for k, bearing in ((1, 0.3), (2, 1.3)):
         factor = gtsam.BearingRangeFactor2D(
-            x(k), landmark, gtsam.Rot2(bearing), 2.0, sigmas(0.1, 0.2)
+            x(k), landmark, gtsam.Rot2(bearing), 2.0, sigmas(0.05, 0.1)
         )
         factors.add(factor)
     graph = pgo.from_gtsam(factors)
     assert graph.pose_ids[graph.landmarks].tolist() == [landmark]
+    # At two metres 0.05 rad are 0.1 m across.
+    matrices = graph.information[-2:, :2, :2]
+    np.testing.assert_allclose(matrices, np.tile(100.0 * np.eye(2), (2, 1, 1)), atol=1e-9, rtol=0)
     with pytest.raises(GraphError, match="has landmarks"):
         pgo.to_gtsam(graph)
 
@@ -143,6 +146,18 @@ def test_factors_of_other_kinds_are_named_and_counted() -> None:
         pytest.raises(GraphError, match="no pose x3; give one for every key"),
     ):
         pgo.from_gtsam(factors, values, skip_unknown=True)
+
+
+def test_noise_that_no_matrix_of_an_edge_stands_for_is_named() -> None:
+    factors, _ = pose2_slam_example()
+    exactly = gtsam.noiseModel.Constrained.All(3)
+    factors.add(gtsam.BetweenFactorPose2(x(1), x(2), gtsam.Pose2(2, 0, 0), exactly))
+    correlated = gtsam.noiseModel.Gaussian.Information(np.array([[100.0, 10.0], [10.0, 25.0]]))
+    seen = gtsam.Rot2(0.3), 2.0
+    factors.add(gtsam.BearingRangeFactor2D(x(1), int(gtsam.symbol("l", 1)), *seen, correlated))
+    named = "1 BetweenFactorPose2 with Constrained .*1 BearingRangeFactor2D with correlated noise"
+    with pytest.raises(GraphError, match=named):
+        pgo.from_gtsam(factors)
 
 
 def test_weights_alone_are_written_as_matrices() -> None:

@@ -91,6 +91,19 @@ def test_gradient_and_hessian_are_those_of_the_cost(seed: int, n: int, columns: 
     assert second == pytest.approx(curvature, abs=1e-3 * scale)
 
 
+@pytest.mark.parametrize(("seed", "n"), [(0, 8), (3, 8), (0, 2)])  # the last two are trees
+def test_what_rounding_loses_is_a_share_of_the_cost_of_poses(seed: int, n: int) -> None:
+    problem = PGOProblem(varied_graph(seed, n, 2, LOUD))
+    method = ComplexRelaxation()
+    for state in islice(iterate(method, problem), 4):
+        found = method.measure(problem, state)
+        cost = problem.objective(method.poses(problem, state))
+        assert found.objective == cost
+        lost = found.primal_residual * max(cost, state.rounding_level)
+        expected = max(cost - state.point.value, 0.0)
+        assert lost == pytest.approx(expected, abs=state.rounding_level)
+
+
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @settings(max_examples=examples(40))
 @given(seed=SEEDS, n=st.integers(3, 9), rotation_std=st.sampled_from([0.5, 1.0, 2.0]))

@@ -131,6 +131,28 @@ def test_the_search_finds_the_best_of_all_sets() -> None:
     assert num_found == 8
 
 
+@pytest.mark.parametrize("k", [2, 3])
+def test_the_search_leaves_a_set_that_no_single_change_improves(k: int) -> None:
+    """All closures agree, and contradict the edges that stay: one of them alone costs more."""
+    covariance = np.kron(np.eye(k) + 3.0 * np.ones((k, k)), np.eye(3))
+    errors = np.zeros((k, 3))
+    errors[:, 0] = np.sqrt(1.1 * ALLOWED * 4.0)
+    model = LinearChoice(errors, covariance, ALLOWED, np.zeros(k))
+    assert (model.choose(np.zeros(0, dtype=int)).changes() > 0.0).all()
+    assert cost_of(model, tuple(range(k))) < cost_of(model, ())
+    assert model.best(np.zeros(0, dtype=int)).tolist() == list(range(k))
+
+
+def test_a_map_is_bent_to_closures_that_cost_much_and_show_little_of_it() -> None:
+    costs = np.array([6.0, 9.0, 6.0, 2.0, 12.0])
+    residuals = np.array([0.6, 0.9, 3.0, 0.2, 0.1])
+    errors = np.zeros((5, 3))
+    errors[:, 0] = np.sqrt(costs)
+    model = LinearChoice(errors, np.eye(15), ALLOWED, residuals)
+    # The third shows what it costs, the fourth costs little, and the last is not chosen.
+    assert model.suspects(np.arange(4)).tolist() == [1, 0]
+
+
 def test_a_map_that_was_bent_to_a_wrong_closure_comes_back() -> None:
     """One of the closures kept is wrong, and most right ones are out: no single change helps."""
     num_back = 0
