@@ -131,16 +131,22 @@ def test_the_search_finds_the_best_of_all_sets() -> None:
     assert num_found == 8
 
 
-@pytest.mark.parametrize("k", [2, 3])
-def test_the_search_leaves_a_set_that_no_single_change_improves(k: int) -> None:
-    """All closures agree, and contradict the edges that stay: one of them alone costs more."""
-    covariance = np.kron(np.eye(k) + 3.0 * np.ones((k, k)), np.eye(3))
-    errors = np.zeros((k, 3))
-    errors[:, 0] = np.sqrt(1.1 * ALLOWED * 4.0)
+@pytest.mark.parametrize(("k", "seed"), [(3, 103), (8, 5), (8, 11), (8, 36)])
+def test_a_changed_closure_stays_as_it_is_for_a_time_that_grows_with_their_number(
+    k: int, seed: int
+) -> None:
+    """Closures that hang together closely; no or another such time misses the best set."""
+    rng = np.random.default_rng([k, seed])
+    rank = int(rng.integers(2, 3 * k + 1))
+    root = rng.standard_normal((3 * k, rank))
+    covariance = root @ root.T / rank * rng.choice([1.0, 5.0, 30.0]) + 0.1 * np.eye(3 * k)
+    errors = rng.standard_normal((k, 3)) * rng.choice([1.0, 4.0], k)[:, None]
+    errors *= rng.choice([1.0, 2.0])
     model = LinearChoice(errors, covariance, ALLOWED, np.zeros(k))
-    assert (model.choose(np.zeros(0, dtype=int)).changes() > 0.0).all()
-    assert cost_of(model, tuple(range(k))) < cost_of(model, ())
-    assert model.best(np.zeros(0, dtype=int)).tolist() == list(range(k))
+    sets = [kept for size in range(k + 1) for kept in itertools.combinations(range(k), size)]
+    least = min(cost_of(model, kept) for kept in sets)
+    best = model.best(np.zeros(0, dtype=int))
+    assert cost_of(model, tuple(best)) == pytest.approx(least, rel=1e-9)
 
 
 def test_a_map_is_bent_to_closures_that_cost_much_and_show_little_of_it() -> None:
