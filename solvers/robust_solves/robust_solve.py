@@ -351,7 +351,9 @@ class _RobustSolve:
     def with_odometry_doubted(self, settings: GNC) -> _RobustSolve:
         """The solve in which odometry that cycles contradict may be wrong, if it explains more.
 
-        What decides is `Choice.evidence`. A large graph, and one with a start, go without.
+        What decides is `Choice.evidence`. A map that keeps all odometry is one more attempt of this
+        solve: odometry remains known, so that as much is proven of closures. A large graph, and one
+        with a start, go without.
         """
         if not self.known.is_claim or self.doubted.is_large or self.start is not None:
             return self
@@ -376,6 +378,9 @@ class _RobustSolve:
             return self
         before = self.choice.cheapest
         cheapest = other.choice.cheapest
+        if cheapest.kept[self.known.edges].all():
+            self.estimates.append(cheapest)
+            return self
         other.estimates += self.estimates
         evidence = partial(other.choice.evidence, odometry=self.known.edges)
         return other if evidence(cheapest) > evidence(before) else self

@@ -1,7 +1,7 @@
 """What can be solved where: every cell of the guide's table is tried on a tiny graph.
 
 A cell works, and its result is the one that a solve in one place has, or it is refused in one
-sentence. `python tests/thorough/test_capabilities.py` prints the table anew.
+sentence. `PYTHONPATH=tests python tests/thorough/test_capabilities.py` prints the table anew.
 """
 
 from __future__ import annotations

@@ -214,3 +214,15 @@ def test_the_isotropic_cost_is_below_chi2_at_all_poses(d: int, coupled: bool) ->
         R = graph.truth.R @ pgo.exp_map(spread * rng.standard_normal((12, 2 * d - 3)))
         poses = replace(graph.truth, R=R, t=graph.truth.t + spread * rng.standard_normal((12, d)))
         assert (below.edge_costs(poses) <= problem.edge_costs(poses) * (1 + 1e-12)).all()
+
+
+def test_odometry_that_cycles_contradict_and_the_answer_keeps_counts_in_full() -> None:
+    graph = pgo.grid_world(1, 60, np.random.default_rng(0), d=2, loop_closure_probability=0.1)
+    rng = np.random.default_rng(0)
+    i = rng.integers(0, 45, 11)
+    j = i + rng.integers(11, 15, 11)
+    gross = pgo.Poses(pgo.random_rotations(11, 2, rng), rng.uniform(-16.0, 16.0, (11, 2)))
+    spoiled = graph.with_edges(i, j, gross, graph.kappa[0], graph.tau[0])
+    solution = solvers.prove_outliers(solvers.solve(spoiled, robust=solvers.GNC()))
+    assert solution.robust.known[np.abs(spoiled.i - spoiled.j) == 1].all()
+    assert solution.robust.proof.proven_wrong.sum() >= 10  # four where some odometry is doubted
