@@ -59,7 +59,7 @@ class CoarseChains:
         kappa = np.where(is_seen_away, 0.5 * pieces.kappa, pieces.kappa)
         D = np.linalg.norm(origin[high_place] - pieces.center, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):  # without precisions
-            tau_away = 0.5 / (1.0 / pieces.tau + D * D / pieces.kappa)
+            tau_away = 1.0 / (1.0 / pieces.tau + D * D / pieces.kappa)
         tau = np.where(is_seen_away, tau_away, pieces.tau)
         kappa = np.concatenate([(1.0 - _ETA) * kappa, sums.kappa[chosen]])
         tau = np.concatenate([(1.0 - _ETA) * tau, sums.tau[chosen]])

@@ -8,8 +8,10 @@ that turns at c (`chain_sums`), which is from the first pose to itself:
 
 It takes the same time for long cycles as for short ones, and holds for errors of all sizes. Of
 small offsets across a straight chain it is half of the least cost, and little of those along it,
-where turns help nothing; of large errors it is less. Where the chains of two closures overlap their
-edges are passed twice, each time with half of their precisions.
+where turns help nothing; of large errors it is less. A cycle of two closures of one chain whose
+ends do not overlap passes the steps between them twice. These steps are bridges: all that lies
+beyond them can be moved as one, so that at the least cost they have no errors, and each passage may
+be taken for edges of its own.
 """
 
 from __future__ import annotations
@@ -67,12 +69,8 @@ class CycleBounds:
         cycle = product(through_a, inverse(through_b))
         sums = self.sums.along(i_a, i_b) + of_closures[a] + of_closures[b].moved(cycle)
         sums += self.sums.along(j_a, j_b).moved(through_a)
-        # Of cycles that pass edges twice all precisions are halved.
         reach = self.sums.length + np.linalg.norm(t[a], axis=1) + np.linalg.norm(t[b], axis=1)
-        bounds = self._bounds(cycle, sums, reach)
-        begins = np.maximum(np.minimum(i_a, i_b), np.minimum(j_a, j_b))
-        ends = np.minimum(np.maximum(i_a, i_b), np.maximum(j_a, j_b))
-        return np.where(begins < ends, 0.5 * bounds, bounds)
+        return self._bounds(cycle, sums, reach)
 
     def _bounds(self, cycles: Motions, sums: EdgeSums, reach: Array) -> Array:
         """Bounds, (k,), rounded down, for cycles whose points are at most `reach` (k,) away."""

@@ -86,6 +86,28 @@ def test_they_cost_less_at_all_poses(
         assert below <= cost * (1 + 1e-9) + 1e-9
 
 
+@pytest.mark.parametrize("kappa_of_others", [1e6, 1.0])
+def test_a_turn_far_from_the_end_costs_as_much_as_it_did(kappa_of_others: float) -> None:
+    """A bend at the first step of a long straight chain, seen from its last pose."""
+    n = 12
+    t = np.stack([np.arange(float(n)), np.zeros(n)], axis=1)
+    i, j = np.array([*((k, k + 1) for k in range(n - 1)), (0, n - 1)]).T
+    kappa = np.full(n, kappa_of_others)
+    kappa[0] = 1.0
+    R = np.tile(np.eye(2), (n, 1, 1))
+    graph = pgo.PoseGraph(n, i, j, R, t[j] - t[i], kappa, np.full(n, 1e6))
+    sums = ChainSums(Chains.of(graph, np.arange(n) < n - 1), graph.kappa, graph.tau)
+    costs = costs_of(pgo.PGOProblem(graph), CoarseChains(sums), [n - 1], 1)
+    turn = pgo.exp_map(np.full((1, 1), 0.1))
+    bent = np.concatenate([t[:1], t[1] + (t[1:] - t[1]) @ turn[0].T])
+    below, cost = costs(pgo.Poses(np.concatenate([R[:1], np.tile(turn, (n - 1, 1, 1))]), bent))
+    closure = 1e6 * ((bent[-1] - t[-1]) ** 2).sum() + 2.0 * kappa_of_others * 2 * (1 - np.cos(0.1))
+    assert cost - closure == pytest.approx(4.0 * (1.0 - np.cos(0.1)), rel=1e-4)
+    assert below - closure <= cost - closure + 1e-9 * cost
+    if kappa_of_others > 1.0:
+        assert below - closure >= 0.95 * (cost - closure)
+
+
 def test_many_steps_lose_little() -> None:
     """Of a closure that is wrong: the more steps, the closer are the least costs."""
     graph = chain_with_closures(7, 60, 2, 0)

@@ -97,6 +97,34 @@ def test_closures_that_share_a_pose_and_no_step_keep_all_of_their_bound() -> Non
     assert pair_bound_on_a_line([(0, 3), (3, 6)], [1.0, 0.0]) == pytest.approx(1 / 6, rel=1e-3)
 
 
+@pytest.mark.parametrize(("ends", "num_passed"), [((5, 8), 10), ((8, 4), 9), ((2, 8), 7)])
+def test_steps_between_closures_that_a_cycle_passes_twice_count_twice(
+    ends: tuple[int, int], num_passed: int
+) -> None:
+    """One closure wants three steps to be longer by one, the other its own to be shorter by one."""
+    shorter = -1.0 if ends[0] < ends[1] else 1.0
+    bound = pair_bound_on_a_line([(0, 3), ends], [1.0, shorter])
+    assert bound == pytest.approx(4.0 / num_passed, rel=1e-3)
+
+
+@given(seed=SEEDS, d=DIMENSIONS, gap=st.integers(1, 4))
+def test_of_closures_apart_they_are_below_the_sum_of_both_costs(
+    seed: int, d: int, gap: int
+) -> None:
+    """Nothing but the steps between them ties one to the other, and these cost nothing."""
+    n = 7 + gap
+    graph = chain_with_closures(seed, n, d, 2)
+    i, j = graph.i.copy(), graph.j.copy()
+    i[-2:], j[-2:] = (0, n - 4), (3, n - 1)
+    graph = replace(graph, i=i, j=j)
+    known = np.arange(n + 1) < n - 1
+    pair = bounds_of(graph, known).of_pairs(np.array([n - 1, n]))[0, 1]
+    first = known | (np.arange(n + 1) == n - 1)
+    second = known | (np.arange(n + 1) == n)
+    least = least_cost(graph, first) + least_cost(graph, second)
+    assert pair <= least * (1 + 1e-9)
+
+
 @pytest.mark.parametrize("size", [1e-150, 1e-4, 1e150])
 def test_the_unit_of_the_weights_does_not_matter(size: float) -> None:
     graph = chain_with_closures(5, 20, 2, 2)
