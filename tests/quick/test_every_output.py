@@ -31,7 +31,7 @@ TRAJECTORIES = ["x.g2o", "x.tum", "x.txt", "x.kitti"]
 @pytest.fixture(scope="module")
 def planar(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("planar") / "planar.g2o"
-    pgo.write_g2o(pgo.random_geometric(30, np.random.default_rng(0), d=2), path)
+    pgo.write_g2o(pgo.grid_world(1, 30, 0, d=2), path)
     return path
 
 
