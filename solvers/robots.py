@@ -73,9 +73,9 @@ class Robots:
     engine : Engine, optional
         Where the robots run; in this process unless given.
     driver_memory : float
-        Bytes that the driver may take with its fronts. A solve that needs more is refused before it
-        begins. 0 stands for no driver: CONSENSUS alone (`solvers.distributed.robots_alone`), which
-        finds poses and no certificate.
+        Bytes that the driver may take with its matrix and factor. A solve that needs more is
+        refused before it begins. 0 stands for no driver: CONSENSUS alone
+        (`solvers.distributed.robots_alone`), which finds poses and no certificate.
     faults : Faults, optional
         What goes wrong between the robots of a CONSENSUS stage, which then does not wait
         (`solvers.distributed.asynchronous`).

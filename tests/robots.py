@@ -13,25 +13,25 @@ import numpy as np
 import pytest
 from graphs import MILD_NOISE
 from hypothesis import strategies as st
+from scipy.sparse import csr_array
 
 from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses, partition, random_rotations
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import observe
-from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from solvers import InProcess
-from solvers.distributed import multifrontal, robots_of_graph
 from solvers.distributed.driver import Driver
-from solvers.distributed.elimination_choice import leave_poses
-from solvers.distributed.interface import Interface
-from solvers.distributed.multifrontal import FrontOwners
+from solvers.distributed.interface import Interface, Separators
 from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.elimination import Elimination, unpacked
+from solvers.distributed.robots.elimination import Cut, Elimination
+from solvers.distributed.robots.subdomain_blocks import SubdomainBlocks
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.distributed.sparse_interface import CoverPattern, SparseInterface
 from solvers.network.engine import Engine, WorkerPool
 from solvers.network.messages import Idle
+from solvers.soc import subgraph
+from solvers.soc.subdomains import Subdomains
 from solvers.soc.subgraph import Subgraph
 
 Partitioner = Callable[[PoseGraph, int], Partition]
@@ -129,55 +129,44 @@ def spoil(agent: Agent, factor: float) -> None:
 
 
 def interface_of(
-    touched: tuple[IntArray, ...], num_separators: int, widths: tuple[int, ...]
-) -> Interface:
-    """Interface of robots that touch these separators, all fronts with the driver."""
-    fronts = FrontOwners(touched, num_separators)
-    return Interface(num_separators, widths, touched, fronts)
-
-
-def sparse_interface_of(
     touched: tuple[IntArray, ...],
-    coupled: Sequence[IntArray],
     num_separators: int,
     widths: tuple[int, ...],
-) -> SparseInterface:
-    """Sparse interface of robots that touch these separators and couple some pairs of them."""
-    pattern = CoverPattern.of(touched, coupled, num_separators, d=2)
-    fronts = FrontOwners((), num_separators)
-    return SparseInterface(num_separators, widths, touched, fronts, pattern=pattern)
+    coupled: Sequence[IntArray] | None = None,
+    backend: CholeskyBackend | None = None,
+) -> Interface:
+    """Interface of robots that touch these separators and couple some pairs of them, or all."""
+    if coupled is None:
+        coupled = [np.stack(np.tril_indices(len(poses)), axis=1) for poses in touched]
+    cover = np.arange(num_separators)
+    backend = backend or default_backend()
+    return Interface(Separators(cover, touched, tuple(coupled), 2, backend), widths)
 
 
-def share(patch: pytest.MonkeyPatch) -> None:
-    """Every front but the root is a robot's, however small it is."""
-    eliminate_all(patch)
-    patch.setattr(multifrontal, "LEAST_SEPARATORS", 0)
-    patch.setattr(multifrontal, "LEAST_FRONTS", 0)
+def cut_in_one_piece(interior: IntArray, boundary: IntArray) -> Cut:
+    """A cut whose interior may couple all of the boundary."""
+    label = np.zeros(len(interior), dtype=np.int64)
+    g = len(boundary)
+    subdomains = Subdomains(label, csr_array(np.ones((1, g))), csr_array(np.eye(g)))
+    return Cut(interior, boundary, SubdomainBlocks(subdomains, (1,)))
 
 
-def eliminate_all(patch: pytest.MonkeyPatch) -> None:
-    """Robots leave no poses to the driver, whether that is cheaper or not."""
-    patch.setattr(robots_of_graph, "choose_elimination", tuple)
+def packed(matrix: Array) -> Array:
+    """Lower triangle of a symmetric matrix, row by row: what a robot sends that couples all."""
+    return np.asarray(matrix[np.tri(len(matrix), dtype=bool)])
 
 
 @contextmanager
-def sparse_elimination(most_coupled: int) -> Iterator[None]:
-    """Robots leave poses to the driver, whether that is cheaper or not."""
-
-    def left(subgraphs: Sequence[Subgraph]) -> tuple[Subgraph, ...]:
-        return leave_poses(subgraphs, most_coupled)
-
+def leaving(most_coupled: float) -> Iterator[None]:
+    """Robots leave the poses to the driver that would couple more others than this."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(robots_of_graph, "choose_elimination", left)
+        patch.setattr(subgraph, "MOST_COUPLED", most_coupled)
         yield
 
 
 def matrix_of_schur(found: Elimination) -> Array:
     """Schur complement that a robot sends, in full."""
-    blocks = found.cut.blocks
-    if blocks is None:
-        return unpacked(found.schur, len(found.cut.boundary))
-    return blocks.symmetric(found.schur).toarray()
+    return found.cut.blocks.symmetric(found.schur).toarray()
 
 
 def name_of(order: object) -> str:

@@ -12,7 +12,6 @@ from pgo_models.files import check_writable
 from pgo_models.graphs.datasets import known_datasets
 from pgo_models.graphs.g2o import write_g2o
 from pgo_models.graphs.g2o_readings import Reading
-from pgo_models.graphs.partitioning import Partition, PartitionMethod
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.separators import report_partition
 from solvers.cli.explanations import explained_by_its_graph
@@ -122,17 +121,7 @@ def _describe_graph(
     if robots is not None or split is not None:
         partition = chosen_partition(loaded, robots, split)
         costs = report_partition(partition, loaded).facts()
-        costs = [("partition", partition.method.value), *costs, *_driver_facts(loaded, partition)]
+        costs = [("partition", partition.method.value), *costs]
         facts += [("", ""), *costs]
         record["partition"] = figures_of_facts(costs)
     return facts, record
-
-
-def _driver_facts(loaded: PoseGraph, robots: Partition) -> Facts:
-    """What a driver will need, and advice; nothing where no driver can solve the graph."""
-    if robots.method is PartitionMethod.SINGLETONS or not loaded.is_connected:
-        return []
-    from solvers.distributed.forecast import advice, forecast
-
-    expected = forecast(robots, loaded)
-    return [*expected.facts(), ("advice", advice(robots, loaded, expected))]

@@ -72,7 +72,7 @@ class RobotsOfDriver:
         answers = self.driver.network.ask(finish_copies, requests, Count.PIGGYBACKED)
         R = np.empty_like(self.driver.current.R)
         for answer in answers:
-            R[answer.in_cover] = answer.R
+            R[self.driver.positions(answer.numbers)] = answer.R
         # The copies of robots that do not wait differ, so that all robots take those of the owners.
         self.driver.adopt(R)
 

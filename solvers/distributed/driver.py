@@ -3,17 +3,14 @@
 Terms:
 
 - cover: a set of poses with an end of every edge between two robots (a vertex cover), or a single
-  pose where there is no such edge; where areas of robots interleave, also poses that robots leave
-  to the driver (`solvers.distributed.elimination_choice`). Its g poses are the separators, which
+  pose where there is no such edge; also the poses that robots leave to the driver, as eliminating
+  them would couple many others (`solvers.soc.subdomains`). Its g poses are the separators, which
   the driver holds.
 - boundary of a robot: the poses of the cover that its edges join; its other poses are its interior.
   Every edge belongs to one robot.
 - interface: the linear system on the cover, the sum of what all robots leave of their systems when
-  they eliminate their interiors (Schur complements and reduced right-hand sides).
-- fronts: the dense matrices in which the interface is factored, along a tree of groups of robots
-  (the separator tree, `solvers.distributed.multifrontal`). The driver holds the front of all robots
-  and, unless there are many large ones, the others, too. Where robots leave poses, the driver
-  factors one sparse matrix instead (`solvers.distributed.sparse_interface`).
+  they eliminate their interiors (Schur complements and reduced right-hand sides). Its matrix is
+  sparse, and the driver factors it (`solvers.distributed.interface`).
 
 The robots eliminate their interiors, the driver sums, solves on the cover, and sends every robot
 the solution on its boundary. No message of an iteration contains an interior pose, or a measurement
@@ -35,8 +32,7 @@ Every `ask` scatters a request and gathers the answers. Its `Count` says what th
 - OFF: nothing.
 
 A solve of M x = b, a step (a) of SOC, a Newton direction, and the best translations of given
-rotations take one round each, a proof of the certificate two. Where robots hold fronts, gather and
-scatter go along the tree, level by level (`Ledger.bytes_by_level`).
+rotations take one round each, a proof of the certificate two.
 
 The cost of poses is F = tr(X^T M X). X, ((d + 1) n, d), stacks the rows t_i^T of all n poses, then
 the d rows of every R_i^T; M, of side (d + 1) n, sums up the edges. M X is half the gradient of F.
@@ -63,11 +59,10 @@ from pgo_models.geometry.rotations import (
     unstack_transposes,
 )
 from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
 from pgo_models.relaxations.low_rank import poses_from, tangent_widths
-from solvers.distributed.elimination_choice import CoverSystem
-from solvers.distributed.interface import Interface, InterfaceFactor
-from solvers.distributed.multifrontal import FrontOwners
+from solvers.distributed.interface import Interface, InterfaceFactor, Separators
 from solvers.distributed.robots import current_poses, start, translations
 from solvers.distributed.robots.agent import order_interior
 from solvers.distributed.robots.interior import Interior
@@ -166,17 +161,20 @@ class Driver:
         open_pool: Callable[[], WorkerPool | CountedPool],
         memory: float = DEFAULT_MEMORY,
         grounded_position: int | None = None,
+        backend: CholeskyBackend | None = None,
     ) -> None:
         """Start the robots, unless `open_pool` returns a pool whose robots are at work already.
 
         `memory` is the largest number of bytes that the interface may take; a SettingError if it
         would take more. The value 0 selects a run without a driver (`robots_alone`): no interface
         is built or solved, and this object only carries the messages of the robots and adds up.
-        Bounds are grounded in the middle of the cover unless a position is given.
+        Bounds are grounded in the middle of the cover unless a position is given. `backend` factors
+        the interface.
         """
         self.num_poses = num_poses
         self.d = summaries[0].d
         self.memory = memory
+        self._separators = Separators.of(summaries, backend)
         self._read_cover(summaries)
         g = len(self.cover)
         R = np.broadcast_to(np.eye(self.d), (g, self.d, self.d)).copy()
@@ -186,22 +184,16 @@ class Driver:
         # Factor of the matrix of the translations on the cover, once it is needed.
         self._laplacian: InterfaceFactor | None = None
 
-        has_interface = memory != 0
-        system = CoverSystem.of(summaries)
-        self.grounded_position = system.middle if grounded_position is None else grounded_position
-        if has_interface:
-            self._any_widths = system.interface(())  # `interface` sets the widths
-        else:
-            no_fronts = FrontOwners((), len(self.cover))
-            self._any_widths = Interface(len(self.cover), (), system.touched, no_fronts)
         self._interfaces: dict[Widths, Interface] = {}
-        if has_interface:
+        if grounded_position is None:
+            grounded_position = self._separators.middle
+        self.grounded_position = grounded_position
+        if memory != 0:
             self.interface(*self.tangent).check_memory(memory)
         self._moments: WeakKeyDictionary[Moment, HeldByDriver] = WeakKeyDictionary()
         pool = open_pool()
         self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(summaries))
         try:
-            self._any_widths.fronts.hand_out(self.network, self.robots_with_edges)
             self.describe(Count.OFF)
         except BaseException:  # also Ctrl-C: no robot stays behind
             self.network.workers.close()
@@ -209,11 +201,8 @@ class Driver:
 
     def _read_cover(self, summaries: Sequence[RobotSummary]) -> None:
         """Take the cover, and what every robot holds of it, from the robots' summaries."""
-        positions = np.concatenate([robot.in_cover for robot in summaries])
-        numbers = np.concatenate([robot.cover for robot in summaries])
-        self.cover: IntArray = np.zeros(len(np.unique(positions)), dtype=np.int64)
-        self.cover[positions] = numbers
-        self._held_cover = [robot.in_cover for robot in summaries]
+        self.cover = self._separators.cover
+        self._held_cover = [self.positions(robot.cover) for robot in summaries]
         # Robots with edges, and the poses that these edges join.
         with_edges = [robot for robot in summaries if robot.touched is not None]
         self.robots_with_edges = np.array([robot.robot for robot in with_edges])
@@ -238,20 +227,16 @@ class Driver:
         order: InteriorOrder[Q, A],
         requests: Sequence[Q],
         count: Count = Count.ROUND,
-        is_along: bool = False,
     ) -> list[A]:
         """Give every interior an order with its own request; return their answers.
 
-        Requests and answers are in the order of `robots_with_edges`. Requests with `is_along` are
-        parts of a solution, which go along the separator tree where robots hold fronts.
+        Requests and answers are in the order of `robots_with_edges`.
         """
         request_of: list[Q | None] = [None] * self.network.ledger.num_robots
         for robot, request in zip(self.robots_with_edges.tolist(), requests, strict=True):
             request_of[robot] = request
         order_of_agent = partial(order_interior, order)
-        answers = self.network.ask(
-            order_of_agent, request_of, count, self.robots_with_edges, is_along
-        )
+        answers = self.network.ask(order_of_agent, request_of, count, self.robots_with_edges)
         return [cast(A, answers[robot]) for robot in self.robots_with_edges.tolist()]
 
     def moment(self) -> Moment:
@@ -324,13 +309,13 @@ class Driver:
         (1, d) is the layout of X: one row of translations and d of rotations for every pose.
         """
         if widths not in self._interfaces:
-            self._interfaces[widths] = replace(self._any_widths, widths=widths)
+            self._interfaces[widths] = Interface(self._separators, widths)
         return self._interfaces[widths]
 
     def release_newton(self) -> None:
         """Let go of the interface of Newton's unknowns, whose memory a proof may need.
 
-        Only a sparse one holds much, its pattern; the next step of Newton builds it again.
+        It holds the pattern of its matrix; the next step of Newton builds it again.
         """
         self._interfaces.pop(self.tangent, None)
 
@@ -355,6 +340,10 @@ class Driver:
         )
 
     # Positions of the driver's unknowns.
+
+    def positions(self, poses: IntArray) -> IntArray:
+        """Positions in the cover of poses that are in it."""
+        return np.searchsorted(self.cover, poses)
 
     @property
     def rotation_rows(self) -> IntArray:
@@ -442,17 +431,17 @@ class Driver:
         """
         answers = self.ask(start.chordal, None, Count.PIGGYBACKED)
         # Unknowns of these widths are solved for at the start alone: the factor is not kept.
-        interface = replace(self._any_widths, widths=(self.d,))
+        interface = Interface(self._separators, (self.d,))
         factor = interface.factorize([answer.schur for answer in answers])
         Y, parts, _ = factor.solve([answer.right.b for answer in answers])
         self.current = replace(self.current, R=project_to_rotations(unstack_transposes(Y)))
-        self.ask_each(start.project, parts, is_along=True)
+        self.ask_each(start.project, parts)
         if averaged:
             assert self._stiffness is not None
             pulls = self.ask(start.average, self._stiffness, Count.PIGGYBACKED)
             angles, parts = self.best_translations(pulls)  # the same matrix
             self.current = replace(self.current, R=self.current.R @ exp_map(angles))
-            self.ask_each(start.turn_by, parts, is_along=True)
+            self.ask_each(start.turn_by, parts)
         self.set_translations(self.ask(translations.reduce_translations, None, Count.PIGGYBACKED))
 
     def set_poses(self, poses: Poses) -> None:
@@ -520,7 +509,7 @@ class Driver:
         `answers` are the robots' reduced right-hand sides, which were gathered by the ask before.
         """
         t, parts = self.best_translations(answers)
-        costs = self.ask_each(translations.set_translations, parts, is_along=True)
+        costs = self.ask_each(translations.set_translations, parts)
         self.current = self.with_cost(replace(self.current, t=t), costs)
 
     def best_translations(

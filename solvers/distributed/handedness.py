@@ -203,7 +203,7 @@ def _iterated(driver: Driver, proof: InterfaceProof, shift: float, X: Array) -> 
         X, parts, _ = proof.factor.solve([answer.b @ C for answer in answers], b)
         X[:g] = 0.0
         orders = [VectorsOrder(part, C) for part in parts]
-        answers = driver.ask_each(robot_orders.follow_vectors, orders, is_along=True)
+        answers = driver.ask_each(robot_orders.follow_vectors, orders)
         energies = X.T @ b + sum(answer.energies for answer in answers)
         products = X.T @ X + sum(answer.products for answer in answers)
         last = theta[0]

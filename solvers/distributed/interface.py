@@ -1,175 +1,282 @@
-"""Interface problem of substructuring: the sum of Schur complements, factored along a tree.
+"""Interface problem of substructuring: the sum of Schur complements, one sparse matrix.
 
-An interface says which unknowns there are. Its factors are values: each stays as it is when another
-one is computed.
+Robots leave the poses to the driver that would couple many others (`solvers.soc.subdomains`), and
+send sparse Schur complements. The driver factors their sum in one order of elimination of all its
+poses. An interface says which unknowns there are. Its factors are values: each stays as it is when
+another one is computed.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
+from functools import cached_property, partial
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array, tril
 
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.floating_point import OUTWARD, column_error, gamma
-from pgo_models.problem.matrices import columns_of
-from solvers.distributed.multifrontal import FactorName, FrontOwners, levels
-from solvers.distributed.robots.elimination import FrontMatrix, FrontParts, HeldFront
-from solvers.distributed.robots.subdomain_blocks import Widths
+from pgo_models.graphs.pose_graph import IntArray, edge_counts, middle_node
+from pgo_models.problem.cholesky import (
+    CholeskyBackend,
+    CholeskyFactor,
+    SymbolicCholesky,
+    analyze,
+    default_backend,
+)
+from pgo_models.problem.floating_point import OUTWARD, gamma
+from pgo_models.problem.matrices import columns_of, inner
+from pgo_models.problem.ordering import (
+    most_counts,
+    order_of_pattern,
+    pattern_of_edges,
+    row_order,
+)
+from solvers.distributed.robots.subdomain_blocks import (
+    Widths,
+    coupled_unknowns,
+    entry_keys,
+    positions_of,
+)
+from solvers.soc.subgraph import RobotSummary
 
-# memory of a front at work, in fronts: itself, and copies of what is added to it or split off
-_AT_WORK = 4.25
+Int32Array = NDArray[np.int32]
+# Bytes of a stored entry of the sum: its value, twice, its key, its row, and CVXOPT's copy.
+_BYTES_OF_ENTRY = 44
+# Bytes of an entry of a factor. CHOLMOD stores its value. SuperLU stores L and U, each with rows,
+# 12 bytes an entry, and the bound on its rounding takes up to eight more matrices of that pattern.
+_BYTES_OF_FACTOR = {CholeskyBackend.CHOLMOD: 8, CholeskyBackend.SUPERLU: 120}
 
 Solved = tuple[Array, list[Array], float]
 
 
-class InterfaceFactor(Protocol):
-    """A factor of the sum of the robots' Schur complements and the driver's own blocks."""
+@dataclass(frozen=True, eq=False)
+class Separators:
+    """The poses that the driver solves for, and which of them are coupled.
 
-    def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
-        """Solve for the sum of the robots' right-hand sides and the driver's `own`, (side, k).
+    A robot without edges touches nothing; one whose edges have no end in the cover touches no pose.
+    """
 
-        The answer is x, (side, k), x on every robot's boundary, and b^T x.
+    cover: IntArray  # (g,): their numbers in the whole graph, ascending
+    touched: tuple[IntArray, ...]  # (g_a,) each: positions of those that a robot touches, ascending
+    # (k, 2) each: as `RobotSummary.coupled`; () without a driver that solves
+    coupled: tuple[IntArray, ...]
+    d: int
+    backend: CholeskyBackend
+
+    @classmethod
+    def of(
+        cls, summaries: Sequence[RobotSummary], backend: CholeskyBackend | None = None
+    ) -> Separators:
+        """Separators of robots; those with edges touch some."""
+        cover = np.unique(np.concatenate([robot.cover for robot in summaries]))
+        touched = [robot.touched for robot in summaries if robot.touched is not None]
+        coupled = [robot.coupled for robot in summaries if robot.coupled is not None]
+        return cls(
+            cover=cover,
+            touched=tuple(np.searchsorted(cover, poses) for poses in touched),
+            coupled=tuple(coupled),
+            d=summaries[0].d,
+            backend=backend or default_backend(),
+        )
+
+    @cached_property
+    def of_robots(self) -> tuple[csr_array, ...]:
+        """Lower triangles of the poses that every robot touches."""
+        triangles = []
+        for poses, pairs in zip(self.touched, self.coupled, strict=True):
+            shape = (len(poses), len(poses))
+            triangles.append(csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=shape))
+        return tuple(triangles)
+
+    @cached_property
+    def lower(self) -> csc_array:
+        """Lower triangle of the cover, (g, g)."""
+        pairs = [poses[coupled] for poses, coupled in zip(self.touched, self.coupled, strict=True)]
+        larger, smaller = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs]).T
+        return pattern_of_edges(len(self.cover), larger, smaller)
+
+    @cached_property
+    def order(self) -> IntArray:
+        """Order of elimination of the poses, (g,)."""
+        return order_of_pattern(self.lower, self.d)
+
+    @cached_property
+    def analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of a matrix with one entry for two poses that are coupled."""
+        return analyze(_stored(self.lower, self.backend)[0], self.backend, self.order)
+
+    @cached_property
+    def num_filled(self) -> int:
+        """Number of pairs of poses in the factor."""
+        return int(self.analysis.counts.in_row.sum())
+
+    @property
+    def middle(self) -> int:
+        """Position in the cover of a pose in the middle, by the number of coupled pairs between.
+
+        Bounds are proved with that pose left out: the smallest eigenvalue of what remains is much
+        smaller where a pose at the rim is.
         """
+        rows, columns = self.lower.tocoo().coords
+        return middle_node(edge_counts(rows, columns, len(self.cover)))
+
+
+def _stored(lower: csc_array, backend: CholeskyBackend) -> tuple[csc_array, IntArray | slice]:
+    """Pattern that the library wants of a lower triangle, and which entry each of its entries is.
+
+    CHOLMOD reads the lower triangle; SuperLU needs the symmetric matrix.
+    """
+    if backend is CholeskyBackend.CHOLMOD:
+        return lower, slice(None)
+    numbers = np.arange(1, lower.nnz + 1)
+    numbered = csc_array((numbers, lower.indices, lower.indptr), shape=lower.shape)
+    whole = csc_array(numbered + tril(numbered, -1).T)
+    whole.sort_indices()
+    entries = whole.data - 1
+    return csc_array((np.ones(whole.nnz), whole.indices, whole.indptr), whole.shape), entries
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownsPattern:
+    """The pattern of the unknowns, and its analysis."""
+
+    lower: csc_array
+    robots: tuple[Int32Array, ...]  # positions of every robot's entries among those of `lower`
+    stored: csc_array  # what is factored, and which entry of `lower` each of its entries is
+    entries: IntArray | slice
+    analysis: SymbolicCholesky
 
 
 @dataclass(frozen=True, eq=False)
 class Interface:
     """The matrix of the sum, for one kind of unknowns."""
 
-    num_separators: int
+    separators: Separators
     widths: Widths  # numbers per separator in every field; fields are stacked
-    touched: tuple[IntArray, ...]  # (g_a,) each: separators that every robot touches, ascending
-    fronts: FrontOwners
 
     @property
     def side(self) -> int:
         """Number of unknowns."""
-        return sum(self.widths) * self.num_separators
+        return sum(self.widths) * len(self.separators.cover)
 
     @cached_property
     def columns(self) -> tuple[IntArray, ...]:
         """Columns of every robot's boundary, each (g_a sum(widths),)."""
-        return tuple(columns_of(poses, self.num_separators, self.widths) for poses in self.touched)
+        num_separators = len(self.separators.cover)
+        return tuple(
+            columns_of(poses, num_separators, self.widths) for poses in self.separators.touched
+        )
 
     @property
     def num_bytes(self) -> int:
-        """Memory for contributions, fronts at work and the factor, known before it is spent."""
+        """Memory for contributions, their sum and the factor, known before it is spent."""
         width = sum(self.widths)
-        tree = self.fronts.tree
-        # numbers, in separators squared: of the factor so far, and of complements that wait
-        kept = 0.0
-        waiting = 0.0
-        most = 0.0
-        for front in tree:
-            e = len(front.eliminated)
-            b = len(front.boundary)
-            most = max(most, kept + waiting + _AT_WORK * (e + b) ** 2)
-            added = sum(0.5 * len(tree[child].boundary) ** 2 for child in front.children)
-            waiting += 0.5 * b**2 - added
-            kept += e * (e + b)
-        own = self.side * (width + 4)  # blocks of the driver, and orders of the unknowns
-        return int(8 * (width**2 * most + sum(self.num_entries) + own))
+        separators = self.separators
+        summed = _BYTES_OF_ENTRY * width**2 * separators.lower.nnz
+        factor = _BYTES_OF_FACTOR[separators.backend] * width**2 * separators.num_filled
+        # What robots send, and where it is added.
+        return summed + factor + 12 * sum(self.num_entries)
 
     @property
     def num_entries(self) -> list[int]:
         """Numbers that every robot sends of its Schur complement."""
-        sides = [sum(self.widths) * len(poses) for poses in self.touched]
-        return [side * (side + 1) // 2 for side in sides]
+        width = sum(self.widths)
+        lower = width * (width + 1) // 2
+        return [
+            width**2 * (robot.nnz - robot.shape[0]) + lower * robot.shape[0]
+            for robot in self.separators.of_robots
+        ]
 
     def check_memory(self, limit: float) -> None:
         """Refuse before the memory is spent: a SettingError when `num_bytes` is above `limit`."""
         if self.num_bytes <= limit:
             return
-        need = f"{1e-9 * self.num_bytes:.2g} GB for {self.num_separators} separators"
+        num_separators = len(self.separators.cover)
+        need = f"{1e-9 * self.num_bytes:.2g} GB for {num_separators} separators"
         raise SettingError(
-            f"the driver, and robots that hold fronts for it, would need {need}, more than "
+            f"the driver would need {need}, more than "
             f"{1e-9 * limit:.2g} GB: they are solved for in the start, Newton and the certificate, "
             "whatever the coupling; use a METIS partition or fewer robots, raise driver_memory "
             "(--driver-memory), or set it to 0: CONSENSUS without a driver, which gives poses and "
             "no certificate"
         )
 
+    @cached_property
+    def unknowns(self) -> UnknownsPattern:
+        """The pattern of the unknowns, analysed when it is first needed."""
+        separators = self.separators
+        lower = csc_array(coupled_unknowns(csr_array(separators.lower), self.widths))
+        order = row_order(separators.order, *self.widths)
+        most = partial(most_counts, separators.analysis, *self.widths)
+        stored, entries = _stored(lower, separators.backend)
+        analysis = analyze(stored, separators.backend, order, most)
+        keys = _keys(lower)
+        positions = []
+        for columns, coupled in zip(self.columns, separators.of_robots, strict=True):
+            of_robot = coupled_unknowns(coupled, self.widths).tocoo()
+            keys_of_robot = entry_keys(columns[of_robot.col], columns[of_robot.row], self.side)
+            positions.append(positions_of(keys_of_robot, keys).astype(np.int32))
+        return UnknownsPattern(lower, tuple(positions), stored, entries, analysis)
+
     def factorize(
         self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()
     ) -> InterfaceFactor:
         """Sum the robots' Schur complements and the driver's own blocks, and factor the sum.
 
-        The contributions, (g (g + 1) / 2,) for a robot with g columns, are as `Elimination.schur`;
-        the driver's own are pairs of columns (q, w) and values (q, w, w), each block on unknowns of
-        one separator. A NotPositiveDefiniteError when the sum is not positive definite.
+        The contributions are as `Elimination.schur`; the driver's own are pairs of columns (q, w)
+        and values (q, w, w), each block on unknowns of one separator. A NotPositiveDefiniteError
+        when the sum is not positive definite.
         """
-        width = sum(self.widths)
-        place = np.empty(self.side, dtype=np.int64)
-        place[self.order] = np.arange(self.side)
-        blocks = np.zeros((self.num_separators, width, width))
-        for columns, values in own:
-            separator, number = np.divmod(place[columns], width)
-            np.add.at(
-                blocks, (separator[:, :1, None], number[:, :, None], number[:, None, :]), values
-            )
-        name = self.fronts.new_factor()
-        matrix = FrontMatrix(name.number, self.widths, self.fronts.factors_in_use)
-        schur: dict[int, Array] = {}
-        for level in levels(self.fronts.tree):
-            parts = parts_of_fronts(self.fronts, level, contributions, schur, blocks)
-            orders = {number: (matrix, of_front) for number, of_front in parts.items()}
-            schur.update(self.fronts.ask(HeldFront.eliminate, orders))
-        return TreeFactor(self, name)
+        unknowns = self.unknowns
+        values = np.zeros(unknowns.lower.nnz)
+        keys = _keys(unknowns.lower)
+        for positions, part in zip(unknowns.robots, contributions, strict=True):
+            values[positions] += part
+        for columns, blocks in own:
+            row = np.broadcast_to(columns[:, :, None], blocks.shape)
+            column = np.broadcast_to(columns[:, None, :], blocks.shape)
+            is_lower = row >= column
+            of_blocks = entry_keys(column[is_lower], row[is_lower], self.side)
+            np.add.at(values, positions_of(of_blocks, keys), blocks[is_lower])
+        del keys
+        stored = unknowns.stored
+        matrix = csc_array(
+            (values[unknowns.entries], stored.indices, stored.indptr), shape=stored.shape
+        )
+        return InterfaceFactor(self, unknowns.analysis.factorize(matrix))
 
-    @cached_property
-    def order(self) -> IntArray:
-        """Unknowns, stacked field by field, in the order separator by separator."""
-        count = self.num_separators
-        fields: list[IntArray] = []
-        first = 0
-        for width in self.widths:
-            rows = first + np.arange(width * count)
-            fields.append(rows.reshape(count, width))
-            first += width * count
-        return np.concatenate(fields, axis=1).ravel()
+    def expected_error(self) -> Array:
+        """Return the share of the diagonal that factoring may take, 0 where it is not known before.
+
+        See `SymbolicCholesky.expected_error`.
+        """
+        return self.unknowns.analysis.expected_error()
 
     def rounding(
-        self, sizes: Sequence[Array], own: Sequence[tuple[IntArray, Array]], diagonal: Array
+        self,
+        sizes: Sequence[Array],
+        own: Sequence[tuple[IntArray, Array]],
+        diagonal: Array,
+        of_factor: Array,
     ) -> Array:
         """Bound by how much the factor can differ from the exact sum, as a diagonal, (side,).
 
         `own` are as there, `sizes`, (g,) each, the `row_sums` of the contributions in the scale of
-        `diagonal`, (side,), which is at least the diagonal of the sum.
+        `diagonal`, (side,), which is at least the diagonal of the sum. `of_factor`, (side,), is the
+        `expected_error` or the `backward_error` of the factor. An entry of the sum has a term of
+        every robot, and of the driver's own blocks.
         """
-        # Terms of the sum in every column: the eliminated unknowns of every front that a separator
-        # is in, and one for every part that is added there.
-        terms_of_separator = np.zeros(self.num_separators, dtype=np.int64)
-        most_in_row = 0
-        every = sum(self.widths)
-        for front in self.fronts.tree:
-            num_parts = len(front.robots) + len(front.children)
-            terms_of_separator[front.separators] += every * len(front.eliminated) + num_parts
-            most_in_row = max(most_in_row, every * len(front.separators))
-        terms = np.concatenate([np.repeat(terms_of_separator, width) for width in self.widths])
-        terms += len(sizes)
-        sums = self._row_sums(sizes, own, diagonal)
-        of_sums = gamma(float(terms.max(initial=0)) + 8.0)
-        of_factor = column_error(terms.astype(float), float(most_in_row))
-        error: Array = of_sums * sums + of_factor / (1.0 - of_sums) * diagonal
-        return OUTWARD * error
-
-    def _row_sums(
-        self, sizes: Sequence[Array], own: Sequence[tuple[IntArray, Array]], diagonal: Array
-    ) -> Array:
-        """Sum the `row_sums` of all parts of the sum, (side,)."""
+        of_sums = gamma(float(len(sizes) + len(own)) + 8.0)
         sums = self.gather([size[:, None] for size in sizes])[:, 0]
         for columns, values in own:  # as `row_sums`, block by block
             root = np.sqrt(diagonal[columns])
             weighted = np.abs(values) @ (1.0 / root)[:, :, None]
             np.add.at(sums, columns, root * weighted[:, :, 0])
-        return sums
+        error: Array = of_sums * sums + of_factor / (1.0 - of_sums) * diagonal
+        return OUTWARD * error
 
     def gather(self, parts: Sequence[Array]) -> Array:
         """Sum the robots' vectors on their boundaries, (side, k)."""
@@ -184,73 +291,30 @@ class Interface:
 
 
 @dataclass(frozen=True, eq=False)
-class TreeFactor:
-    """A factor along the tree; every front keeps its part under the name, as long as this lives."""
+class InterfaceFactor:
+    """A factor of the sum of the robots' Schur complements and the driver's own blocks."""
 
     interface: Interface
-    name: FactorName
+    factor: CholeskyFactor
+
+    def backward_error(self) -> Array:
+        """Share of the diagonal that factoring took at most (`CholeskyFactor.backward_error`)."""
+        return self.factor.backward_error()
 
     def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
-        """Solve as `InterfaceFactor.solve`: down to the root, and back."""
-        space = self.interface
-        fronts = space.fronts
-        k = parts[0].shape[1]
-        width = sum(space.widths)
-        blocks = own[space.order].reshape(-1, width, k) if own is not None else None
-        reduced, energy = self._reduce(parts, blocks)
-        x = np.empty((space.num_separators, width, k))
-        on_parts = list(parts)
-        known = reduced  # x on the boundary of fronts; that of the root is empty
-        for level in reversed(levels(fronts.tree)):
-            orders = {number: (self.name.number, known.pop(number)) for number in level}
-            answers = fronts.ask(HeldFront.substitute, orders)
-            for number, (x_E, below) in answers.items():
-                front = fronts.tree[number]
-                x[front.eliminated] = x_E.reshape(-1, width, k)
-                num_robots = len(front.robots)
-                for robot, part in zip(front.robots, below[:num_robots], strict=True):
-                    on_parts[robot] = part
-                known.update(zip(front.children, below[num_robots:], strict=True))
-        stacked = np.empty((space.side, k))
-        stacked[space.order] = x.reshape(stacked.shape)
-        return stacked, on_parts, energy
+        """Solve for the sum of the robots' right-hand sides and the driver's `own`, (side, k).
 
-    def _reduce(
-        self, parts: Sequence[Array], blocks: Array | None
-    ) -> tuple[dict[int, Array], float]:
-        """Reduce right-hand sides front by front, to what the root leaves, and compute b^T x."""
-        fronts = self.interface.fronts
-        energy = 0.0
-        reduced: dict[int, Array] = {}
-        for level in levels(fronts.tree):
-            parts_of_level = parts_of_fronts(fronts, level, parts, reduced, blocks)
-            orders = {
-                number: (self.name.number, of_front) for number, of_front in parts_of_level.items()
-            }
-            answers = fronts.ask(HeldFront.reduce, orders)
-            reduced.update({number: b for number, (b, _) in answers.items()})
-            energy += math.fsum(square for _, square in answers.values())
-        return reduced, energy
+        The answer is x, (side, k), x on every robot's boundary, and b^T x.
+        """
+        b = self.interface.gather(parts)
+        if own is not None:
+            b += own
+        x = self.factor.solve(b) if b.size else b
+        return x, self.interface.scatter(x), inner(b, x)
 
 
-def parts_of_fronts(
-    fronts: FrontOwners,
-    level: Sequence[int],
-    robots: Sequence[Array],
-    children: dict[int, Array],
-    own: Array | None,
-) -> dict[int, FrontParts]:
-    """Collect what the fronts of a level are the sum of.
-
-    The driver's part goes along where it is not zero; those of children are used up.
-    """
-    parts: dict[int, FrontParts] = {}
-    for number in level:
-        front = fronts.tree[number]
-        of_robots = [robots[robot] for robot in front.robots]
-        of_children = [children.pop(child) for child in front.children]
-        of_driver = own[front.eliminated] if own is not None else None
-        if of_driver is not None and not of_driver.any():
-            of_driver = None
-        parts[number] = FrontParts((*of_robots, *of_children), of_driver)
-    return parts
+def _keys(lower: csc_array) -> IntArray:
+    """Return the `entry_keys` of the entries of a pattern, column by column, ascending."""
+    side = lower.shape[1]
+    columns = np.repeat(np.arange(side), np.diff(lower.indptr))
+    return entry_keys(columns, lower.indices, side)

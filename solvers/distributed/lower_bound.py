@@ -13,6 +13,7 @@ import numpy as np
 
 from pgo_models.certificates import lower_bound as central
 from pgo_models.certificates.definiteness import (
+    ATTEMPTS,
     FIRST_MARGIN,
     ROUNDING_MULTIPLE,
     is_in_range,
@@ -22,10 +23,11 @@ from pgo_models.certificates.lower_bound import LowerBound
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array, BoolArray, stack_transposes
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum, gamma
 from pgo_models.problem.matrices import columns_of
 from solvers.distributed.driver import Driver
-from solvers.distributed.interface import InterfaceFactor
+from solvers.distributed.interface import Interface, InterfaceFactor
 from solvers.distributed.robots.handedness import report_terms, take_closed_form
 from solvers.distributed.robots.proof import ProofSums
 from solvers.distributed.robots.proof_orders import fits_part, move_proof, prove_interior
@@ -226,7 +228,7 @@ def _moved(
     own = np.where(free[:, None], point.sums.product, 0.0)  # as robots leave out the fixed rows
     rights = [step.right for step in point.steps]
     move, parts, energy = proof.factor.solve([right.b for right in rights], own)
-    steps = driver.ask_each(move_proof, parts, is_along=True)
+    steps = driver.ask_each(move_proof, parts)
     X = point.X.copy()
     # the translations matter in the residuals alone, which the robots have
     X[g:] -= move[g:]
@@ -313,16 +315,50 @@ def eliminate_S(
     if len(contributions) < len(answers):
         return None
     added[is_fixed[columns].any(axis=1)] = 0.0
-    lost = space.rounding(sizes, [(columns, added)], diagonal) + 8.0 * UNIT_ROUNDOFF * diagonal
-    shift = np.maximum(share * diagonal, ROUNDING_MULTIPLE * lost)
-    shifted = np.where(is_fixed, diagonal, -shift)
-    own = [(columns, added), (np.arange(len(diagonal))[:, None], shifted[:, None, None])]
-    try:
-        factor = space.factorize(contributions, own)
-    except NotPositiveDefiniteError:
+    proven = _factored_S(space, contributions, sizes, columns, added, diagonal, is_fixed, share)
+    if proven is None:
         return None
+    factor, slack = proven
     traces = [*np.einsum("naa->na", Lambda).ravel().tolist(), *(answer.trace for answer in answers)]
-    return InterfaceProof(factor, (shift - lost) / OUTWARD, answers, Lambda, traces)
+    return InterfaceProof(factor, slack, answers, Lambda, traces)
+
+
+def _factored_S(
+    space: Interface,
+    contributions: Sequence[Array],
+    sizes: Sequence[Array],
+    columns: IntArray,
+    added: Array,
+    diagonal: Array,
+    is_fixed: BoolArray,
+    share: float,
+) -> tuple[InterfaceFactor, Array] | None:
+    """Factor S on the separators less a share of its diagonal, more where rounding needs it.
+
+    The answer is the factor, and the diagonal that S is at least; None when S is not shown to be
+    positive definite. The driver adds the blocks `added` in `columns`.
+    """
+    blocks = [(columns, added)]
+
+    def lost(of_factor: Array) -> Array:
+        """What rounding can take, with this share of the diagonal for the factor."""
+        rounding = space.rounding(sizes, blocks, diagonal, of_factor)
+        return rounding + 8.0 * UNIT_ROUNDOFF * diagonal
+
+    of_factor = space.expected_error()
+    for _ in range(ATTEMPTS):
+        shift = np.maximum(share * diagonal, ROUNDING_MULTIPLE * lost(of_factor))
+        shifted = np.where(is_fixed, diagonal, -shift)
+        on_diagonal = (np.arange(len(diagonal))[:, None], shifted[:, None, None])
+        try:
+            factor = space.factorize(contributions, [*blocks, on_diagonal])
+        except NotPositiveDefiniteError:
+            return None
+        of_factor = factor.backward_error()
+        taken = lost(of_factor)
+        if (2.0 * taken <= shift).all():
+            return factor, (shift - taken) / OUTWARD
+    return None
 
 
 def _rows_of_robots(

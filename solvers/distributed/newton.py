@@ -155,7 +155,7 @@ class EliminatedAlgebra:
         else:
             turned = driver.ask(descent.turn, length, Count.PIGGYBACKED)
         t, parts = driver.best_translations(turned)
-        answers = driver.ask_each(descent.evaluate_trial, parts, is_along=True)
+        answers = driver.ask_each(descent.evaluate_trial, parts)
         return self._trial(self._moved(model, length)[0], t, answers)
 
     def _moved(self, model: Model, length: float) -> tuple[Array, Array]:

@@ -24,12 +24,6 @@ from pgo_models.graphs.pose_graph import IntArray, edge_counts, least_tree
 from pgo_models.graphs.written_digits import most_digits
 from pgo_models.problem.weighting import Weighting
 from solvers.distributed.driver import Driver
-from solvers.distributed.elimination_choice import (
-    MOST_COUPLED,
-    CoverSystem,
-    may_leave_poses,
-    positions_in_cover,
-)
 from solvers.distributed.robots.own_consistency import (
     AgreeingCounts,
     ConsistentPart,
@@ -48,11 +42,8 @@ from solvers.distributed.robots.own_file import (
     join_neighbours,
     number_poses,
     place_cover,
-    place_larger_cover,
-    propose_poses,
     read_file,
     take_cost,
-    take_larger_cover,
 )
 from solvers.network.counted_pool import Count, CountedPool
 from solvers.network.engine import Engine
@@ -60,7 +51,7 @@ from solvers.robust.bridges import bridges
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.revision import threshold_scale
-from solvers.soc.subgraph import RobotSummary, place_poses
+from solvers.soc.subgraph import place_poses
 
 SOLVE_PARTS = "solve each part in a folder of its own"
 
@@ -216,8 +207,6 @@ def _placed(
     has_two_costs = not all(can_run_soc)
     places = [(placement, has_two_costs) for placement in placements]
     summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
-    if memory != 0:
-        summaries = _chosen_elimination(network, summaries)
     return Driver(summaries, num_poses, lambda: network, memory), sizes
 
 
@@ -265,19 +254,6 @@ def _agreeing(network: CountedPool, neighbours: list[IntArray]) -> tuple[list[Bo
 def borders_of(parts: Sequence[ConsistentPart]) -> tuple[list[Border], int]:
     """Borders of what is left, and how many edges are not."""
     return [part.border for part in parts], sum(part.num_rejected for part in parts)
-
-
-def _chosen_elimination(network: CountedPool, summaries: list[RobotSummary]) -> list[RobotSummary]:
-    """Have robots leave poses to the driver where that is cheaper, as `choose_elimination`."""
-    system = CoverSystem.of(summaries)
-    if not may_leave_poses(system):
-        return summaries
-    held = network.ask(propose_poses, [MOST_COUPLED] * len(summaries), Count.ROUND)
-    larger = network.ask(place_larger_cover, positions_in_cover(held), Count.ROUND)
-    if CoverSystem.of(larger).flops >= system.flops:
-        return summaries
-    network.ask(take_larger_cover, [None] * len(summaries), Count.PIGGYBACKED)
-    return larger
 
 
 def _own_weighting(borders: Sequence[Border]) -> Weighting:

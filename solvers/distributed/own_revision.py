@@ -152,8 +152,9 @@ def go_to_poses_found(driver: Driver) -> None:
     R = driver.current.R.copy()
     t = driver.current.t.copy()
     for own in network.ask(tell_cover, nothing, Count.ROUND):
-        R[own.in_cover] = own.poses.R
-        t[own.in_cover] = own.poses.t
+        positions = driver.positions(own.numbers)
+        R[positions] = own.poses.R
+        t[positions] = own.poses.t
     driver.current = replace(driver.current, R=R, t=t)
     network.ask(go_to_solved, driver.poses_of_cover(), Count.PIGGYBACKED)
     answers = driver.ask(current_poses.evaluate, None, Count.PIGGYBACKED)

@@ -14,11 +14,11 @@ from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.distributed.driver import Driver, collect
 from solvers.distributed.driver_place import AttemptWithFaults, DriverPlace
-from solvers.distributed.elimination_choice import bytes_of_edges, choose_elimination
 from solvers.distributed.handedness import (
     RobotsPoint,
     begin_without_terms,
@@ -37,6 +37,7 @@ from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.here import Here
 from solvers.network.counted_pool import Count
 from solvers.network.engine import DEFAULT_MEMORY, Engine
+from solvers.network.ledger import BYTES_PER_NUMBER
 from solvers.place import AnySOC, Attempt, Ending, OwnStart, Traits, after_search
 from solvers.result import Outcome, Stage
 from solvers.riemannian.prefixes import GrowingStart
@@ -60,14 +61,19 @@ def open_driver(
     """
     subgraphs = split_graph(problem, robots, thresholds)
     if memory != 0:
-        subgraphs = choose_elimination(subgraphs)
-    grounded = middle_separator(problem.graph, subgraphs)
+        subgraphs = tuple(subgraph.for_driver() for subgraph in subgraphs)
     summaries = [subgraph.summary for subgraph in subgraphs]
+    grounded = middle_separator(problem.graph, summaries)
     start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
-    driver = Driver(summaries, problem.num_poses, start, memory, grounded)
+    driver = Driver(summaries, problem.num_poses, start, memory, grounded, problem.backend)
     ledger = driver.network.ledger
-    driver.network.ledger = replace(ledger, graph_bytes=bytes_of_edges(subgraphs))
+    driver.network.ledger = replace(ledger, graph_bytes=bytes_of_edges(problem.graph))
     return driver
+
+
+def bytes_of_edges(graph: PoseGraph) -> int:
+    """Bytes of a list of all edges, each a relative pose and the two precisions of F."""
+    return BYTES_PER_NUMBER * graph.num_edges * (graph.d * (graph.d + 1) // 2 + 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,7 +195,7 @@ class EliminatedClimb:
         """Return the direction of the smallest eigenvalue; all poses go to the next dimension."""
         driver = self.driver
         x, moves, length = _direction(driver, proven.eta)
-        values = driver.ask_each(climbing.climb, moves, is_along=True)
+        values = driver.ask_each(climbing.climb, moves)
         own = climbing.pulled(driver.current.multipliers, x[len(driver.cover) :])
         value = math.fsum([*values, -own])
         flat = append_dimension(poses_from(driver.current.R, driver.current.t))
@@ -248,7 +248,7 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
         if abs(value - last_value) <= _SETTLED * value:
             break
         moves = [Move(part, scale) for part in parts]
-        answers = driver.ask_each(climbing.follow_direction, moves, is_along=True)
+        answers = driver.ask_each(climbing.follow_direction, moves)
         own = np.concatenate([no_translations, scale * x[g:]])
     own_blocks = own[g:].reshape(-1, d)
     own_largest = float(np.sum(own_blocks**2, axis=1).max())

@@ -219,7 +219,7 @@ def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock,
     b[rows] = (0.5 * block.rho)[:, None] * block.shift
     x, parts, _ = state.factor.solve([right.b for right in state.right], b)
     block, own_sums = block.after_solve(x[rows])
-    sums_of_robots = driver.ask_each(recursion.solve, parts, is_along=True)
+    sums_of_robots = driver.ask_each(recursion.solve, parts)
     return block, own_sums + np.sum(sums_of_robots, axis=0)
 
 

@@ -41,8 +41,6 @@ class CountedPool:
         self._traffic: dict[bytes, Traffic] = {}
         # Bytes, already on the ledger, of the snapshots that a recovering pool took unasked.
         self._counted_snapshot_bytes = 0
-        # Names of the fields that go along a tree of workers.
-        self.elsewhere: tuple[str, ...] = ()
         # Robots without a driver sum along a tree to its root: all of them, parents first, and the
         # parent of each.
         self.tree: tuple[IntArray, IntArray] | None = None
@@ -54,21 +52,18 @@ class CountedPool:
         requests: Sequence[Q],
         count: Count,
         robots: IntArray | None = None,
-        is_along: bool = False,
     ) -> list[A]:
         """Answers of all workers to an order, each with its request.
 
         The ledger counts what `robots`, all unless given, exchange with the driver. Messages to
-        other workers are counted when they are exchanged. If there is a tree of workers, requests
-        with `is_along` go along it, and are counted there.
+        other workers are counted when they are exchanged.
         """
         answers = self._obeyed(order, requests)
         self._count_snapshots(answers if order is take_snapshot else [])
         if count is Count.OFF:
             return answers
         robots = np.arange(len(requests)) if robots is None else robots
-        asked = [] if is_along and self.elsewhere else requests
-        self._count_exchange_with_driver(robots, asked, answers, count)
+        self._count_exchange_with_driver(robots, requests, answers, count)
         if count in (Count.ALL_REDUCE, Count.GATHER):
             self.ledger = self.ledger.after_all_reduce(0)
         return answers
@@ -85,11 +80,9 @@ class CountedPool:
     def _count_exchange_with_driver(
         self, robots: IntArray, requests: Sequence[Any], answers: Sequence[Any], count: Count
     ) -> None:
-        """Count requests, unless there are none, and answers."""
-        request_sizes = [0] * len(robots)
-        if requests:
-            request_sizes = [count_bytes(requests[a], self.elsewhere) for a in robots.tolist()]
-        answer_sizes = [count_bytes(answers[a], self.elsewhere) for a in robots.tolist()]
+        """Count requests and answers."""
+        request_sizes = [count_bytes(requests[a]) for a in robots.tolist()]
+        answer_sizes = [count_bytes(answers[a]) for a in robots.tolist()]
         parent = np.full(len(robots), DRIVER)
         if self.tree is not None:
             outwards, parent = self.tree
@@ -131,7 +124,6 @@ class CountedPool:
         receiver: IntArray,
         sizes: Sequence[int] | IntArray,
         is_round: bool,
-        level: int = 0,
     ) -> None:
         """Count an exchange of messages of `sizes` bytes each, (q,).
 
@@ -140,8 +132,8 @@ class CountedPool:
         num_bytes = np.array(sizes, dtype=np.int64)
         is_sent = (num_bytes > 0) & (sender != receiver)
         exchange = sender[is_sent], receiver[is_sent], num_bytes[is_sent]
-        key = np.append(np.concatenate(exchange), level).tobytes()
-        traffic = self._traffic.setdefault(key, Traffic(*exchange, level))
+        key = np.concatenate(exchange).tobytes()
+        traffic = self._traffic.setdefault(key, Traffic(*exchange))
         self.ledger = self.ledger.after_exchange(traffic, is_round)
 
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar
 from pgo_models.errors import check_settings
 from solvers.network.messages import Worker, obey, raise_first_error
 
-# Bytes that the driver of a solve by robots may take with its fronts, unless given.
+# Bytes that the driver of a solve by robots may take with its matrix and factor, unless given.
 DEFAULT_MEMORY = 4e9
 T = TypeVar("T")
 Q = TypeVar("Q")

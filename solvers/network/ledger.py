@@ -26,16 +26,11 @@ class Traffic(Summarised):
         Robot that receives it, or `DRIVER`.
     num_bytes : IntArray, (q,)
         Payload of every message, eight bytes a number.
-    level : int
-        Level of the separator tree whose messages these are, in either direction: 1 between its
-        leaves and their parents, and so on towards the root. 0 for messages outside of the tree,
-        between the driver and robots or between neighbouring robots.
     """
 
     sender: IntArray
     receiver: IntArray
     num_bytes: IntArray
-    level: int = 0
 
     def __post_init__(self) -> None:
         if not self.sender.shape == self.receiver.shape == self.num_bytes.shape:
@@ -51,11 +46,10 @@ class Ledger(Summarised):
     """Communication of a distributed run; a solve by robots returns it as `Solution.ledger`.
 
     A round is one exchange that robots wait for: between neighbouring robots, or from the robots to
-    the driver, the process that coordinates them, and back. The way through a separator tree, level
-    by level, is one round. An all-reduce, after which every robot knows the sum of a few numbers,
-    is counted in `all_reduces`, not in `rounds`. Where the driver does the summing, its messages
-    are in `counted` like any others; elsewhere no single messages are known, and only their payload
-    is added to `all_reduce_bytes`.
+    the driver, the process that coordinates them, and back. An all-reduce, after which every robot
+    knows the sum of a few numbers, is counted in `all_reduces`, not in `rounds`. Where the driver
+    does the summing, its messages are in `counted` like any others; elsewhere no single messages
+    are known, and only their payload is added to `all_reduce_bytes`.
 
     Parameters
     ----------
@@ -210,14 +204,7 @@ class Ledger(Summarised):
     @property
     def num_bytes(self) -> int:
         """Payload of the messages in `counted`, in bytes."""
-        return int(self.bytes_by_level.sum())
-
-    @property
-    def bytes_by_level(self) -> IntArray:
-        """Bytes on every level of the separator tree, (levels + 1,); entry 0 is outside of it."""
-        level = [traffic.level for traffic, _ in self.counted]
-        payload = [times * int(traffic.num_bytes.sum()) for traffic, times in self.counted]
-        return np.bincount(level, weights=payload, minlength=1).astype(np.int64)
+        return sum(times * int(traffic.num_bytes.sum()) for traffic, times in self.counted)
 
     @property
     def bytes_sent(self) -> IntArray:

@@ -4,7 +4,7 @@ Requests and answers are numbers, arrays and records.
 """
 
 import enum
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -103,14 +103,13 @@ def raise_first_error(answers: list[Any]) -> list[Any]:
     return answers
 
 
-def count_bytes(record: object, ignored_fields: Collection[str] = ()) -> int:
+def count_bytes(record: object) -> int:
     """Count the bytes that a request or an answer carries between a worker and the driver.
 
     A number takes eight bytes, an array its `nbytes`, and a token those of its message.
 
-    A mapping holds messages for other workers, which are counted when they are exchanged. Fields in
-    `ignored_fields` are counted elsewhere, and fields whose names begin with `measured` are off the
-    ledger.
+    A mapping holds messages for other workers, which are counted when they are exchanged. Fields
+    whose names begin with `measured` are off the ledger.
     """
     if isinstance(record, np.ndarray):
         return record.nbytes
@@ -119,12 +118,12 @@ def count_bytes(record: object, ignored_fields: Collection[str] = ()) -> int:
     if isinstance(record, Token):
         return record.num_bytes
     if isinstance(record, tuple):
-        return sum(count_bytes(item, ignored_fields) for item in record)
+        return sum(count_bytes(item) for item in record)
     fields = getattr(type(record), "__dataclass_fields__", None)
     if fields is None:
         return BYTES_PER_NUMBER * int(np.size(record))  # type: ignore[arg-type] # a number or an array
     total = 0
     for name in fields:
-        if name not in ignored_fields and not name.startswith("measured"):
-            total += count_bytes(getattr(record, name), ignored_fields)
+        if not name.startswith("measured"):
+            total += count_bytes(getattr(record, name))
     return total

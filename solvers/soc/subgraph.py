@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +23,7 @@ from pgo_models.graphs.separators import cover_of_edges
 from pgo_models.problem.edge_cost import EdgeCost
 from pgo_models.problem.initialization import largest_stiffness
 from pgo_models.problem.problem import PGOProblem, as_problem
-from solvers.soc.subdomains import Subdomains, find_subdomains, poses_to_leave
+from solvers.soc.subdomains import MOST_COUPLED, Subdomains, find_subdomains, poses_to_leave
 
 
 class PartProblem(PGOProblem):
@@ -47,8 +48,8 @@ class Subgraph:
         Numbers of its poses in the whole graph, ascending.
     owner : (n_a,) array
         Which robot owns each pose.
-    in_cover : (n_a,) array
-        Position of each pose among those that the driver solves for, or -1.
+    is_separator : (n_a,) array
+        Whether the driver solves for a pose.
     is_counted : (m_a,) array
         Whether an edge is this robot's in sums over robots; every edge of the whole graph is
         counted once. An edge to a pose that the driver does not solve for is counted by the owner
@@ -67,16 +68,15 @@ class Subgraph:
         (`PGOProblem.convex_part`).
     thresholds : (m_a,) array or None
         What its edges may cost in a robust solve, inf for known inliers.
-    is_sparse : bool
-        Whether the robot sends its Schur complement subdomain by subdomain
-        (`solvers.soc.subdomains`), or as one dense matrix.
+    has_driver : bool
+        Whether there is a driver that solves for poses (`for_driver`).
     """
 
     robot: int
     graph: PoseGraph
     poses: IntArray
     owner: IntArray
-    in_cover: IntArray
+    is_separator: BoolArray
     is_counted: BoolArray
     copies: IntArray
     common: tuple[tuple[int, IntArray], ...]
@@ -84,7 +84,7 @@ class Subgraph:
     weights: EdgeCost
     final: EdgeCost | None = None
     thresholds: Array | None = None
-    is_sparse: bool = False
+    has_driver: bool = False
 
     @cached_property
     def is_own(self) -> BoolArray:
@@ -125,47 +125,39 @@ class Subgraph:
         return Part(
             problem=PartProblem(counted, None, self.weights.of_edges(kept)),
             poses=self.poses[poses],
-            in_cover=self.in_cover[poses],
+            is_separator=self.is_separator[poses],
             final=final,
             edges=self.edges[kept],
             thresholds=None if self.thresholds is None else self.thresholds[kept],
-            is_sparse=self.is_sparse,
         )
 
-    def poses_left(self, most_coupled: int) -> IntArray:
-        """Numbers of its interior poses that it leaves to the driver (`poses_to_leave`)."""
+    def for_driver(self) -> Subgraph:
+        """The subgraph of a robot with a driver, to which it leaves poses (`poses_to_leave`).
+
+        It leaves none where its Schur complement would have more entries then. Every edge is
+        counted by the robot that counted it before.
+        """
+        eliminating = replace(self, has_driver=True)
         part = self.part
         if part is None:
-            return np.zeros(0, dtype=np.int64)
-        is_boundary = part.in_cover >= 0
-        return part.poses[poses_to_leave(part.problem.graph, is_boundary, most_coupled)]
-
-    def held_cover(self, poses_of_driver: IntArray) -> IntArray:
-        """Poses of the robot in the cover, ascending, with those that it leaves to the driver."""
-        return np.union1d(self.poses[self.in_cover >= 0], poses_of_driver)
-
-    def with_larger_cover(self, poses_of_driver: IntArray, positions: IntArray) -> Subgraph:
-        """The subgraph when the driver solves for the poses that robots leave to it, too.
-
-        `poses_of_driver` are poses of this robot. `positions` says where the new cover has the
-        poses of `held_cover`. Every edge is counted by the robot that counted it before.
-        """
-        in_cover = np.full(len(self.poses), -1)
-        in_cover[np.searchsorted(self.poses, self.held_cover(poses_of_driver))] = positions
-        return replace(self, in_cover=in_cover, is_sparse=True)
+            return eliminating
+        chosen = poses_to_leave(part.problem.graph, part.is_separator, MOST_COUPLED)
+        is_separator = self.is_separator.copy()
+        is_separator[np.searchsorted(self.poses, part.poses[chosen])] = True
+        leaving = replace(eliminating, is_separator=is_separator)
+        assert leaving.part is not None
+        num_sent = leaving.part.subdomains.coupled.nnz
+        return leaving if num_sent < part.subdomains.num_products else eliminating
 
     @cached_property
     def summary(self) -> RobotSummary:
         """What the driver is sent of it."""
         poses_of_part = self.counted[0]
-        in_cover_of_part = self.in_cover[poses_of_part]
-        touched = np.sort(in_cover_of_part[in_cover_of_part >= 0])
-        shared = np.flatnonzero(self.in_cover >= 0)
+        touched = self.poses[poses_of_part[self.is_separator[poses_of_part]]]
         return RobotSummary(
             robot=self.robot,
             d=self.graph.d,
-            cover=self.poses[shared],
-            in_cover=self.in_cover[shared],
+            cover=self.poses[self.is_separator],
             touched=touched if self.is_counted.any() else None,
             has_two_costs=self.final is not None,
             has_translations=self.weights.has_translations,
@@ -176,8 +168,8 @@ class Subgraph:
 
     @property
     def _coupled(self) -> IntArray | None:
-        """Pairs of touched poses that the Schur complement couples, (k, 2), if it is sparse."""
-        if self.part is None or not self.is_sparse:
+        """Pairs of touched poses that the Schur complement couples, (k, 2), if there is one."""
+        if self.part is None or not self.has_driver:
             return None
         return np.stack(self.part.subdomains.coupled.nonzero(), axis=1)
 
@@ -194,11 +186,8 @@ class RobotSummary:
         Dimension.
     cover : (h,) array
         Numbers in the whole graph of the poses in the cover that the robot holds.
-    in_cover : (h,) array
-        Their positions in the cover.
     touched : array or None
-        Positions in the cover of the poses that the robot's counted edges join; None if it counts
-        none.
+        Numbers of those that the robot's counted edges join; None if it counts none.
     has_two_costs : bool
         Whether SOC is run on another cost than the one that is solved.
     has_translations : bool
@@ -207,7 +196,7 @@ class RobotSummary:
         Numbers of all poses that these edges join; None where only the robot may know them.
     coupled : (k, 2) array or None
         Pairs of positions in `touched`, the larger first, of poses that are coupled in the Schur
-        complement of the robot; None where it is dense.
+        complement of the robot; None without one.
     stiffness : float or None
         Largest kappa / tau of the counted edges, see `largest_stiffness`; None where their
         rotations cannot be averaged.
@@ -216,7 +205,6 @@ class RobotSummary:
     robot: int
     d: int
     cover: IntArray
-    in_cover: IntArray
     touched: IntArray | None
     has_two_costs: bool
     has_translations: bool
@@ -230,24 +218,24 @@ class Placement:
     """The poses that a robot shares with others, with the fields that `Subgraph` has of them."""
 
     poses: IntArray  # (h,): their numbers in the whole graph
-    in_cover: IntArray
+    is_separator: BoolArray
     copies: IntArray
     common: tuple[tuple[int, IntArray], ...]  # positions in `poses`
 
     def of(
         self, robot: int, graph: PoseGraph, poses: IntArray, owner: IntArray
-    ) -> tuple[IntArray, BoolArray, IntArray, tuple[tuple[int, IntArray], ...]]:
-        """`in_cover`, `is_counted`, `copies` and `common` of the robot's subgraph."""
+    ) -> tuple[BoolArray, BoolArray, IntArray, tuple[tuple[int, IntArray], ...]]:
+        """`is_separator`, `is_counted`, `copies` and `common` of the robot's subgraph."""
         positions = np.searchsorted(poses, self.poses)
-        in_cover = np.full(len(poses), -1)
-        in_cover[positions] = self.in_cover
+        is_separator = np.zeros(len(poses), dtype=bool)
+        is_separator[positions] = self.is_separator
         copies = np.ones(len(poses), dtype=np.int64)
         copies[positions] = self.copies
         # The owner of an end outside the cover counts the edge; if both ends are outside they have
         # the same owner. Else the owner of the first end counts it.
-        counted_by = np.where(in_cover[graph.j] < 0, owner[graph.j], owner[graph.i])
+        counted_by = np.where(is_separator[graph.j], owner[graph.i], owner[graph.j])
         common = tuple((other, positions[shared]) for other, shared in self.common)
-        return in_cover, counted_by == robot, copies, common
+        return is_separator, counted_by == robot, copies, common
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,26 +248,22 @@ class Part:
         The cost that SOC is run on.
     poses : (p,) array
         Numbers of its poses in the whole graph.
-    in_cover : (p,) array
-        Position of each pose among those that the driver solves for, or -1 for the robot's
-        interior.
+    is_separator : (p,) array
+        Whether the driver solves for a pose; the others are the robot's interior.
     final : PartProblem or None
         The cost that is solved, where SOC is run on another one.
     edges : (k,) array or None
         Numbers of its edges in the whole graph.
     thresholds : (k,) array or None
         What its edges may cost in a robust solve.
-    is_sparse : bool
-        Whether its Schur complement is sent subdomain by subdomain.
     """
 
     problem: PartProblem
     poses: IntArray
-    in_cover: IntArray
+    is_separator: BoolArray
     final: PartProblem | None = None
     edges: IntArray | None = None
     thresholds: Array | None = None
-    is_sparse: bool = False
 
     def weighted(self, weights: Array) -> Part:
         """The part with the costs of its edges times weights, (k,)."""
@@ -299,13 +283,12 @@ class Part:
     @cached_property
     def interior(self) -> IntArray:
         """Poses of the part that only this robot knows."""
-        return np.flatnonzero(self.in_cover < 0)
+        return np.flatnonzero(~self.is_separator)
 
     @cached_property
     def boundary(self) -> IntArray:
-        """Poses of the part that the driver solves for, in the driver's order."""
-        in_cover = np.flatnonzero(self.in_cover >= 0)
-        return in_cover[np.argsort(self.in_cover[in_cover])]
+        """Poses of the part that the driver solves for."""
+        return np.flatnonzero(self.is_separator)
 
     @cached_property
     def subdomains(self) -> Subdomains:
@@ -376,13 +359,13 @@ def _subgraph(
         weights_error=graph.weights_error,
     )
     convex_part = problem.convex_part
-    in_cover, is_counted, copies, common = placement.of(robot, local, poses, owner)
+    is_separator, is_counted, copies, common = placement.of(robot, local, poses, owner)
     return Subgraph(
         robot,
         local,
         poses,
         owner,
-        in_cover,
+        is_separator,
         is_counted,
         copies,
         common,
@@ -405,8 +388,8 @@ def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int)
     cover = cover_of_edges(i, j)
     if not len(poses):  # the bound is grounded at a pose that the driver has
         poses, owner, cover = np.array([[middle], [0], [0]])
-    in_cover = np.full(len(poses), -1)
-    in_cover[cover] = np.arange(len(cover))
+    is_separator = np.zeros(len(poses), dtype=bool)
+    is_separator[cover] = True
     # A robot holds its own poses, and the far ends of its edges.
     pose = np.concatenate([np.arange(len(poses)), i, j])
     robot = np.concatenate([owner, owner[j], owner[i]])
@@ -415,12 +398,10 @@ def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int)
     by_robot = holds.tocsc()
     copies = np.diff(holds.indptr)
     placements = []
-    for number, held_poses in enumerate(np.split(by_robot.indices, by_robot.indptr[1:-1])):
-        held_poses.sort()
-        common = _poses_in_common(holds[held_poses].tocsc(), number)
-        placements.append(
-            Placement(poses[held_poses], in_cover[held_poses], copies[held_poses], common)
-        )
+    for number, own in enumerate(np.split(by_robot.indices, by_robot.indptr[1:-1])):
+        own.sort()
+        common = _poses_in_common(holds[own].tocsc(), number)
+        placements.append(Placement(poses[own], is_separator[own], copies[own], common))
     return placements
 
 
@@ -437,10 +418,8 @@ def _poses_in_common(holds: csc_array, robot: int) -> tuple[tuple[int, IntArray]
     return tuple(common)
 
 
-def middle_separator(graph: PoseGraph, subgraphs: tuple[Subgraph, ...]) -> int:
+def middle_separator(graph: PoseGraph, summaries: Sequence[RobotSummary]) -> int:
     """Position in the cover of the pose that is nearest to the middle of the graph."""
-    in_cover = np.full(graph.num_poses, -1)
-    for subgraph in subgraphs:
-        in_cover[subgraph.poses] = np.maximum(in_cover[subgraph.poses], subgraph.in_cover)
+    cover = np.unique(np.concatenate([robot.cover for robot in summaries]))
     order = poses_by_distance(graph, middle_pose(graph))
-    return int(in_cover[order[np.argmax(in_cover[order] >= 0)]])
+    return int(np.searchsorted(cover, order[np.argmax(np.isin(order, cover))]))

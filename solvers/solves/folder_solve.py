@@ -257,7 +257,7 @@ def solve_folder(
 class FilesOfRobots:
     """Files that robots read, each where it runs, under one name, to be solved for one cost.
 
-    `engine` runs the robots, `memory` are the bytes that the driver's fronts may take.
+    `engine` runs the robots, `memory` are the bytes that the driver may take.
     """
 
     name: str

@@ -294,7 +294,7 @@ def driver_job(robots: str, poses: str) -> dict[str, object]:
         "rounds": solution.ledger.rounds,
         "driver": total - timed.seconds.sum(),
         "busiest": timed.seconds.max(),
-        "levels": [round(1e-6 * one, 1) for one in solution.ledger.bytes_by_level],
+        "sent": round(1e-6 * solution.ledger.num_bytes, 1),
         "gap": solution.certificate.proven_gap,
         "verdict": solution.certificate.verdict.name,
         "memory": memory(),
@@ -444,7 +444,7 @@ def driver_table() -> Table:
         "rounds",
         "driver, s",
         "busiest robot, s",
-        "MB by level",
+        "MB sent",
         "gap",
         "MB",
     )
@@ -456,7 +456,7 @@ def driver_table() -> Table:
             str(robots),
             *(str(row[key]) for key in ("cover", "rounds")),
             *(f"{row[key]:.2f}" for key in ("driver", "busiest")),
-            " / ".join(map(str, row["levels"])),
+            str(row["sent"]),
             f"{rounded_up(row['gap'], 2)} {row['verdict']}",
             f"{row['memory']:.0f}",
         )

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import enum
-import importlib.util
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from itertools import islice
@@ -15,7 +14,7 @@ from budget import examples
 from every_solver import SOLVERS
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings, strategies as st
-from robots import metis, share, sparse_elimination
+from robots import leaving, metis
 from scipy.sparse import issparse
 
 import pgo_models
@@ -312,26 +311,17 @@ BY_ROBOTS = pytest.mark.parametrize("begin", METHODS_OF_ROBOTS.values(), ids=MET
 
 
 @contextmanager
-def fronts_with_robots() -> Iterator[Engine]:
-    with pytest.MonkeyPatch.context() as patch:
-        share(patch)
-        yield InProcess()
-
-
-@contextmanager
-def fronts_with_driver() -> Iterator[Engine]:
+def by_default() -> Iterator[Engine]:
     yield InProcess(threads=2)
 
 
 @contextmanager
-def sparse_matrix_with_driver() -> Iterator[Engine]:
-    with sparse_elimination(2):
+def poses_left_to_the_driver() -> Iterator[Engine]:
+    with leaving(2):
         yield InProcess()
 
 
-PLACES = [fronts_with_driver, fronts_with_robots]
-if importlib.util.find_spec("cvxopt") is not None:  # CHOLMOD, of the extra `fast`
-    PLACES.append(sparse_matrix_with_driver)
+PLACES = [by_default, poses_left_to_the_driver]
 IN_EVERY_PLACE = pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)
 
 
@@ -387,7 +377,7 @@ def test_a_step_twice_from_one_state_gives_the_same_state_twice(begin: Begin, pl
 
 def test_a_state_of_another_driver_is_refused() -> None:
     method = SubstructuredNewton()
-    with driver_in(fronts_with_driver) as driver, driver_in(fronts_with_driver) as other:
+    with driver_in(by_default) as driver, driver_in(by_default) as other:
         state = method.init(other, None)
         with pytest.raises(SettingError, match="not of a run with this driver; begin with"):
             method.step(driver, state)

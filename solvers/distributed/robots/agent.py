@@ -12,7 +12,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.relaxations.low_rank import LiftedPoses
-from solvers.distributed.robots.elimination import FrontFactor, HeldFront
 from solvers.distributed.robots.interior import Interior, interior_of
 from solvers.distributed.robots.proof import RobotProof
 from solvers.distributed.robots.records import Reweigh, RobotAscent
@@ -66,14 +65,13 @@ class AgentRecord:
 
     held: HeldStates
     moments: Mapping[int, HeldStates]
-    front: HeldFront | None
 
 
 @dataclass(frozen=True, eq=False)
 class CoverRotations:
-    """Omega of the own poses that are in the cover, and their positions there."""
+    """Omega of the own poses that are in the cover, and their numbers in the whole graph."""
 
-    in_cover: IntArray
+    numbers: IntArray
     R: np.ndarray
 
 
@@ -108,8 +106,6 @@ CLASSES = (
     RecursionSession,
     DescentSession,
     ProofSession,
-    HeldFront,
-    FrontFactor,
 )
 
 
@@ -121,7 +117,6 @@ class BaseAgent(ABC):
         # As in `Held`.
         self.interior: Interior | None = interior
         self.copies: Copies | None = None
-        self.front: HeldFront | None = None  # None if it holds no front of the separator tree
         self.moments: dict[int, Held] = {}
 
     @property
@@ -144,7 +139,7 @@ class BaseAgent(ABC):
         """State that earlier orders left, as arrays, with matrices instead of their factors."""
         moments = {number: _states(held) for number, held in self.moments.items()}
         held = _states(Held(self.interior, self.copies))
-        return serialize(AgentRecord(held, moments, self.front))
+        return serialize(AgentRecord(held, moments))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this robot."""
@@ -152,7 +147,6 @@ class BaseAgent(ABC):
         held = self._restored(record.held)
         self.interior = held.interior
         self.copies = held.copies
-        self.front = record.front
         self.moments = {number: self._restored(states) for number, states in record.moments.items()}
 
     def _restored(self, states: HeldStates) -> Held:
@@ -215,20 +209,6 @@ def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: BaseAgent, request
     return answer
 
 
-def take_front(agent: BaseAgent, front: HeldFront | None) -> None:
-    """Hold this front of the separator tree from now on."""
-    agent.front = front
-
-
-def order_front(
-    order: Callable[[HeldFront, Q], tuple[HeldFront, A]], agent: BaseAgent, request: Q
-) -> A:
-    """Give an order to the front that the robot holds."""
-    assert agent.front is not None
-    agent.front, answer = order(agent.front, request)
-    return answer
-
-
 def begin_copies(agent: BaseAgent, cover: Poses) -> Rows:
     """Start the copies at the current poses, of which the driver sends those of the cover."""
     if not isinstance(agent.copies, ConsensusRobot):
@@ -250,11 +230,10 @@ def held_poses(agent: BaseAgent, cover: Poses) -> Poses:
     subgraph = agent.subgraph
     d = subgraph.graph.d
     n = len(subgraph.poses)
-    in_cover = subgraph.in_cover >= 0
     R = np.broadcast_to(np.eye(d), (n, d, d)).copy()
     t = np.zeros((n, d))
-    R[in_cover] = cover.R
-    t[in_cover] = cover.t
+    R[subgraph.is_separator] = cover.R
+    t[subgraph.is_separator] = cover.t
     if agent.interior is not None:
         part = agent.interior.part
         poses = agent.interior.poses
@@ -273,5 +252,5 @@ def finish_copies(agent: BaseAgent, _: None) -> CoverRotations:
     if interior is not None:
         position = np.searchsorted(subgraph.poses, interior.part.poses)
         agent.interior = interior.at_rotations(omega[position])
-    own = np.flatnonzero(subgraph.is_own & (subgraph.in_cover >= 0))
-    return CoverRotations(subgraph.in_cover[own], omega[own])
+    own = np.flatnonzero(subgraph.is_own & subgraph.is_separator)
+    return CoverRotations(subgraph.poses[own], omega[own])

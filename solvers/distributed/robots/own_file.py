@@ -225,15 +225,10 @@ class CostedFile:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFile:
-    """After `place_cover`: its subgraph, as a robot has it that was given one.
-
-    Poses may be proposed to be left to the driver: their numbers, and its subgraph if they are.
-    """
+    """After `place_cover`: its subgraph, as a robot has it that was given one."""
 
     joined: JoinedFile
     subgraph: Subgraph
-    left: IntArray | None = None
-    larger: Subgraph | None = None
     answer: Poses | None = None  # the poses that were kept
     # Of a robust solve: edges within their thresholds, (m_a,), as far as this robot counts them,
     # and edges of everything that are near the map.
@@ -272,11 +267,6 @@ class FileAgent(BaseAgent):
     def subgraph(self) -> Subgraph:
         """Its part of the graph, once the cover is placed."""
         return self.known(PlacedFile).subgraph
-
-    def place(self, record: PlacedFile) -> None:
-        """Take another subgraph, with an interior at the identity."""
-        self.record = record
-        self.interior = interior_of(record.subgraph, self.backend)
 
 
 def read_file(agent: FileAgent, _: None) -> Claim:
@@ -454,32 +444,10 @@ def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary
     subgraph = Subgraph(
         *known, *placement.of(*known), edges, weights, final, thresholds=joined.thresholds
     )
-    agent.place(PlacedFile(joined, subgraph))
+    subgraph = subgraph.for_driver()
+    agent.record = PlacedFile(joined, subgraph)
+    agent.interior = interior_of(subgraph, agent.backend)
     return replace(subgraph.summary, part=None)
-
-
-def propose_poses(agent: FileAgent, most_coupled: int) -> IntArray:
-    """Propose poses to leave to the driver; return those of the cover, with them, that it holds."""
-    placed = agent.known(PlacedFile)
-    left = placed.subgraph.poses_left(most_coupled)
-    agent.record = replace(placed, left=left)
-    return placed.subgraph.held_cover(left)
-
-
-def place_larger_cover(agent: FileAgent, positions: IntArray) -> RobotSummary:
-    """Learn where these poses would be in the cover."""
-    placed = agent.known(PlacedFile)
-    assert placed.left is not None
-    larger = placed.subgraph.with_larger_cover(placed.left, positions)
-    agent.record = replace(placed, larger=larger)
-    return replace(larger.summary, part=None)
-
-
-def take_larger_cover(agent: FileAgent, _: None) -> None:
-    """Leave the poses to the driver."""
-    placed = agent.known(PlacedFile)
-    assert placed.larger is not None
-    agent.place(PlacedFile(placed.joined, placed.larger))
 
 
 def keep_answer(agent: FileAgent, cover: Poses) -> Answer:

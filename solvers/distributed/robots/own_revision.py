@@ -74,9 +74,9 @@ class SolvedPoses:
 
 @dataclass(frozen=True, eq=False)
 class OwnCover:
-    """Own poses in the cover, and their positions there, (h,)."""
+    """Own poses in the cover, and their numbers in the whole graph, (h,)."""
 
-    in_cover: IntArray
+    numbers: IntArray
     poses: Poses
 
 
@@ -174,9 +174,9 @@ def tell_cover(agent: FileAgent, _: None) -> OwnCover:
     """Order: return the own poses that were found, of those in the cover."""
     placed = agent.known(PlacedFile)
     subgraph = placed.subgraph
-    in_cover = subgraph.in_cover[subgraph.is_own]
-    shared = np.flatnonzero(in_cover >= 0)
-    return OwnCover(in_cover[shared], _solved(placed.joined)[shared])
+    own = np.flatnonzero(subgraph.is_own)
+    in_cover = np.flatnonzero(subgraph.is_separator[own])
+    return OwnCover(subgraph.poses[own[in_cover]], _solved(placed.joined)[in_cover])
 
 
 def go_to_solved(agent: FileAgent, cover: Poses) -> None:

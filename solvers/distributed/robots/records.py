@@ -14,8 +14,6 @@ from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.copies import OwnPoses
 from solvers.soc.recursion_block import Agreement
 
-ALONG_TREE = ("b", "schur", "x")  # fields of what goes between a robot and the front above it
-
 
 @dataclass(frozen=True, eq=False)
 class RightHandSide:
@@ -29,7 +27,7 @@ class RightHandSide:
 class Reduced:
     """A robot's matrix and right-hand side with the interior eliminated."""
 
-    schur: Array  # (w g (w g + 1) / 2,): lower triangle, packed
+    schur: Array  # as `Elimination.schur`
     diagonal: Array  # (w g,): of the matrix before the elimination
     right: RightHandSide
 

@@ -56,30 +56,30 @@ class SubdomainBlocks:
     The columns of a subdomain are the unknowns of the poses that it reaches.
     """
 
-    pattern: csr_array  # (g, g): lower triangle
-    label: IntArray  # (i,): subdomain of every unknown of the interior
-    # (s + 1,), (c,): where the columns of every subdomain begin, and the columns, ascending
-    pointers: IntArray
-    columns: IntArray
+    subdomains: Subdomains
+    widths: Widths
 
-    @classmethod
-    def of(cls, subdomains: Subdomains, widths: Widths) -> SubdomainBlocks:
-        """Blocks of unknowns with these numbers per pose."""
-        of_fields = [kron(subdomains.reached, np.ones((1, width))) for width in widths]
-        reached = csr_array(block_array([of_fields])) if subdomains.reached.nnz else None
-        num_subdomains = subdomains.reached.shape[0]
-        pointers = np.zeros(num_subdomains + 1, dtype=np.int64)
-        columns = np.zeros(0, dtype=np.int64)
-        if reached is not None:
-            reached.sort_indices()
-            pointers = reached.indptr.astype(np.int64)
-            columns = reached.indices.astype(np.int64)
-        return cls(
-            pattern=coupled_unknowns(subdomains.coupled, widths),
-            label=np.concatenate([np.repeat(subdomains.label, width) for width in widths]),
-            pointers=pointers,
-            columns=columns,
-        )
+    @cached_property
+    def pattern(self) -> csr_array:
+        """Lower triangle, (g, g)."""
+        return coupled_unknowns(self.subdomains.coupled, self.widths)
+
+    @cached_property
+    def label(self) -> IntArray:
+        """Subdomain of every unknown of the interior, (i,)."""
+        label = self.subdomains.label
+        return np.concatenate([np.repeat(label, width) for width in self.widths])
+
+    @cached_property
+    def reached(self) -> csr_array:
+        """Entries where a subdomain reaches an unknown of the boundary, (s, g)."""
+        of_poses = self.subdomains.reached
+        of_fields = [kron(of_poses, np.ones((1, width))) for width in self.widths]
+        if not of_poses.nnz:
+            return csr_array((of_poses.shape[0], sum(self.widths) * of_poses.shape[1]))
+        reached = csr_array(block_array([of_fields]))
+        reached.sort_indices()
+        return reached
 
     @property
     def side(self) -> int:
@@ -111,17 +111,18 @@ class SubdomainBlocks:
 
     def compressed(self, K_IG: csr_array) -> Array:
         """K_IG, (i, g), with the columns of every subdomain moved to the front."""
-        widest = int(np.diff(self.pointers).max(initial=0))
+        pointers = self.reached.indptr
+        num_columns = np.diff(pointers)
         entries = K_IG.tocoo()
         subdomain = self.label[entries.row]
-        of_columns = np.repeat(np.arange(len(self.pointers) - 1), np.diff(self.pointers))
+        of_columns = np.repeat(np.arange(len(num_columns)), num_columns)
         places = positions_of(
             entry_keys(subdomain, entries.col, self.side),
-            entry_keys(of_columns, self.columns, self.side),
+            entry_keys(of_columns, self.reached.indices, self.side),
         )
-        front = np.zeros((K_IG.shape[0], widest))
-        front[entries.row, places - self.pointers[subdomain]] = entries.data
-        return front
+        compressed = np.zeros((K_IG.shape[0], int(num_columns.max(initial=0))))
+        compressed[entries.row, places - pointers[subdomain]] = entries.data
+        return compressed
 
     def products(self, Z: Array, row_order: IntArray) -> Products:
         """Sum Z^T Z over the subdomains, from Z, (i, .), with compressed columns.
@@ -130,7 +131,7 @@ class SubdomainBlocks:
         """
         label = self.label[row_order]
         by_subdomain = np.argsort(label, kind="stable")
-        ends = np.searchsorted(label[by_subdomain], np.arange(len(self.pointers)))
+        ends = np.searchsorted(label[by_subdomain], np.arange(len(self.reached.indptr)))
         lower = np.zeros(self.pattern.nnz)
         nonzeros_in_column = np.zeros(self.side)
         squares = np.zeros(self.side)
@@ -146,8 +147,9 @@ class SubdomainBlocks:
     @cached_property
     def _blocks(self) -> list[tuple[IntArray, IntArray]]:
         """Columns of every subdomain, and the positions of its lower triangle."""
-        blocks = []
-        for columns in np.split(self.columns, self.pointers[1:-1]):
+        blocks: list[tuple[IntArray, IntArray]] = []
+        reached = self.reached.indices.astype(np.int64)
+        for columns in np.split(reached, self.reached.indptr[1:-1]):
             row, column = np.tril_indices(len(columns))
             blocks.append((columns, self._positions(columns[row], columns[column])))
         return blocks

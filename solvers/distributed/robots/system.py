@@ -88,7 +88,7 @@ class FactoredPart:
     def grounds(self) -> bool:
         """Whether pose 0 is in the interior; else another robot or the driver grounds it."""
         has_pose_0 = bool(self.part.poses[0] == 0)
-        is_interior = bool(self.part.in_cover[0] < 0)
+        is_interior = bool(not self.part.is_separator[0])
         return has_pose_0 and is_interior
 
     def cut(self, widths: Widths) -> Cut:
@@ -99,8 +99,7 @@ class FactoredPart:
         p = part.problem.num_poses
         interior = columns_of(part.interior, p, widths)
         boundary = columns_of(part.boundary, p, widths)
-        blocks = SubdomainBlocks.of(part.subdomains, widths) if part.is_sparse else None
-        return Cut(interior, boundary, None, blocks)
+        return Cut(interior, boundary, SubdomainBlocks(part.subdomains, widths))
 
     def eliminate(self, K: csc_array, widths: Widths) -> tuple[FactoredPart, Elimination]:
         """Eliminate the interior of a matrix, with the analysis of the last one like it."""

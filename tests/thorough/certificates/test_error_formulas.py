@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import varied_graph
-from robots import interface_of
+from robots import cut_in_one_piece, interface_of
 from scipy.sparse import csc_array
 
 from pgo_models import PGOProblem
@@ -36,7 +36,7 @@ from pgo_models.problem.floating_point import (
 )
 from pgo_models.problem.initialization import chordal_start
 from solvers.distributed.robots import elimination as substructure, proof as robot_proof
-from solvers.distributed.robots.elimination import Cut, eliminate, row_sums
+from solvers.distributed.robots.elimination import eliminate, row_sums
 from solvers.riemannian.polish import polish
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
@@ -230,7 +230,7 @@ def test_errors_of_an_elimination_and_of_the_driver(
     backend: CholeskyBackend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     K = arrow(1, 12)
-    cut = Cut(np.arange(2, 11), np.array([0, 1, 11]), None)
+    cut = cut_in_one_piece(np.arange(2, 11), np.array([0, 1, 11]))
     plain, verified = (eliminate(K, cut, backend, is_verified) for is_verified in (False, True))
     assert plain.factor is not None
     Z = plain.factor.half_solve(plain.K_IG.toarray())
@@ -260,14 +260,14 @@ def test_errors_of_an_elimination_and_of_the_driver(
     parts = [np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[5.0, -1.0], [-1.0, 4.0]])]
     diagonal = np.array([2.0, 8.0, 4.0])
     sizes = [row_sums(part, diagonal[poses]) for poses, part in zip(touched, parts, strict=True)]
-    found = interface.rounding(sizes, [], diagonal)
+    of_factor = np.array([1e-12, 3e-12, 2e-12])
+    found = interface.rounding(sizes, [], diagonal, of_factor)
     sums = np.zeros(3)
     for poses, size in zip(touched, sizes, strict=True):
         sums[poses] += size
-    # Of every pose at least its own column, two contributions and eight more roundings.
-    assert (
-        found >= ENOUGH * (gamma(11.0) * sums + column_error(np.full(3, 3.0), 2.0) * diagonal)
-    ).all()
+    # Of every entry two contributions and eight more roundings.
+    assert (found >= ENOUGH * (gamma(10.0) * sums + of_factor * diagonal)).all()
+    assert (found <= 1.001 * (gamma(10.0) * sums + of_factor * diagonal)).all()
 
 
 def test_what_an_eta_costs_and_the_last_rounding() -> None:
@@ -383,7 +383,7 @@ def test_a_robot_counts_the_rounding_of_its_separators_entries(
     problem = PGOProblem(varied_graph(7, 8, d))
     share = 1e-6
     is_inside = np.concatenate([np.arange(8) >= 2, np.repeat(np.arange(8) >= 2, d)])
-    cut = Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
+    cut = cut_in_one_piece(np.flatnonzero(is_inside), np.flatnonzero(~is_inside))
     Lambda = np.zeros((8, d, d))
     S, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     S_before = S.diagonal()

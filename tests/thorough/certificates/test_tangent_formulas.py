@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs import informed, random_poses
+from robots import cut_in_one_piece
 
 from pgo_models import PGOProblem, Weighting
 from pgo_models.certificates import lower_bound
@@ -27,7 +28,6 @@ from pgo_models.problem.excess import CoupledExcess, Tangent
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u, gamma
 from pgo_models.problem.information_costs import ExcessCost, TangentCost
 from pgo_models.problem.matrices import rotation_columns
-from solvers.distributed.robots.elimination import Cut
 from solvers.distributed.robots.proof import verify_interior
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
@@ -393,7 +393,7 @@ def test_the_constant_and_its_error_in_a_bound_with_eta_alone(d: int) -> None:
 def test_a_robot_counts_the_rounding_of_separators_whose_diagonal_is_negative(d: int) -> None:
     problem, _ = touching(of_file(d, coupled=True, n=8))
     is_inside = np.concatenate([np.arange(8) >= 4, np.repeat(np.arange(8) >= 4, d)])
-    cut = Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
+    cut = cut_in_one_piece(np.flatnonzero(is_inside), np.flatnonzero(~is_inside))
     before = problem.M.diagonal()
     assert (before[cut.boundary] < 0.0).any()
     eta = 1e3 * float(np.abs(before).max())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import assume, given
-from robots import contiguous, driver_at
+from robots import contiguous, cut_in_one_piece, driver_at
 
 from pgo_models import PGOProblem, PoseGraph, Poses
 from pgo_models.certificates import lower_bound
@@ -144,7 +144,7 @@ def test_weights_near_the_ends_of_the_doubles_prove_nothing(exponent: int) -> No
 def test_weights_near_the_ends_of_the_doubles_prove_nothing_to_a_robot(exponent: int) -> None:
     problem = scaled_problem(exponent)
     inside = np.arange(problem.side) % 8 >= 2
-    cut = Cut(np.flatnonzero(inside), np.flatnonzero(~inside), None)
+    cut = cut_in_one_piece(np.flatnonzero(inside), np.flatnonzero(~inside))
     nothing_fixed = np.zeros(0, dtype=np.int64)
     found = robot_proof.verify_interior(
         problem, np.zeros((8, 3, 3)), 0.0, cut, nothing_fixed, 1e-12, None
@@ -156,7 +156,7 @@ def robot_of_eight_poses(d: int) -> tuple[PGOProblem, Cut]:
     """A problem of which a robot has six poses in its interior."""
     problem = PGOProblem(varied_graph(7, 8, d))
     is_inside = np.concatenate([np.arange(8) >= 2, np.repeat(np.arange(8) >= 2, d)])
-    return problem, Cut(np.flatnonzero(is_inside), np.flatnonzero(~is_inside), None)
+    return problem, cut_in_one_piece(np.flatnonzero(is_inside), np.flatnonzero(~is_inside))
 
 
 @pytest.mark.parametrize("size", [-1e160, -1e200, math.nan])

@@ -12,7 +12,6 @@ import pytest
 import pgo_models as pgo
 from pgo_models.graphs.separators import report_partition
 from pgo_models.graphs.trajectories import read_times
-from solvers.distributed.forecast import forecast
 
 ROOT = Path(__file__).parents[3]
 PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()"]
@@ -173,17 +172,6 @@ def test_info_shows_what_a_partition_costs(pgo_command):
         pgo.partition(pgo.load("robots"), 3), pgo.load("robots")
     ).facts():
         assert re.search(rf"^{label} +{re.escape(text)}$", out, re.M)
-
-
-def test_info_forecasts_what_the_driver_needs(pgo_command):
-    code, out, _ = pgo_command("info", "robots", "--robots", 3, "--split", "contiguous")
-    assert code == 0
-    expected = forecast(pgo.partition(pgo.load("robots"), 3), pgo.load("robots"))
-    for label, text in expected.facts():
-        assert re.search(rf"^{label} +{re.escape(text)}$", out, re.M)
-    assert re.search(r"^advice +none needed", out, re.M)
-    # Robots of one pose each have no driver.
-    assert "advice" not in pgo_command("info", "robots", "--split", "singletons")[1]
 
 
 def test_certify_judges_poses_that_are_not_optimal_with_3(pgo_command, tmp_path):

@@ -206,7 +206,7 @@ def test_no_interior_pose_and_no_private_measurement_crosses(
     # as the robots hold them
     graph = solution.problem.graph
     poses = solution.certificate.poses
-    cover = np.unique(np.concatenate([share.poses[share.in_cover >= 0] for share in engine.shares]))
+    cover = np.unique(np.concatenate([share.poses[share.is_separator] for share in engine.shares]))
     interior = np.setdiff1d(np.arange(n), cover)
     private = ~np.isin(graph.i, cover) & ~np.isin(graph.j, cover)
     secrets = np.concatenate(

@@ -60,7 +60,7 @@ from solvers.soc.recursion_block import Rotations
 
 TOLERANCE = 1e-6
 OFF = ("describe", "set_poses")
-ALONE = ("in_cover", "force", "schur", "b")  # fields that are sent to a driver only
+ALONE = ("numbers", "force", "schur", "b")  # fields that are sent to a driver only
 
 
 def alone(parts: Partition, **settings: Any) -> Robots:

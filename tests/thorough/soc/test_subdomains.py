@@ -5,8 +5,7 @@ from budget import examples
 from graphs import SEEDS, varied_graph
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import PGOProblem, PoseGraph, grid_world, partition
-from solvers.distributed.elimination_choice import leave_poses
+from pgo_models import PartitionMethod, PGOProblem, PoseGraph, grid_world, partition
 from solvers.soc.subdomains import find_subdomains, poses_to_leave
 from solvers.soc.subgraph import split_graph
 
@@ -52,30 +51,22 @@ def test_no_subdomain_reaches_more_poses_than_allowed(seed: int, n: int, most: i
     assert not poses_to_leave(graph, is_boundary, n).any()
 
 
-def test_poses_are_left_where_a_robot_would_couple_many() -> None:
+def test_a_robot_leaves_poses_where_it_sends_less_then_and_keeps_its_edges() -> None:
     graph = grid_world(4, 100, np.random.default_rng(0), d=2)
-    shares = split_graph(PGOProblem(graph), partition(graph, 4))
-    for share in shares:
+    interleaved = partition(graph, 10, PartitionMethod.CONTIGUOUS)
+    num_left = []
+    for share in split_graph(PGOProblem(graph), interleaved):
+        found = share.for_driver()
         assert share.part is not None
-        assert len(share.poses_left(graph.num_poses)) == 0
-        assert 0 < len(share.poses_left(4)) < len(share.part.interior)
-
-
-def test_a_larger_cover_keeps_edges_and_their_owners() -> None:
-    graph = grid_world(4, 60, np.random.default_rng(0), d=2)
-    shares = split_graph(PGOProblem(graph), partition(graph, 4))
-    left = [share.poses_left(4) for share in shares]
-    before = np.unique(np.concatenate([share.poses[share.in_cover >= 0] for share in shares]))
-    cover = np.union1d(before, np.concatenate(left))
-    larger = leave_poses(shares, 4)
-    assert len(cover) > len(before)
-    for share, of_robot, found in zip(shares, left, larger, strict=True):
-        held = found.in_cover >= 0
-        np.testing.assert_array_equal(cover[found.in_cover[held]], found.poses[held])
-        expected = np.union1d(share.poses[share.in_cover >= 0], of_robot)
-        np.testing.assert_array_equal(found.poses[held], expected)
+        assert found.part is not None
+        assert found.summary.coupled is not None
+        assert share.summary.coupled is None
+        assert found.is_separator[share.is_separator].all()
+        assert len(found.summary.coupled) <= share.part.subdomains.coupled.nnz
+        num_left.append(int(found.is_separator.sum() - share.is_separator.sum()))
         np.testing.assert_array_equal(found.is_counted, share.is_counted)
         # every pose of the part outside the cover is the robot's own
-        assert found.part is not None
         assert np.isin(found.part.poses[found.part.interior], share.poses[share.is_own]).all()
-        assert found.summary.coupled is not None
+    assert max(num_left) > 0
+    (alone,) = split_graph(PGOProblem(graph), partition(graph, 1))
+    assert alone.for_driver().is_separator.sum() == 1

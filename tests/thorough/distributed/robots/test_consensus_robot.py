@@ -80,7 +80,9 @@ class Watching(Recording):
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         answers = super().ask(order, requests)
-        grounded = middle_separator(self.graph, tuple(self.shares))
+        summaries = [share.summary for share in self.shares]
+        cover = np.unique(np.concatenate([summary.cover for summary in summaries]))
+        grounded = cover[middle_separator(self.graph, summaries)]
         if name_of(order) == "describe":
             self.secrets: list[list[Array]] = [[] for _ in self.agents]
         for agent in self.agents:
@@ -88,7 +90,7 @@ class Watching(Recording):
             share = agent.subgraph
             if holder is not None:
                 for other, secrets in zip(self.shares, self.secrets, strict=True):
-                    hidden = ~np.isin(share.poses, other.poses) & (share.in_cover != grounded)
+                    hidden = ~np.isin(share.poses, other.poses) & (share.poses != grounded)
                     rows = np.concatenate([hidden, np.repeat(hidden, share.graph.d)])
                     block = holder.state.block
                     known = (holder.state.X, *((block.omega, block.s) if block is not None else ()))

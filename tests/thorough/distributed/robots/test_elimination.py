@@ -1,4 +1,3 @@
-import tracemalloc
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +10,8 @@ from robots import (
     PARTITIONERS,
     Partitioner,
     interface_of,
+    leaving,
     matrix_of_schur,
-    sparse_interface_of,
 )
 from scipy.sparse import csc_array, diags_array
 
@@ -24,18 +23,11 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import riemannian_hessian
 from pgo_models.problem.matrices import columns_of
-from solvers.distributed.elimination_choice import leave_poses
-from solvers.distributed.interface import Interface, InterfaceFactor, TreeFactor
-from solvers.distributed.multifrontal import FrontOwners
+from solvers.distributed.interface import Interface, InterfaceFactor, Separators
 from solvers.distributed.robots.elimination import (
     Cut,
     Elimination,
-    FrontMatrix,
-    FrontParts,
-    HeldFront,
     eliminate,
-    packed,
-    unpacked,
 )
 from solvers.distributed.robots.system import FactoredPart
 from solvers.soc.subgraph import Part, split_graph
@@ -95,16 +87,14 @@ def split(
     """Matrix of a kind plus a diagonal, (side,).
 
     Each robot adds it in its interior, the driver on the cover. With `most_coupled` the robots
-    leave poses to the driver, and the interface is sparse.
+    leave poses to the driver.
     """
     n = problem.num_poses
     widths = widths_of(kind, problem.d)
     poses = random_poses(problem.num_poses, problem.d, seed)
-    shares = split_graph(problem.graph, parts)
-    if most_coupled is not None:
-        shares = leave_poses(shares, most_coupled)
+    with leaving(np.inf if most_coupled is None else most_coupled):
+        shares = [share.for_driver() for share in split_graph(problem.graph, parts)]
     working = [share.part for share in shares if share.part is not None]
-    cover = np.unique(np.concatenate([part.poses[part.boundary] for part in working]))
     pieces = []
     cuts = []
     columns = []
@@ -117,11 +107,8 @@ def split(
         pieces.append((matrix_of(part.problem, local, kind) + diags_array(added)).tocsc())
         cuts.append(cut)
         columns.append(mine)
-    touched = tuple(part.in_cover[part.boundary] for part in working)
-    interface = interface_of(touched, len(cover), widths)
-    if most_coupled is not None:
-        coupled = [share.summary.coupled for share in shares if share.summary.coupled is not None]
-        interface = sparse_interface_of(touched, coupled, len(cover), widths)
+    separators = Separators.of([share.summary for share in shares])
+    cover = separators.cover
     at = columns_of(cover, n, widths)
     return Split(
         whole=matrix_of(problem, poses, kind).toarray() + np.diag(diagonal),
@@ -130,7 +117,7 @@ def split(
         cuts=cuts,
         columns=columns,
         own=[(np.arange(len(at))[:, None], diagonal[at][:, None, None])],
-        interface=interface,
+        interface=Interface(separators, widths),
         cover_columns=at,
     )
 
@@ -283,27 +270,6 @@ def test_without_separators_there_is_nothing_to_solve() -> None:
     assert factor.solve([np.zeros((0, 3))])[0].shape == (0, 3)
 
 
-# Columns and packing.
-
-
-@given(count=st.integers(0, 6), widths=st.lists(st.integers(1, 4), min_size=1, max_size=3))
-def test_unknowns_by_field_and_by_separator_are_the_same(count: int, widths: list[int]) -> None:
-    order = Interface(count, tuple(widths), (), FrontOwners((), 0)).order
-    assert sorted(order.tolist()) == list(range(count * sum(widths)))
-    for separator, columns in enumerate(order.reshape(count, sum(widths))):
-        np.testing.assert_array_equal(
-            columns, columns_of(np.array([separator]), count, tuple(widths))
-        )
-
-
-@given(seed=SEEDS, side=st.integers(0, 12))
-def test_a_packed_matrix_is_unpacked_as_it_was(seed: int, side: int) -> None:
-    half = np.random.default_rng(seed).standard_normal((side, side))
-    matrix = half + half.T
-    assert packed(matrix).shape == (side * (side + 1) // 2,)
-    np.testing.assert_array_equal(unpacked(packed(matrix), side), matrix)
-
-
 # The driver's memory.
 
 
@@ -317,33 +283,6 @@ def copies(seed: int, number: int, separators: int, each: int) -> tuple[IntArray
     return tuple(touched)
 
 
-@pytest.mark.parametrize(
-    ("number", "separators", "each"),
-    [(1, 90, 90), (2, 120, 80), (5, 160, 70), (32, 260, 24), (64, 90, 40)],
-)
-@pytest.mark.parametrize("widths", [(1,), (1, 3), (3, 3)], ids=str)
-def test_factoring_takes_no_more_memory_than_was_said(
-    number: int, separators: int, each: int, widths: tuple[int, ...]
-) -> None:
-    touched = copies(0, number, separators, each)
-    interface = interface_of(touched, separators, widths)
-    # imports and caches
-    interface.factorize([packed(np.eye(len(columns))) for columns in interface.columns])
-    said = interface.num_bytes
-    tracemalloc.start()
-    try:
-        factor = interface.factorize(
-            [packed(np.eye(len(columns))) for columns in interface.columns]
-        )
-        most = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert isinstance(factor, TreeFactor)
-    small = 100_000 + 2000 * len(interface.fronts.tree)  # objects, and arrays of a few numbers
-    assert most <= said + small
-    assert most >= 0.2 * said  # and it is not said from far above
-
-
 def test_what_would_not_fit_is_refused_with_the_way_out() -> None:
     touched = copies(0, 5, 160, 70)
     interface = interface_of(touched, 160, (3, 3))
@@ -351,14 +290,3 @@ def test_what_would_not_fit_is_refused_with_the_way_out() -> None:
     too_large = r"for 160 separators, more than .* METIS partition or fewer robots, "
     with pytest.raises(SettingError, match=too_large + "raise driver_memory"):
         interface.check_memory(interface.num_bytes - 1)
-
-
-@pytest.mark.parametrize("side", [3, 8, 40])
-def test_a_front_whose_pivots_are_nan_is_rejected(side: int) -> None:
-    """The matrix is finite, and LAPACK finds no pivot that is negative."""
-    dense = np.eye(side)
-    dense[0, 0] = 1e-20
-    dense[0, -1] = dense[-1, 0] = 1e304
-    front = HeldFront(side, side, (np.arange(side),), 1)
-    with pytest.raises(NotPositiveDefiniteError, match="pivot"):
-        front.eliminate((FrontMatrix(0, (1,), ()), FrontParts((packed(dense),), None)))

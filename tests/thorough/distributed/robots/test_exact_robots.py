@@ -23,8 +23,8 @@ from robots import (
     Partitioner,
     contiguous,
     driver_at,
+    leaving,
     metis,
-    sparse_elimination,
     star,
 )
 
@@ -130,7 +130,7 @@ def test_what_a_driver_says_to_be_definite_is(
     poses = polish(problem, chordal_start(problem))
     with ExitStack() as stack:
         if most is not None:
-            stack.enter_context(sparse_elimination(most))
+            stack.enter_context(leaving(most))
         driver = stack.enter_context(closing(driver_at(problem, cut(problem.graph, seed), poses)))
         r = driver.grounded_position
         X = Poses(driver.current.R, driver.current.t).stacked()

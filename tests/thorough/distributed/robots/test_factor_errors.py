@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import cvxopt
 import numpy as np
@@ -22,7 +21,7 @@ from exact_arithmetic import (
 from graphs import DIMENSIONS, SEEDS, still_ring, varied_graph
 from hypothesis import given, settings, strategies as st
 from roads import road
-from robots import interface_of, matrix_of_schur, sparse_interface_of
+from robots import cut_in_one_piece, interface_of, leaving, matrix_of_schur, packed
 from scipy.sparse import csc_array, csr_array
 
 from pgo_models import PGOProblem, partition
@@ -38,9 +37,7 @@ from pgo_models.problem.cholesky import (
 )
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.ordering import row_order
-from solvers.distributed.elimination_choice import leave_poses
-from solvers.distributed.interface import TreeFactor
-from solvers.distributed.robots.elimination import Cut, eliminate, packed, row_sums, unpacked
+from solvers.distributed.robots.elimination import Cut, eliminate, row_sums
 from solvers.distributed.robots.proof import verify_interior
 from solvers.distributed.robots.subdomain_blocks import SubdomainBlocks
 from solvers.distributed.robots.system import FactoredPart
@@ -135,7 +132,7 @@ def bordered(seed: int, coupling: float) -> tuple[Array, Cut]:
     K = well_conditioned(seed, i + g - 1, 1)
     K[:i, i:] *= coupling
     K[i:, :i] *= coupling
-    return K, Cut(np.arange(i), np.arange(i, i + g), None)
+    return K, cut_in_one_piece(np.arange(i), np.arange(i, i + g))
 
 
 @BACKENDS
@@ -148,7 +145,7 @@ def test_an_elimination_is_below_its_matrix(backend: CholeskyBackend, coupling: 
         for is_verified in (True, False):
             found = eliminate(stored_matrix(K), cut, backend, is_verified)
             left = exact(K)
-            left[i:, i:] -= exact(unpacked(found.schur, len(K) - i))
+            left[i:, i:] -= exact(matrix_of_schur(found))
             if is_verified:
                 left[:i, :i] += np.diag(exact(found.interior_error) * exact(K.diagonal()[:i]))
             is_below = is_positive_definite([dict(enumerate(row)) for row in left])
@@ -174,8 +171,8 @@ def subdivided(seed: int) -> tuple[Array, Cut]:
     K[i:, :i] = K[:i, i:].T
     K += 2.0 * np.diag(np.abs(K).sum(axis=1))
     everything = csr_array(np.tri(g))
-    blocks = SubdomainBlocks.of(Subdomains(label, csr_array(1 * reached), everything), (1,))
-    return K, Cut(np.arange(i), np.arange(i, i + g), None, blocks)
+    blocks = SubdomainBlocks(Subdomains(label, csr_array(1 * reached), everything), (1,))
+    return K, Cut(np.arange(i), np.arange(i, i + g), blocks)
 
 
 @BACKENDS
@@ -184,7 +181,8 @@ def test_an_elimination_of_subdomains_is_below_its_matrix(backend: CholeskyBacke
     for seed in range(24):
         K, cut = subdivided(seed)
         i = len(cut.interior)
-        dense = eliminate(csc_array(K), replace(cut, blocks=None), backend, is_verified=True)
+        whole = cut_in_one_piece(cut.interior, cut.boundary)
+        dense = eliminate(csc_array(K), whole, backend, is_verified=True)
         for is_verified in (True, False):
             found = eliminate(csc_array(K), cut, backend, is_verified)
             schur = matrix_of_schur(found)
@@ -272,8 +270,9 @@ def test_what_a_robot_hands_on_is_below_its_part_of_S(
 ) -> None:
     graph = varied_graph(seed, n, d)
     rng = np.random.default_rng(seed)
-    shares = split_graph(graph, partition(graph, 2))
-    for share in shares if most is None else leave_poses(shares, most):
+    with leaving(np.inf if most is None else most):
+        shares = [share.for_driver() for share in split_graph(graph, partition(graph, 2))]
+    for share in shares:
         if share.part is None:
             continue
         problem = share.part.problem
@@ -284,51 +283,18 @@ def test_what_a_robot_hands_on_is_below_its_part_of_S(
         assert is_true_of_robot(problem, part, Lambda, eta, 1e-15, backend) is not False
 
 
+@BACKENDS
 @pytest.mark.parametrize("cancelling", [0.0, 1e6])
-def test_the_drivers_factor_is_within_its_rounding(cancelling: float) -> None:
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        g = int(rng.integers(3, 7))
-        d = int(rng.integers(2, 4))
-        touched = tuple(
-            np.arange(g) if a < 2 else np.sort(rng.permutation(g)[:2]) for a in range(4)
-        )
-        space = interface_of(touched, g, (1, d))
-        contributions = []
-        K = np.full((space.side, space.side), MP.mpf(0), dtype=object)
-        for a, columns in enumerate(space.columns):
-            W = rng.standard_normal((len(columns), len(columns)))
-            C = W @ W.T + (cancelling if a == 0 else -cancelling if a == 1 else 0.0) * np.eye(
-                len(columns)
-            )
-            contributions.append(packed(C))
-            K[np.ix_(columns, columns)] += exact(unpacked(contributions[-1], len(columns)))
-        values = np.broadcast_to(np.eye(d + 1), (g, d + 1, d + 1)) * rng.uniform(0.1, 1.0)
-        columns = np.stack([columns_of(np.array([pose]), g, (1, d)) for pose in range(g)])
-        for block in zip(columns, values, strict=True):
-            K[np.ix_(block[0], block[0])] += exact(block[1])
-        diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
-        sides = [
-            (unpacked(one, len(at)), diagonal[at])
-            for one, at in zip(contributions, space.columns, strict=True)
-        ]
-        lost = space.rounding([row_sums(*side) for side in sides], [(columns, values)], diagonal)
-        factor = space.factorize(contributions, [(columns, values)])
-        assert isinstance(factor, TreeFactor)
-        difference = square_of_tree(factor) - K
-        assert max(largest_share(sign * difference, diagonal) for sign in (1, -1)) > 0.0
-        assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
-
-
-@pytest.mark.parametrize("cancelling", [0.0, 1e6])
-def test_the_drivers_sparse_factor_is_within_its_rounding(cancelling: float) -> None:
+def test_the_drivers_factor_is_within_its_rounding(
+    backend: CholeskyBackend, cancelling: float
+) -> None:
     for seed in range(12):
         rng = np.random.default_rng(seed)
         g = int(rng.integers(4, 9))
         d = int(rng.integers(2, 4))
         touched = tuple(np.sort(rng.permutation(g)[: int(rng.integers(2, 5))]) for _ in range(4))
         coupled = [np.stack(np.tril_indices(len(poses)), axis=1) for poses in touched]
-        space = sparse_interface_of(touched, coupled, g, (1, d))
+        space = interface_of(touched, g, (1, d), coupled, backend)
         contributions = []
         parts = []
         K = np.full((space.side, space.side), MP.mpf(0), dtype=object)
@@ -336,7 +302,7 @@ def test_the_drivers_sparse_factor_is_within_its_rounding(cancelling: float) -> 
             W = rng.standard_normal((len(columns), len(columns)))
             added = (cancelling if a == 0 else -cancelling if a == 1 else 0.0) * (a < 2)
             C = W @ W.T + added * np.eye(len(columns))
-            parts.append(unpacked(packed(C), len(columns)))
+            parts.append(np.tril(C) + np.tril(C, -1).T)
             contributions.append(packed(C))  # the pattern is full
             K[np.ix_(columns, columns)] += exact(parts[-1])
         # more than what is subtracted where only one of the first two robots is
@@ -346,34 +312,13 @@ def test_the_drivers_sparse_factor_is_within_its_rounding(cancelling: float) -> 
             K[np.ix_(block[0], block[0])] += exact(block[1])
         diagonal = np.asarray(K.diagonal(), dtype=float) * (1.0 + 1e-12)
         sizes = [row_sums(C, diagonal[at]) for C, at in zip(parts, space.columns, strict=True)]
-        lost = space.rounding(sizes, [(columns, values)], diagonal)
-        factor = space.factorize(contributions, [(columns, values)]).factor
-        assert isinstance(factor, _CholmodFactor)
-        order = factor.row_order()
-        L = csc_array(np.array(cvxopt.matrix(cholmod.getfactor(factor._numeric))))
-        product = np.full((space.side, space.side), MP.mpf(0), dtype=object)
-        exact_L = exact(L.toarray())
-        product[np.ix_(order, order)] = exact_L @ exact_L.T
-        difference = product - K
+        own = [(columns, values)]
+        factor = space.factorize(contributions, own)
+        assert (space.expected_error() <= factor.backward_error()).all()
+        lost = space.rounding(sizes, own, diagonal, factor.backward_error())
+        difference = square_of(factor.factor, space.unknowns.analysis) - K
         assert max(largest_share(sign * difference, diagonal) for sign in (1, -1)) > 0.0
         assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
-
-
-def square_of_tree(factor: TreeFactor) -> Exact:
-    """R^T R of the driver's factor, taken exactly, in the order of its unknowns."""
-    space = factor.interface
-    tree = space.fronts.tree
-    width = sum(space.widths)
-    side = space.side
-    order = space.order
-    product = np.full((side, side), MP.mpf(0), dtype=object)
-    for number, front in enumerate(tree):
-        if len(front.eliminated):
-            found = space.fronts.held[number].factors[factor.name.number]
-            rows = order[(width * front.separators[:, None] + np.arange(width)).ravel()]
-            L = exact(np.concatenate([found.L_EE, found.L_BE]))
-            product[np.ix_(rows, rows)] += L @ L.T
-    return product
 
 
 @BACKENDS

@@ -42,17 +42,14 @@ def check_shares(graph: PoseGraph, parts: Partition) -> None:
         )
         np.testing.assert_array_equal(subgraph.owner, parts.robot[subgraph.poses])
         np.testing.assert_array_equal(local.pose_ids, graph.pose_ids[subgraph.poses])
-        inside = subgraph.in_cover >= 0
-        np.testing.assert_array_equal(cover[subgraph.in_cover[inside]], subgraph.poses[inside])
-        assert not np.isin(subgraph.poses[~inside], cover).any()
+        np.testing.assert_array_equal(subgraph.is_separator, np.isin(subgraph.poses, cover))
         np.add.at(counted, np.array(edges, dtype=int)[subgraph.is_counted], 1)
         if subgraph.part is None:
             assert not subgraph.is_counted.any()
             continue
         part = subgraph.part
-        np.testing.assert_array_equal(part.in_cover >= 0, np.isin(part.poses, cover))
         assert sorted([*part.interior, *part.boundary]) == list(range(len(part.poses)))
-        assert (np.diff(part.in_cover[part.boundary]) > 0).all()
+        np.testing.assert_array_equal(part.boundary, np.flatnonzero(np.isin(part.poses, cover)))
         # Its interior is its own alone: no other robot's part has a pose of it.
         assert (parts.robot[part.poses[part.interior]] == subgraph.robot).all()
         interiors += part.poses[part.interior].tolist()

@@ -1,32 +1,32 @@
-"""Robots that leave poses to a driver with one sparse matrix: the answers of robots that do not."""
+"""The driver's sparse matrix: what robots leave changes no answer, and its memory is known."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 from graphs import varied_graph
-from robots import Recording, arrays_in, scattered, sparse_elimination
+from robots import Recording, arrays_in, leaving, scattered
 
 from pgo_models import PartitionMethod, PGOProblem, PoseGraph, grid_world, partition
 from pgo_models.graphs.partitioning import Partition
 from solvers import InProcess, Pipeline, Robots, solve
-from solvers.distributed.elimination_choice import CoverSystem, choose_elimination, leave_poses
+from solvers.distributed.interface import Separators
 from solvers.distributed.lower_bound import best_bound_distributed
 from solvers.distributed.robots_of_graph import open_driver
-from solvers.distributed.sparse_interface import SparseInterface
 from solvers.soc.subgraph import split_graph
-
-pytest.importorskip("cvxopt")
 
 
 @pytest.mark.parametrize(("seed", "d"), [(0, 2), (1, 3), (2, 2), (7, 3)])
 @pytest.mark.parametrize("most_coupled", [0, 3, 100])
-def test_the_numbers_are_those_of_fronts(seed: int, d: int, most_coupled: int) -> None:
+def test_the_numbers_are_those_of_robots_that_leave_no_poses(
+    seed: int, d: int, most_coupled: int
+) -> None:
     graph = varied_graph(seed, 30, d)
     robots = scattered(graph, seed + 4)
     pipeline = Pipeline(staircase=None)
-    expected = solve(graph, pipeline, robots=robots)
-    with sparse_elimination(most_coupled):
+    with leaving(np.inf):
+        expected = solve(graph, pipeline, robots=robots)
+    with leaving(most_coupled):
         found = solve(graph, pipeline, robots=robots)
     assert found.objective == pytest.approx(expected.objective, rel=1e-9)
     assert found.lower_bound == pytest.approx(expected.lower_bound, rel=1e-6, abs=1e-9)
@@ -43,9 +43,8 @@ def test_the_numbers_are_those_of_fronts(seed: int, d: int, most_coupled: int) -
 def test_the_staircase_climbs_with_a_sparse_interface(seed: int) -> None:
     graph = varied_graph(seed, 24, 2)
     robots = scattered(graph, 5)
-    with sparse_elimination(2):
+    with leaving(2):
         driver = open_driver(PGOProblem(graph), robots, InProcess())
-        assert isinstance(driver.interface(3, 3), SparseInterface)
         assert driver.fits(3)
         found = solve(graph, Pipeline(), robots=robots)
     assert found.is_certified == solve(graph, Pipeline(), robots=robots).is_certified
@@ -54,7 +53,7 @@ def test_the_staircase_climbs_with_a_sparse_interface(seed: int) -> None:
 def test_the_ledger_counts_the_entries_that_are_sent() -> None:
     graph = grid_world(4, 60, np.random.default_rng(0), d=2)
     engine = Recording()
-    with sparse_elimination(8):
+    with leaving(8):
         ledger = solve(graph, Pipeline(staircase=None), robots=Robots(4, engine=engine)).ledger
     assert ledger is not None
     off = ("describe", "set_poses", "cost", "result")
@@ -77,34 +76,19 @@ def numbers_in(answers: list[Any]) -> list[tuple[str, Any]]:
     return [found for answer in answers for found in arrays_in(answer)]
 
 
-def test_robots_leave_poses_where_their_messages_become_shorter() -> None:
-    graph = grid_world(8, 30, np.random.default_rng(0), d=2)
-    shares = split_graph(PGOProblem(graph), partition(graph, 4))
-    chosen = choose_elimination(shares)
-    assert all(share.is_sparse for share in chosen)
-    before, after = (CoverSystem.of([s.summary for s in some]) for some in (shares, chosen))
-    assert after.num_sent < before.num_sent
-    driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess(), memory=0)
-    assert not isinstance(driver.interface(1), SparseInterface)
-    driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
-    assert isinstance(driver.interface(1), SparseInterface)
-
-
 def test_memory_is_known_before_it_is_spent() -> None:
     graph = grid_world(4, 200, np.random.default_rng(0), d=2)
-    with sparse_elimination(8):
+    with leaving(8):
         driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
     interface = driver.interface(1, 2)
-    assert isinstance(interface, SparseInterface)
     unknowns = interface.unknowns
     width = 3
-    factor = width**2 * int(interface.pattern.counts.sum())
+    factor = width**2 * interface.separators.num_filled
     sent = sum(len(positions) for positions in unknowns.robots)
     assert interface.num_bytes >= 8 * (factor + unknowns.lower.nnz) + 12 * sent
 
 
-@pytest.mark.parametrize("is_sparse", [False, True])
-def test_the_middle_of_a_row_of_robots_is_half_way(is_sparse: bool) -> None:
+def test_the_middle_of_a_row_of_robots_is_half_way() -> None:
     # Poses in a row; every robot has a stretch of it, but the robots are numbered at random.
     num_robots = 9
     n = 10 * num_robots
@@ -114,16 +98,14 @@ def test_the_middle_of_a_row_of_robots_is_half_way(is_sparse: bool) -> None:
     graph = PoseGraph(n, i, i + 1, turns, steps, np.ones(n - 1), np.ones(n - 1))
     robot = np.repeat(np.random.default_rng(0).permutation(num_robots), 10)
     subgraphs = split_graph(PGOProblem(graph), Partition(robot, PartitionMethod.GIVEN))
-    if is_sparse:
-        subgraphs = leave_poses(subgraphs, 2)
-    system = CoverSystem.of([subgraph.summary for subgraph in subgraphs])
-    assert (system.coupled is not None) == is_sparse
-    assert abs(int(system.cover[system.middle]) - n // 2) <= 10
+    summaries = [subgraph.for_driver().summary for subgraph in subgraphs]
+    separators = Separators.of(summaries)
+    assert abs(int(separators.cover[separators.middle]) - n // 2) <= 10
 
 
 def test_a_proof_lets_go_of_the_factor_of_newton() -> None:
     graph = grid_world(4, 60, np.random.default_rng(0), d=2)
-    with sparse_elimination(8):
+    with leaving(8):
         driver = open_driver(PGOProblem(graph), partition(graph, 4), InProcess())
     driver.go_to_chordal_start()
     newton = driver.interface(*driver.tangent)
