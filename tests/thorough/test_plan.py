@@ -76,6 +76,18 @@ def test_ctrl_c_in_a_step_leaves_the_answer_and_its_bound(
     assert solution.stages[-1].name == "interruption"
 
 
+def test_ctrl_c_between_the_first_loops_leaves_the_best_poses_without_a_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = PGOProblem(pgo.load("grid"))
+    monkeypatch.setattr(solvers.Newton, "init", failing(KeyboardInterrupt()))
+    solution = solvers.solve(problem)
+    assert solution.status is Status.INTERRUPTED
+    assert solution.lower_bound == 0.0
+    assert [stage.name for stage in solution.stages] == ["chordal start", "interruption"]
+    np.testing.assert_allclose(solution.objective, solution.stages[0].objective, rtol=1e-9)
+
+
 def test_an_error_of_the_program_is_not_taken_for_a_failure(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
