@@ -46,7 +46,7 @@ _PARTNERS = 3
 # Mean of the noise on the weights of a tree: log 2, as between an edge whose votes all agree, and
 # one of which half do.
 _MEAN_NOISE = 0.7
-_SEED = 0
+_SEED = 0  # fixed, so that every solve is the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,17 +74,17 @@ class Agreement:
 
     @classmethod
     def of(cls, problem: PGOProblem, scale: float = 1.0) -> Agreement:
-        """Votes of the edges that measure whole motions, or rotations where these are all.
+        """Votes of the edges that measure whole motions, or rotations if these are the unknowns.
 
-        `scale` is that of the errors, in the squares of what the matrices claim.
+        `scale` multiplies the covariances that the matrices claim.
         """
         rng = np.random.default_rng(_SEED)
         walks = _Walks.of(problem)
         paths = walks.paths_of_two(rng)
         cycles = (walks.cycles_of_three(paths), walks.cycles_of_four(paths))
         m = problem.graph.num_edges
-        few = (found[_few_of_each_edge(found % m, rng)] for found in cycles)
-        return cls(m, tuple(walks.judged(found, scale) for found in few))
+        few = (of_length[_few_of_each_edge(of_length % m, rng)] for of_length in cycles)
+        return cls(m, tuple(walks.judged(of_length, scale) for of_length in few))
 
     @cached_property
     def shares(self) -> Array:
@@ -185,11 +185,11 @@ class _Walks:
             is_here = at[apart:] == at[:-apart]
             first = self.back(steps[:-apart][is_here])
             paths.append(np.column_stack([first, steps[apart:][is_here]]))
-        found = np.concatenate(paths)
-        is_backward = self.begins[found[:, 0]] > self.ends[found[:, 1]]
-        found[is_backward] = self.back(found[is_backward])[:, ::-1]
-        is_open = self.begins[found[:, 0]] != self.ends[found[:, 1]]
-        return rng.permutation(found[is_open])
+        joined = np.concatenate(paths)
+        is_backward = self.begins[joined[:, 0]] > self.ends[joined[:, 1]]
+        joined[is_backward] = self.back(joined[is_backward])[:, ::-1]
+        is_open = self.begins[joined[:, 0]] != self.ends[joined[:, 1]]
+        return rng.permutation(joined[is_open])
 
     def cycles_of_three(self, paths: IntArray) -> IntArray:
         """Cycles (c, 3): paths of two steps, and every step that leads back."""
@@ -211,11 +211,11 @@ class _Walks:
         pairs = np.sort(pairs)
         cycles = [np.zeros((0, 4), dtype=np.int64)]
         for apart in range(1, _PARTNERS + 1):
-            there = paths[:-apart]
+            outward = paths[:-apart]
             back = self.back(paths[apart:])[:, ::-1]
-            has_other_middle = self.ends[there[:, 0]] != self.ends[back[:, 0]]
+            has_other_middle = self.ends[outward[:, 0]] != self.ends[back[:, 0]]
             is_cycle = (pairs[apart:] == pairs[:-apart]) & has_other_middle
-            cycles.append(np.column_stack([there[is_cycle], back[is_cycle]]))
+            cycles.append(np.column_stack([outward[is_cycle], back[is_cycle]]))
         return self._distinct(np.concatenate(cycles))
 
     def judged(self, cycles: IntArray, scale: float) -> Cycles:
@@ -241,7 +241,7 @@ class _Walks:
         return begins * np.int64(self.num_poses) + ends
 
     def _distinct(self, cycles: IntArray) -> IntArray:
-        """Cycles of steps, of which each is found along several paths, once."""
+        """Each cycle once, although several paths lead along it."""
         _, first = np.unique(np.sort(cycles % self.num_edges, axis=1), axis=0, return_index=True)
         return cycles[first]
 

@@ -1,7 +1,7 @@
 """Search without odometry: maps along trees of edges that agree, and the edges that fit these.
 
-A single start ends in a wrong minimum where many edges are wrong. Trees of edges whose cycles agree
-(`Agreement`) give starts that differ, most of which have no wrong edge.
+A single start ends in a wrong minimum where many edges are wrong. So several starts are made along
+trees of edges whose cycles agree (`Agreement`). Most of these trees have no wrong edge.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SHRINKING = (9.0, 3.0, 1.0, 1.0, 1.0)
 # Trees, one of them without noise. The right edges of a view graph of 12 poses, 27 % of whose edges
 # are wrong, are found from 10 trees of 32.
 _MOST_TREES = 31
-_LEAST_TREES = 2
+_LEAST_TREES = 2  # the one without noise and another
 # Scale of the errors below which they are rounding: a tree fits all its edges.
 _LEAST_SCALE = 1e-12
 # Trees times edges: some seconds on a large graph.

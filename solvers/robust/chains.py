@@ -107,10 +107,10 @@ def is_whole(graph: PoseGraph) -> BoolArray:
 
 def measured_covariances(graph: PoseGraph) -> Array:
     """Covariances of the measurements, (m, k, k), of whole motions; zeros elsewhere."""
-    whole = is_whole(graph)
+    is_motion = is_whole(graph)
     information = gaussian_information(graph)
     covariances = np.zeros(information.shape)
-    covariances[whole] = np.linalg.inv(definite(information[whole]))
+    covariances[is_motion] = np.linalg.inv(definite(information[is_motion]))
     return covariances
 
 

@@ -1,15 +1,15 @@
 """Search for the closures to keep: clusters of them are added, removed and exchanged as units.
 
-Where a map has drifted, the closures of a right run cost thousands of thresholds one at a time, and
-almost nothing once the map has followed them together. What decides of a cluster is therefore not
-its residuals, but
+On a map that has drifted, each right closure of a run costs thousands of thresholds. Once the map
+follows all of them together, they cost almost nothing. So a cluster is not judged by its residuals,
+but by
 
     T = min F(edges kept and the cluster) - min F(edges kept).
 
 On a right map T of k right closures is chi^2 with k d (d + 1) / 2 degrees of freedom to first
-order, however far the map moves. A cluster is added where T is at most the quantile 0.99, times the
-scale s of the errors; a cluster kept is removed where its T is beyond what chance explains, even
-if a large one costs more in the truncated cost of `revision`, which decides of exchanges.
+order, however far the map moves. A cluster is added if T is at most the quantile 0.99 times the
+scale s of the errors. A kept cluster is removed if its T is beyond what chance explains, even if a
+large one then costs more in the truncated cost of `revision`. That cost decides on exchanges.
 """
 
 from __future__ import annotations
@@ -170,11 +170,11 @@ class ClusterSearch:
     def with_likely(self, fit: Fit) -> Fit:
         """The fit with rejected edges beyond their thresholds that are likely right.
 
-        Where most errors are smaller than the matrices claim, edges come back that lie within what
-        the matrices claim, if most of these are right (`_are_likely_within`). Else edges come
-        back between the quantiles 0.99 and 0.999 of their costs, where 0.9 % of the
-        right ones lie, if fewer wrong ones are expected there. An edge within its threshold was
-        rejected for another reason, and stays so.
+        Most errors may be smaller than the matrices claim. Then edges within the claimed errors
+        come back, if most of these are right (`_are_likely_within`). Otherwise edges between the
+        quantiles 0.99 and 0.999 of their costs come back. Among them are 0.9 % of all right edges;
+        fewer wrong ones must be expected there. An edge within its threshold was rejected for
+        another reason, and stays rejected.
         """
         if not self.sets.scale > 0.0:  # the edges kept fit exactly
             return fit

@@ -182,7 +182,7 @@ def _agreement(closures: Closures, odometry: Array, threshold: float) -> BoolArr
     d = R.shape[1]
     k = len(closures)
     agree = np.zeros((k, k), dtype=bool)
-    own = _rotation_trace(closures.covariance, d)
+    of_closure = _rotation_trace(closures.covariance, d)
     along = _rotation_trace(odometry, d)
     along_i = along[closures.i]
     along_j = along[closures.j]
@@ -190,7 +190,7 @@ def _agreement(closures: Closures, odometry: Array, threshold: float) -> BoolArr
         b = np.arange(a + 1, k)
         between = np.abs(along_i[a] - along_i[b]) + np.abs(along_j[a] - along_j[b])
         squared_chord = 0.5 * np.sum((R[a] - R[b]) ** 2, axis=(1, 2))
-        near = b[squared_chord <= threshold * (own[a] + own[b] + between)]
+        near = b[squared_chord <= threshold * (of_closure[a] + of_closure[b] + between)]
         distances = cycle_distances(closures, odometry, np.full(len(near), a), near)
         agree[a, near[distances <= threshold]] = True
     return agree | agree.T

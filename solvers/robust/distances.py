@@ -42,25 +42,25 @@ class FirstOrder:
         alone, and 2 (S_i + S_j), with the marginal covariances S of the ends.
         """
         distances = np.zeros(len(edges))
-        whole = is_whole(self.chains.graph)[edges]
-        closures = self._closures(edges[whole])
-        distances[whole] = np.maximum(self._along_chain(closures), self._of_map(closures))
+        is_motion = is_whole(self.chains.graph)[edges]
+        closures = self._closures(edges[is_motion])
+        distances[is_motion] = np.maximum(self._along_chain(closures), self._of_map(closures))
         return distances
 
     def distances(self, edges: IntArray) -> Array:
         """Distances of edges, (k,), by a factor with the fill of all of them."""
         distances = np.zeros(len(edges))
-        whole = is_whole(self.chains.graph)[edges]
-        if not (whole.any() and self.inliers.has_translations):
+        is_motion = is_whole(self.chains.graph)[edges]
+        if not (is_motion.any() and self.inliers.has_translations):
             return distances
-        closures = self._closures(edges[whole])
+        closures = self._closures(edges[is_motion])
         try:
             joint = self._marginals.joint_of_pairs(closures.i, closures.j)
         except NotPositiveDefiniteError:
             return distances
         J = np.concatenate([self._in_frame(closures.i), -self._in_frame(closures.j)], axis=2)
         compliance = J @ joint @ np.swapaxes(J, 1, 2)
-        distances[whole] = squared_distances(closures.cycle, closures.covariance + compliance)
+        distances[is_motion] = squared_distances(closures.cycle, closures.covariance + compliance)
         return distances
 
     @cached_property
@@ -75,12 +75,12 @@ class FirstOrder:
     def _along_chain(self, closures: Closures) -> Array:
         """Distances with the compliance of the chain between the ends; zero between two chains."""
         distances = np.zeros(len(closures))
-        own = self.chains.chain[closures.i] == self.chains.chain[closures.j]
-        of_one_chain = closures[own]
+        is_on_one_chain = self.chains.chain[closures.i] == self.chains.chain[closures.j]
+        of_one_chain = closures[is_on_one_chain]
         along = self.chains.covariance_at((self.poses.R, self.poses.t))
         compliance = along[of_one_chain.j] - along[of_one_chain.i]
         covariance = of_one_chain.covariance + compliance
-        distances[own] = squared_distances(of_one_chain.cycle, covariance)
+        distances[is_on_one_chain] = squared_distances(of_one_chain.cycle, covariance)
         return distances
 
     def _of_map(self, closures: Closures) -> Array:

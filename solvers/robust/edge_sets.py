@@ -25,7 +25,7 @@ _LEAST_DECREASE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class EdgeSets:
-    """Sets of edges of `problem`, all of which have those that are known.
+    """Sets of edges of `problem`. Every set has the known inliers.
 
     `pairs` has its closures. `allowed` (m,) are the thresholds of the truncated cost, times the
     scale s of the errors, which is `scale`. A search among sets ends early once `has_time` is

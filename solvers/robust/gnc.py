@@ -57,7 +57,8 @@ LAST_STEPS = 10
 _MOST_HARD_STEPS = 10
 # Relative decrease of the weighted cost below which the poses follow the weights well enough.
 _NEARLY_STATIONARY = 1e-2
-# Scale of the thresholds: 2.5 times the quantile 0.99 is the quantile 1 - 1e-6, about.
+# Scale of the thresholds: 2.5 times the quantile 0.99 is the quantile 1 - 1e-6, about. Below the
+# least scale residuals are rounding.
 LARGEST_SCALE = 2.5
 _LEAST_SCALE = 1e-12
 # Bound on the control at which the schedule starts again after the thresholds were scaled: mu is at
@@ -364,11 +365,11 @@ def first_schedule(
 ) -> tuple[GNCSchedule, RatioSums]:
     """Schedule of state 0, and the sums over its edges.
 
-    With a map that has been found before it is the last one, which starts as a schedule that
-    starts again: what the thresholds are scaled to is known. Else its control is `first_control` of
-    the largest ratio r_e^2 / c_e^2. If that is so small that even the best-fitting edge would
-    hardly count, the control of truncated least squares is raised until this edge has
-    `least_weight`, about.
+    From an earlier map the schedule starts as one that starts again, since the scale of the
+    thresholds is known. It is then the last one. Otherwise its control is `first_control` of the
+    largest ratio r_e^2 / c_e^2. If that is so small that even the best-fitting edge would hardly
+    count, the control of truncated least squares is raised until this edge has about
+    `least_weight`.
     """
     # The control only decides which edges are undecided, a sum that is not used here.
     sums = edges.sums(settings.loss, mu=1.0, scale=settings.scale)

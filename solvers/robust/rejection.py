@@ -361,8 +361,8 @@ class Rejection(Summarised):
 
 def text_of_bridges(number: int) -> str:
     """What is said of so many bridges, at least one."""
-    one = "one edge" if number == 1 else f"each of {number} edges"
-    return f"{one} is the only one between two parts of the map, and nothing checks it"
+    subject = "one edge" if number == 1 else f"each of {number} edges"
+    return f"{subject} is the only one between two parts of the map, and nothing checks it"
 
 
 def _summary(attempt: Attempt) -> str:

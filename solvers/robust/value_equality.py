@@ -11,8 +11,8 @@ import numpy as np
 class ValueEquality:
     """Base of frozen dataclasses with arrays, declared with `eq=False`: equal where all fields are.
 
-    The equality that a dataclass generates asks for the truth of an array, which has none, and its
-    hash for that of an array, which has none either.
+    A dataclass generates an equality that asks for the truth of an array, and a hash that asks for
+    its hash. Arrays have neither.
     """
 
     __slots__ = ()

@@ -47,7 +47,8 @@ _AFFORDABLE_OPERATIONS = 2e10
 # these are widened.
 TIGHT_SCALES = (0.1, 0.01)
 _TIGHT_SPREAD = 0.3
-# Settings of the attempt with smaller steps.
+# The attempt with smaller steps: at most this growth of the control from one step to the next, and
+# at least so many Newton steps with the weights of one control.
 _SLOW_GROWTH = 1.4
 _SLOW_INNER_STEPS = 5
 # Cycles from which on the errors of the edges kept can be estimated.
@@ -195,12 +196,13 @@ def _with_other_loss(settings: GNC) -> tuple[str, GNC]:
 class Estimate:
     """Result of an attempt: the edges kept, (m,), and the solution with them.
 
-    `found` (m,) are those kept before their revision. `scale` is the factor on the thresholds.
-    `error_scale` is that of the edges kept, 1 where too few cycles are left to estimate it.
+    `before_revision` (m,) are the edges kept before the revision. `scale` is the factor on the
+    thresholds. `error_scale` is that of the edges kept; it is 1 if their cycles are too few to
+    estimate it.
     """
 
     attempt: Attempt
-    found: BoolArray
+    before_revision: BoolArray
     kept: BoolArray
     scale: float
     error_scale: float
@@ -286,8 +288,8 @@ class PlacesOfEdges:
     def revised(self, estimate: Estimate, kept: BoolArray, poses: Poses) -> Estimate:
         """The estimate with the edges `kept`, (m,), in place of those found, from poses nearby."""
         began = time.perf_counter()
-        num_removed = int((estimate.found & ~kept).sum())
-        num_added = int((kept & ~estimate.found).sum())
+        num_removed = int((estimate.before_revision & ~kept).sum())
+        num_added = int((kept & ~estimate.before_revision).sum())
         name = estimate.stage.name
         name += f", less {num_removed} that others contradict" if num_removed else ""
         name += f", with {num_added} that they can follow" if num_added else ""
@@ -296,7 +298,7 @@ class PlacesOfEdges:
         revised = Estimate.of(self.doubted, kept, estimate.scale, solution, stage, began)
         seconds = estimate.attempt.seconds + revised.attempt.seconds
         attempt = replace(revised.attempt, seconds=seconds)
-        return replace(revised, attempt=attempt, found=estimate.found)
+        return replace(revised, attempt=attempt, before_revision=estimate.before_revision)
 
     def solution_nearby(self, kept: BoolArray, start: Poses | None) -> Solution:
         """Solution with the kept edges, (m,), by Newton alone, from a start near it or its own."""

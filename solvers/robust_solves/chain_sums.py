@@ -36,7 +36,8 @@ from solvers.robust.chains import Chains, Closures, Motions
 _ROUNDING = 2.0**-45
 # Of sums along a chain, per pose.
 _ROUNDING_OF_SUMS = 2.0**-48
-_INWARD = 1.0 - 1e-12
+# Factor on lower bounds for the rounding of their last formulas: 1e-12 is 9,000 roundings.
+INWARD = 1.0 - 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +123,9 @@ class ChainSums:
             spread = sums.values[:, -3] - softness * np.sum(center**2, axis=1)
             rounding = _ROUNDING_OF_SUMS * n * (total + softness)
             reach = np.maximum(reach, np.linalg.norm(center, axis=1))
-            kappa = _INWARD / (softness + rounding)
+            kappa = INWARD / (softness + rounding)
             spread = spread + sums.values[:, -2] + rounding * np.square(reach)
-            tau = _INWARD / (spread + _ROUNDING_OF_SUMS * n * of_offsets)
+            tau = INWARD / (spread + _ROUNDING_OF_SUMS * n * of_offsets)
         is_known = (sums.values[:, -1] == 0.0) & np.isfinite(kappa) & np.isfinite(tau)
         is_known &= (kappa > 0.0) & (tau > 0.0)
         return SingleEdges(center, np.where(is_known, kappa, 0.0), np.where(is_known, tau, 0.0))

@@ -38,7 +38,7 @@ _WIDE_GAP = 0.5
 _FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, second_try=False)
 # A wide gap can be proven far from a stationary point.
 _COARSE_STAIRCASE = Staircase(tolerance=1e-2, gap=_WIDE_GAP)
-_MOST_STEPS = 100
+_MOST_STEPS = 100  # of the coarse staircase; after them the best bound so far stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +52,15 @@ class ClosureCosts:
     def lower_bound(self, edges: tuple[int, ...], s: float, num_steps: int | None) -> float:
         """Proven lower bound, as far as it is above s.
 
-        With `num_steps` chains are made of so many steps. Where chi2 is not quadratic its tangent
-        proves little of a cost as large as that of a wrong closure, and the bound is that of an F
-        below it.
+        With `num_steps` chains are made of so many steps. The tangent of a chi2 that is not
+        quadratic proves little of the large cost of a wrong closure. The bound is then that of an F
+        below chi2.
         """
         if num_steps is not None:
-            found = CoarseChains(self.sums).with_closures(edges, num_steps)
-            if found is None:
+            coarse_chains = CoarseChains(self.sums).with_closures(edges, num_steps)
+            if coarse_chains is None:
                 return 0.0
-            coarse, rounding = found
+            coarse, rounding = coarse_chains
             problem = PGOProblem(coarse, self.problem.backend, Weighting.ISOTROPIC)
             return _relaxed_bound(problem, s + rounding) - rounding
         subgraph = self._between_ends(edges)
@@ -125,18 +125,18 @@ def _isotropic_graph_below(graph: PoseGraph) -> PoseGraph:
 def precisions_below(problem: PGOProblem) -> tuple[Array, Array]:
     """Return kappa and tau, (m,), of an F below the cost at all poses.
 
-    They are zero where the cost is neither F nor chi2, and for edges of which no such F is known:
-    with matrices that are singular, or that rounding hides, or that measure no whole motion.
+    They are zero if the cost is neither F nor chi2. They are also zero for single edges: those with
+    singular matrices, those that rounding hides, and those that measure no whole motion.
     """
     graph = problem.graph
     kappa = np.zeros(graph.num_edges)
     tau = np.zeros(graph.num_edges)
-    whole = np.flatnonzero(is_whole(graph))
+    motions = np.flatnonzero(is_whole(graph))
     if problem.weighting is Weighting.ISOTROPIC:
-        kappa[whole] = graph.kappa[whole]
-        tau[whole] = graph.tau[whole]
+        kappa[motions] = graph.kappa[motions]
+        tau[motions] = graph.tau[motions]
     elif problem.weighting is Weighting.INFORMATION:
-        _set_precisions_below(graph, whole, kappa, tau)
+        _set_precisions_below(graph, motions, kappa, tau)
     return kappa, tau
 
 
@@ -184,11 +184,11 @@ def _bound_above(problem: PGOProblem, s: float) -> float:
     for _ in range(2):
         place = Here(RunMonitor(progress=False), StageTable(), problem, gap)
         try:
-            found = solve_at(place, replace(_FOR_BOUNDS, gap=gap), None)
+            attempt = solve_at(place, replace(_FOR_BOUNDS, gap=gap), None)
         except FAILURES:
             break
-        bound = max(bound, found.proof.lower_bound)
-        least = found.proof.objective
+        bound = max(bound, attempt.proof.lower_bound)
+        least = attempt.proof.objective
         if bound > s or least <= s:
             break
         gap = 0.5 * (least - s) / least

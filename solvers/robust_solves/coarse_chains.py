@@ -1,10 +1,10 @@
 """Chains with few poses, whose cost is below that of the chains themselves.
 
-A piece of a chain costs at least as much as one edge (`chain_sums`, which has the notation), from
-the pose before the piece to its last pose, in a frame whose origin is the point c where that edge
-turns. Poses at which closures end keep their frames. So the last step before them is a piece of its
-own, if there are two pieces or more: it turns there if it was measured in this direction. Any other
-piece that ends there is seen from elsewhere, with the vector D from c. As
+A piece of a chain costs at least as much as one edge, from the pose before the piece to its last
+pose (`chain_sums` has the notation). The frame of the last pose has its origin at the point c where
+that edge turns. Poses at which closures end keep their frames. So the last step before them is a
+piece of its own, if there are two pieces or more: it turns there if it was measured in this
+direction. Any other piece that ends there is seen from elsewhere, with the vector D from c. As
 
     ||e + W D||^2 <= (1 / tau + ||D||^2 / kappa) (tau ||e||^2 + kappa ||W||_F^2),
 

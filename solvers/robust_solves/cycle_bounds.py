@@ -23,9 +23,8 @@ import numpy as np
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.robust.chains import Closures, Motions, inverse, product
-from solvers.robust_solves.chain_sums import ChainSums, EdgeSums
+from solvers.robust_solves.chain_sums import INWARD, ChainSums, EdgeSums
 
-_INWARD = 1.0 - 1e-12
 # Pairs at a time, for memory.
 _CHUNK = 100_000
 
@@ -83,4 +82,4 @@ class CycleBounds:
             offset = np.linalg.norm(moved - edge.center, axis=1) - rounding * reach
             bounds = edge.kappa * np.maximum(turn, 0.0) ** 2
             bounds += edge.tau * np.maximum(offset, 0.0) ** 2
-        return np.where(edge.kappa > 0.0, _INWARD * np.nan_to_num(bounds, posinf=0.0), 0.0)
+        return np.where(edge.kappa > 0.0, INWARD * np.nan_to_num(bounds, posinf=0.0), 0.0)

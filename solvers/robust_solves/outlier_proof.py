@@ -253,14 +253,13 @@ def _single_distances(chains: Chains, edges: IntArray) -> Array:
     """First-order distances, (k,), of edges from the chain between their ends; zero elsewhere."""
     graph = chains.graph
     distances = np.zeros(len(edges))
-    whole = np.flatnonzero(is_whole(graph)[edges])
-    closures = chains.closures(edges[whole])
-    own = chains.chain[closures.i] == chains.chain[closures.j]
-    along = chains.covariance[closures.j[own]] - chains.covariance[closures.i[own]]
-    covariance = closures.covariance[own] + along
-    distances[whole[own]] = squared_distances(
-        (closures.cycle[0][own], closures.cycle[1][own]), covariance
-    )
+    motions = np.flatnonzero(is_whole(graph)[edges])
+    closures = chains.closures(edges[motions])
+    is_on_one_chain = chains.chain[closures.i] == chains.chain[closures.j]
+    of_one_chain = closures[is_on_one_chain]
+    along = chains.covariance[of_one_chain.j] - chains.covariance[of_one_chain.i]
+    covariance = of_one_chain.covariance + along
+    distances[motions[is_on_one_chain]] = squared_distances(of_one_chain.cycle, covariance)
     return distances
 
 
@@ -271,8 +270,8 @@ def _pair_distances(chains: Chains, edges: IntArray) -> Array:
     """
     k = len(edges)
     distances = np.zeros((k, k))
-    whole = np.flatnonzero(is_whole(chains.graph)[edges])
-    closures = chains.closures(edges[whole])
+    motions = np.flatnonzero(is_whole(chains.graph)[edges])
+    closures = chains.closures(edges[motions])
     a, b = chains.pairs(closures)
-    distances[whole[a], whole[b]] = cycle_distances(closures, chains.covariance, a, b)
+    distances[motions[a], motions[b]] = cycle_distances(closures, chains.covariance, a, b)
     return distances + distances.T

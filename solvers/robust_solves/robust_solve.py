@@ -113,13 +113,13 @@ def go_on_robustly(
 ) -> Solution:
     """Solution of a graph that has grown, from its start, without the edges that are wrong.
 
-    `kept` (m,) are the edges that were kept before, with the known inliers and what else the poses
-    need (`held_together`), and `new` (m,) those that were not there. All that are neither kept nor
-    known are candidates: they are tested in clusters against the map, which may also lose clusters
-    that it has kept, or exchange one for another (`ClusterSearch`). So a later closure can revise
-    an earlier decision. There is one attempt, which is cheap; a robust solve of the whole graph
-    makes several. With PCM the pairwise consistent edges are those kept.
-    Errors are those of `solve_robustly`.
+    `kept` (m,) are the edges kept before, with the known inliers and those that hold poses
+    (`held_together`). `new` (m,) are the edges added since. All edges that are neither kept nor
+    known are candidates. They are tested in clusters against the map. The map may also lose a
+    cluster that it has kept, or exchange one for another (`ClusterSearch`). So a later closure
+    can revise an earlier decision. There is one attempt, which is cheap; a robust solve of the
+    whole graph makes several. With PCM the pairwise consistent edges are those kept. Errors are
+    those of `solve_robustly`.
     """
     job = _RobustSolve.of(robust, request)
     job.new = new
@@ -330,7 +330,9 @@ class _RobustSolve:
         The start of the plan from least squares is solved for, where that is affordable.
         """
         if plan.settings is None:
-            return any(np.array_equal(plan.candidates, other.found) for other in self.estimates)
+            return any(
+                np.array_equal(plan.candidates, other.before_revision) for other in self.estimates
+            )
         return plan.starts_at_least_squares and not self._has_least_squares()
 
     def _plans(self, settings: GNC) -> Iterator[Plan]:
@@ -393,7 +395,7 @@ class _RobustSolve:
     def _has_least_squares(self) -> bool:
         """Whether the solution with every edge is there, or could be found.
 
-        It is found where that is affordable and no start was given.
+        It is computed if that is affordable and no start was given.
         """
         if self.least_squares is None and self.start is None and self.doubted.is_affordable:
             every_edge = self.doubted.every_edge
@@ -519,7 +521,7 @@ class _RobustSolve:
         if not is_open(of_attempt.certificate, of_attempt.status):
             return of_attempt
         solution = self.places.solution(estimate.kept, estimate.poses)
-        has_changed = not np.array_equal(estimate.kept, estimate.found)
+        has_changed = not np.array_equal(estimate.kept, estimate.before_revision)
         if not has_changed or solution.is_certified:
             return solution
         try:
