@@ -36,8 +36,8 @@ rotations take one round each, a proof of the certificate two.
 
 The cost of poses is F = tr(X^T M X). X, ((d + 1) n, d), stacks the rows t_i^T of all n poses, then
 the d rows of every R_i^T; M, of side (d + 1) n, sums up the edges. M X is half the gradient of F.
-Rows on the cover have the same layout, with g in place of n. For chi2, which is not quadratic, M is
-that of the quadratic cost that touches it at the current poses.
+Rows on the cover have the same layout, with g in place of n. chi2 is not quadratic; M is then the
+matrix of its tangent, the quadratic cost that equals chi2 to first order at the current poses.
 """
 
 import math
@@ -561,8 +561,8 @@ def collect(driver: Driver) -> tuple[Poses, Array]:
     R[driver.cover] = driver.current.R
     t[driver.cover] = driver.current.t
     Lambda[driver.cover] = driver.current.multipliers
-    for own in driver.ask(current_poses.result, None, Count.OFF):
-        R[own.poses] = own.R
-        t[own.poses] = own.t
-        Lambda[own.poses] = own.Lambda
+    for answer in driver.ask(current_poses.result, None, Count.OFF):
+        R[answer.poses] = answer.R
+        t[answer.poses] = answer.t
+        Lambda[answer.poses] = answer.Lambda
     return poses_from(R, t), Lambda

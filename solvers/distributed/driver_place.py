@@ -98,7 +98,7 @@ class DriverPlace(PlaceOfRobots):
         return Attempt()
 
     def run_soc(self, attempt: Attempt, soc: AnySOC) -> Attempt:
-        """Run SOC from the current poses, which stay where it finds none that cost less."""
+        """Run SOC from the current poses, and return to them if its poses cost more."""
         journal = self.journal
         if journal.goes_on_with(SubstructuredNewton):
             return attempt
@@ -128,11 +128,11 @@ class DriverPlace(PlaceOfRobots):
             return replace(attempt, status=finished.status)
         rounds = driver.network.ledger.rounds
         offset = finished.iterations - rounds
-        heard = AttemptWithFaults(
+        with_faults = AttemptWithFaults(
             status=finished.status, offset=offset, patience=soc.max_iterations
         )
-        heard.check_heard(self.faults, rounds)
-        return heard
+        with_faults.check_heard(self.faults, rounds)
+        return with_faults
 
     def _run_coupling(self, soc: AnySOC) -> Outcome[Any]:
         """Run the coupling that the settings name, or the paper's; its factors go with it."""

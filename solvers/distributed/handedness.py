@@ -28,7 +28,7 @@ from solvers.network.moments import Moment
 _SETTLED = 1e-3
 _FAR = 1.0  # of the smallest eigenvalue: a shift farther below it is moved closer
 _MOST_STEPS = 10  # with one shift
-_MOST_SHIFTS = 8
+_MOST_SHIFTS = 8  # each after at most `_MOST_STEPS` steps
 _DEPENDENT = 1e-13  # of the largest square of a direction in the span: less is rounding
 
 

@@ -176,10 +176,11 @@ class EliminatedAlgebra:
 class SubstructuredNewton:
     """Newton by a driver and its robots, from the poses that they hold; `newton` has the settings.
 
-    Where the Hessian is not positive definite it is that of S + eta blockdiag(0, I), with a small
-    eta that makes it so, if the model `is_shifted`, which follows negative curvature; else the
-    damped Gauss-Newton matrix. Where `is_straight`, translations move along with the rotations,
-    one round a move; else they are solved for, two rounds a move. `enough` is as in `StepRules`.
+    A Hessian that is not positive definite is replaced. If the model `is_shifted`, the Hessian of
+    S + eta blockdiag(0, I) takes its place, with a small eta that makes it definite: the move then
+    follows negative curvature. Otherwise the damped Gauss-Newton matrix does. If `is_straight`,
+    translations move along with the rotations, one round a move; else they are solved for, two
+    rounds a move. `enough` is as in `StepRules`.
     """
 
     newton: Newton = field(default_factory=Newton)
@@ -248,14 +249,14 @@ def model_at(driver: Driver, order: ModelOrder) -> Model | None:
         return None
     interface = driver.interface(*driver.tangent)
     try:
-        own = _own(driver, reduced, order)
-        factor = interface.factorize([answer.schur for answer in reduced], own)
+        blocks = _blocks_of_driver(driver, reduced, order)
+        factor = interface.factorize([answer.schur for answer in reduced], blocks)
     except NotPositiveDefiniteError:
         return None
     return _solved(order, factor, driver.current, [answer.right for answer in reduced])
 
 
-def _own(
+def _blocks_of_driver(
     driver: Driver, reduced: Sequence[Reduced], order: ModelOrder
 ) -> list[tuple[IntArray, Array]]:
     """What the driver adds: the multipliers of the cover, the ground, the damping."""
@@ -263,19 +264,19 @@ def _own(
     at = LiftedPoses(driver.current.R, driver.current.t)
     interface = driver.interface(*driver.tangent)
     layout = at.layout
-    own: list[tuple[IntArray, Array]] = []
+    blocks: list[tuple[IntArray, Array]] = []
     diagonal = interface.gather([answer.diagonal[:, None] for answer in reduced])[:, 0]
     columns = layout.rotations(np.arange(g))
     if order.second_order:
         curvature = -at.curvature(driver.current.multipliers - order.eta * np.eye(driver.d))
-        own.append((columns, curvature))
+        blocks.append((columns, curvature))
         diagonal[columns] += np.einsum("naa->na", curvature)
     extra = np.zeros_like(diagonal)
     zero = driver.columns_of_pose_0(*driver.tangent)
     extra[zero] = abs(diagonal[zero])
     extra += order.damping * (diagonal + extra)
-    own.append((np.arange(interface.side)[:, None], extra[:, None, None]))
-    return own
+    blocks.append((np.arange(interface.side)[:, None], extra[:, None, None]))
+    return blocks
 
 
 def _solved(

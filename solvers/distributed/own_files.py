@@ -106,7 +106,7 @@ class OpenedFiles:
         return len(bridges(i, j, np.ones(len(self.borders), dtype=bool)))
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
-        """The same robots with other edges, of which they have told the borders.
+        """The same robots with other edges; `borders` are their borders with these.
 
         A GraphError if these do not connect the poses.
         """
@@ -151,7 +151,7 @@ def open_files(
         numbered = number_ids(claims, files)
         num_poses = numbered.num_poses
         sent = network.ask(number_poses, numbered.runs, Count.PIGGYBACKED)
-        received = [(told, trust_folder) for told in network.exchange(sent)]
+        received = [(lines, trust_folder) for lines in network.exchange(sent)]
         borders = network.ask(join_neighbours, received, Count.PIGGYBACKED)
         has_indefinite = any(border.has_indefinite for border in borders)
         if weighting is Weighting.OWN:
@@ -225,8 +225,12 @@ def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) ->
 
 def _agreements(network: CountedPool, quantile: float, scale: float) -> list[AgreeingCounts]:
     """Have every two robots judge the edges between them, with errors of a scale."""
-    told = network.ask(tell_trajectories, [None] * network.ledger.num_robots, Count.PIGGYBACKED)
-    requests = [(trajectories, quantile, scale) for trajectories in network.exchange(told)]
+    trajectories_sent = network.ask(
+        tell_trajectories, [None] * network.ledger.num_robots, Count.PIGGYBACKED
+    )
+    requests = [
+        (trajectories, quantile, scale) for trajectories in network.exchange(trajectories_sent)
+    ]
     return network.ask(judge_closures, requests, Count.PIGGYBACKED)
 
 

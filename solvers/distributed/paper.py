@@ -96,8 +96,8 @@ class PaperByRobots:
         num_poses = sum(part.num_poses for part in parts)
         num_rows = num_poses * driver.d
         penalty = CommonPenalty(math.fsum(part.rho for part in parts) / num_poses)
-        told = [self._told(penalty)] * len(poses)
-        replies = robots.ask(PaperRobot.start, told, Count.ALL_REDUCE)
+        orders = [self._order(penalty)] * len(poses)
+        replies = robots.ask(PaperRobot.start, orders, Count.ALL_REDUCE)
         state = PaperRobotsState(
             k=0,
             penalty=penalty,
@@ -118,8 +118,8 @@ class PaperByRobots:
             return replace(following, dual_residual=math.nan, objective=math.nan)
         primal, change, _ = np.sqrt(state.squares) / state.root
         penalty = state.penalty.after(self.soc.penalty, float(primal), float(change))
-        told = self._told(penalty)
-        orders = [(told, rows) for rows in state.rows]
+        order = self._order(penalty)
+        orders = [(order, rows) for rows in state.rows]
         answers = RobotsOfDriver(driver).ask(PaperRobot.step, orders, Count.ALL_REDUCE)
         gradient = math.sqrt(math.fsum(last.gradient for last, _ in answers))
         following = replace(
@@ -148,7 +148,7 @@ class PaperByRobots:
         driver.return_to(state.moment)
         RobotsOfDriver(driver).finish()
 
-    def _told(self, penalty: CommonPenalty) -> PaperPenalty:
+    def _order(self, penalty: CommonPenalty) -> PaperPenalty:
         assert isinstance(self.soc.r_step, RStep)  # as `check_paper` has seen
         return PaperPenalty(penalty.rho, self.soc.r_step)
 

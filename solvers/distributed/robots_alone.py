@@ -8,11 +8,11 @@ follows. Best translations of given rotations, Newton and the certificate need a
 "Without a driver" is said of the method. One process still has the whole graph: it makes the tree,
 delivers all messages, and collects the poses of the result, so that it sees every pose.
 
-The sums that robots need, and so their tests of convergence, go along a tree of robots. CONVERGED
-means of SOC that the relative gradient of F over rotations and translations is within its tolerance
-at the poses that the robots hold and that are returned. How far F is from an optimum does not
-follow from it. Of the start, in which the rotations are first relaxed and then held, it means that
-the residuals of the recursion are within `_START_TOLERANCE`.
+The sums that robots need, and so their tests of convergence, go along a tree of robots. For SOC
+CONVERGED means that the relative gradient of F over rotations and translations is within its
+tolerance at the returned poses. It does not tell how far F is from an optimum. For the start, which
+first relaxes the rotations and then holds them, CONVERGED means that the residuals of the recursion
+are within `_START_TOLERANCE`.
 """
 
 import time

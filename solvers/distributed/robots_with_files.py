@@ -67,10 +67,9 @@ class KeptAnswer:
 class RobotsWithFiles(DriverPlace):
     """A solve by robots with own files: of the folder `name`, to a relative `gap`.
 
-    `kept` are the answers that the robots have kept, the last of which is theirs. With
-    `begins_at`, the name of a start, it begins at poses that the robots have found before. While
-    the map `is_on_the_way` to another one, no shift of the bound is looked for that would cost more
-    than the gap.
+    `kept` are the answers that the robots have kept; the last one is their current answer. With
+    `begins_at`, the name of a start, the solve begins at earlier poses of the robots. While the map
+    `is_on_the_way` to another one, shifts of the bound that cost more than the gap are not tried.
     """
 
     name: str

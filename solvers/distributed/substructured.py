@@ -233,5 +233,7 @@ def _factorize(
     """
     rows = driver.rotation_rows[:, None]
     half_penalty = (0.5 * block.rho)[:, None, None]
-    own = [(rows, half_penalty), *driver.grounding_block()]
-    return driver.interface(1, driver.d).factorize([answer.schur for answer in reduced], own)
+    blocks_of_driver = [(rows, half_penalty), *driver.grounding_block()]
+    return driver.interface(1, driver.d).factorize(
+        [answer.schur for answer in reduced], blocks_of_driver
+    )

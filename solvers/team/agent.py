@@ -76,7 +76,7 @@ class TeamAgent(FileAgent):
         super().__init__((number, Path(f"{name}.g2o")))
         self.text = text
         self.sharing = sharing
-        self._told: OwnAnswer | None = None
+        self._answer_of_driver: OwnAnswer | None = None
 
     def lines(self) -> G2OLines:
         """Lines of the robot's measurements."""
@@ -84,13 +84,13 @@ class TeamAgent(FileAgent):
 
     def take(self, answer: OwnAnswer) -> None:
         """Keep the answer that the driving robot has sent."""
-        self._told = answer
+        self._answer_of_driver = answer
 
     @property
     def answer(self) -> OwnAnswer | None:
         """What is known of its poses; None before the end of a solve."""
-        if self._told is not None or not isinstance(self.record, PlacedFile):
-            return self._told
+        if self._answer_of_driver is not None or not isinstance(self.record, PlacedFile):
+            return self._answer_of_driver
         if self.record.answer is None:
             return None
         own_poses = np.flatnonzero(self.record.subgraph.is_own)

@@ -129,14 +129,14 @@ def _with_terms(robot: Interior, terms: HandednessTerms | None) -> tuple[Interio
 def _with_vectors(robot: Interior, X: Array, b: Array) -> tuple[Interior, VectorsAnswer]:
     """The robot at vectors X that b led to: the next right-hand side, and parts of X^T b, X^T X."""
     rows = robot.interior_rows
-    own = X[rows]
+    X_E = X[rows]
     right_hand_side = np.zeros_like(X)
-    right_hand_side[rows] = own
+    right_hand_side[rows] = X_E
     session = robot.session(ProofSession)
     system, right = session.system.with_right(right_hand_side)
     following = robot.in_session(replace(session, system=system))
     following = _with_ascent(following, replace(_ascent(robot), X=X))
-    return following, VectorsAnswer(right.b, own.T @ b[rows], own.T @ own)
+    return following, VectorsAnswer(right.b, X_E.T @ b[rows], X_E.T @ X_E)
 
 
 def _with_ascent(robot: Interior, ascent: RobotAscent) -> Interior:

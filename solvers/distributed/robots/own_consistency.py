@@ -1,10 +1,10 @@
 """Pairwise consistency by the robots: closures between two of them are judged by these two.
 
-A robot tells each neighbour how its odometry leads from one pose to the next of those that closures
-between the two touch: one message each way. Then both know the cycles of all closures between them,
-and find the same largest set that agrees (`solvers.robust.consistency`). The closures of a robot
-with itself it judges alone. Each tells the driver how many agree with those of every neighbour, and
-is told of which neighbours they stay.
+Closures between two robots touch some poses of each. A robot sends its neighbour the odometry from
+one of these poses to the next, in one message. Then both know the cycles of all closures between
+them, and compute the same largest set that agrees (`solvers.robust.consistency`). A robot judges
+the closures with itself alone. It tells the driver how many closures with each neighbour agree, and
+the driver answers with the neighbours whose closures stay.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
     is_own = joined.owners == robot
     chains = Chains.of(graph, own_odometry(graph, is_own))
     R, t = chains.motion
-    told = {}
+    trajectories = {}
     for other in neighbours_of(joined, robot):
         between = edges_between(joined, robot, other)
         ends = np.concatenate([graph.i[between], graph.j[between]])
@@ -107,10 +107,10 @@ def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
         to_begin = inverse((R[begins], t[begins]))
         seen_R, seen_t = product(to_begin, (R[poses], t[poses]))
         grown = chains.covariance[poses] - chains.covariance[begins]
-        told[other] = Trajectory(
+        trajectories[other] = Trajectory(
             joined.numbers[poses], chains.chain[poses], seen_R, seen_t, carried(to_begin, grown)
         )
-    return told
+    return trajectories
 
 
 def tell_error_scale(agent: FileAgent, request: tuple[Weighting, float]) -> float:
@@ -118,8 +118,8 @@ def tell_error_scale(agent: FileAgent, request: tuple[Weighting, float]) -> floa
 
     It multiplies the covariances that the matrices claim: the lower quartile of the squared
     Mahalanobis distances between closures and odometry, over that of chi^2. Three closures of four
-    may be wrong. Where odometry has gaps, and few closures are on a chain, the edges that agree
-    pairwise by a quantile are solved, and it is what they cost over what is expected
+    may be wrong. If odometry has gaps, and few closures are on a chain, the edges that agree
+    pairwise by a quantile are solved. The scale is then their cost over the expected one
     (`error_scale`). The request is the cost that is solved, and the quantile.
     """
     weighting, quantile = request
@@ -152,11 +152,11 @@ def judge_closures(
     own_graph, odometry, among_own = _own_part(joined, robot)
     if own_graph is not None:
         kept[among_own] = _own_agreeing(own_graph, odometry, quantile, scale)
-    own = _trajectories(robot, joined)
+    own_trajectories = _trajectories(robot, joined)
     num_agreeing = []
     for other, theirs in received.items():
         between = edges_between(joined, robot, other)
-        known = {robot: own[other], other: theirs}
+        known = {robot: own_trajectories[other], other: theirs}
         both = [known[k] for k in sorted(known)]
         kept[between] = _agree(joined, between, both, quantile, scale)
         num_agreeing.append(int(kept[between].sum()))
@@ -228,14 +228,14 @@ def with_edges(everything: JoinedFile, robot: int, kept: BoolArray) -> JoinedFil
     )
 
 
-def go_on_with(agent: FileAgent, left: JoinedFile) -> ConsistentPart:
+def go_on_with(agent: FileAgent, remaining: JoinedFile) -> ConsistentPart:
     """Go on with what is left, and report it."""
-    everything = everything_of(left)
+    everything = everything_of(remaining)
     graph = everything.graph
     is_counted = everything.owners[np.stack([graph.i, graph.j])].min(axis=0) == agent.robot
-    is_counted[left.edges] = False
-    agent.record = left
-    return ConsistentPart(border_of(agent.robot, left), int(is_counted.sum()))
+    is_counted[remaining.edges] = False
+    agent.record = remaining
+    return ConsistentPart(border_of(agent.robot, remaining), int(is_counted.sum()))
 
 
 def _agree(

@@ -1,9 +1,12 @@
 """Orders of a robust solve by robots with own files, after a solve with edges that agree pairwise.
 
-They stand in the sequence in which they are given: `tell_solved` and `judge_near` where only edges
-near the map come back, `take_back`, those that place the robot anew, `tell_cover` and
-`go_to_solved`, those of `reweighting`, then `tell_links`, `tell_kept` and `keep`, and `go_back`
-where nothing better was found.
+The orders are given in this sequence:
+
+1. `tell_solved` and `judge_near`, if only edges near the map come back;
+2. `take_back`, and the orders that place the robot anew;
+3. `tell_cover` and `go_to_solved`;
+4. the orders of `reweighting`;
+5. `tell_links`, `tell_kept` and `keep`, or `go_back` if the map is no better.
 """
 
 from __future__ import annotations
@@ -92,15 +95,15 @@ def tell_solved(agent: FileAgent, _: None) -> Mapping[int, SolvedPoses]:
     """Order: tell every neighbour of the own poses found that edges between the two touch."""
     placed = agent.known(PlacedFile)
     everything = everything_of(placed.joined)
-    solved = _found(placed)
-    own = np.flatnonzero(everything.owners == agent.robot)
-    told = {}
+    solved = _own_poses_of(placed)
+    own_poses = np.flatnonzero(everything.owners == agent.robot)
+    messages = {}
     for other in neighbours_of(everything, agent.robot):
         between = edges_between(everything, agent.robot, other)
         ends = np.concatenate([everything.graph.i[between], everything.graph.j[between]])
-        places = np.flatnonzero(np.isin(own, ends))
-        told[other] = SolvedPoses(everything.numbers[own[places]], solved[places])
-    return told
+        places = np.flatnonzero(np.isin(own_poses, ends))
+        messages[other] = SolvedPoses(everything.numbers[own_poses[places]], solved[places])
+    return messages
 
 
 def judge_near(
@@ -115,11 +118,11 @@ def judge_near(
     placed = agent.known(PlacedFile)
     everything = everything_of(placed.joined)
     graph = everything.graph
-    own = everything.owners == agent.robot
+    is_own = everything.owners == agent.robot
     R = np.tile(np.eye(graph.d), (graph.num_poses, 1, 1))
     t = np.zeros((graph.num_poses, graph.d))
-    solved = _found(placed)
-    R[own], t[own] = solved.R, solved.t
+    solved = _own_poses_of(placed)
+    R[is_own], t[is_own] = solved.R, solved.t
     for theirs in received.values():
         places = np.searchsorted(everything.numbers, theirs.numbers)
         R[places], t[places] = theirs.poses.R, theirs.poses.t
@@ -142,7 +145,7 @@ def take_back(agent: FileAgent, request: TakenBack) -> Border:
     robot = agent.robot
     placed = agent.known(PlacedFile)
     everything = everything_of(placed.joined)
-    solved = _found(placed)
+    solved = _own_poses_of(placed)
     assert everything.agrees is not None
     if request.comes_back is ComesBack.AGREEING:
         candidates = everything.agrees
@@ -207,12 +210,12 @@ def tell_links(agent: FileAgent, request: tuple[float, Poses]) -> Links:
     subgraph = placed.subgraph
     ratio = np.zeros(graph.num_edges)
     if agent.interior is not None:
-        whole = agent.interior.whole
-        assert whole.edges is not None
-        ratio[whole.edges] = whole.ratios(agent.interior.poses, scale)
-    own = held_poses(agent, cover)[np.flatnonzero(subgraph.is_own)]
+        part = agent.interior.whole
+        assert part.edges is not None
+        ratio[part.edges] = part.ratios(agent.interior.poses, scale)
+    own_poses = held_poses(agent, cover)[np.flatnonzero(subgraph.is_own)]
     links = _counted_links(placed)
-    agent.record = replace(placed, joined=replace(joined, solved=own), within=ratio <= 1.0)
+    agent.record = replace(placed, joined=replace(joined, solved=own_poses), within=ratio <= 1.0)
     owners = np.stack([joined.owners[graph.i[links]], joined.owners[graph.j[links]]], axis=1)
     return Links(owners, ratio[links])
 
@@ -229,11 +232,11 @@ def tell_kept(agent: FileAgent, is_held: BoolArray) -> Mapping[int, BoolArray]:
     kept = placed.within.copy()
     kept[_counted_links(placed)[is_held]] = True
     agent.record = replace(placed, within=kept)
-    told = {}
+    messages = {}
     for other in neighbours_of(joined, agent.robot):
         between = edges_between(joined, agent.robot, other)
-        told[other] = np.stack([subgraph.is_counted[between], kept[between]])
-    return told
+        messages[other] = np.stack([subgraph.is_counted[between], kept[between]])
+    return messages
 
 
 def _counted_links(placed: PlacedFile) -> IntArray:
@@ -256,8 +259,8 @@ def keep(agent: FileAgent, received: Mapping[int, BoolArray]) -> ConsistentPart:
     everything = everything_of(joined)
     stays = np.zeros(everything.graph.num_edges, dtype=bool)
     stays[joined.edges[kept]] = True
-    left = with_edges(everything, agent.robot, stays)
-    return go_on_with(agent, replace(left, solved=joined.solved, before=joined.before))
+    remaining = with_edges(everything, agent.robot, stays)
+    return go_on_with(agent, replace(remaining, solved=joined.solved, before=joined.before))
 
 
 def go_back(agent: FileAgent, _: None) -> ConsistentPart:
@@ -267,8 +270,8 @@ def go_back(agent: FileAgent, _: None) -> ConsistentPart:
     return go_on_with(agent, before)
 
 
-def _found(placed: PlacedFile) -> Poses:
-    """Own poses that the last solve has found."""
+def _own_poses_of(placed: PlacedFile) -> Poses:
+    """Poses of the robot at the end of the last solve."""
     return placed.kept[np.flatnonzero(placed.subgraph.is_own)]
 
 

@@ -32,9 +32,12 @@ def coupled_unknowns(coupled: csr_array, widths: Widths) -> csr_array:
         begin += width * g
     unknowns = np.concatenate(of_pose, axis=1)  # (g, sum(widths)): of every pose
     rows, columns = coupled.tocoo().coords
-    one = unknowns[rows][:, :, None]
-    other = unknowns[columns][:, None, :]
-    ends = np.maximum(one, other).ravel(), np.minimum(one, other).ravel()
+    row_unknowns = unknowns[rows][:, :, None]
+    column_unknowns = unknowns[columns][:, None, :]
+    ends = (
+        np.maximum(row_unknowns, column_unknowns).ravel(),
+        np.minimum(row_unknowns, column_unknowns).ravel(),
+    )
     lower = csr_array((np.ones(len(ends[0])), ends), shape=(side, side))
     lower.sum_duplicates()  # two unknowns of one pose come twice; sorted, too
     return lower.astype(bool)
