@@ -13,7 +13,7 @@ from scipy.sparse import csc_array, csr_array
 
 from pgo_models.html_tables import facts_table
 
-_WIDTH = 100
+_WIDTH = 100  # letters of a line, as in the code
 _MOST_LETTERS = 60  # of a field
 _FEW = 4  # numbers of an array, or entries of a list, that are shown one by one
 

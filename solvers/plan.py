@@ -51,8 +51,9 @@ SMALL = 1000
 # Newton steps of a first attempt on graphs with landmarks. On all graphs tried, those that ended at
 # the global minimum took at most as many, and the others 17 to 100.
 LANDMARK_STEPS = 16
+# Residuals at which SOC of a second attempt ends; `WARM_START`, the first one, ends at 5e-3.
 SECOND_TRY_TOLERANCE = 1e-6
-HULL_PASSES = 3
+HULL_PASSES = 3  # with CLOSER the last one has a hundredth of the first tolerance
 CLOSER = 0.1  # factor on the tolerance of the next pass over the relaxation with hulls
 Improvement = Callable[[Place, Pipeline, Attempt], Attempt]
 

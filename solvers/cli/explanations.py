@@ -33,10 +33,11 @@ from solvers.solution import Solution, note_of_weights
 if TYPE_CHECKING:  # what commands that solve nothing do not need
     from solvers.studies.readings import ReadingComparison
 
-# Ratios of the cost to the expected one beyond which other readings of a file are tried,
+# Ratios of the cost to the expected one. Other readings of a file are tried above the first and
+# below the second, if the graph has few edges: that takes hardly longer than the solve.
 _FAR_ABOVE = 10.0
 _BELOW = 0.1
-_FEW_EDGES = 500  # up to which that takes hardly longer than the solve
+_FEW_EDGES = 500
 _FEW_FOR_NOISE = 5000  # edges up to which the noise is estimated in a few seconds
 P = ParamSpec("P")
 T = TypeVar("T")
