@@ -276,9 +276,9 @@ def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:
 def extended_partition(robots: Partition, ids: IntArray, graph: PoseGraph) -> Partition:
     """Owners of the poses of a graph that has grown, from the `robots` of the poses with these ids.
 
-    A new pose goes to the robot that the graph names, where the robots are those that it names, and
-    else to the robot of the pose that its first edge joins it with. A GraphError where no edge
-    joins some of the latter poses with known ones.
+    If the robots are those that the graph names, a new pose goes to the robot that the graph names
+    for it. Otherwise it goes to the robot of the pose that its first edge joins it with. A
+    GraphError if no edge joins some of these poses with known ones.
     """
     owner = np.full(graph.num_poses, -1)
     _, known, place = np.intersect1d(graph.pose_ids, ids, return_indices=True)

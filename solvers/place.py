@@ -175,7 +175,7 @@ def is_open(certificate: Certificate, status: Status) -> bool:
 
 
 def after_search(best: Attempt, certificate: Certificate, stage: Stage) -> Attempt:
-    """The same poses after a search for a bound, which counts as an ending if time ran out."""
+    """The attempt after a search for a bound; its status is the search's if time ran out."""
     status = stage.status if stage.status in OUT_OF_TIME else best.status
     return replace(best, certificate=certificate, status=status)
 
@@ -242,7 +242,7 @@ class Place(ABC):
 
     @abstractmethod
     def run_soc(self, attempt: Attempt, soc: Any) -> Attempt:  # noqa: ANN401 - as the page chose it
-        """Run SOC from the poses, which stay where SOC finds none that cost less."""
+        """Run SOC from the poses, and return to them if its poses cost more."""
 
     @abstractmethod
     def run_newton(self, attempt: Attempt, newton: Newton) -> Attempt:

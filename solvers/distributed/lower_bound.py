@@ -216,7 +216,7 @@ class CoverProof:
 
     @property
     def quadratic(self) -> float:
-        """The same with the error of G."""
+        """Bound on the loss to G = S X, with the error of G."""
         return self.sums.quadratic
 
 

@@ -123,7 +123,7 @@ class OpenedFiles:
         )
 
     def with_parts(self, parts: Sequence[ConsistentPart]) -> OpenedFiles:
-        """The same robots with what they report to be left."""
+        """The same robots with the edges that remain in their reports."""
         return self.with_edges(*borders_of(parts))
 
 

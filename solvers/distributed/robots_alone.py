@@ -69,9 +69,9 @@ class StartInCopies(Attempt):
 class RobotsAlone(PlaceOfRobots):
     """A solve by robots of one graph without a driver.
 
-    It has a start and CONSENSUS. Of the whole problem only the trees are used, and F of the start
-    and of the poses that are returned. `faults` go wrong between the robots, which then do not
-    wait.
+    It has a start and CONSENSUS. The whole problem serves for the trees alone, and for F of the
+    start and of the returned poses. With `faults`, messages between robots are lost or late, and
+    the robots do not wait.
     """
 
     here: Here
@@ -79,7 +79,7 @@ class RobotsAlone(PlaceOfRobots):
 
     @property
     def traits(self) -> Traits:
-        """Those of the graph, and that there is no driver."""
+        """Traits of the graph; there are robots and no driver."""
         return replace(self.here.traits, has_robots=True, has_driver=False)
 
     def note(self, best: Attempt) -> str:

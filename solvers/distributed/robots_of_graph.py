@@ -89,7 +89,7 @@ class RobotsOfGraph(DriverPlace):
 
     @property
     def traits(self) -> Traits:
-        """Those of the graph; its rotations are averaged where all robots can."""
+        """Traits of the graph; its rotations are averaged if all robots can average theirs."""
         # The rotation of a loose world depends on positions alone.
         averages = self.driver.can_average and not self.here.problem.graph.is_world_loose
         return replace(self.here.traits, averages=averages, has_robots=True)
@@ -130,9 +130,9 @@ class RobotsOfGraph(DriverPlace):
         return Attempt(poses, certificate=certificate)
 
     def certify(self, attempt: Attempt) -> Attempt:
-        """Collect the poses from the robots, and find their certificate by driver and robots.
+        """Collect the poses from the robots, and prove their certificate by driver and robots.
 
-        Of the whole problem nothing is used but F of these poses.
+        The whole problem serves for F of these poses alone.
         """
         here = self.here
         with self.monitor.showing("certificate"):

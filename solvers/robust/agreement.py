@@ -93,7 +93,7 @@ class Agreement:
 
     @cached_property
     def own_shares(self) -> Array:
-        """The same, where a cycle speaks against an edge only as far as its other edges are right.
+        """Shares where a cycle speaks against an edge only as far as its other edges are right.
 
         That is the least of their shares. A right edge so has a large share although most of its
         cycles have a wrong edge, and one of which nothing can be said has a half, about.

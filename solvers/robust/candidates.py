@@ -59,9 +59,9 @@ class Candidates:
         return self.first_order.distances(self.farthest[chosen]) / self.largest[chosen]
 
     def near(self, chosen: IntArray, most: float, beyond: float = -np.inf) -> Iterator[int]:
-        """Those of some that are within `most` times their thresholds to first order.
+        """Those of the `chosen` whose first-order distance is between two multiples of a threshold.
 
-        They are farther than `beyond` times these.
+        It is above `beyond` times the threshold, and at most `most` times.
         """
         for first in range(0, len(chosen), _TOGETHER):
             looked_at = chosen[first : first + _TOGETHER]

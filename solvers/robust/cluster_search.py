@@ -90,7 +90,7 @@ class ClusterSearch:
 
     @cached_property
     def singly(self) -> ClusterSearch:
-        """The same search with every edge as a cluster of its own: new ones come in runs alone."""
+        """The search with every edge as a cluster of its own; new edges are left to the runs."""
         return replace(self, new=None, is_single=True)
 
     def improved(self, kept: BoolArray, poses: Poses) -> Fit:
@@ -307,12 +307,12 @@ class ClusterSearch:
     def _with_each(
         self, fit: Fit, candidates: Candidates, chosen: list[int]
     ) -> tuple[Fit, list[int]]:
-        """The fit with those of some candidates whose T passes the test, and those that do not.
+        """The fit with the chosen candidates whose T passes the test, and those that fail it.
 
-        Where all of them together pass, that is one solve; else those that are within their
-        thresholds at the map with all of them are tried on their own, and then the others; halves
-        are if none or all are within. A cluster that hides among others is removed later, by its
-        own rise of the cost. Those that time leaves no trial count as not passing.
+        If all of them pass together, one solve is enough. Otherwise those within their thresholds
+        at the map with all of them are tried on their own, and then the others. If none or all are
+        within, each half is tried. A wrong cluster that hides among others is removed later, by its
+        own rise of the cost. Candidates that time leaves no trial count as failed.
         """
         if len(chosen) == 1:
             k = chosen[0]

@@ -133,7 +133,7 @@ class LinearChoice:
         return choice
 
     def suspects(self, chosen: IntArray) -> IntArray:
-        """Those of the chosen closures, (s,), that the map may have been bent to, the worst first.
+        """Chosen closures, (s,), that may have bent the map to them, the worst first.
 
         What such a closure costs is not small, but its own residual is: the other edges pay.
         """

@@ -538,8 +538,8 @@ class _RobustSolve:
     ) -> Solution:
         """The solution with the decision on every edge, and the account of all that was sent.
 
-        `scale` is that of the thresholds beside which the residuals are reported, and
-        `noise` how many times their claim the squared errors of all edges are.
+        `scale` is the factor on the thresholds beside which residuals are reported. `noise` is the
+        factor by which the squared errors of all edges exceed their claim.
         """
         choice = self.choice
         allowed = scale * self.doubted.thresholds

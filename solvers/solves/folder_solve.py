@@ -386,7 +386,7 @@ def _solved_from(answer: _Answer, start: str, pipeline: Pipeline) -> _Answer:
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:
-    """For whom it holds, why the cost is F where that was not asked for, and the place's note."""
+    """Note of a solution: absent robots, why the cost is F in place of chi2, and `note`."""
     reason = ""
     if weighting is Weighting.OWN and opened.has_indefinite:
         reason = "the cost is F, as some information matrices are indefinite: chi2 can be negative"

@@ -41,14 +41,15 @@ from solvers.riemannian.shrunk_bound import bound_is_tight, with_shrunk_informat
 def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
     """Judge anybody's poses by a proven lower bound on the global optimum.
 
-    The bound is found at a stationary point. Poses that are not stationary are polished first
-    (damped Newton, `polish`); where that point does not give the gap, the one that the chordal
-    start polishes to is tried, and the better bound is taken. `source` says what was done; the gap
-    is always that of the poses given. `certify_at` bounds at the poses as they are. Of a problem
-    with `Weighting.INFORMATION` all of this is chi2 instead of F, bounded by its tangent at the
-    stationary point, and where that fails by smaller information matrices (`bound_by_shrinking`).
-    Where the bound is still wide, in space handedness terms follow (`HandednessAscent`), and in the
-    plane the relaxation with rotations as complex numbers (`ComplexRelaxation`).
+    The bound is proved at a stationary point. Poses that are not stationary are polished first
+    (damped Newton, `polish`). If this point does not give the gap, the chordal start is polished,
+    too, and the better bound is taken. `source` says what was done; the gap is always that of the
+    poses given. `certify_at` bounds at the poses as they are.
+
+    With `Weighting.INFORMATION` the cost is chi2 instead of F. Its tangent at the stationary point
+    is bounded, and if that fails smaller information matrices are (`bound_by_shrinking`). If the
+    bound is still wide, handedness terms follow in space (`HandednessAscent`), and the relaxation
+    with rotations as complex numbers in the plane (`ComplexRelaxation`).
 
     Parameters
     ----------

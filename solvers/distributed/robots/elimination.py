@@ -78,9 +78,9 @@ def eliminate(
     """Factor the interior of a robot's matrix and form its Schur complement.
 
     K_GG - Z^T Z with Z = U^-T K_IG, U^T U = K_II, by forward substitution alone: [U, Z] are rows of
-    the Cholesky factor of the whole. So its rounding is that of one
-    (`pgo_models.problem.floating_point`), and with `is_verified` what rounding can take of the
-    separators' part is subtracted from the diagonal of the Schur complement: for the given K,
+    the Cholesky factor of K. So the rounding is that of a Cholesky factor
+    (`pgo_models.problem.floating_point`). With `is_verified` a bound on the rounding of the
+    separators' part is subtracted from the diagonal of the Schur complement. For the given K,
     exactly,
 
         x^T K x >= x_G^T schur x_G - x_I^T diag(interior_error) diag(K_II) x_I.

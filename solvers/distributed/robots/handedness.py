@@ -1,8 +1,8 @@
 """What a robot does for the handedness terms of its edges.
 
 These terms (`pgo_models.certificates.handedness`) are in closed form, or an ascent moves them
-(`solvers.handedness.ascent`). The lowest eigenvectors that it needs come from inverse iteration
-with an elimination of S less the terms, that of the session that `prove_interior` began.
+(`solvers.handedness.ascent`). The ascent needs the lowest eigenvectors of S less the terms. They
+come from inverse iteration with the elimination of the session that `prove_interior` began.
 """
 
 from dataclasses import replace

@@ -50,7 +50,7 @@ class System:
         return RightHandSide(*self.elimination.reduce(self.b))
 
     def with_right(self, b: Array) -> tuple[System, RightHandSide]:
-        """The same matrix with another right-hand side, and that side on the boundary."""
+        """The system with the right-hand side b, and b reduced to the boundary."""
         following = replace(self, b=b)
         return following, following.right
 
@@ -107,7 +107,7 @@ class FactoredPart:
         return self.with_cut(widths, elimination.cut), elimination
 
     def with_cut(self, widths: Widths, cut: Cut) -> FactoredPart:
-        """The same with a cut that has an analysis."""
+        """The part with a cut whose analysis is known."""
         return replace(self, cuts={**self.cuts, widths: cut})
 
     def eliminated_again(self, system: System) -> System:
@@ -118,7 +118,7 @@ class FactoredPart:
         )
 
     def with_laplacian(self) -> FactoredPart:
-        """The same with the elimination of the matrix of the translations."""
+        """The part with the elimination of the matrix of the translations."""
         if self.known_laplacian is not None:
             return self
         problem = self.part.problem
