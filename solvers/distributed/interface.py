@@ -133,10 +133,12 @@ def _stored(lower: csc_array, backend: CholeskyBackend) -> tuple[csc_array, IntA
         return lower, slice(None)
     numbers = np.arange(1, lower.nnz + 1)
     numbered = csc_array((numbers, lower.indices, lower.indptr), shape=lower.shape)
-    whole = csc_array(numbered + tril(numbered, -1).T)
-    whole.sort_indices()
-    entries = whole.data - 1
-    return csc_array((np.ones(whole.nnz), whole.indices, whole.indptr), whole.shape), entries
+    symmetric = csc_array(numbered + tril(numbered, -1).T)
+    symmetric.sort_indices()
+    entries = symmetric.data - 1
+    return csc_array(
+        (np.ones(symmetric.nnz), symmetric.indices, symmetric.indptr), symmetric.shape
+    ), entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +224,7 @@ class Interface:
         return UnknownsPattern(lower, tuple(positions), stored, entries, analysis)
 
     def factorize(
-        self, contributions: Sequence[Array], own: Sequence[tuple[IntArray, Array]] = ()
+        self, contributions: Sequence[Array], of_driver: Sequence[tuple[IntArray, Array]] = ()
     ) -> InterfaceFactor:
         """Sum the robots' Schur complements and the driver's own blocks, and factor the sum.
 
@@ -235,7 +237,7 @@ class Interface:
         keys = _keys(unknowns.lower)
         for positions, part in zip(unknowns.robots, contributions, strict=True):
             values[positions] += part
-        for columns, blocks in own:
+        for columns, blocks in of_driver:
             row = np.broadcast_to(columns[:, :, None], blocks.shape)
             column = np.broadcast_to(columns[:, None, :], blocks.shape)
             is_lower = row >= column
@@ -258,20 +260,20 @@ class Interface:
     def rounding(
         self,
         sizes: Sequence[Array],
-        own: Sequence[tuple[IntArray, Array]],
+        of_driver: Sequence[tuple[IntArray, Array]],
         diagonal: Array,
         of_factor: Array,
     ) -> Array:
         """Bound by how much the factor can differ from the exact sum, as a diagonal, (side,).
 
-        `own` are as there, `sizes`, (g,) each, the `row_sums` of the contributions in the scale of
+        `of_driver` are as there, `sizes`, (g,) each, the `row_sums` of the contributions in the scale of
         `diagonal`, (side,), which is at least the diagonal of the sum. `of_factor`, (side,), is the
         `expected_error` or the `backward_error` of the factor. An entry of the sum has a term of
         every robot, and of the driver's own blocks.
         """
-        of_sums = gamma(float(len(sizes) + len(own)) + 8.0)
+        of_sums = gamma(float(len(sizes) + len(of_driver)) + 8.0)
         sums = self.gather([size[:, None] for size in sizes])[:, 0]
-        for columns, values in own:  # as `row_sums`, block by block
+        for columns, values in of_driver:  # as `row_sums`, block by block
             root = np.sqrt(diagonal[columns])
             weighted = np.abs(values) @ (1.0 / root)[:, :, None]
             np.add.at(sums, columns, root * weighted[:, :, 0])
@@ -301,14 +303,14 @@ class InterfaceFactor:
         """Share of the diagonal that factoring took at most (`CholeskyFactor.backward_error`)."""
         return self.factor.backward_error()
 
-    def solve(self, parts: Sequence[Array], own: Array | None = None) -> Solved:
-        """Solve for the sum of the robots' right-hand sides and the driver's `own`, (side, k).
+    def solve(self, parts: Sequence[Array], of_driver: Array | None = None) -> Solved:
+        """Solve for the sum of the robots' right-hand sides and that `of_driver`, (side, k).
 
         The answer is x, (side, k), x on every robot's boundary, and b^T x.
         """
         b = self.interface.gather(parts)
-        if own is not None:
-            b += own
+        if of_driver is not None:
+            b += of_driver
         x = self.factor.solve(b) if b.size else b
         return x, self.interface.scatter(x), inner(b, x)
 

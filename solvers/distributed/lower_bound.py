@@ -91,8 +91,8 @@ def best_bound_with_terms(driver: Driver, gap: float, less_terms: Array) -> Lowe
         return grounded
     if not (less_terms > 0.0).all():
         return central.NO_BOUND
-    found = _search_forms(driver, gap, less_terms)
-    return replace(found, terms=_collect_terms(driver)) if found.value > 0.0 else found
+    bound = _search_forms(driver, gap, less_terms)
+    return replace(bound, terms=_collect_terms(driver)) if bound.value > 0.0 else bound
 
 
 def diagonal_less_terms(driver: Driver, described: Sequence[TermsAnswer]) -> Array:
@@ -225,9 +225,11 @@ def _moved(
 ) -> tuple[CoverProof, float]:
     """Proof at X - S_r^-1 S X, and the gain: two rounds."""
     g = len(driver.cover)
-    own = np.where(free[:, None], point.sums.product, 0.0)  # as robots leave out the fixed rows
+    product_on_cover = np.where(
+        free[:, None], point.sums.product, 0.0
+    )  # as robots leave out the fixed rows
     rights = [step.right for step in point.steps]
-    move, parts, energy = proof.factor.solve([right.b for right in rights], own)
+    move, parts, energy = proof.factor.solve([right.b for right in rights], product_on_cover)
     steps = driver.ask_each(move_proof, parts)
     X = point.X.copy()
     # the translations matter in the residuals alone, which the robots have
@@ -248,29 +250,29 @@ def _sum_up(
     space = driver.interface(1, d)
     parts = [step.sums for step in steps]
     blocks = evaluate_multipliers(proof.Lambda, X[g:].reshape(g, d, d))
-    own = np.zeros_like(X)
-    own[g:] = blocks.product
-    product = space.gather([part.product for part in parts]) + own
+    product_on_cover = np.zeros_like(X)
+    product_on_cover[g:] = blocks.product
+    product = space.gather([part.product for part in parts]) + product_on_cover
     error = np.zeros_like(X)
     error[g:] = blocks.product_error
-    sizes = space.gather([np.abs(part.product) for part in parts]) + np.abs(own)
+    sizes = space.gather([np.abs(part.product) for part in parts]) + np.abs(product_on_cover)
     of_robots = space.gather([part.error for part in parts])
     error += of_robots + gamma(len(parts) + 2.0) * sizes
     value = exact_sum([*(part.value for part in parts), blocks.value])
     value_error = exact_sum(part.value_error for part in parts)
     value_error += blocks.value_error + UNIT_ROUNDOFF * abs(value)
     slack = proof.slack[free]
-    left = exact_sum(part.left for part in parts)
-    left += central.quadratic_loss(product[free], 0.0, slack)
+    loss = exact_sum(part.left for part in parts)
+    loss += central.quadratic_loss(product[free], 0.0, slack)
     quadratic = exact_sum(part.quadratic for part in parts)
     quadratic += central.quadratic_loss(product[free], error[free], slack)
     return ProofSums(
         value=value,
         value_error=OUTWARD * value_error,
-        left=left,
+        left=loss,
         quadratic=OUTWARD * quadratic,
         squared_distances=exact_sum(part.squared_distances for part in parts),
-        product=own,
+        product=product_on_cover,
         error=error,
     )
 

@@ -107,8 +107,8 @@ def _judged(
     scale = finished.state.schedule.scale
     covers = [(scale, cover) for cover in driver.poses_of_cover()]
     links = network.ask(tell_links, covers, Count.ROUND)
-    told = network.ask(tell_kept, holding(links), Count.PIGGYBACKED)
-    parts = network.ask(keep, network.exchange(told), Count.PIGGYBACKED)
+    kept_by_counters = network.ask(tell_kept, holding(links), Count.PIGGYBACKED)
+    parts = network.ask(keep, network.exchange(kept_by_counters), Count.PIGGYBACKED)
     try:
         return stage, opened.with_parts(parts)
     except GraphError:  # they leave poses of a robot apart
@@ -121,9 +121,10 @@ def _taken_back(opened: OpenedFiles, job: Pass) -> list[TakenBack]:
     num_robots = network.ledger.num_robots
     near: Sequence[Mapping[int, BoolArray]] = [{}] * num_robots
     if job.comes_back is ComesBack.NEAR:
-        told = network.ask(tell_solved, [None] * num_robots, Count.PIGGYBACKED)
+        solved_poses = network.ask(tell_solved, [None] * num_robots, Count.PIGGYBACKED)
         requests = [
-            (received, opened.weighting, job.gnc.quantile) for received in network.exchange(told)
+            (received, opened.weighting, job.gnc.quantile)
+            for received in network.exchange(solved_poses)
         ]
         near = network.exchange(network.ask(judge_near, requests, Count.PIGGYBACKED))
     return [
@@ -151,10 +152,10 @@ def go_to_poses_found(driver: Driver) -> None:
     nothing = [None] * network.ledger.num_robots
     R = driver.current.R.copy()
     t = driver.current.t.copy()
-    for own in network.ask(tell_cover, nothing, Count.ROUND):
-        positions = driver.positions(own.numbers)
-        R[positions] = own.poses.R
-        t[positions] = own.poses.t
+    for on_cover in network.ask(tell_cover, nothing, Count.ROUND):
+        positions = driver.positions(on_cover.numbers)
+        R[positions] = on_cover.poses.R
+        t[positions] = on_cover.poses.t
     driver.current = replace(driver.current, R=R, t=t)
     network.ask(go_to_solved, driver.poses_of_cover(), Count.PIGGYBACKED)
     answers = driver.ask(current_poses.evaluate, None, Count.PIGGYBACKED)

@@ -196,8 +196,8 @@ class EliminatedClimb:
         driver = self.driver
         x, moves, length = _direction(driver, proven.eta)
         values = driver.ask_each(climbing.climb, moves)
-        own = climbing.pulled(driver.current.multipliers, x[len(driver.cover) :])
-        value = math.fsum([*values, -own])
+        value_on_cover = climbing.pulled(driver.current.multipliers, x[len(driver.cover) :])
+        value = math.fsum([*values, -value_on_cover])
         flat = append_dimension(poses_from(driver.current.R, driver.current.t))
         force = np.concatenate(
             [driver.current.force, np.zeros((len(driver.current.force), 1))], axis=1
@@ -233,14 +233,16 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
     d = driver.d
     no_translations = np.zeros((g, 1))
     rng = np.random.default_rng(g)
-    own = np.concatenate([no_translations, rng.standard_normal((d * g, 1))])
+    vector_on_cover = np.concatenate([no_translations, rng.standard_normal((d * g, 1))])
     answers = driver.ask(climbing.begin_direction, None)
     value = math.inf
     scale = 1.0
     for _ in range(_MOST_POWERS):
-        own_square = float(np.sum(own**2))
+        own_square = float(np.sum(vector_on_cover**2))
         norm = math.sqrt(math.fsum([own_square, *(answer.square for answer in answers)]))
-        x, parts, energy = proof.factor.solve([answer.right.b for answer in answers], own)
+        x, parts, energy = proof.factor.solve(
+            [answer.right.b for answer in answers], vector_on_cover
+        )
         energy = math.fsum([energy, *(answer.right.energy for answer in answers)])
         last_value = value
         value = norm**2 / energy
@@ -249,8 +251,8 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
             break
         moves = [Move(part, scale) for part in parts]
         answers = driver.ask_each(climbing.follow_direction, moves)
-        own = np.concatenate([no_translations, scale * x[g:]])
-    own_blocks = own[g:].reshape(-1, d)
+        vector_on_cover = np.concatenate([no_translations, scale * x[g:]])
+    own_blocks = vector_on_cover[g:].reshape(-1, d)
     own_largest = float(np.sum(own_blocks**2, axis=1).max())
     largest = max([own_largest, *(answer.largest for answer in answers)])
     return scale * x, [Move(part, scale) for part in parts], norm / math.sqrt(largest)

@@ -252,5 +252,5 @@ def finish_copies(agent: BaseAgent, _: None) -> CoverRotations:
     if interior is not None:
         position = np.searchsorted(subgraph.poses, interior.part.poses)
         agent.interior = interior.at_rotations(omega[position])
-    own = np.flatnonzero(subgraph.is_own & subgraph.is_separator)
-    return CoverRotations(subgraph.poses[own], omega[own])
+    own_separators = np.flatnonzero(subgraph.is_own & subgraph.is_separator)
+    return CoverRotations(subgraph.poses[own_separators], omega[own_separators])

@@ -298,14 +298,14 @@ def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Told]:
     edges = Edges(rows, numbers, owners)
     places = placed_poses(lines)
     owners_of_places = runs.owner[runs.of(places.ids)]
-    told = {}
+    messages = {}
     for robot in np.unique(np.append(owners, owners_of_places)).tolist():
         touches = (owners == robot).any(axis=1)
-        told[robot] = Told(edges.some(touches), places.some(owners_of_places == robot))
+        messages[robot] = Told(edges.some(touches), places.some(owners_of_places == robot))
     no_lines = slice(0)
-    own = told.pop(agent.robot, Told(edges.some(no_lines), places.some(no_lines)))
-    agent.record = NumberedFile(lines, own, runs.digits)
-    return told
+    own_message = messages.pop(agent.robot, Told(edges.some(no_lines), places.some(no_lines)))
+    agent.record = NumberedFile(lines, own_message, runs.digits)
+    return messages
 
 
 def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) -> Border:
@@ -317,11 +317,11 @@ def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) 
     received, is_trusted = request
     known = agent.known(NumberedFile)
     lines = known.lines
-    told = [part for _, part in sorted({**received, agent.robot: known.own}.items())]
+    parts = [part for _, part in sorted({**received, agent.robot: known.own}.items())]
     if not is_trusted:
-        check_places(lines.d, [part.places for part in told])
-        check_measurements(lines.d, [part.edges.rows for part in told])
-    edges = _joined_edges([part.edges for part in told])
+        check_places(lines.d, [part.places for part in parts])
+        check_measurements(lines.d, [part.edges.rows for part in parts])
+    edges = _joined_edges([part.edges for part in parts])
     if not len(edges.numbers):
         raise GraphError(
             f"{agent.path}: no edge touches a pose of this robot; add one, or remove the file"

@@ -177,9 +177,9 @@ def tell_cover(agent: FileAgent, _: None) -> OwnCover:
     """Order: return the own poses that were found, of those in the cover."""
     placed = agent.known(PlacedFile)
     subgraph = placed.subgraph
-    own = np.flatnonzero(subgraph.is_own)
-    in_cover = np.flatnonzero(subgraph.is_separator[own])
-    return OwnCover(subgraph.poses[own[in_cover]], _solved(placed.joined)[in_cover])
+    own_separators = np.flatnonzero(subgraph.is_own)
+    in_cover = np.flatnonzero(subgraph.is_separator[own_separators])
+    return OwnCover(subgraph.poses[own_separators[in_cover]], _solved(placed.joined)[in_cover])
 
 
 def go_to_solved(agent: FileAgent, cover: Poses) -> None:
