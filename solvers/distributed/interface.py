@@ -266,10 +266,10 @@ class Interface:
     ) -> Array:
         """Bound by how much the factor can differ from the exact sum, as a diagonal, (side,).
 
-        `of_driver` are as there, `sizes`, (g,) each, the `row_sums` of the contributions in the scale of
-        `diagonal`, (side,), which is at least the diagonal of the sum. `of_factor`, (side,), is the
-        `expected_error` or the `backward_error` of the factor. An entry of the sum has a term of
-        every robot, and of the driver's own blocks.
+        `of_driver` are the blocks of `factorize`. `sizes`, (g,) each, are the `row_sums` of the
+        contributions in the scale of `diagonal`, (side,), which is at least the diagonal of the
+        sum. `of_factor`, (side,), is the `expected_error` or the `backward_error` of the factor.
+        An entry of the sum has a term of every robot, and of the driver's own blocks.
         """
         of_sums = gamma(float(len(sizes) + len(of_driver)) + 8.0)
         sums = self.gather([size[:, None] for size in sizes])[:, 0]
