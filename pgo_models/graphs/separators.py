@@ -73,7 +73,7 @@ class PartitionReport:
     num_cut_edges: int
     num_edges: int
     separators: IntArray  # (num_robots,): poses of every robot that have an edge to another
-    cover: int  # poses of the vertex cover, for which the driver of SUBSTRUCTURED solves
+    cover: int  # poses of the vertex cover, among those that the driver solves for
     copies: int  # copies of separator poses that robots hold of others' poses
     d: int  # dimension of the space
 

@@ -2,7 +2,6 @@
 
 The orders stand below in the sequence in which they are given: `read_file`, `number_poses`,
 `join_neighbours`, those of `own_consistency` where edges are judged, `take_cost`, `place_cover`;
-where areas of robots interleave `propose_poses`, `place_larger_cover` and `take_larger_cover`;
 then, after the solve, `keep_answer`, `return_to_answer`, `move_answer` and `write_answer`. Where
 edges are judged again those of `own_revision` follow `keep_answer`, and go on with `take_cost`.
 `solvers.distributed.own_files` gives them.
