@@ -18,6 +18,7 @@
 # %%
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 
 import pgo_models as pgo
 import solvers
@@ -320,22 +321,23 @@ axes.invert_yaxis()
 # This cell is for the tests of the library; if you have changed parameters, you may skip it.
 
 # %%
-assert np.isclose(cost(graph, graph.truth), problem.objective(graph.truth))
-assert solution.is_certified
-assert certificate.eta == 0
-assert certificate.digits >= 11
-objective, by_hand, _ = rows["the solution"]
-assert np.isclose(by_hand, solution.lower_bound, rtol=1e-11, atol=0)
-objective, by_hand, by_library = rows["0.1 degrees off"]
-assert np.isclose(by_hand, by_library, rtol=1e-7, atol=0)
-assert max(by_hand, by_library) < solution.objective < objective
-rng = np.random.default_rng(1)
-for _ in range(100):
-    anything = pgo.Poses(pgo.random_rotations(n, d, rng), rng.normal(0.0, 3.0, (n, d)))
-    assert problem.objective(anything) >= solution.lower_bound
-assert solution.lower_bound <= solution.objective < problem.objective(graph.truth)
-assert worst.gap > 0.9
-for _ in range(100):  # a local minimum: nearby poses cost more
-    nearby = stuck.R @ pgo.exp_map(rng.normal(0.0, 0.01, (count, 1)))
-    assert ring_problem.objective(ring_problem.with_best_translations(nearby)) > worst.objective
-assert any(certificate.is_certified for certificate in certificates)
+with NamedNumbers():
+    assert np.isclose(cost(graph, graph.truth), problem.objective(graph.truth))
+    assert solution.is_certified
+    assert certificate.eta == 0
+    assert certificate.digits >= 11
+    objective, by_hand, _ = rows["the solution"]
+    assert np.isclose(by_hand, solution.lower_bound, rtol=1e-11, atol=0)
+    objective, by_hand, by_library = rows["0.1 degrees off"]
+    assert np.isclose(by_hand, by_library, rtol=1e-7, atol=0)
+    assert max(by_hand, by_library) < solution.objective < objective
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        anything = pgo.Poses(pgo.random_rotations(n, d, rng), rng.normal(0.0, 3.0, (n, d)))
+        assert problem.objective(anything) >= solution.lower_bound
+    assert solution.lower_bound <= solution.objective < problem.objective(graph.truth)
+    assert worst.gap > 0.9
+    for _ in range(100):  # a local minimum: nearby poses cost more
+        nearby = stuck.R @ pgo.exp_map(rng.normal(0.0, 0.01, (count, 1)))
+        assert ring_problem.objective(ring_problem.with_best_translations(nearby)) > worst.objective
+    assert any(certificate.is_certified for certificate in certificates)

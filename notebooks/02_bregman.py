@@ -27,6 +27,7 @@ import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
 from drawings.bregman import tangent_film, tilting_film
+from drawings.checks import NamedNumbers
 from scipy.optimize import brentq
 
 import solvers
@@ -392,19 +393,20 @@ print("||b|| at k = 10, 20, 30, 40:", np.round(growth[10::10], 2))
 # it.
 
 # %%
-assert np.all(np.diff(to_solution) < 0.0)
-assert np.allclose(line_p, np.exp(line_x) - 1.0, atol=1e-6)
-assert np.allclose(path[1:4], 0.0, atol=1e-5)
-assert np.allclose(path[5:], [0.0, 1.0], atol=1e-5)
-assert np.isclose(tilts[4:, 1], 1.0, atol=1e-5).all()
-assert max(alone[1] for alone in penalty_alone) < 0.95
-assert max(x_differences) < 1e-5
-assert max(p_differences) < 1e-5
-assert np.linalg.norm(result.state.x - truth) < 1e-5
-assert result.status is solvers.Status.CONVERGED
-assert (residuals[1:] <= np.array(bounds) * (1 + 1e-6)).all()
-assert disturbed[-1] < 1e-4 < 0.1 < not_added_back[-1]
-assert np.all(np.diff(to_data) <= 1e-6)
-assert to_truth[stop] < 0.6 * to_truth[-1]
-assert np.allclose(states[40].x, states[20].x, atol=1e-5)
-assert np.isclose(growth[40] - growth[30], growth[30] - growth[20], rtol=1e-3)
+with NamedNumbers():
+    assert np.all(np.diff(to_solution) < 0.0)
+    assert np.allclose(line_p, np.exp(line_x) - 1.0, atol=1e-6)
+    assert np.allclose(path[1:4], 0.0, atol=1e-5)
+    assert np.allclose(path[5:], [0.0, 1.0], atol=1e-5)
+    assert np.isclose(tilts[4:, 1], 1.0, atol=1e-5).all()
+    assert max(alone[1] for alone in penalty_alone) < 0.95
+    assert max(x_differences) < 1e-5
+    assert max(p_differences) < 1e-5
+    assert np.linalg.norm(result.state.x - truth) < 1e-5
+    assert result.status is solvers.Status.CONVERGED
+    assert (residuals[1:] <= np.array(bounds) * (1 + 1e-6)).all()
+    assert disturbed[-1] < 1e-4 < 0.1 < not_added_back[-1]
+    assert np.all(np.diff(to_data) <= 1e-6)
+    assert to_truth[stop] < 0.6 * to_truth[-1]
+    assert np.allclose(states[40].x, states[20].x, atol=1e-5)
+    assert np.isclose(growth[40] - growth[30], growth[30] - growth[20], rtol=1e-3)

@@ -21,6 +21,7 @@ import itertools
 import matplotlib.pyplot as plt
 import numpy as np
 from drawings.bregman_is_admm import draw_adaptive, draw_counts, draw_residuals, spiral_film
+from drawings.checks import NamedNumbers
 
 import pgo_models as pgo
 import solvers
@@ -366,17 +367,18 @@ spiral_film(block_path(one_by_one)[:81, [0, 3]], two_blocks[:81, [0, 3]], every=
 # it.
 
 # %%
-assert all(difference < 1e-5 for difference in worst_difference.values())
-assert np.nanmin(counts[0]) < 100
-assert np.ptp(counts[:, penalties.index(1.0)]) <= 2  # small penalty: T does not matter
-save = counts[0, -2] / counts[2, -2]
-assert 4.0 < save < 6.0  # large penalty: T = 5 saves a factor of about 5 outer iterations
-most = {rule: max(map(len, traces)) for rule, traces in by_rule.items()}
-assert most[10.0, True] < 160
-assert most[10.0, False] < 160
-assert most[2.0, True] < 90
-assert min(map(len, by_rule[2.0, False])) == 1000
-assert min(map(len, by_rule[10.0, False])) >= 81
-assert np.linalg.norm(two_blocks[-1, :3]) < 1e-4
-assert spiral[1] > 1e3
-assert spiral[10] < 1e-6
+with NamedNumbers():
+    assert all(difference < 1e-5 for difference in worst_difference.values())
+    assert np.nanmin(counts[0]) < 100
+    assert np.ptp(counts[:, penalties.index(1.0)]) <= 2  # small penalty: T does not matter
+    save = counts[0, -2] / counts[2, -2]
+    assert 4.0 < save < 6.0  # large penalty: T = 5 saves a factor of about 5 outer iterations
+    most = {rule: max(map(len, traces)) for rule, traces in by_rule.items()}
+    assert most[10.0, True] < 160
+    assert most[10.0, False] < 160
+    assert most[2.0, True] < 90
+    assert min(map(len, by_rule[2.0, False])) == 1000
+    assert min(map(len, by_rule[10.0, False])) >= 81
+    assert np.linalg.norm(two_blocks[-1, :3]) < 1e-4
+    assert spiral[1] > 1e3
+    assert spiral[10] < 1e-6

@@ -25,6 +25,7 @@ import time
 import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 from drawings.splitting_orthogonality import (
     CircleStep,
     draw_flow_chart,
@@ -420,24 +421,25 @@ solvers.certify(ring_problem, stuck.poses)
 # it.
 
 # %%
-assert np.allclose(by_svd, pgo.project_to_rotations(Y))
-assert np.isclose(found.objective, closed_form, rtol=1e-6)
-assert max(differences.values()) < 1e-6
-assert min(moved[factor] for factor in (0.5, 0.9, 0.99)) > 0.1
-assert max(moved[factor] for factor in (1.01, 1.1, 2.0)) < 1e-4
-assert curves[1.0][-1] > 0.1
-assert curves[1.5].min() < 1e-2 < curves[1.5][-1]
-assert curves[2.0][-1] < 1e-9 < curves[16.0][-1]
-assert runs["... accelerated (the default)"].iterations < runs["multiplier penalty"].iterations
-assert np.isclose(runs["fixed rho = 1"].objective, best.objective, rtol=1e-6)
-assert stuck.status is solvers.Status.CONVERGED
-assert stuck.objective > 100.0
-assert solvers.solve(ring_problem).objective < 1e-12 * stuck.objective
-assert np.allclose(nearest_rotation(np.diag([2.0, -1.0])), np.eye(2))
-assert np.allclose(settled[-1].omega, optimum, atol=0.02)
-assert np.allclose(
-    [nearest_rotation(np.array([[x, -y], [y, x]]))[:, 0] for x, y in Y[:, 0, :2]],
-    [point / np.linalg.norm(point) for point in Y[:, 0, :2]],
-)
-assert min(from_optimum) < 2.0
-assert max(from_optimum[-8:]) > 90.0
+with NamedNumbers():
+    assert np.allclose(by_svd, pgo.project_to_rotations(Y))
+    assert np.isclose(found.objective, closed_form, rtol=1e-6)
+    assert max(differences.values()) < 1e-6
+    assert min(moved[factor] for factor in (0.5, 0.9, 0.99)) > 0.1
+    assert max(moved[factor] for factor in (1.01, 1.1, 2.0)) < 1e-4
+    assert curves[1.0][-1] > 0.1
+    assert curves[1.5].min() < 1e-2 < curves[1.5][-1]
+    assert curves[2.0][-1] < 1e-9 < curves[16.0][-1]
+    assert runs["... accelerated (the default)"].iterations < runs["multiplier penalty"].iterations
+    assert np.isclose(runs["fixed rho = 1"].objective, best.objective, rtol=1e-6)
+    assert stuck.status is solvers.Status.CONVERGED
+    assert stuck.objective > 100.0
+    assert solvers.solve(ring_problem).objective < 1e-12 * stuck.objective
+    assert np.allclose(nearest_rotation(np.diag([2.0, -1.0])), np.eye(2))
+    assert np.allclose(settled[-1].omega, optimum, atol=0.02)
+    assert np.allclose(
+        [nearest_rotation(np.array([[x, -y], [y, x]]))[:, 0] for x, y in Y[:, 0, :2]],
+        [point / np.linalg.norm(point) for point in Y[:, 0, :2]],
+    )
+    assert min(from_optimum) < 2.0
+    assert max(from_optimum[-8:]) > 90.0

@@ -28,6 +28,7 @@ from pathlib import Path
 import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 from drawings.sdp_and_certificates import bounds_film, noise_film
 
 import pgo_models as pgo
@@ -403,37 +404,38 @@ plot_tightness([(name, np.deg2rad(swept), share) for name, share in shares.items
 # This cell holds what the text says of the numbers above. If you have changed a parameter, skip it.
 
 # %%
-assert np.isclose(primal.value, answer.objective, rtol=1e-5)
-assert np.isclose(dual.value, answer.objective, rtol=1e-4)
-assert np.abs(from_sdp - from_poses).max() < 1e-2
-assert relaxed.verdict is pgo.Verdict.CERTIFIED
-assert verified.is_verified
-assert float(verified.gap) < 1e-10
-assert not changed.is_verified
-assert float(changed.bound) < answer.lower_bound
-assert relaxed.rank.rank == 3
-assert all(abs(difference) < 1e-8 * objective for objective, difference, _ in rows.values())
-assert rows["8 poses, optimum"][2] > -1e-6
-assert rows["ring, optimum"][2] > -1e-6
-assert rows["8 poses, random"][2] < -1.0
-assert rows["ring, local minimum"][2] < -1.0
-assert climbed.objective < 0.02 * stuck.objective
-assert answer.certificate.eta == 0
-assert np.abs(smallest[0][:d]).max() < 1e-9 < 1e-2 < smallest[1][0]
-for name, certificates in on_the_way.items():
-    assert all(
-        item.lower_bound <= optima[name].objective <= item.objective * (1 + 1e-12)
-        for item in certificates
-    )
-    assert certificates[0].gap > 0.05
-    assert all(item.eta == 0 for item in certificates[5:])
-    assert certificates[-1].gap < 1e-8
-assert all(shares[name][0] == 1.0 for name in ("circle", "grid"))
-assert shares["circle"][-1] < 0.5
-assert shares["grid"][-1] == 0.0
-assert shares["circle"].sum() > shares["grid"].sum()
-for noise, eigenvalues, gap in levels:
-    is_tight = noise <= 55.0
-    assert (eigenvalues[3] < 1e-4 * eigenvalues[2]) == is_tight
-    assert (gap < 1e-6) == is_tight
-assert levels[-1][2] > 0.05
+with NamedNumbers():
+    assert np.isclose(primal.value, answer.objective, rtol=1e-5)
+    assert np.isclose(dual.value, answer.objective, rtol=1e-4)
+    assert np.abs(from_sdp - from_poses).max() < 1e-2
+    assert relaxed.verdict is pgo.Verdict.CERTIFIED
+    assert verified.is_verified
+    assert float(verified.gap) < 1e-10
+    assert not changed.is_verified
+    assert float(changed.bound) < answer.lower_bound
+    assert relaxed.rank.rank == 3
+    assert all(abs(difference) < 1e-8 * objective for objective, difference, _ in rows.values())
+    assert rows["8 poses, optimum"][2] > -1e-6
+    assert rows["ring, optimum"][2] > -1e-6
+    assert rows["8 poses, random"][2] < -1.0
+    assert rows["ring, local minimum"][2] < -1.0
+    assert climbed.objective < 0.02 * stuck.objective
+    assert answer.certificate.eta == 0
+    assert np.abs(smallest[0][:d]).max() < 1e-9 < 1e-2 < smallest[1][0]
+    for name, certificates in on_the_way.items():
+        assert all(
+            item.lower_bound <= optima[name].objective <= item.objective * (1 + 1e-12)
+            for item in certificates
+        )
+        assert certificates[0].gap > 0.05
+        assert all(item.eta == 0 for item in certificates[5:])
+        assert certificates[-1].gap < 1e-8
+    assert all(shares[name][0] == 1.0 for name in ("circle", "grid"))
+    assert shares["circle"][-1] < 0.5
+    assert shares["grid"][-1] == 0.0
+    assert shares["circle"].sum() > shares["grid"].sum()
+    for noise, eigenvalues, gap in levels:
+        is_tight = noise <= 55.0
+        assert (eigenvalues[3] < 1e-4 * eigenvalues[2]) == is_tight
+        assert (gap < 1e-6) == is_tight
+    assert levels[-1][2] > 0.05

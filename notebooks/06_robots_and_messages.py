@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 from drawings.robots_and_messages import (
     draw_absence,
     draw_faults,
@@ -543,16 +544,17 @@ draw_faults(curves, (3, 23))
 # They hold for the parameters as they stand. A reader who has changed some may skip this cell.
 
 # %%
-assert [len(poses) for _, poses in at_the_seam.values()] == [4, 12, 18]
-assert together.status is solvers.Status.CONVERGED
-assert small_gaps[-1] < 1e-3 < 1e-1 < small_gaps[0]
-assert difference < 1e-8
-assert gap(ours[-1]) < 1e-3
-assert shared.is_certified
-assert np.isclose(shared.objective, best.objective, rtol=1e-6)
-assert losses[0.6][-1] < 1e-5
-assert losses[0.9][-1] < losses[0.9][20]
-assert mistaken[0.3][-1] > 1e-2
-assert returns[-1] < 1e-4 < never[-1]
-assert np.ptp(never[-20:]) < 1e-4
-assert all(solution.is_certified for solution in faulty.values())
+with NamedNumbers():
+    assert [len(poses) for _, poses in at_the_seam.values()] == [4, 12, 18]
+    assert together.status is solvers.Status.CONVERGED
+    assert small_gaps[-1] < 1e-3 < 1e-1 < small_gaps[0]
+    assert difference < 1e-8
+    assert gap(ours[-1]) < 1e-3
+    assert shared.is_certified
+    assert np.isclose(shared.objective, best.objective, rtol=1e-6)
+    assert losses[0.6][-1] < 1e-5
+    assert losses[0.9][-1] < losses[0.9][20]
+    assert mistaken[0.3][-1] > 1e-2
+    assert returns[-1] < 1e-4 < never[-1]
+    assert np.ptp(never[-20:]) < 1e-4
+    assert all(solution.is_certified for solution in faulty.values())

@@ -25,6 +25,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from drawings.checks import NamedNumbers
 
 import pgo_models as pgo
 import solvers
@@ -466,27 +467,28 @@ for name in NAMES:
 # If you have changed seeds or settings, these checks may fail; you may skip them.
 
 # %%
-assert all(difference < 1e-9 for difference in differences.values())
-for name in NAMES:
-    run = published_run(graphs[name])
-    assert optima[name].is_certified
-    assert 0.02 < curves[name][-1] < 0.12
-    assert abs(curves[name][-1] - rotation_gaps[name]) < 1e-3
-    assert abs(adaptive_curves[name][-1] - rotation_gaps[name]) < 1e-3
-    assert all(abs(ending) < 1e-5 for ending in endings[name])
-    assert gap(name, never[name]) > 1.5 * curves[name][-1]
-assert not any(finding.failed for finding in findings(tables))
-for row in published_rows()[:3]:
-    excess = row.soc.objective - row.se_sync.objective
-    assert 1.0 < excess / draws[row.name]["optimum_std"] < 4.0
-for name in ("parking-garage", "cubicle", "torus3D"):
-    assert np.isclose(draws[name]["optimum"], published[name].se_sync.objective, rtol=5e-4)
-by_name = {(row["graph"], row["method"]): row for row in full["rows"]}
-for name in ("parking-garage", "cubicle", "torus3D"):
-    soc = by_name[name, "SOC as in the paper"]
-    assert soc["objective"] < soc["paper_objective"]
-    assert soc["rounds"] <= soc["paper_iterations"]
-for name in ("cubicle", "torus3D"):
-    soc = by_name[name, "SOC as in the paper"]
-    assert soc["gap_after_first_stage"] > soc["paper_gap"]
-    assert reference[name] > soc["paper_objective"]
+with NamedNumbers():
+    assert all(difference < 1e-9 for difference in differences.values())
+    for name in NAMES:
+        run = published_run(graphs[name])
+        assert optima[name].is_certified
+        assert 0.02 < curves[name][-1] < 0.12
+        assert abs(curves[name][-1] - rotation_gaps[name]) < 1e-3
+        assert abs(adaptive_curves[name][-1] - rotation_gaps[name]) < 1e-3
+        assert all(abs(ending) < 1e-5 for ending in endings[name])
+        assert gap(name, never[name]) > 1.5 * curves[name][-1]
+    assert not any(finding.failed for finding in findings(tables))
+    for row in published_rows()[:3]:
+        excess = row.soc.objective - row.se_sync.objective
+        assert 1.0 < excess / draws[row.name]["optimum_std"] < 4.0
+    for name in ("parking-garage", "cubicle", "torus3D"):
+        assert np.isclose(draws[name]["optimum"], published[name].se_sync.objective, rtol=5e-4)
+    by_name = {(row["graph"], row["method"]): row for row in full["rows"]}
+    for name in ("parking-garage", "cubicle", "torus3D"):
+        soc = by_name[name, "SOC as in the paper"]
+        assert soc["objective"] < soc["paper_objective"]
+        assert soc["rounds"] <= soc["paper_iterations"]
+    for name in ("cubicle", "torus3D"):
+        soc = by_name[name, "SOC as in the paper"]
+        assert soc["gap_after_first_stage"] > soc["paper_gap"]
+        assert reference[name] > soc["paper_objective"]

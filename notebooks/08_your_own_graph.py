@@ -23,6 +23,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 
 import pgo_models as pgo
 import solvers
@@ -497,42 +498,43 @@ print(f"KITTI {problem.objective(kitti):.9f}, g2o {problem.objective(again.initi
 # If you have changed the graph or the settings, these checks may fail; you may skip them.
 
 # %%
-assert np.isclose(graph.tau[0], 0.05**-2, rtol=1e-5)
-assert np.isclose(graph.kappa[0], 0.03**-2, rtol=1e-5)
-assert "broken.g2o" in message
-assert "6" in message
-assert solution.is_certified
-assert certificate.eta == 0
-assert np.isclose(gap_by_hand, certificate.gap, rtol=1e-8, atol=0)
-assert np.isclose(bound, proved, rtol=1e-11, atol=0)
-assert certificate.gap > 1e-6
-assert proved <= solution.objective <= F_theirs
-assert fooled.is_certified
-assert fooled.objective > 1.5 * solution.objective
-assert worst == graph.num_edges
-assert np.flatnonzero(suspect.is_misfit).tolist() == [worst]
-assert not solution.edge_residuals.is_doubtful
-assert not shown.is_certified
-assert blamed != guilty
-assert misled.edge_residuals.is_doubtful
-assert relieved.is_certified
-assert not relieved.edge_residuals.is_doubtful
-assert pgo.absolute_trajectory_error(solution.poses, truth) < 0.8 * pgo.absolute_trajectory_error(
-    fooled.poses, truth
-)
-assert np.isclose(problem.objective(returned), solution.objective, rtol=1e-9)
-assert np.isclose(problem.objective(kitti), solution.objective, rtol=1e-9)
-assert np.isclose(problem.objective(again.initial), solution.objective, rtol=1e-9)
-folder.cleanup()
-assert by_chi2.is_certified
-assert pgo.chi2(seen, by_chi2.poses) <= pgo.chi2(seen, by_F.poses)
-assert judged.gap > 0.1
-assert not judged.is_certified
-for cost, below in near.values():
-    assert below <= cost * (1 + 1e-9)
-assert (on_line[:, 1] <= on_line[:, 0] * (1 + 1e-9)).all()
-assert in_the_world.is_certified
-assert surveyed.is_certified
-assert rejected == survey.index(mistaken)
-assert place.endswith(f"survey.g2o:{len(survey)}")
-assert np.linalg.norm(mapped - trees, axis=1).max() < 0.5
+with NamedNumbers():
+    assert np.isclose(graph.tau[0], 0.05**-2, rtol=1e-5)
+    assert np.isclose(graph.kappa[0], 0.03**-2, rtol=1e-5)
+    assert "broken.g2o" in message
+    assert "6" in message
+    assert solution.is_certified
+    assert certificate.eta == 0
+    assert np.isclose(gap_by_hand, certificate.gap, rtol=1e-8, atol=0)
+    assert np.isclose(bound, proved, rtol=1e-11, atol=0)
+    assert certificate.gap > 1e-6
+    assert proved <= solution.objective <= F_theirs
+    assert fooled.is_certified
+    assert fooled.objective > 1.5 * solution.objective
+    assert worst == graph.num_edges
+    assert np.flatnonzero(suspect.is_misfit).tolist() == [worst]
+    assert not solution.edge_residuals.is_doubtful
+    assert not shown.is_certified
+    assert blamed != guilty
+    assert misled.edge_residuals.is_doubtful
+    assert relieved.is_certified
+    assert not relieved.edge_residuals.is_doubtful
+    assert pgo.absolute_trajectory_error(
+        solution.poses, truth
+    ) < 0.8 * pgo.absolute_trajectory_error(fooled.poses, truth)
+    assert np.isclose(problem.objective(returned), solution.objective, rtol=1e-9)
+    assert np.isclose(problem.objective(kitti), solution.objective, rtol=1e-9)
+    assert np.isclose(problem.objective(again.initial), solution.objective, rtol=1e-9)
+    folder.cleanup()
+    assert by_chi2.is_certified
+    assert pgo.chi2(seen, by_chi2.poses) <= pgo.chi2(seen, by_F.poses)
+    assert judged.gap > 0.1
+    assert not judged.is_certified
+    for cost, below in near.values():
+        assert below <= cost * (1 + 1e-9)
+    assert (on_line[:, 1] <= on_line[:, 0] * (1 + 1e-9)).all()
+    assert in_the_world.is_certified
+    assert surveyed.is_certified
+    assert rejected == survey.index(mistaken)
+    assert place.endswith(f"survey.g2o:{len(survey)}")
+    assert np.linalg.norm(mapped - trees, axis=1).max() < 0.5

@@ -23,6 +23,7 @@
 # %%
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 from drawings.wrong_edges import draw_maps, draw_surrogates, shift_film, weights_film
 
 import pgo_models as pgo
@@ -623,62 +624,61 @@ shift_film(shifts, answers, np.array(pairs), is_bad, base.truth)
 # If you have changed seeds or settings, these checks may fail; you may skip them.
 
 # %%
-assert without.is_certified
-assert fooled.is_certified
-assert residuals.overall > 5 * residuals.overall_allowed
-assert own_share < 0.2
-assert int(np.argmax(residuals.cost / residuals.allowed)) != wrong
-assert removed == [(1, 26)]
-assert greedy.is_certified
-assert greedy.edge_residuals.overall > greedy.edge_residuals.overall_allowed
-assert pgo.absolute_trajectory_error(greedy.poses, truth) > errors["least squares"]
-assert (rejected == is_wrong).all()
-assert (robust.robust.rejected == rejected).all()
-assert robust.is_certified
-assert np.isclose(pgo.PGOProblem(clean).objective(poses), robust.objective, rtol=1e-9)
-assert np.isclose(robust.objective, without.objective, rtol=1e-9)
-assert "not proven" in robust.robust.conditional
-assert (
-    errors["truncated"]
-    < 1.001 * errors["without it"]
-    < 0.5 * errors["Huber"]
-    < 0.5 * errors["least squares"]
-)
-assert 0.1 < huber_weight < 1.0
-for name, (solution, spoiled) in found.items():
-    assert solution.is_certified
-    assert (solution.robust.rejected == spoiled).all()
-    assert (rejected_of[name] == spoiled).all()
-assert not pairwise.is_certified
-assert pairwise.robust.warning
-assert graduated.is_certified
-assert graduated.robust.by_chance < 0.05 * graduated.robust.num_closures_kept
-assert not graduated.robust.warning
-assert (graduated.robust.rejected == bad_meetings).all()
-found_out, spoiled, _ = shifted_runs["found out"]
-assert (found_out.robust.rejected == spoiled).all()
-assert silent.is_certified
-assert silent.robust.kept[is_bad].all()
-assert silent.robust.rejected[~is_bad].any()
-assert not silent.edge_residuals.is_doubtful
-assert totals["wrong map"] < 0.5 * totals["right map"]
-assert d_squared + num_right * limit < 12 * limit
-assert doubted.robust.is_certified
-assert doubted.verdict.name == "DOUBTFUL"
-assert doubted.robust.kept[is_near].any()
-assert not doubted.robust.rejected[~is_near].any()
-assert doubted.robust.by_chance > 0.5 * doubted.robust.num_closures_kept
-assert not doubted.edge_residuals.is_doubtful
-assert (answer.robust.rejected == is_gross).all()
-assert in_W.sum() == 10
-assert not (in_W & ~is_gross).any()
-assert (proof.proven_wrong == in_W).all()
-assert not solvers.prove_outliers(silent).robust.proof.proven_wrong.any()
-assert [answer.verdict.name for answer in answers] == (
-    ["CERTIFIED"] * 6 + ["DOUBTFUL"] * 4
-)
-assert [answer.robust.kept[is_bad].all() for answer in answers] == [True] * 9 + [False]
-assert [answer.robust.rejected[known].sum() for answer in answers] == [0] * 8 + [1, 0]
-assert (answers[-1].robust.rejected == is_bad).all()
-assert "12 more edges fit" in answers[-1].robust.headline
-assert pairs[7][0] < pairs[7][1]
+with NamedNumbers():
+    assert without.is_certified
+    assert fooled.is_certified
+    assert residuals.overall > 5 * residuals.overall_allowed
+    assert own_share < 0.2
+    assert int(np.argmax(residuals.cost / residuals.allowed)) != wrong
+    assert removed == [(1, 26)]
+    assert greedy.is_certified
+    assert greedy.edge_residuals.overall > greedy.edge_residuals.overall_allowed
+    assert pgo.absolute_trajectory_error(greedy.poses, truth) > errors["least squares"]
+    assert (rejected == is_wrong).all()
+    assert (robust.robust.rejected == rejected).all()
+    assert robust.is_certified
+    assert np.isclose(pgo.PGOProblem(clean).objective(poses), robust.objective, rtol=1e-9)
+    assert np.isclose(robust.objective, without.objective, rtol=1e-9)
+    assert "not proven" in robust.robust.conditional
+    assert (
+        errors["truncated"]
+        < 1.001 * errors["without it"]
+        < 0.5 * errors["Huber"]
+        < 0.5 * errors["least squares"]
+    )
+    assert 0.1 < huber_weight < 1.0
+    for name, (solution, spoiled) in found.items():
+        assert solution.is_certified
+        assert (solution.robust.rejected == spoiled).all()
+        assert (rejected_of[name] == spoiled).all()
+    assert not pairwise.is_certified
+    assert pairwise.robust.warning
+    assert graduated.is_certified
+    assert graduated.robust.by_chance < 0.05 * graduated.robust.num_closures_kept
+    assert not graduated.robust.warning
+    assert (graduated.robust.rejected == bad_meetings).all()
+    found_out, spoiled, _ = shifted_runs["found out"]
+    assert (found_out.robust.rejected == spoiled).all()
+    assert silent.is_certified
+    assert silent.robust.kept[is_bad].all()
+    assert silent.robust.rejected[~is_bad].any()
+    assert not silent.edge_residuals.is_doubtful
+    assert totals["wrong map"] < 0.5 * totals["right map"]
+    assert d_squared + num_right * limit < 12 * limit
+    assert doubted.robust.is_certified
+    assert doubted.verdict.name == "DOUBTFUL"
+    assert doubted.robust.kept[is_near].any()
+    assert not doubted.robust.rejected[~is_near].any()
+    assert doubted.robust.by_chance > 0.5 * doubted.robust.num_closures_kept
+    assert not doubted.edge_residuals.is_doubtful
+    assert (answer.robust.rejected == is_gross).all()
+    assert in_W.sum() == 10
+    assert not (in_W & ~is_gross).any()
+    assert (proof.proven_wrong == in_W).all()
+    assert not solvers.prove_outliers(silent).robust.proof.proven_wrong.any()
+    assert [answer.verdict.name for answer in answers] == (["CERTIFIED"] * 6 + ["DOUBTFUL"] * 4)
+    assert [answer.robust.kept[is_bad].all() for answer in answers] == [True] * 9 + [False]
+    assert [answer.robust.rejected[known].sum() for answer in answers] == [0] * 8 + [1, 0]
+    assert (answers[-1].robust.rejected == is_bad).all()
+    assert "12 more edges fit" in answers[-1].robust.headline
+    assert pairs[7][0] < pairs[7][1]

@@ -22,6 +22,7 @@ import itertools
 import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 from drawings.soc_beyond_robots import (
     draw_components,
     draw_errors,
@@ -381,19 +382,20 @@ print("rho = 8, other starts: objectives", np.round(sorted(objectives), 3))
 # check is that the library's Procrustes problem has the sum of squares as its cost.
 
 # %%
-by_library = procrustes(points, seen, rotation=True).objective([squares])
-assert np.isclose(by_library, np.sum((points @ squares - seen) ** 2))
-assert residual < 1e-2
-assert (np.abs(thresholded) > 1e-9).sum(axis=0).max() < 0.2 * side**2
-assert price(plate, 0.2, modes) < 0.8 * price(plate, 0.2, waves)
-assert np.all(np.diff(shares) > 0)
-assert shares[0] < 0.2 < 0.99 < shares[-1]
-assert np.isclose(run.objective, price(string, 0.2, by_hand), rtol=1e-3)
-assert errors[0.0][1] < 1.0
-assert all(squares > 3 * distances for squares, distances in (errors[0.2], errors[0.4]))
-assert likeness(components).min() > 0.99 > likeness(principal).min()
-assert variances[0] >= variances[1] > 0.97 * variances[0]
-assert all(ours <= cut * (1 + 1e-9) for ours, cut in zip(*curves.values(), strict=True))
-assert difference < 1e-9
-assert never > 0.1
-assert max(objectives) < 1.2 * min(objectives)
+with NamedNumbers():
+    by_library = procrustes(points, seen, rotation=True).objective([squares])
+    assert np.isclose(by_library, np.sum((points @ squares - seen) ** 2))
+    assert residual < 1e-2
+    assert (np.abs(thresholded) > 1e-9).sum(axis=0).max() < 0.2 * side**2
+    assert price(plate, 0.2, modes) < 0.8 * price(plate, 0.2, waves)
+    assert np.all(np.diff(shares) > 0)
+    assert shares[0] < 0.2 < 0.99 < shares[-1]
+    assert np.isclose(run.objective, price(string, 0.2, by_hand), rtol=1e-3)
+    assert errors[0.0][1] < 1.0
+    assert all(squares > 3 * distances for squares, distances in (errors[0.2], errors[0.4]))
+    assert likeness(components).min() > 0.99 > likeness(principal).min()
+    assert variances[0] >= variances[1] > 0.97 * variances[0]
+    assert all(ours <= cut * (1 + 1e-9) for ours, cut in zip(*curves.values(), strict=True))
+    assert difference < 1e-9
+    assert never > 0.1
+    assert max(objectives) < 1.2 * min(objectives)

@@ -23,6 +23,7 @@ import matplotlib.image
 import matplotlib.pyplot as plt
 import numpy as np
 from drawings.bregman_on_a_picture import film_of_iterates, plot_progress, show_pictures
+from drawings.checks import NamedNumbers
 from matplotlib.cbook import get_sample_data
 from scipy.fft import dctn, idctn
 
@@ -392,19 +393,20 @@ print(f"off by {np.abs(guessed - low_rank)[~fewer].max():.1f} elsewhere")
 # Readers who have changed parameters may skip this cell, which holds for those given.
 
 # %%
-assert decibel(smooth) > decibel(noisy) + 5
-assert residual < 0.1
-assert difference < 1e-5
-assert quality[stop] > quality[0] + 2
-assert quality[stop] > quality[-1]
-assert np.all(np.diff(to_data) <= 0)
-assert quality[stop] > quality.max() - 0.5
-assert quality[stop] > decibel(smooth) - 0.5
-assert (stop, int(np.argmax(quality))) == (3, 4)
-assert lasso(runs["FISTA"][50], weight) < lasso(runs["ISTA"][50], weight)
-assert min(decibel(u) for u in filled.values()) > decibel(f) + 5
-assert np.linalg.norm(K(runs["linearised Bregman"][-1]) - f) < 1e-2 * np.linalg.norm(f)
-assert np.isclose(np.linalg.norm(completed, "nuc"), nuclear.value, rtol=1e-3)
-assert np.abs(completed - low_rank).max() < 1e-2
-assert np.mean(levels < 0.1 / 63) > 0.5
-assert np.abs(guessed - low_rank)[fewer].max() < 0.05 < np.abs(guessed - low_rank)[~fewer].max()
+with NamedNumbers():
+    assert decibel(smooth) > decibel(noisy) + 5
+    assert residual < 0.1
+    assert difference < 1e-5
+    assert quality[stop] > quality[0] + 2
+    assert quality[stop] > quality[-1]
+    assert np.all(np.diff(to_data) <= 0)
+    assert quality[stop] > quality.max() - 0.5
+    assert quality[stop] > decibel(smooth) - 0.5
+    assert (stop, int(np.argmax(quality))) == (3, 4)
+    assert lasso(runs["FISTA"][50], weight) < lasso(runs["ISTA"][50], weight)
+    assert min(decibel(u) for u in filled.values()) > decibel(f) + 5
+    assert np.linalg.norm(K(runs["linearised Bregman"][-1]) - f) < 1e-2 * np.linalg.norm(f)
+    assert np.isclose(np.linalg.norm(completed, "nuc"), nuclear.value, rtol=1e-3)
+    assert np.abs(completed - low_rank).max() < 1e-2
+    assert np.mean(levels < 0.1 / 63) > 0.5
+    assert np.abs(guessed - low_rank)[fewer].max() < 0.05 < np.abs(guessed - low_rank)[~fewer].max()

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
+from drawings.checks import NamedNumbers
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.linalg import splu
 
@@ -353,16 +354,17 @@ print(f"J of the hidden permutation {ends.problem.objective([hidden]):g}")
 # Readers who have changed parameters may skip this cell, which holds for those given.
 
 # %%
-assert mine.status is solvers.Status.CONVERGED
-assert np.isclose(mine.objective, best.objective, rtol=1e-6)
-assert max(differences) < 1e-6
-assert by_lu.iterations == by_cholesky.iterations
-assert np.isclose(doubled.objective, best.objective, rtol=1e-6)
-assert np.array_equal(axes.values[0], hidden)
-assert len(written) == 1
-assert price > 0.0
-assert tightened.objective > best.objective
-assert too_small.status is not solvers.Status.CONVERGED
-assert by_soc.status is solvers.Status.CONVERGED
-assert ends.status is solvers.Status.CONVERGED
-assert ends.problem.objective([hidden]) == 0.0 < 1.0 < ends.objective
+with NamedNumbers():
+    assert mine.status is solvers.Status.CONVERGED
+    assert np.isclose(mine.objective, best.objective, rtol=1e-6)
+    assert max(differences) < 1e-6
+    assert by_lu.iterations == by_cholesky.iterations
+    assert np.isclose(doubled.objective, best.objective, rtol=1e-6)
+    assert np.array_equal(axes.values[0], hidden)
+    assert len(written) == 1
+    assert price > 0.0
+    assert tightened.objective > best.objective
+    assert too_small.status is not solvers.Status.CONVERGED
+    assert by_soc.status is solvers.Status.CONVERGED
+    assert ends.status is solvers.Status.CONVERGED
+    assert ends.problem.objective([hidden]) == 0.0 < 1.0 < ends.objective

@@ -20,6 +20,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from drawings.checks import NamedNumbers
 from drawings.is_it_really_the_best import film_of_multipliers, film_of_the_way
 
 import pgo_models as pgo
@@ -396,35 +397,42 @@ for name in loose:
 # This cell is for the tests of the library; if you have changed parameters, you may skip it.
 
 # %%
-assert np.abs(gradient).max() < 1e-4
-assert min(changes) > cost_of_answer
-assert np.allclose(returns, cost_of_answer, rtol=1e-9, atol=0)
-assert best.objective < 0.5 * cost_of_answer < 0.5 * problem.objective(town.truth)
-assert best.is_certified
-assert 0.55 < certificate.gap < 0.6
-assert certificate.verdict is pgo.Verdict.NOT_CERTIFIED
-assert np.isclose(bound(best_lambda)[0], least, rtol=1e-7, atol=0)
-assert all(bounds <= least + 1e-12)
-assert np.isclose(np.linalg.norm(bound(best_lambda)[1]), 1.0)
-assert bound(W)[0] == -np.inf
-assert np.allclose(by_library, bounds, rtol=0, atol=1e-7)
-assert all(np.array(by_library) <= bounds + 1e-12)
-assert np.isclose(2 * of_two.certificate.Lambda[1, 0, 0], best_lambda, rtol=1e-6, atol=0)
-assert of_two.is_certified
-assert costs.max() > 1.5 * costs[0]
-assert np.isclose(costs[-1], best.objective)
-assert verified.is_verified
-assert float(verified.gap) < 1e-10
-assert [result.is_verified for result in attempts.values()] == [False, True, False, False, False]
-assert float(attempts["and a smaller claim"].bound) < best.lower_bound
-assert float(attempts["another measurement"].bound) < float(
-    attempts["another measurement"].objective
-)
-assert not any(solved.is_certified for solved in plain.values())
-assert full["circle, 70 degrees"].is_certified
-assert np.isclose(
-    full["circle, 70 degrees"].objective, plain["circle, 70 degrees"].objective, rtol=1e-9
-)
-assert not full["grid, 80 degrees"].is_certified
-assert full["grid, 80 degrees"].objective < plain["grid, 80 degrees"].objective - 1
-assert full["grid, 80 degrees"].gap < 0.01 < plain["grid, 80 degrees"].gap
+with NamedNumbers():
+    assert np.abs(gradient).max() < 1e-4
+    assert min(changes) > cost_of_answer
+    assert np.allclose(returns, cost_of_answer, rtol=1e-9, atol=0)
+    assert best.objective < 0.5 * cost_of_answer < 0.5 * problem.objective(town.truth)
+    assert best.is_certified
+    assert 0.55 < certificate.gap < 0.6
+    assert certificate.verdict is pgo.Verdict.NOT_CERTIFIED
+    assert np.isclose(bound(best_lambda)[0], least, rtol=1e-7, atol=0)
+    assert all(bounds <= least + 1e-12)
+    assert np.isclose(np.linalg.norm(bound(best_lambda)[1]), 1.0)
+    assert bound(W)[0] == -np.inf
+    assert np.allclose(by_library, bounds, rtol=0, atol=1e-7)
+    assert all(np.array(by_library) <= bounds + 1e-12)
+    assert np.isclose(2 * of_two.certificate.Lambda[1, 0, 0], best_lambda, rtol=1e-6, atol=0)
+    assert of_two.is_certified
+    assert costs.max() > 1.5 * costs[0]
+    assert np.isclose(costs[-1], best.objective)
+    assert verified.is_verified
+    assert float(verified.gap) < 1e-10
+    assert [result.is_verified for result in attempts.values()] == [
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
+    assert float(attempts["and a smaller claim"].bound) < best.lower_bound
+    assert float(attempts["another measurement"].bound) < float(
+        attempts["another measurement"].objective
+    )
+    assert not any(solved.is_certified for solved in plain.values())
+    assert full["circle, 70 degrees"].is_certified
+    assert np.isclose(
+        full["circle, 70 degrees"].objective, plain["circle, 70 degrees"].objective, rtol=1e-9
+    )
+    assert not full["grid, 80 degrees"].is_certified
+    assert full["grid, 80 degrees"].objective < plain["grid, 80 degrees"].objective - 1
+    assert full["grid, 80 degrees"].gap < 0.01 < plain["grid, 80 degrees"].gap

@@ -21,6 +21,7 @@
 import itertools
 
 import numpy as np
+from drawings.checks import NamedNumbers
 from drawings.rotation_averaging import film_of_arrows, plot_noise
 
 import pgo_models as pgo
@@ -427,28 +428,29 @@ print(
 # This cell is for the tests of the library; if you have changed parameters, you may skip it.
 
 # %%
-assert np.allclose(mean, pgo.project_to_rotations(C[None])[0])
-assert mean_error < 0.5 * single_errors.mean()
-assert np.linalg.det(C) < 0.9
-assert np.isclose(by_hand[0], ring_solution.objective, rtol=1e-9)
-assert all(after <= before + 1e-9 for before, after in itertools.pairwise(costs))
-assert np.isclose(costs[-1], solution.objective, rtol=1e-9)
-assert np.isclose(cost(graph, from_start[-1]), solution.objective, rtol=1e-9)
-assert eigenvalue_bound <= solution.objective <= cost(graph, start)
-assert np.isclose(np.trace(Y.T @ L @ Y), costs[-1])
-assert np.allclose(L, problem.L.toarray())
-assert np.isclose(cost(graph, solution.poses.R), solution.objective)
-assert solution.is_certified
-assert ring_solution.is_certified
-assert np.abs(eigenvalues_of_S[:2]).max() < 1e-8 < 1 < eigenvalues_of_S[2]
-assert np.allclose(Lambda, pgo.multipliers(problem, solution.poses), atol=1e-8)
-assert np.isclose(trace, solution.objective)
-assert share[0] == 1.0
-assert share[-1] == 0.0
-assert next_of_S[0] > 0.5
-assert next_of_S[-1] < 0.1
-assert of_L[0, 2] < 0.01 < 0.5 < of_L[0, 3]
-assert np.isclose(wound_costs[-1], by_hand[-2], rtol=1e-6)
-assert stuck.gap > 0.99
-assert smallest_wound < -0.1
-assert cost(ring, unwound) < 2 * ring_solution.objective + 0.1
+with NamedNumbers():
+    assert np.allclose(mean, pgo.project_to_rotations(C[None])[0])
+    assert mean_error < 0.5 * single_errors.mean()
+    assert np.linalg.det(C) < 0.9
+    assert np.isclose(by_hand[0], ring_solution.objective, rtol=1e-9)
+    assert all(after <= before + 1e-9 for before, after in itertools.pairwise(costs))
+    assert np.isclose(costs[-1], solution.objective, rtol=1e-9)
+    assert np.isclose(cost(graph, from_start[-1]), solution.objective, rtol=1e-9)
+    assert eigenvalue_bound <= solution.objective <= cost(graph, start)
+    assert np.isclose(np.trace(Y.T @ L @ Y), costs[-1])
+    assert np.allclose(L, problem.L.toarray())
+    assert np.isclose(cost(graph, solution.poses.R), solution.objective)
+    assert solution.is_certified
+    assert ring_solution.is_certified
+    assert np.abs(eigenvalues_of_S[:2]).max() < 1e-8 < 1 < eigenvalues_of_S[2]
+    assert np.allclose(Lambda, pgo.multipliers(problem, solution.poses), atol=1e-8)
+    assert np.isclose(trace, solution.objective)
+    assert share[0] == 1.0
+    assert share[-1] == 0.0
+    assert next_of_S[0] > 0.5
+    assert next_of_S[-1] < 0.1
+    assert of_L[0, 2] < 0.01 < 0.5 < of_L[0, 3]
+    assert np.isclose(wound_costs[-1], by_hand[-2], rtol=1e-6)
+    assert stuck.gap > 0.99
+    assert smallest_wound < -0.1
+    assert cost(ring, unwound) < 2 * ring_solution.objective + 0.1

@@ -22,6 +22,7 @@ import cvxpy as cp
 import matplotlib.pyplot as plt
 import numpy as np
 from drawings.beyond_the_relaxation import ascent_film, edge_film
+from drawings.checks import NamedNumbers
 
 import pgo_models as pgo
 import solvers
@@ -442,38 +443,39 @@ plot_tightness(curves)
 # This cell holds what the text says of the numbers above. If you have changed a parameter, skip it.
 
 # %%
-assert not loose.is_certified
-assert relaxed.rank.rank == 4
-assert loose.certificate.eta > 0
-assert relaxed.lower_bound <= loose.objective < relaxed.objective
-assert 1e-4 < loose.gap < 0.01
-assert by_hand["poses"] < by_hand["relaxation"] < loose.objective
-assert abs(by_hand["relaxation"] - loose.lower_bound) < 0.01
-assert least["rotations"] > -1e-9
-assert least["reflections"] < -0.1
-for p, of_rotations, of_mirrors in settings:
-    none_below = min(costs.min() for costs in of_rotations + of_mirrors) > -1e-9
-    assert none_below == (24 <= p <= 40)
-assert spectra[0][0] < 0 < spectra[-1][0]
-assert len(spectra) < 50
-assert terms.num_pairs > 0
-assert proven <= loose.objective
-assert proven > loose.objective * (1 - 1e-9)
-assert closed.is_certified
-assert closed.stages[-1].name == "HandednessAscent"
-assert closed.lower_bound <= best_descent * (1 + 1e-12)
-assert loose.lower_bound < closed.lower_bound
-assert with_hulls.verdict is pgo.Verdict.CERTIFIED
-assert with_hulls.rank.rank == 3
-assert np.isclose(in_the_plane["Q"][0], in_the_plane["Q_c"][0])
-assert planar.is_certified
-assert planar.certificate.bound.is_complex
-assert in_the_plane["Q"][1] < 0.9 * planar.objective
-assert np.isclose(in_the_plane["Q_c"][1], planar.objective, rtol=1e-4)
-assert in_the_plane["Q"][2] < 0 < in_the_plane["Q_c"][2]
-assert sweeps["circle"].fraction[0] == sweeps["grid"].fraction[0] == 1.0
-assert sweeps["circle"].fraction[-1] < 0.5
-assert sweeps["circle"].fraction_with_terms[-1] == 1.0
-assert sweeps["grid"].fraction[-1] == sweeps["grid"].fraction_with_terms[-1] == 0.0
-assert sweeps["circle"].last_tight > sweeps["grid"].last_tight
-assert (sweeps["grid"].fraction_with_terms >= sweeps["grid"].fraction).all()
+with NamedNumbers():
+    assert not loose.is_certified
+    assert relaxed.rank.rank == 4
+    assert loose.certificate.eta > 0
+    assert relaxed.lower_bound <= loose.objective < relaxed.objective
+    assert 1e-4 < loose.gap < 0.01
+    assert by_hand["poses"] < by_hand["relaxation"] < loose.objective
+    assert abs(by_hand["relaxation"] - loose.lower_bound) < 0.01
+    assert least["rotations"] > -1e-9
+    assert least["reflections"] < -0.1
+    for p, of_rotations, of_mirrors in settings:
+        none_below = min(costs.min() for costs in of_rotations + of_mirrors) > -1e-9
+        assert none_below == (24 <= p <= 40)
+    assert spectra[0][0] < 0 < spectra[-1][0]
+    assert len(spectra) < 50
+    assert terms.num_pairs > 0
+    assert proven <= loose.objective
+    assert proven > loose.objective * (1 - 1e-9)
+    assert closed.is_certified
+    assert closed.stages[-1].name == "HandednessAscent"
+    assert closed.lower_bound <= best_descent * (1 + 1e-12)
+    assert loose.lower_bound < closed.lower_bound
+    assert with_hulls.verdict is pgo.Verdict.CERTIFIED
+    assert with_hulls.rank.rank == 3
+    assert np.isclose(in_the_plane["Q"][0], in_the_plane["Q_c"][0])
+    assert planar.is_certified
+    assert planar.certificate.bound.is_complex
+    assert in_the_plane["Q"][1] < 0.9 * planar.objective
+    assert np.isclose(in_the_plane["Q_c"][1], planar.objective, rtol=1e-4)
+    assert in_the_plane["Q"][2] < 0 < in_the_plane["Q_c"][2]
+    assert sweeps["circle"].fraction[0] == sweeps["grid"].fraction[0] == 1.0
+    assert sweeps["circle"].fraction[-1] < 0.5
+    assert sweeps["circle"].fraction_with_terms[-1] == 1.0
+    assert sweeps["grid"].fraction[-1] == sweeps["grid"].fraction_with_terms[-1] == 0.0
+    assert sweeps["circle"].last_tight > sweeps["grid"].last_tight
+    assert (sweeps["grid"].fraction_with_terms >= sweeps["grid"].fraction).all()
