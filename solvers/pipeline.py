@@ -1,7 +1,7 @@
 """solve(problem): from the start to the certificate, in one Solution.
 
-`solvers.plan` has the steps of a solve in their order, `solvers.places` where they are taken; here
-it is decided which page a solve follows.
+`solvers.plan` has the steps of a solve in their order, and `solvers.places` opens where they are
+taken. Here it is decided whether a solve is plain, robust or one with terms of its own.
 """
 
 from __future__ import annotations

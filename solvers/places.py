@@ -1,7 +1,7 @@
-"""Where a request is solved: its place is opened here, a page is read at it, and it is closed.
+"""Where a request is solved: its place is opened, the steps of the solve are taken, it is closed.
 
-A page takes the steps of a solve at a place: `solvers.plan.solve_at` is the one of `solve`. The
-places of robots are imported when they are asked for.
+`solvers.plan.solve_at` takes the steps of `solve` at a place. The places of robots are imported
+when they are asked for.
 """
 
 from __future__ import annotations

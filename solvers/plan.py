@@ -13,8 +13,8 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
 5. Another attempt, from a start that grows: prefixes of the graph, each solved from the one before.
    On graphs with landmarks Newton of the first attempt has few steps, as this attempt may follow.
    If this attempt does not close the gap, the first one takes the rest of its steps.
-6. A second attempt by a finer SOC. It starts at the optimum of F where the cost is a chi2 that SOC
-   cannot run on.
+6. A second attempt: by a finer SOC, or by Newton from the optimum of F where the cost is a chi2
+   that SOC cannot run on.
 7. A relaxation of the cost: poses that its solution rounds to, and its bound. In the plane it has
    rotations as complex numbers, and is never worse than the semidefinite one, which the staircase
    solves. For chi2, bounds by smaller information matrices, whose cost is below chi2.
@@ -23,9 +23,10 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
    convex hulls of rotations is solved.
 
 Steps 5 to 8 are taken while the answer is open, where the settings ask for them and nothing stands
-against them (`improved`). They can only improve the answer. What fails in them, as linear algebra
-does (`pgo_models.errors.FAILURES`), leaves the answer before it, with a sentence. A step that is
-asked for and cannot be taken has a line in the table of stages, which says why.
+against them (`improved`). A Newton that was cut short goes on in any case. They can only improve
+the answer. What fails in them, as linear algebra does (`pgo_models.errors.FAILURES`), leaves the
+answer before it, with a sentence. A step that is asked for and cannot be taken has a line in the
+table of stages, which says why.
 """
 
 from __future__ import annotations

@@ -219,8 +219,7 @@ def compare_readings(
     with warnings.catch_warnings(action="ignore"):  # of the reader, once more
         fits = [trial.fit(reading) for reading in Reading if reading is not Reading.AS_WRITTEN]
     others = tuple(fit for fit in fits if fit is not None)
-    proposed = () if solution.certificate.fit.is_exact else _proposed(others, written)
-    return ReadingComparison(problem.cost_name, written, others, proposed)
+    return ReadingComparison(problem.cost_name, written, others, _proposed(others, written))
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,7 @@ def test_a_solution_is_certified_and_its_numbers_agree(seed, n, d):
 
 def test_stages_are_steps_of_the_solve_in_their_order(solution):
     names = [stage.name for stage in solution.stages]
-    assert any("chordal" in name for name in names)
-    assert any("Newton" in name for name in names)
+    assert names.index("chordal start") < names.index("Newton")
     assert all(np.isfinite(stage.objective) for stage in solution.stages)
 
 
@@ -53,7 +52,7 @@ def test_out_of_time_returns_the_best_poses_and_says_so():
     assert "TIME_LIMIT" in str(found.status)
 
 
-def test_a_callback_stops_a_solve():
+def test_a_callback_ends_the_stage_that_runs():
     seen = []
 
     def callback(state, record):
@@ -61,8 +60,8 @@ def test_a_callback_stops_a_solve():
         return len(seen) > 1
 
     found = solvers.solve(pgo.load("sphere"), callback=callback)
+    assert solvers.Status.STOPPED in {stage.status for stage in found.stages}
     assert np.isfinite(found.objective)
-    assert len(seen) >= 2
 
 
 def test_a_solution_is_printed_pickled_and_written(solution, tmp_path):
