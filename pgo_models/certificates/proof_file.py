@@ -96,6 +96,10 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         raise SettingError(f"no proof to write: {what}; {way_out}")
     at_bound = replace(certificate, poses=graph.near_zero(certificate.poses))
     proven = _proven_at(problem, at_bound)
+    objective = problem.objective(proven.poses)  # chi2 may come out below zero
+    if certificate.verdict is Verdict.TRIVIAL and objective < 0.0:
+        what = f"{certificate.cost} is below its rounding, and that it is never negative needs none"
+        raise SettingError(f"no proof to write: {what}; leave out --proof")
     poses = graph.near_zero(proven.poses)
     positions = poses.t.copy()
     if graph.has_far_priors:
@@ -119,8 +123,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         "format": FORMAT,
         "cost": cost,
         "d": d,
-        # chi2 may come out below zero
-        "objective": max(problem.objective(proven.poses), 0.0),
+        "objective": max(objective, 0.0),
         "lower_bound": _claimed_bound(problem, at_bound, proven),
         "eta": eta,
         "ground": _name(graph, _ground(graph)),
@@ -171,11 +174,11 @@ def _terms_of_poses(graph: PoseGraph, terms: HandednessTerms | None) -> Handedne
     return HandednessTerms(i[is_kept], j[is_kept], terms.T[is_kept], terms.P[is_kept])
 
 
-def _share_edges(graph: PoseGraph, terms: HandednessTerms) -> bool:
-    """Whether every term is of two poses that share an edge."""
-    pairs = set(zip(graph.i.tolist(), graph.j.tolist(), strict=True))
-    of_terms = zip(terms.i.tolist(), terms.j.tolist(), strict=True)
-    return all((i, j) in pairs or (j, i) in pairs for i, j in of_terms)
+def _are_of_landmarks(graph: PoseGraph, terms: HandednessTerms | None) -> bool:
+    """Whether a term is of a landmark, as robots may have them (`_terms_of_poses`)."""
+    if terms is None:
+        return False
+    return bool(np.isin(np.stack([terms.i, terms.j]), graph.landmarks).any())
 
 
 def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, object]]:
@@ -242,8 +245,8 @@ def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
     terms = _terms_of_poses(problem.graph, certificate.bound.terms)
     if math.isnan(certificate.eta):
         return _Proven(best, Lambda_of_poses, 0.0)
-    if terms is not None and not _share_edges(problem.graph, terms):
-        # M has no blocks for them. The bound is proven with the landmarks between the poses.
+    if terms is not None and _are_of_landmarks(problem.graph, certificate.bound.terms):
+        # M may have no blocks for them. The bound is proven with the landmarks between the poses.
         return _Proven(best, Lambda_of_poses, certificate.bound.value)
     if not problem.is_quadratic:
         points.append((certificate.poses, Lambda_of_poses))

@@ -30,7 +30,7 @@ BAD_INPUT = 1
 NOT_CONVERGED = 2
 NOT_CERTIFIED = 3
 BROKEN_OFF = 130
-_LONGEST_LINE = 2000  # characters of an error message
+_LONGEST_LINE = 900  # characters of an error message: eleven lines of a terminal
 QuietOption = Annotated[
     bool, typer.Option("--quiet", "-q", help="Print errors and warnings alone.")
 ]
