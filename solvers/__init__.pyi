@@ -1,5 +1,10 @@
 from solvers.baselines.gauss_seidel import GaussSeidel as GaussSeidel
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
+from solvers.carry.faults import Faults as Faults
+from solvers.carry.process import (
+    InProcess as InProcess,
+)
+from solvers.carry.ray_engine import RayEngine as RayEngine
 from solvers.convex.bregman import (
     AlternatingBregman as AlternatingBregman,
     Bregman as Bregman,
@@ -13,11 +18,6 @@ from solvers.convex.orthogonal import (
 )
 from solvers.growing import extend as extend
 from solvers.loop import Solver as Solver, iterate as iterate, run as run
-from solvers.network.engine import (
-    InProcess as InProcess,
-)
-from solvers.network.faults import Faults as Faults
-from solvers.network.ray_engine import RayEngine as RayEngine
 from solvers.pipeline import solve as solve
 from solvers.reporting.film import film as film
 from solvers.reporting.report import write_report as write_report
@@ -29,7 +29,7 @@ from solvers.result import (
 from solvers.riemannian.newton import Newton as Newton, gauss_newton as gauss_newton
 from solvers.riemannian.polish import polish as polish
 from solvers.riemannian.staircase import Staircase as Staircase
-from solvers.robots import Checkpoint as Checkpoint, Robots as Robots
+from solvers.robots.settings import Checkpoint as Checkpoint, Robots as Robots
 from solvers.robust.consistency import PCM as PCM
 from solvers.robust.gnc import GNC as GNC
 from solvers.robust.irls import IRLS as IRLS

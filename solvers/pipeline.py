@@ -24,7 +24,7 @@ from solvers.places import solution_by
 from solvers.plan import solve_at
 from solvers.request import Pipeline, SolveRequest
 from solvers.result import Record
-from solvers.robots import Robots
+from solvers.robots.settings import Robots
 from solvers.solution import Solution
 
 if TYPE_CHECKING:  # what a solve in one place does not need

@@ -1,8 +1,8 @@
 """A place where a solve runs: the verbs that the plan of a solve needs, and what they pass on.
 
 `solvers.plan` says in which order they are called. A place is `solvers.here.Here`, or robots:
-`solvers.distributed.robots_of_graph`, `solvers.distributed.robots_alone` and
-`solvers.distributed.robots_with_files`.
+`solvers.robots.place_with_graph`, `solvers.robots.place_without_driver` and
+`solvers.robots.place_with_files`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
+from solvers.carry.ledger import Ledger
 from solvers.handedness.complex_relaxation import ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch
 from solvers.loop import RunMonitor
-from solvers.network.ledger import Ledger
 from solvers.result import OUT_OF_TIME, Stage, StageTable, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart

@@ -37,7 +37,7 @@ def with_partition(request: SolveRequest) -> SolveRequest:
     """The request with the robots that a number of them stands for."""
     if request.robots is None:
         return request
-    from solvers.distributed.chosen_robots import robots_of_solve
+    from solvers.robots.chosen_robots import robots_of_solve
 
     graph = request.problem.graph
     owners = robots_of_solve(request.pipeline.soc, request.robots.owners, graph)
@@ -62,10 +62,10 @@ def _open_here(request: SolveRequest) -> Iterator[Place]:
 @contextmanager
 def _open_robots(request: SolveRequest, gnc: GNC | None) -> Iterator[Place]:
     """The robots of one graph, with a driver or alone."""
-    from solvers.distributed.checkpoint import Journal, run_fingerprint
-    from solvers.distributed.robots_alone import RobotsAlone
-    from solvers.distributed.robots_of_graph import RobotsOfGraph, open_driver
-    from solvers.network.engine import InProcess
+    from solvers.carry.process import InProcess
+    from solvers.robots.checkpoint import Journal, run_fingerprint
+    from solvers.robots.place_with_graph import RobotsOfGraph, open_driver
+    from solvers.robots.place_without_driver import RobotsAlone
 
     robots = request.robots
     assert robots is not None

@@ -38,8 +38,8 @@ from functools import partial
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FAILURES, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
+from solvers.carry.faults import RobotSilentError
 from solvers.handedness.hull_lagrangian import HullLagrangian
-from solvers.network.faults import RobotSilentError
 from solvers.place import AUTO, AnySOC, Attempt, FirstStage, OwnStart, Place, Step, Traits
 from solvers.request import Pipeline
 from solvers.result import Stage, Status

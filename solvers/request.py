@@ -20,7 +20,7 @@ from solvers.place import AUTO, Attempt, FirstStage, Place, Step
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
-from solvers.robots import Robots
+from solvers.robots.settings import Robots
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 from solvers.solution import Solution, choose_gauge, note_of

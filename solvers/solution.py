@@ -20,7 +20,7 @@ from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
-from solvers.network.ledger import Ledger
+from solvers.carry.ledger import Ledger
 from solvers.reporting.gauge import choose_gauge as choose_gauge
 from solvers.reporting.json_records import (
     certificate_json as certificate_json,

@@ -14,7 +14,7 @@ import solvers
 from pgo_models import PGOError, grid
 from pgo_models.graphs.partitioning import Partition
 from solvers import solve
-from solvers.network.messages import Idle
+from solvers.carry.messages import Idle
 
 _MEGABYTE = 2**20
 

@@ -22,14 +22,14 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from solvers import InProcess
-from solvers.distributed.driver import Driver
-from solvers.distributed.interface import Interface, Separators
-from solvers.distributed.robots.agent import Agent
-from solvers.distributed.robots.elimination import Cut, Elimination
-from solvers.distributed.robots.subdomain_blocks import SubdomainBlocks
-from solvers.distributed.robots_of_graph import open_driver
-from solvers.network.engine import Engine, WorkerPool
-from solvers.network.messages import Idle
+from solvers.carry.messages import Idle
+from solvers.carry.process import Engine, WorkerPool
+from solvers.robots.agent import Agent
+from solvers.robots.driver import Driver
+from solvers.robots.elimination import Cut, Elimination
+from solvers.robots.interface import Interface, Separators
+from solvers.robots.place_with_graph import open_driver
+from solvers.robots.subdomain_blocks import SubdomainBlocks
 from solvers.soc import subgraph
 from solvers.soc.subdomains import Subdomains
 from solvers.soc.subgraph import Subgraph

@@ -18,7 +18,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, factorize
 from solvers.baselines.sweep_order import Schedule
-from solvers.network.ledger import Ledger, Traffic
+from solvers.carry.ledger import Ledger, Traffic
 
 
 @dataclass(frozen=True, eq=False)

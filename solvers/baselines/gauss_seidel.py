@@ -37,7 +37,7 @@ from solvers.baselines.block_relaxation import (
     take_turns,
 )
 from solvers.baselines.sweep_order import Schedule, schedule
-from solvers.network.ledger import Ledger
+from solvers.carry.ledger import Ledger
 from solvers.result import Measurement, Status
 
 

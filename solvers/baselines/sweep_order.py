@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
-from solvers.network.ledger import BYTES_PER_NUMBER, Traffic
+from solvers.carry.ledger import BYTES_PER_NUMBER, Traffic
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.carry.process import DEFAULT_MEMORY, Engine, InProcess
 from solvers.cli.options import BackEndName, FirstStage, Robust, Runner, Start, TakenForRight
-from solvers.network.engine import DEFAULT_MEMORY, Engine, InProcess
 from solvers.request import Pipeline
 from solvers.riemannian.newton import gauss_newton
 from solvers.soc.paper import PaperSOC
@@ -172,7 +172,7 @@ def chosen_engine(
             f"--address is that of a Ray cluster, got --engine {engine.value}; use --engine ray"
         )
     if engine is Runner.RAY or address is not None:
-        from solvers.network.ray_engine import RayEngine
+        from solvers.carry.ray_engine import RayEngine
 
         return RayEngine(address=address)
     num_threads = (os.cpu_count() or 1) if engine is Runner.THREADS else 1

@@ -2,6 +2,10 @@
 
 import enum
 import math
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -116,22 +120,38 @@ def robot_command(
         patience=patience,
     )
     robot.read(graph)
-    reporter = _Reporter(quiet or as_json)
-    interrupted = False
-    with ZenohLink(robot, listen, connect or []) as link:
+    reporter = _Reporter(quiet)
+    with ZenohLink(robot, listen, connect or []) as link, _interrupt_noted() as interrupted:
         reporter.say(f"{name} listens at {listen}, and waits for {', '.join(robot.others)}")
-        try:
-            carry(robot, link, wait, reporter)
-        except KeyboardInterrupt:
-            if robot.outcome is None:
-                raise
-            interrupted = True
+        carry(robot, link, wait, reporter, interrupted.is_set)
+    if interrupted.is_set() and robot.outcome is None:
+        raise KeyboardInterrupt
     writers = [(out, robot.write)] if out is not None and robot.poses else []
     record = robot.as_json if as_json else None
     text = wrapped("\n".join(f"{label:<12} {value}" for label, value in robot.facts()), _INDENT)
     save_then_show(writers, lambda: typer.echo(text), record, quiet)
-    is_done = robot.is_certified and not interrupted
+    is_done = robot.is_certified and not interrupted.is_set()
     raise typer.Exit(DONE if is_done else NOT_CERTIFIED)
+
+
+@contextmanager
+def _interrupt_noted() -> Iterator[threading.Event]:
+    """Yield an event that the first Ctrl-C sets; the next one is as always.
+
+    An exception in its place might come up in a callback of the network, which would swallow it.
+    """
+    noted = threading.Event()
+    as_always = signal.getsignal(signal.SIGINT)
+
+    def note(*_: object) -> None:
+        noted.set()
+        signal.signal(signal.SIGINT, as_always)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, as_always)
 
 
 def _secret(path: Path) -> bytes:

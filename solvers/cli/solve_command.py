@@ -21,6 +21,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.style import is_picture, plotly
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.carry.process import Engine
 from solvers.cli import choices
 from solvers.cli.explanations import (
     advice_on_file,
@@ -75,12 +76,11 @@ from solvers.cli.shell import (
     save_then_show,
     wrapped,
 )
-from solvers.network.engine import Engine
 from solvers.pipeline import solve
 from solvers.progress.bars import JobBar
 from solvers.request import Pipeline
 from solvers.result import Status
-from solvers.robots import Checkpoint, Robots
+from solvers.robots.settings import Checkpoint, Robots
 from solvers.soc.soc import SOC, WARM_START
 from solvers.solution import Solution, check_format, check_target
 

@@ -11,7 +11,7 @@ linear (Polyak 1969), and back to P >= 0.
 
 How far a step goes, and when to stop, is decided here; where the P and the eigenvectors are is
 `AscentPoint`. There are two: `solvers.handedness.certificate_spectrum` in one place, and
-`solvers.distributed.handedness` by a driver and its robots, each of which has the P of its edges.
+`solvers.robots.handedness` by a driver and its robots, each of which has the P of its edges.
 """
 
 from dataclasses import dataclass, replace

@@ -6,7 +6,7 @@ from pathlib import Path
 from pgo_models.certificates.certificate import Certificate
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.partitioning import Partition
-from solvers.network.ledger import Ledger
+from solvers.carry.ledger import Ledger
 from solvers.reporting.result_table import finite_or_none
 from solvers.result import Stage
 

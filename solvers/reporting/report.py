@@ -26,7 +26,7 @@ from pgo_models.plots.interactive_plots import MOST_DOTS, explore_graph
 from pgo_models.plots.pages import PAGE_CONFIG
 from pgo_models.plots.style import plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
-from solvers.network.ledger import Ledger
+from solvers.carry.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
 from solvers.reporting.fit_plots import explore_fit

@@ -18,7 +18,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.network.ledger import Ledger
+from solvers.carry.ledger import Ledger
 from solvers.reporting.edge_fit import Advice, EdgeFit
 from solvers.result import Stage, Status
 from solvers.robust.rejection import Rejection, Support

@@ -3,7 +3,7 @@
 At a stationary point of rank r the relaxation is solved if a bound proves it. Else Q - Lambda has a
 negative eigenvalue, whose eigenvector in one more dimension leads down. When a rank ends, and how,
 is decided here; what that needs of poses and matrices is `ClimbAlgebra`. There are two: in
-`solvers.riemannian.staircase` in one place, and in `solvers.distributed.staircase` by a driver and
+`solvers.riemannian.staircase` in one place, and in `solvers.robots.climb` by a driver and
 its robots.
 
 How the points of one rank are improved differs, and is worth it. In one place a product with Q is

@@ -3,7 +3,7 @@
 The rules of the method are here: which matrix is factored, how far a move goes, when another move
 takes the same factor, and when the iteration has come to its end. What they need of poses and
 matrices is `NewtonAlgebra`. There are two: `solvers.riemannian.polish` in one place,
-with sparse Cholesky, and `solvers.distributed.newton` by a driver and its robots, which eliminate
+with sparse Cholesky, and `solvers.robots.newton` by a driver and its robots, which eliminate
 to separators and send messages.
 """
 

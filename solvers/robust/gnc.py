@@ -27,7 +27,7 @@ by the median ratio r_e^2 / c_e^2 of the edges kept, and the schedule starts onc
 
 The algorithm is `next_state`. It is written against `ReweightedEdges`: who holds the edges
 evaluates their residuals and minimises with weights. `solvers.robust.weighted_edges` does that in
-one place, `solvers.distributed.robust` by a driver and robots.
+one place, `solvers.robots.reweigh` by a driver and robots.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from pgo_models.problem.ordering import analyze_poses, most_counts, pose_order
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import edge_residuals
-from solvers.network.ledger import Ledger
+from solvers.carry.ledger import Ledger
 from solvers.place import Place
 from solvers.places import open_place
 from solvers.plan import solve_at

@@ -17,7 +17,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray, tangent_dimension
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
-from solvers.network.ledger import Ledger
+from solvers.carry.ledger import Ledger
 from solvers.place import is_open
 from solvers.places import with_partition
 from solvers.request import SolveRequest

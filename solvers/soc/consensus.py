@@ -12,7 +12,7 @@ penalty rho of its pose. One iteration is that of `solvers.soc.joint`, robot by 
 Only (b) needs the neighbours: the robots send each other s_a = x_a + B_a on the poses that both
 hold. Translations of separators take their mean in (b). `ConsensusRobot.step` is the iteration on
 one robot. `Consensus.step` calls the robots and decides what follows from sums over them. They may
-be in one process (`LocalRobots`) or on a network (`solvers.distributed.consensus`).
+be in one process (`LocalRobots`) or on a network (`solvers.robots.consensus`).
 """
 
 import math
@@ -26,9 +26,9 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import relative_length
-from solvers.network.counted_pool import Count, by_link, delivered
-from solvers.network.moments import Moment
-from solvers.network.serialization import COMPUTED_AGAIN
+from solvers.carry.counted_pool import Count, by_link, delivered
+from solvers.carry.moments import Moment
+from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot

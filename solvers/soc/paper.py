@@ -111,7 +111,7 @@ class PaperSOC:
     ----------
     robots : Partition or None
         Who owns which poses. Unless given, one pose a robot, as in the paper; where robots run the
-        solve (`solvers.distributed.paper`), those.
+        solve (`solvers.robots.paper`), those.
     penalty : PenaltyRule
         Rule of rho, one for all poses: BalancedPenalty, BoydPenalty, FixedPenalty, or an own one,
         whose first penalties are averaged. The paper's own is `BoydPenalty`.

@@ -3,7 +3,7 @@
 Orders are as in `solvers.soc.consensus_robot`. A robot does the steps (a), (b) and (c) of its own
 poses, and tells its neighbours its R of the poses that they hold, once an iteration, in full
 precision. They repeat (b) and (c) for these poses, and so know omega, too, which nobody sends.
-`solvers.distributed.paper` gives the orders.
+`solvers.robots.paper` gives the orders.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Each coupling is a class of its own, with `init`, `step`, `measure` and `converged`: `joint` is the
 recursion to read first, `consensus` that of robots with copies of their neighbours' poses. JOINT by
-robots and a driver, SUBSTRUCTURED, is `solvers.distributed.substructured`. Their states have x,
+robots and a driver, SUBSTRUCTURED, is `solvers.robots.soc`. Their states have x,
 omega, B and rho in common.
 """
 

@@ -1,7 +1,7 @@
 """solve_folder(folder): robots load their own files, solve together, and write their own poses.
 
 No party has the whole graph. The process that calls `solve_folder` is the driver: it learns the
-interface between the robots (`solvers.distributed.own_files`), and of the answer the cost, its
+interface between the robots (`solvers.robots.setup`), and of the answer the cost, its
 bound and sums. It also delivers the messages between robots, which nothing of it reads. Without an
 engine the robots run in this process, too, each with its own data.
 """
@@ -25,23 +25,23 @@ from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
-from solvers.distributed.checkpoint import Journal
-from solvers.distributed.own_files import OpenedFiles, open_files
-from solvers.distributed.own_revision import Pass, revised
-from solvers.distributed.paper import check_paper
-from solvers.distributed.robots.own_file import READ_HERE, RobotFile, write_answer
-from solvers.distributed.robots.own_revision import ComesBack
-from solvers.distributed.robots_with_files import RobotsWithFiles
+from solvers.carry.counted_pool import Count
+from solvers.carry.ledger import Ledger
+from solvers.carry.process import Engine, InProcess
+from solvers.carry.ray_engine import RayEngine
 from solvers.loop import RunMonitor
-from solvers.network.counted_pool import Count
-from solvers.network.engine import Engine, InProcess
-from solvers.network.ledger import Ledger
-from solvers.network.ray_engine import RayEngine
 from solvers.place import AUTO, Attempt, FirstStage
 from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import Record, Stage, StageTable, Status
-from solvers.robots import Robots
+from solvers.robots.checkpoint import Journal
+from solvers.robots.own_file import READ_HERE, RobotFile, write_answer
+from solvers.robots.paper import check_paper
+from solvers.robots.place_with_files import RobotsWithFiles
+from solvers.robots.revision import Pass, revised
+from solvers.robots.revision_of_robot import ComesBack
+from solvers.robots.settings import Robots
+from solvers.robots.setup import OpenedFiles, open_files
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry

@@ -18,8 +18,8 @@ from solvers.baselines.gauss_seidel import DGSStage, GaussSeidel, GaussSeidelSta
 from solvers.baselines.gtsam import run_gtsam
 from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.baselines.sweep_order import schedule
+from solvers.carry.ledger import Ledger
 from solvers.loop import Solver, run
-from solvers.network.ledger import Ledger
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.result import OUT_OF_TIME, History, Record, Run, Status

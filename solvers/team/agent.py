@@ -17,7 +17,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_parser import G2OLines, parse_lines
 from pgo_models.graphs.pose_graph import IntArray
-from solvers.distributed.robots.own_file import FileAgent, PlacedFile
+from solvers.robots.own_file import FileAgent, PlacedFile
 from solvers.solution import Solution
 
 

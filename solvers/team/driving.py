@@ -20,9 +20,9 @@ from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.carry.messages import Idle, Worker, obey, raise_first_error
+from solvers.carry.process import DEFAULT_MEMORY
 from solvers.loop import RunMonitor
-from solvers.network.engine import DEFAULT_MEMORY
-from solvers.network.messages import Idle, Worker, obey, raise_first_error
 from solvers.pipeline import solution_for
 from solvers.request import Pipeline, SolveRequest
 from solvers.robust.consistency import PCM

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import count
 from typing import Any, NamedTuple
 
-from solvers.network.messages import Token, count_bytes
+from solvers.carry.messages import Token, count_bytes
 
 DRIVER_PLACE = 0  # the first robot of a solve drives it; its messages need no letters
 

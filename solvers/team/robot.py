@@ -22,10 +22,10 @@ from pgo_models.files import replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
-from solvers.distributed.own_files import SOLVE_PARTS
-from solvers.distributed.robots.own_file import READ_HERE
-from solvers.network.serialization import deserialize, serialize
+from solvers.carry.serialization import deserialize, serialize
 from solvers.request import Pipeline
+from solvers.robots.own_file import READ_HERE
+from solvers.robots.setup import SOLVE_PARTS
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry

@@ -1,6 +1,6 @@
 """Messages as bytes: versioned arrays without pickle, sealed with the key of a team.
 
-A message is a record (`solvers.network.serialization`): a tree in JSON, and the arrays in it. Its
+A message is a record (`solvers.carry.serialization`): a tree in JSON, and the arrays in it. Its
 bytes are a mark and version, the HMAC-SHA256 of what follows (RFC 2104), and the record,
 compressed. Who does not have the key can neither make a message nor change one. Messages are not
 encrypted: a transport may do that.
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError
-from solvers.network.serialization import deserialize, serialize
+from solvers.carry.serialization import deserialize, serialize
 
 _MARK = b"PGO1"  # the last character is the version
 _SEAL_BYTES = 32  # of HMAC-SHA256
@@ -40,15 +40,15 @@ _ROOMS = (
     "pgo_models.graphs",
     "pgo_models.problem",
     "pgo_models.relaxations",
-    "solvers.distributed.robots",
-    "solvers.network",
+    "solvers.robots",
+    "solvers.carry",
     "solvers.riemannian",
     "solvers.robust.weighted_edges",
     "solvers.soc",
 )
 _MODULES_OF_ORDERS = (
-    "solvers.distributed.robots.",
-    "solvers.network.moments",
+    "solvers.robots.",
+    "solvers.carry.moments",
     "solvers.soc.",
     "solvers.team.agent",
 )

@@ -100,7 +100,11 @@ class ZenohLink:
 
 
 def carry(
-    robot: Robot, link: ZenohLink, seconds: float, report: Callable[[Robot], None] | None = None
+    robot: Robot,
+    link: ZenohLink,
+    seconds: float,
+    report: Callable[[Robot], None] | None = None,
+    is_ended: Callable[[], bool] = lambda: False,
 ) -> None:
     """Carry a robot's messages until its team is settled, or so many seconds are over.
 
@@ -114,6 +118,8 @@ def carry(
         How long it may take.
     report : callable, optional
         Called after every step.
+    is_ended : callable, optional
+        Asked after every step whether to end now.
     """
     began = time.monotonic()
     settled_at: float | None = None
@@ -131,7 +137,7 @@ def carry(
         settled_at = (settled_at or now) if robot.is_settled else None
         if settled_at is not None and now - settled_at > _RETRIES_AT_THE_END * robot.retry:
             return
-        if now - began > seconds:
+        if now - began > seconds or is_ended():
             return
 
 

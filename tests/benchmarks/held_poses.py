@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import pgo_models as pgo
 import solvers
 from solvers import InProcess
-from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.robots_alone import collect_copies
-from solvers.distributed.robots_of_graph import open_driver
 from solvers.loop import run
 from solvers.result import Record
+from solvers.robots.consensus import ConsensusSOC
+from solvers.robots.place_with_graph import open_driver
+from solvers.robots.place_without_driver import collect_copies
 from solvers.soc.consensus import ConsensusState
 
 MOST_ITERATIONS = 400

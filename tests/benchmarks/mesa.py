@@ -30,7 +30,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import diagonal_positions, norm
 from pgo_models.summaries import Summarised
 from solvers import Measurement, Status
-from solvers.network.ledger import BYTES_PER_NUMBER, Ledger, Traffic
+from solvers.carry.ledger import BYTES_PER_NUMBER, Ledger, Traffic
 from solvers.soc.subgraph import PartProblem
 
 _DAMPING = 1e-5  # first one of Levenberg-Marquardt, relative to the diagonal

@@ -32,13 +32,13 @@ import solvers
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start
 from solvers import InProcess
-from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.driver import Driver
-from solvers.distributed.robots_alone import collect_copies
-from solvers.distributed.robots_of_graph import open_driver
+from solvers.carry.ledger import Ledger
 from solvers.loop import run
-from solvers.network.ledger import Ledger
 from solvers.result import Record
+from solvers.robots.consensus import ConsensusSOC
+from solvers.robots.driver import Driver
+from solvers.robots.place_with_graph import open_driver
+from solvers.robots.place_without_driver import collect_copies
 
 REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
 GRAPHS = ("smallGrid3D", "sphere2500", "intel", "kitti_07", "kitti_00")

@@ -35,13 +35,13 @@ import solvers
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.separators import vertex_cover
 from solvers import Faults, InProcess, RayEngine
-from solvers.distributed.asynchronous import AsynchronousSOC, AsynchronousState
-from solvers.distributed.consensus import RobotsOfDriver
-from solvers.distributed.robots_of_graph import open_driver
+from solvers.carry.counted_pool import Count
+from solvers.carry.process import Engine
 from solvers.loop import run
-from solvers.network.counted_pool import Count
-from solvers.network.engine import Engine
 from solvers.result import History, Record, Run
+from solvers.robots.asynchronous import AsynchronousSOC, AsynchronousState
+from solvers.robots.consensus import RobotsOfDriver
+from solvers.robots.place_with_graph import open_driver
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 

@@ -35,7 +35,7 @@ ORDER = {
     "solvers": (
         "result",
         "progress",
-        "network",
+        "carry",
         "soc",
         "riemannian",
         "robust",
@@ -43,11 +43,10 @@ ORDER = {
         "handedness",
         "convex",
         "baselines",
-        "robots",
+        "robots.settings",
         "place",
         "here",
-        "distributed.robots",
-        "distributed",
+        "robots",
         "reporting",
         "solution",
         "request",
@@ -260,7 +259,7 @@ ours = [name for name in sys.modules if name.startswith(("pgo_models.", "solvers
 assert ours == ["pgo_models.lazy_names"], ours
 solvers.solve, solvers.SOC, solvers.Solution
 pgo_models.PGOProblem, pgo_models.read_g2o, solvers.certify
-late = ("rich", "scipy.spatial", "scipy.special", "cvxpy", "solvers.distributed")
+late = ("rich", "scipy.spatial", "scipy.special", "cvxpy", "solvers.robots.driver")
 late += ("solvers.reporting.report", "solvers.studies.benchmark")
 found = [name for name in late if name in sys.modules]
 assert not found, found

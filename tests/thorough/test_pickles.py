@@ -34,7 +34,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.marginals import Marginals
 from solvers import iterate, run
-from solvers.network.ledger import Traffic
+from solvers.carry.ledger import Traffic
 from solvers.reporting.edge_fit import judge_edges
 from solvers.soc.r_step import RotationStep, RSubproblem
 from solvers.studies.comparison import Comparison

@@ -40,18 +40,18 @@ from solvers import (
     iterate,
     run,
 )
-from solvers.distributed.asynchronous import AsynchronousSOC
-from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.driver import Driver
-from solvers.distributed.handedness import RobotsPoint, begin_without_terms
-from solvers.distributed.newton import SubstructuredNewton
-from solvers.distributed.robots_of_graph import open_driver
-from solvers.distributed.robust import SharedGNC
-from solvers.distributed.staircase import SubstructuredStaircase
-from solvers.distributed.substructured import SubstructuredSOC
+from solvers.carry.process import Engine
 from solvers.handedness.ascent import HandednessAscent
 from solvers.loop import Method
-from solvers.network.engine import Engine
+from solvers.robots.asynchronous import AsynchronousSOC
+from solvers.robots.climb import SubstructuredStaircase
+from solvers.robots.consensus import ConsensusSOC
+from solvers.robots.driver import Driver
+from solvers.robots.handedness import RobotsPoint, begin_without_terms
+from solvers.robots.newton import SubstructuredNewton
+from solvers.robots.place_with_graph import open_driver
+from solvers.robots.reweigh import SharedGNC
+from solvers.robots.soc import SubstructuredSOC
 from solvers.soc.anderson import Anderson
 
 Make = Callable[..., Any]

@@ -35,9 +35,9 @@ from pgo_models.problem.floating_point import (
     gamma,
 )
 from pgo_models.problem.initialization import chordal_start
-from solvers.distributed.robots import elimination as substructure, proof as robot_proof
-from solvers.distributed.robots.elimination import eliminate, row_sums
 from solvers.riemannian.polish import polish
+from solvers.robots import elimination as substructure, proof_of_robot as robot_proof
+from solvers.robots.elimination import eliminate, row_sums
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
 SIZES = [(t, low, P) for t in (1e-6, 1.0, 1e6) for low in (0.0, 1.0, 1e9) for P in (1e-6, 1.0, 1e4)]

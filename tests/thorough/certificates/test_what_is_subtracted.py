@@ -21,11 +21,10 @@ from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.errors import ProofError
 from pgo_models.geometry.rotations import Array, random_rotations
 from pgo_models.problem.initialization import chordal_start
-from solvers.distributed import lower_bound as distributed_bound
-from solvers.distributed.interface import Interface
-from solvers.distributed.robots import proof as robot_proof
-from solvers.distributed.robots.elimination import Cut, Elimination, eliminate
 from solvers.riemannian.polish import polish
+from solvers.robots import proof as distributed_bound, proof_of_robot as robot_proof
+from solvers.robots.elimination import Cut, Elimination, eliminate
+from solvers.robots.interface import Interface
 
 
 def one_edge(kappa: float) -> PGOProblem:

@@ -29,7 +29,7 @@ UNUSED_BY_SOLVE = EXTRAS | {
     "scipy.stats",
     "solvers.baselines",
     "solvers.convex",
-    "solvers.distributed",
+    "solvers.robots",
     "solvers.solves.folder_solve",
     "solvers.reporting.report",
     "solvers.robust_solves",
@@ -76,7 +76,7 @@ def test_a_command_imports_nothing_that_it_does_not_use(arguments, unused, monke
 
 
 def test_what_an_option_needs_is_imported_with_it():
-    assert "solvers.distributed.driver" in modules_of("solve", "grid", "--robots", "2")
+    assert "solvers.robots.driver" in modules_of("solve", "grid", "--robots", "2")
     assert "solvers.robust.gnc" in modules_of("solve", "grid", "--robust", "gnc")
 
 

@@ -14,8 +14,8 @@ from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, Fit
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
+from solvers.carry.ledger import Ledger, Traffic
 from solvers.cli import app as cli
-from solvers.network.ledger import Ledger, Traffic
 from solvers.reporting.edge_fit import EdgeFit, fit_sentence, judge_edges
 from solvers.reporting.report import report_page
 from solvers.reporting.report_text import advice, headline, meaning

@@ -9,9 +9,9 @@ from hypothesis import assume, given, strategies as st
 from robots import PARTITIONERS, Partitioner, metis
 
 from solvers import SOC, InProcess, Status, iterate, run
-from solvers.distributed.consensus import ConsensusSOC
-from solvers.distributed.robots_of_graph import open_driver
-from solvers.network.ledger import DRIVER
+from solvers.carry.ledger import DRIVER
+from solvers.robots.consensus import ConsensusSOC
+from solvers.robots.place_with_graph import open_driver
 from solvers.soc.rounding import RowChange
 
 BYTES = st.sampled_from([1, 2])

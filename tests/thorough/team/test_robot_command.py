@@ -62,6 +62,12 @@ class Fleet:
             text=True,
         )
 
+    def says(self, name: str, text: str) -> None:
+        """Wait until a robot says something on stderr."""
+        stderr = self.processes[name].stderr
+        assert stderr is not None
+        assert any(text in line for line in stderr)
+
     def ended(self, name: str, seconds: float = 90.0) -> tuple[int, dict[str, object]]:
         """Exit code and JSON of a robot."""
         process = self.processes[name]
@@ -211,7 +217,7 @@ def test_a_robot_that_is_cut_off_for_twenty_seconds_goes_on(fleet: Fleet) -> Non
 def test_ctrl_c_keeps_what_is_known(fleet: Fleet) -> None:
     fleet.start("a")
     fleet.start("b")
-    time.sleep(9.0)
+    fleet.says("a", "CERTIFIED, for a, b")
     fleet.processes["a"].send_signal(signal.SIGINT)
     code, told = fleet.ended("a")
     assert code != 0

@@ -21,8 +21,8 @@ from pgo_models import NoiseModel, PoseGraph
 from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import Sharing
-from solvers.distributed.robots.own_file import Told
-from solvers.network.messages import Token
+from solvers.carry.messages import Token
+from solvers.robots.own_file import Told
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.agent import OwnAnswer

@@ -1,0 +1,1 @@
+"""What carries messages between robots: this process, Ray, Zenoh; and what counts them."""

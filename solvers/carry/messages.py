@@ -1,0 +1,129 @@
+"""Orders to workers: functions of a worker and a request.
+
+Requests and answers are numbers, arrays and records.
+"""
+
+import enum
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgo_models.errors import PGOError
+from solvers.carry.ledger import BYTES_PER_NUMBER
+
+Snapshot = Mapping[str, NDArray[Any]]
+
+
+class Worker(Protocol):
+    """One robot as an engine runs it."""
+
+    def snapshot(self) -> Snapshot:
+        """Return the state that earlier orders left in the worker.
+
+        Returns
+        -------
+        mapping of str to array
+            Arrays of any shape, by name.
+        """
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot.
+
+        Parameters
+        ----------
+        snapshot : mapping of str to array
+            Arrays by name, of the shapes that `snapshot` returned.
+        """
+
+
+@dataclass(frozen=True)
+class Token:
+    """Stands for a message that a robot sends another itself: number `number` of its answer.
+
+    The answer is that to order number `call`. The message has so many bytes.
+    """
+
+    sender: int
+    call: int
+    number: int
+    num_bytes: int
+
+
+class Idle(enum.Enum):
+    """Stands for a request: the worker gets no order, and its answer is None."""
+
+    IDLE = "no order"
+
+
+def take_snapshot(worker: Worker, _: None) -> Snapshot:
+    """Order: return the state that earlier orders left in the worker."""
+    return worker.snapshot()
+
+
+def restore(worker: Worker, snapshot: Snapshot) -> None:
+    """Order: continue from a snapshot."""
+    worker.restore(snapshot)
+
+
+def snapshot_bytes(snapshots: Sequence[Snapshot]) -> int:
+    """Bytes of all arrays of the snapshots."""
+    return sum(array.nbytes for snapshot in snapshots for array in snapshot.values())
+
+
+def obey(
+    workers: Sequence[Worker], order: Callable[[Any, Any], Any], requests: Sequence[object]
+) -> list[Any]:
+    """Answers of workers to an order, each with its request.
+
+    A PGOError that a worker raises takes the place of its answer, so that the answers of the other
+    workers are not lost; see `raise_first_error`.
+    """
+    return [
+        _answer(worker, order, request) for worker, request in zip(workers, requests, strict=True)
+    ]
+
+
+def _answer(worker: Worker, order: Callable[[Any, Any], Any], request: object) -> Any:  # noqa: ANN401 - the order chooses
+    if request is Idle.IDLE:
+        return None
+    try:
+        return order(worker, request)
+    except PGOError as error:
+        return error
+
+
+def raise_first_error(answers: list[Any]) -> list[Any]:
+    """Raise the first PGOError among the answers; return the answers if there is none."""
+    for answer in answers:
+        if isinstance(answer, PGOError):
+            raise answer
+    return answers
+
+
+def count_bytes(record: object) -> int:
+    """Count the bytes that a request or an answer carries between a worker and the driver.
+
+    A number takes eight bytes, an array its `nbytes`, and a token those of its message.
+
+    A mapping holds messages for other workers, which are counted when they are exchanged. Fields
+    whose names begin with `measured` are off the ledger.
+    """
+    if isinstance(record, np.ndarray):
+        return record.nbytes
+    if record is None or isinstance(record, Mapping):
+        return 0
+    if isinstance(record, Token):
+        return record.num_bytes
+    if isinstance(record, tuple):
+        return sum(count_bytes(item) for item in record)
+    fields = getattr(type(record), "__dataclass_fields__", None)
+    if fields is None:
+        return BYTES_PER_NUMBER * int(np.size(record))  # type: ignore[arg-type] # a number or an array
+    total = 0
+    for name in fields:
+        if not name.startswith("measured"):
+            total += count_bytes(getattr(record, name))
+    return total

@@ -1,1 +1,0 @@
-"""Methods by many robots, with a driver or without."""

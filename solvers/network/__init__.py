@@ -1,1 +1,0 @@
-"""Where workers run and what crosses between them; no mathematics."""

@@ -1,0 +1,256 @@
+"""One robot as an engine runs it: its interior for the driver, and its copies for CONSENSUS."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from pgo_models.certificates.handedness import HandednessTerms
+from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.relaxations.low_rank import LiftedPoses
+from solvers.carry.messages import Snapshot
+from solvers.carry.moments import Recall
+from solvers.carry.serialization import deserialize, serialize
+from solvers.robots.interior import Interior, interior_of
+from solvers.robots.proof_of_robot import RobotProof
+from solvers.robots.records import Reweigh, RobotAscent
+from solvers.robots.state import (
+    AveragingSession,
+    DescentSession,
+    InteriorState,
+    ProofSession,
+    RecursionSession,
+    RelaxationSession,
+)
+from solvers.robots.system import System
+from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
+from solvers.soc.consensus_robot import ConsensusRobot
+from solvers.soc.copies import CopiesState, CopyLayout, ReceivedRows, Rows, TurnSettings, Waiting
+from solvers.soc.paper_block import PaperIterate
+from solvers.soc.paper_robot import PaperCopies, PaperPenalty, PaperRobot
+from solvers.soc.r_step import RStep
+from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
+from solvers.soc.subgraph import Subgraph
+
+Q = TypeVar("Q")
+A = TypeVar("A")
+# A robot that holds what its neighbours send: of CONSENSUS, or of Algorithm 1 of the paper.
+Copies = ConsensusRobot | PaperRobot
+C = TypeVar("C", ConsensusRobot, PaperRobot)
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """What a robot holds at a moment: interior and copies, as values."""
+
+    interior: Interior | None  # None if it counts no edge
+    copies: Copies | None  # None before SOC with copies of neighbours' poses begins
+
+
+@dataclass(frozen=True, eq=False)
+class HeldStates:
+    """The states of what a robot holds, without what follows from its subgraph."""
+
+    interior: InteriorState | None
+    copies: CopiesState | PaperCopies | None
+
+
+@dataclass(frozen=True, eq=False)
+class AgentRecord:
+    """State that orders leave with an agent; a checkpoint contains it."""
+
+    held: HeldStates
+    moments: Mapping[int, HeldStates]
+
+
+@dataclass(frozen=True, eq=False)
+class CoverRotations:
+    """Omega of the own poses that are in the cover, and their numbers in the whole graph."""
+
+    numbers: IntArray
+    R: np.ndarray
+
+
+# Classes of the records in a snapshot.
+CLASSES = (
+    AgentRecord,
+    HeldStates,
+    InteriorState,
+    CopiesState,
+    Waiting,
+    TurnSettings,
+    Poses,
+    LiftedPoses,
+    RecursionBlock,
+    StepSettings,
+    Rotations,
+    Anderson,
+    AndersonShare,
+    AndersonSums,
+    ReceivedRows,
+    PaperCopies,
+    PaperIterate,
+    PaperPenalty,
+    RStep,
+    RobotProof,
+    HandednessTerms,
+    Reweigh,
+    RobotAscent,
+    System,
+    RelaxationSession,
+    AveragingSession,
+    RecursionSession,
+    DescentSession,
+    ProofSession,
+)
+
+
+class BaseAgent(ABC):
+    """A robot that obeys orders: an order replaces its state by the one that the order returns."""
+
+    def __init__(self, backend: CholeskyBackend | None, interior: Interior | None) -> None:
+        self.backend = backend
+        # As in `Held`.
+        self.interior: Interior | None = interior
+        self.copies: Copies | None = None
+        self.moments: dict[int, Held] = {}
+
+    @property
+    @abstractmethod
+    def subgraph(self) -> Subgraph:
+        """Its part of the graph."""
+
+    def recall(self, recall: Recall) -> None:
+        """Forget, keep, and return to moments."""
+        moments = {number: held for number, held in self.moments.items() if number in recall.in_use}
+        if recall.kept is not None:
+            moments.setdefault(recall.kept, Held(self.interior, self.copies))
+        if recall.returned_to is not None:
+            held = moments[recall.returned_to]
+            self.interior = held.interior
+            self.copies = held.copies
+        self.moments = moments
+
+    def snapshot(self) -> Snapshot:
+        """State that earlier orders left, as arrays, with matrices instead of their factors."""
+        moments = {number: _states(held) for number, held in self.moments.items()}
+        held = _states(Held(self.interior, self.copies))
+        return serialize(AgentRecord(held, moments))
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot of this robot."""
+        record: AgentRecord = deserialize(snapshot, CLASSES)
+        held = self._restored(record.held)
+        self.interior = held.interior
+        self.copies = held.copies
+        self.moments = {number: self._restored(states) for number, states in record.moments.items()}
+
+    def _restored(self, states: HeldStates) -> Held:
+        """What belongs to states."""
+        interior = self.interior
+        if interior is not None and states.interior is not None:
+            interior = interior.in_state_of(states.interior)
+        copies: Copies | None = None
+        if isinstance(states.copies, CopiesState):
+            copies = ConsensusRobot(self._layout, CopiesState()).restored(states.copies)
+        elif states.copies is not None:
+            copies = PaperRobot(self._layout, PaperCopies()).restored(states.copies)
+        return Held(interior, copies)
+
+    @property
+    def _layout(self) -> CopyLayout:
+        """What follows from its part of the graph, for robots that hold copies."""
+        if self.copies is not None:
+            return self.copies.layout
+        return CopyLayout(self.subgraph, self.backend)
+
+
+class Agent(BaseAgent):
+    """A robot that was given its part of the graph."""
+
+    def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
+        super().__init__(backend, interior_of(subgraph, backend))
+        self._subgraph = subgraph
+
+    @property
+    def subgraph(self) -> Subgraph:
+        """The part of the graph that it was given."""
+        return self._subgraph
+
+
+def _states(held: Held) -> HeldStates:
+    interior = held.interior.state if held.interior is not None else None
+    copies = held.copies.state if held.copies is not None else None
+    return HeldStates(interior, copies)
+
+
+# Orders are functions of an agent and a request, some of them once their first argument is given.
+
+
+def order_interior(
+    order: Callable[[Interior, Q], tuple[Interior, A]], agent: BaseAgent, request: Q
+) -> A | None:
+    """Give the interior an order; None if the robot counts no edge."""
+    if agent.interior is None:
+        return None
+    agent.interior, answer = order(agent.interior, request)
+    return answer
+
+
+def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: BaseAgent, request: Q) -> A:
+    """Give the copies an order, which is of their kind: a method began with these."""
+    copies: Any = agent.copies
+    assert copies is not None
+    agent.copies, answer = order(copies, request)
+    return answer
+
+
+def begin_copies(agent: BaseAgent, cover: Poses) -> Rows:
+    """Start the copies at the current poses, of which the driver sends those of the cover."""
+    if not isinstance(agent.copies, ConsensusRobot):
+        agent.copies = ConsensusRobot(agent._layout, CopiesState())
+    return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
+
+
+def begin_paper(agent: BaseAgent, cover: Poses) -> Rows:
+    """Start Algorithm 1 at the current poses, of which the driver sends those of the cover."""
+    agent.copies = PaperRobot(agent._layout, PaperCopies())
+    return order_copies(PaperRobot.begin, agent, held_poses(agent, cover))
+
+
+def held_poses(agent: BaseAgent, cover: Poses) -> Poses:
+    """Current poses of all that the robot holds, (n_a).
+
+    Other robots' poses are at the identity unless they are in the cover.
+    """
+    subgraph = agent.subgraph
+    d = subgraph.graph.d
+    n = len(subgraph.poses)
+    R = np.broadcast_to(np.eye(d), (n, d, d)).copy()
+    t = np.zeros((n, d))
+    R[subgraph.is_separator] = cover.R
+    t[subgraph.is_separator] = cover.t
+    if agent.interior is not None:
+        part = agent.interior.part
+        poses = agent.interior.poses
+        position = np.searchsorted(subgraph.poses, part.poses[part.interior])
+        R[position] = poses.R[part.interior]
+        t[position] = poses.t[part.interior]
+    return Poses(R, t)
+
+
+def finish_copies(agent: BaseAgent, _: None) -> CoverRotations:
+    """Take omega for the rotations of the interior; return those of the own poses in the cover."""
+    assert agent.copies is not None
+    subgraph = agent.subgraph
+    omega = agent.copies.omega
+    interior = agent.interior
+    if interior is not None:
+        position = np.searchsorted(subgraph.poses, interior.part.poses)
+        agent.interior = interior.at_rotations(omega[position])
+    own_separators = np.flatnonzero(subgraph.is_own & subgraph.is_separator)
+    return CoverRotations(subgraph.poses[own_separators], omega[own_separators])

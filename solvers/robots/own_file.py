@@ -1,0 +1,508 @@
+"""A robot that loads its own file: what it knows, order by order, until it is one like any other.
+
+The orders stand below in the sequence in which they are given: `read_file`, `number_poses`,
+`join_neighbours`, those of `own_consistency` where edges are judged, `take_cost`, `place_cover`;
+then, after the solve, `keep_answer`, `return_to_answer`, `move_answer` and `write_answer`. Where
+edges are judged again those of `own_revision` follow `keep_answer`, and go on with `take_cost`.
+`solvers.robots.setup` gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from pgo_models.certificates.fit import FITS_WITHOUT_EDGES
+from pgo_models.certificates.rounding_errors import ObjectiveRounding, objective_rounding
+from pgo_models.errors import GraphError
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.g2o import edge_rows_to_keep, make_folder, write_g2o
+from pgo_models.graphs.g2o_folder import (
+    Rows,
+    check_measurements,
+    check_places,
+    measured_edges,
+    placed_poses,
+)
+from pgo_models.graphs.g2o_parser import G2OLines, read_lines
+from pgo_models.graphs.g2o_rows import information_of, measurements_of, poses_of
+from pgo_models.graphs.pose_graph import (
+    WORLD_ID,
+    IntArray,
+    PoseGraph,
+    edge_counts,
+    middle_pose,
+)
+from pgo_models.graphs.precisions import edge_precisions, indefinite_edges
+from pgo_models.graphs.written_digits import WrittenDigits, written_errors
+from pgo_models.problem.weighting import (
+    Weighting,
+    convex_cost,
+    is_isotropic,
+)
+from solvers.robots.agent import BaseAgent, held_poses, order_interior
+from solvers.robots.current_poses import set_poses
+from solvers.robots.interior import Interior, interior_of
+from solvers.soc.subgraph import PartProblem, Placement, RobotSummary, Subgraph
+
+READ_HERE = (
+    "have the graph read in one process: --split given, or solve(read_g2o(folder), robots=..)"
+)
+
+
+RobotFile = tuple[int, Path]  # a robot and its file, on the machine where the robot runs
+# What a file names: d, the ids of its VERTEX lines, and the ids that only its edges name; see
+# `_runs`. And the digits that it is written with.
+Claim = tuple[int, IntArray, IntArray, WrittenDigits]
+
+
+@dataclass(frozen=True, eq=False)
+class OwnedRuns:
+    """Runs of consecutive ids, (k,): first id, number of that pose in the whole graph, owner.
+
+    With the digits of all files together, as they are all written in one way.
+    """
+
+    first: IntArray
+    number: IntArray
+    owner: IntArray
+    digits: WrittenDigits
+
+    def of(self, ids: IntArray) -> IntArray:
+        """The run that each id is in."""
+        return np.searchsorted(self.first, ids, side="right") - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Edges of a file, and the numbers and owners of their ends, (m, 2)."""
+
+    rows: Rows
+    numbers: IntArray
+    owners: IntArray
+
+    def some(self, chosen: IntArray | BoolArray | slice) -> Edges:
+        """Some of the edges."""
+        return Edges(self.rows.some(chosen), self.numbers[chosen], self.owners[chosen])
+
+
+class _JoinedEdges(NamedTuple):
+    """Edges of several files: ids, rows of numbers as in `G2OLines`, and as in `Edges`."""
+
+    ids: IntArray
+    rows: Array
+    numbers: IntArray
+    owners: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a robot tells another: edges that touch its poses, and VERTEX lines of these."""
+
+    edges: Edges
+    places: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """What a robot reports of its edges to other robots."""
+
+    counts: tuple[int, int]  # own poses, and edges, where a shared edge counts at one end
+    pairs: IntArray  # (k, 2): poses that its edges to others join
+    owners: IntArray  # (k, 2): owners of these poses
+    num_edges: IntArray  # (k,): how many edges join them
+    poses: IntArray  # (h,): all of these poses, ascending
+    # (3, h): their components in the graph of all edges, of those with tau > 0, and of those with
+    # kappa > 0.
+    labels: IntArray
+    alone: IntArray  # (3,): number of components without any of these poses
+    middle: int  # its middle pose if it has no edge to another robot, else -1
+    is_isotropic: bool  # whether chi2 of its edges is F
+    has_indefinite: bool  # whether the share of an edge in chi2 can be negative
+
+
+NO_ROUNDING = ObjectiveRounding(0.0, 0.0, FITS_WITHOUT_EDGES)  # of no edges
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Rounding of a robot's part of the cost, and a pose that can hold the frame.
+
+    That pose is its first one with a FIX line, or else its first one.
+    """
+
+    rounding: ObjectiveRounding
+    held: tuple[bool, int, int]  # whether the pose has a FIX line, its number and id
+    solved: Array  # (d + 1, d): rows t and R^T of the pose
+    given: Array  # (d + 1, d): the same in the file, nan if it is not there
+
+
+@dataclass(frozen=True, eq=False)
+class MovedAnswer:
+    """A robot's part of the cost where its answer was moved to, and of F there."""
+
+    cost: float
+    rounding: ObjectiveRounding
+    F: float
+
+
+# What a robot knows, one record after every order of the set-up.
+
+
+@dataclass(frozen=True, eq=False)
+class ReadFile:
+    """After `read_file`: the lines of its file."""
+
+    lines: G2OLines
+
+
+@dataclass(frozen=True, eq=False)
+class NumberedFile:
+    """After `number_poses`: the numbers of its poses, and what its own file says of these."""
+
+    lines: G2OLines
+    own: Told
+    digits: WrittenDigits  # of all files
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedFile:
+    """After `join_neighbours`: its graph, of its own poses and those at the far end of its edges.
+
+    The orders of a robust solve leave another one, with some of the edges.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Its n_a poses and m_a edges.
+    numbers, owners : (n_a,) arrays
+        Numbers of the poses in the whole graph, which ascend, and which robot owns each.
+    given : Array
+        As in `Answer`.
+    rejected : (k, 2) array
+        Ids of the ends of edges that were left out.
+    everything : JoinedFile, optional
+        What was joined at first, with m edges; none if it is this.
+    edges : (m_a,) array
+        The edges of everything that are left; empty if this is everything.
+    agrees : (m,) array, optional
+        Of everything in a robust solve: whether an edge agrees pairwise.
+    before : JoinedFile, optional
+        During a robust solve: what to go back to.
+    thresholds : (m_a,) array, optional
+        During a robust solve: those of the edges.
+    solved : Poses, optional
+        Own poses that the solve before has found.
+    """
+
+    graph: PoseGraph
+    numbers: IntArray
+    owners: IntArray
+    given: Array  # as in `Answer`
+    rejected: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    everything: JoinedFile | None = None
+    edges: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    agrees: BoolArray | None = None
+    before: JoinedFile | None = None
+    thresholds: Array | None = None
+    solved: Poses | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CostedFile:
+    """After `take_cost`: the cost that is solved, of its edges."""
+
+    joined: JoinedFile
+    problem: PartProblem
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedFile:
+    """After `place_cover`: its subgraph, as a robot has it that was given one."""
+
+    joined: JoinedFile
+    subgraph: Subgraph
+    answer: Poses | None = None  # the poses that were kept
+    # Of a robust solve: edges within their thresholds, (m_a,), as far as this robot counts them,
+    # and edges of everything that are near the map.
+    within: BoolArray | None = None
+    near: BoolArray | None = None
+
+    @property
+    def kept(self) -> Poses:
+        """The poses that `keep_answer` kept."""
+        assert self.answer is not None
+        return self.answer
+
+
+FileRecord = ReadFile | NumberedFile | JoinedFile | CostedFile | PlacedFile
+F = TypeVar("F", bound=FileRecord)
+
+
+class FileAgent(BaseAgent):
+    """A robot that loads its own file; `record` is what it knows since the last order below."""
+
+    def __init__(self, source: RobotFile) -> None:
+        super().__init__(backend=None, interior=None)
+        self.robot, self.path = source
+        self.record: FileRecord | None = None
+
+    def lines(self) -> G2OLines:
+        """Lines of its file."""
+        return read_lines(self.path)
+
+    def known(self, kind: type[F]) -> F:
+        """What the order before has left."""
+        assert isinstance(self.record, kind)
+        return self.record
+
+    @property
+    def subgraph(self) -> Subgraph:
+        """Its part of the graph, once the cover is placed."""
+        return self.known(PlacedFile).subgraph
+
+
+def read_file(agent: FileAgent, _: None) -> Claim:
+    """Read the file, and return the ids in it.
+
+    Errors are those of `read_lines`, and a GraphError for priors and landmarks.
+    """
+    lines = agent.lines()
+    if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():
+        raise GraphError(
+            f"{agent.path} has priors or landmarks, which all robots share; {READ_HERE}"
+        )
+    agent.record = ReadFile(lines)
+    ids_of_edges_alone = np.setdiff1d(lines.edge_ids, lines.vertex_ids)
+    runs_of_vertices = _runs(np.unique(lines.vertex_ids))
+    return lines.d, runs_of_vertices, _runs(ids_of_edges_alone), lines.digits
+
+
+def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Told]:
+    """Take numbers and owners for the ids; return what others are to be told of their poses.
+
+    They are messages, by the number of the other robot.
+    """
+    lines = agent.known(ReadFile).lines
+    rows = measured_edges(lines)
+    run = runs.of(rows.ids)
+    numbers = runs.number[run] + rows.ids - runs.first[run]
+    owners = runs.owner[run]
+    edges = Edges(rows, numbers, owners)
+    places = placed_poses(lines)
+    owners_of_places = runs.owner[runs.of(places.ids)]
+    messages = {}
+    for robot in np.unique(np.append(owners, owners_of_places)).tolist():
+        touches = (owners == robot).any(axis=1)
+        messages[robot] = Told(edges.some(touches), places.some(owners_of_places == robot))
+    no_lines = slice(0)
+    own_message = messages.pop(agent.robot, Told(edges.some(no_lines), places.some(no_lines)))
+    agent.record = NumberedFile(lines, own_message, runs.digits)
+    return messages
+
+
+def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) -> Border:
+    """Make the graph of the robot: its own edges, and those that others have of its poses.
+
+    FIX lines of its own poses count. The request is what others told the robot, and whether the
+    folder is trusted, so that nothing is asked that `read_g2o` would ask.
+    """
+    received, is_trusted = request
+    known = agent.known(NumberedFile)
+    lines = known.lines
+    parts = [part for _, part in sorted({**received, agent.robot: known.own}.items())]
+    if not is_trusted:
+        check_places(lines.d, [part.places for part in parts])
+        check_measurements(lines.d, [part.edges.rows for part in parts])
+    edges = _joined_edges([part.edges for part in parts])
+    if not len(edges.numbers):
+        raise GraphError(
+            f"{agent.path}: no edge touches a pose of this robot; add one, or remove the file"
+        )
+    numbers, first, ends = np.unique(edges.numbers, return_index=True, return_inverse=True)
+    owners = edges.owners.ravel()[first]
+    ids = edges.ids.ravel()[first]
+    i, j = ends.reshape(-1, 2).T
+    is_own = owners == agent.robot
+    R_ij, t_ij = poses_of(lines.d, edges.rows)
+    information = information_of(lines.d, edges.rows)
+    kappa, tau = edge_precisions(information)
+    fixed = np.flatnonzero(is_own & np.isin(ids, lines.fixed))
+    graph = PoseGraph(
+        len(ids),
+        i,
+        j,
+        R_ij,
+        t_ij,
+        kappa,
+        tau,
+        information=information,
+        ids=ids,
+        fixed=fixed,
+        name=agent.path.stem,
+        written_error=written_errors(measurements_of(lines.d, edges.rows), known.digits),
+        weights_error=lines.weights_error,
+    )
+    holding = fixed[0] if len(fixed) else np.argmax(is_own)
+    joined = JoinedFile(graph, numbers, owners, _given_pose(lines, ids[holding]))
+    agent.record = joined
+    return border_of(agent.robot, joined)
+
+
+def _joined_edges(files: Sequence[Edges]) -> _JoinedEdges:
+    """Edges of several files as one, in which an edge of several files counts once."""
+    kept_of_files = edge_rows_to_keep([(file.rows.ids, file.rows.numbers) for file in files])
+    parts = [file.some(kept) for file, kept in zip(files, kept_of_files, strict=True)]
+    return _JoinedEdges(
+        np.concatenate([part.rows.ids for part in parts]),
+        np.concatenate([part.rows.numbers for part in parts]),
+        np.concatenate([part.numbers for part in parts]),
+        np.concatenate([part.owners for part in parts]),
+    )
+
+
+def _given_pose(lines: G2OLines, pose_id: int) -> Array:
+    """Rows t and R^T of a pose in the file, (d + 1, d); nan if it is not there."""
+    rows = lines.vertices[lines.vertex_ids == pose_id]
+    if len(rows) == 0:
+        return np.full((lines.d + 1, lines.d), np.nan)
+    return Poses(*poses_of(lines.d, rows)).stacked()
+
+
+def border_of(robot: int, joined: JoinedFile) -> Border:
+    """Border of a robot whose graph is known."""
+    graph = joined.graph
+    numbers = joined.numbers
+    owners = joined.owners
+    ends = np.stack([graph.i, graph.j], axis=1)
+    between = ends[owners[graph.i] != owners[graph.j]]
+    pairs, num_of_pair = np.unique(between, axis=0, return_counts=True)
+    poses = np.unique(pairs)
+    labels = []
+    for kind in (graph.tau >= 0, graph.tau > 0, graph.kappa > 0):
+        adjacency = edge_counts(graph.i[kind], graph.j[kind], graph.num_poses)
+        labels.append(connected_components(adjacency)[1])
+    # A shared edge counts with the owner of the lower number.
+    num_poses = int((owners == robot).sum())
+    num_edges = int((owners[ends].min(axis=1) == robot).sum())
+    return Border(
+        counts=(num_poses, num_edges),
+        pairs=numbers[pairs],
+        owners=owners[pairs],
+        num_edges=num_of_pair,
+        poses=numbers[poses],
+        labels=np.stack(labels)[:, poses],
+        alone=np.array([len(np.setdiff1d(label, label[poses])) for label in labels]),
+        middle=-1 if len(poses) else int(numbers[middle_pose(graph)]),
+        is_isotropic=is_isotropic(graph),
+        has_indefinite=bool(indefinite_edges(graph).any()),
+    )
+
+
+def take_cost(agent: FileAgent, weighting: Weighting) -> bool:
+    """Learn which cost is solved: F or chi2. Return whether SOC can run on the robot's part of it.
+
+    A GraphError for a matrix that chi2 cannot have, and where chi2 is one of rotations alone.
+    """
+    joined = agent.known(JoinedFile)
+    problem = PartProblem(joined.graph, weighting=weighting)
+    try:
+        cost = problem.weights
+    except GraphError as error:
+        raise GraphError(f"{agent.path}: {error}") from error
+    if not cost.has_translations:
+        raise GraphError(f"{agent.path}: no edge measures a translation; {READ_HERE}")
+    agent.record = CostedFile(joined, problem)
+    return cost.is_quadratic and cost.is_convex
+
+
+def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary:
+    """Learn which poses the driver solves for, and which robots hold which of them.
+
+    `place` also says whether SOC runs on another cost than the one that is solved. From now on the
+    robot is an agent like any other.
+    """
+    placement, has_two_costs = place
+    costed = agent.known(CostedFile)
+    joined = costed.joined
+    graph = joined.graph
+    known = agent.robot, graph, joined.numbers, joined.owners
+    edges = np.arange(graph.num_edges)
+    problem = costed.problem
+    weights = problem.weights
+    final = None
+    if has_two_costs:
+        final = weights
+        weights = convex_cost(problem.information, graph.d)
+    subgraph = Subgraph(
+        *known, *placement.of(*known), edges, weights, final, thresholds=joined.thresholds
+    )
+    subgraph = subgraph.for_driver()
+    agent.record = PlacedFile(joined, subgraph)
+    agent.interior = interior_of(subgraph, agent.backend)
+    return replace(subgraph.summary, part=None)
+
+
+def keep_answer(agent: FileAgent, cover: Poses) -> Answer:
+    """Keep the current poses for the answer; the driver sends those of the cover."""
+    placed = agent.known(PlacedFile)
+    joined = placed.joined
+    answer = held_poses(agent, cover)
+    agent.record = replace(placed, answer=answer)
+    interior = agent.interior
+    fixed = joined.graph.fixed
+    holding = int(fixed[0] if len(fixed) else np.argmax(placed.subgraph.is_own))
+    rounding = NO_ROUNDING
+    if interior is not None:
+        rounding = objective_rounding(interior.problem, interior.poses)
+    number = int(joined.numbers[holding])
+    pose_id = int(joined.graph.pose_ids[holding])
+    solved = answer[np.array([holding])].stacked()
+    return Answer(rounding, (len(fixed) > 0, number, pose_id), solved, joined.given)
+
+
+def return_to_answer(agent: FileAgent, _: None) -> None:
+    """Return to the poses that were kept; the driver does likewise."""
+    if agent.interior is not None:
+        answer = _interior_answer(agent.known(PlacedFile), agent.interior)
+        order_interior(set_poses, agent, answer)
+
+
+def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> MovedAnswer:
+    """Move the poses that were kept by (R, t); return the part of the cost there."""
+    placed = agent.known(PlacedFile)
+    placed = replace(placed, answer=placed.kept.moved(*motion))
+    agent.record = placed
+    if agent.interior is None:
+        return MovedAnswer(0.0, NO_ROUNDING, 0.0)
+    problem = agent.interior.problem
+    poses = _interior_answer(placed, agent.interior)
+    graph = problem.graph
+    F = PartProblem(graph, problem.backend, Weighting.ISOTROPIC).objective(poses)
+    return MovedAnswer(problem.objective(poses), objective_rounding(problem, poses), F)
+
+
+def _interior_answer(placed: PlacedFile, interior: Interior) -> Poses:
+    """Poses that were kept, of those that the interior's problem has."""
+    return placed.kept[np.searchsorted(placed.subgraph.poses, interior.part.poses)]
+
+
+def write_answer(folder: Path, agent: FileAgent, _: None) -> None:
+    """Write the poses that were kept, and the robot's edges."""
+    make_folder(folder)
+    placed = agent.known(PlacedFile)
+    path = folder / f"{agent.robot}.g2o"
+    write_g2o(placed.joined.graph, path, placed.kept, placed.subgraph.is_own)
+
+
+def _runs(ids: IntArray) -> IntArray:
+    """First and last id of every run of consecutive ids, (k, 2), of ids in ascending order."""
+    is_first = np.diff(ids, prepend=ids[:1] - 2) != 1
+    is_last = np.diff(ids, append=ids[-1:] + 2) != 1
+    return np.stack([ids[is_first], ids[is_last]], axis=1)

@@ -1,0 +1,353 @@
+"""Robots that load their own files, and a driver that learns only the interface between them.
+
+The driver learns the ids of poses as runs of consecutive ids, so that it can number the poses, and
+of the edges between robots their ends, of which it computes a vertex cover. Measurements between
+two robots are messages between these robots, which the process of the driver delivers: they pass
+through its memory, and nothing of the driver reads them. A pose belongs to the first file with a
+VERTEX line of it, or else to the first file that names it. An edge that stands in several files
+counts once, as in `read_g2o`. What robots do is in `solvers.robots.own_file`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from pgo_models.errors import FileFormatError, GraphError
+from pgo_models.geometry.rotations import BoolArray
+from pgo_models.graphs.pose_graph import IntArray, edge_counts, least_tree
+from pgo_models.graphs.written_digits import most_digits
+from pgo_models.problem.weighting import Weighting
+from solvers.carry.counted_pool import Count, CountedPool
+from solvers.carry.process import Engine
+from solvers.robots.consistency import (
+    AgreeingCounts,
+    ConsistentPart,
+    judge_closures,
+    keep_agreeing,
+    tell_error_scale,
+    tell_trajectories,
+)
+from solvers.robots.driver import Driver
+from solvers.robots.own_file import (
+    READ_HERE,
+    Border,
+    Claim,
+    FileAgent,
+    OwnedRuns,
+    RobotFile,
+    join_neighbours,
+    number_poses,
+    place_cover,
+    read_file,
+    take_cost,
+)
+from solvers.robust.bridges import bridges
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC
+from solvers.robust.revision import threshold_scale
+from solvers.soc.subgraph import place_poses
+
+SOLVE_PARTS = "solve each part in a folder of its own"
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedFiles:
+    """Robots that have read their files, and what their driver knows of the graph.
+
+    Parameters
+    ----------
+    driver : Driver
+        The driver of the robots.
+    borders : sequence of Border
+        What the robots have told of their edges to others.
+    sizes : (2, num_robots) array
+        How many poses, and edges, every robot has.
+    folder : Path
+        Where the files are.
+    weighting : Weighting
+        The cost that is solved: ISOTROPIC or INFORMATION.
+    has_indefinite : bool
+        Whether the share of any edge in chi2 can be negative.
+    num_absent : int
+        Number of poses of robots without a file, as `PoseGraph.absent`.
+    num_rejected : int
+        Edges that robots have left out, as they do not agree with others.
+    threshold_scale : float
+        Scale of the thresholds of a robust solve, for errors as they are among own poses.
+    """
+
+    driver: Driver
+    borders: Sequence[Border]
+    sizes: IntArray
+    folder: Path
+    weighting: Weighting
+    has_indefinite: bool
+    num_absent: int
+    num_rejected: int = 0
+    threshold_scale: float = 1.0
+
+    @property
+    def num_bridges(self) -> int:
+        """Number of edges between robots that are bridges of the graph of robots.
+
+        Nothing checks these. A robot is one node, whatever gaps its own odometry has.
+        """
+        owners = []
+        for robot, border in enumerate(self.borders):
+            is_first = border.owners.min(axis=1) == robot
+            owners.append(np.repeat(border.owners[is_first], border.num_edges[is_first], axis=0))
+        i, j = np.concatenate(owners).T
+        return len(bridges(i, j, np.ones(len(self.borders), dtype=bool)))
+
+    def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
+        """The same robots with other edges; `borders` are their borders with these.
+
+        A GraphError if these do not connect the poses.
+        """
+        old = self.driver
+        driver, sizes = _placed(
+            old.network, borders, old.num_poses, old.memory, self.weighting, self.folder
+        )
+        return replace(
+            self,
+            driver=driver,
+            borders=borders,
+            sizes=sizes,
+            num_rejected=num_rejected,
+        )
+
+    def with_parts(self, parts: Sequence[ConsistentPart]) -> OpenedFiles:
+        """The same robots with the edges that remain in their reports."""
+        return self.with_edges(*borders_of(parts))
+
+
+def open_files(
+    files: Sequence[RobotFile],
+    engine: Engine,
+    memory: float,
+    weighting: Weighting,
+    trust_folder: bool = False,
+    robust: GNC | PCM | None = None,
+) -> OpenedFiles:
+    """Have robots read these files, and agree on the cost that `weighting` stands for.
+
+    In a robust solve they leave out edges that do not agree pairwise. GNC, which takes all edges
+    back, begins with those of the `strongest_neighbours`, where they join all poses.
+
+    Raises a FileFormatError for a file that cannot be read or has no pose of its own, and, unless
+    the folder is trusted, for files that speak against being of one graph. Raises a GraphError if
+    the graph is not connected, or has a matrix that chi2 cannot have. All messages but the start of
+    the robots are counted.
+    """
+    network = CountedPool(engine.open(FileAgent, files), len(files))
+    try:
+        claims = network.ask(read_file, [None] * len(files), Count.ROUND)
+        numbered = number_ids(claims, files)
+        num_poses = numbered.num_poses
+        sent = network.ask(number_poses, numbered.runs, Count.PIGGYBACKED)
+        received = [(lines, trust_folder) for lines in network.exchange(sent)]
+        borders = network.ask(join_neighbours, received, Count.PIGGYBACKED)
+        has_indefinite = any(border.has_indefinite for border in borders)
+        if weighting is Weighting.OWN:
+            weighting = _own_weighting(borders)
+        folder = files[0][1].parent
+        scale = 1.0  # of the errors
+        if isinstance(robust, GNC):
+            scale = _error_scale(network, weighting, robust.quantile)
+
+        def opened(borders: Sequence[Border], num_rejected: int = 0) -> OpenedFiles:
+            driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
+            return OpenedFiles(
+                driver,
+                borders,
+                sizes,
+                folder,
+                weighting,
+                has_indefinite,
+                numbered.num_absent,
+                num_rejected,
+                threshold_scale(scale),
+            )
+
+        if robust is None:
+            return opened(borders)
+        agreements = _agreements(network, robust.quantile, scale)
+        if isinstance(robust, GNC) and not robust.consistent:
+            try:
+                return opened(*_agreeing(network, strongest_neighbours(agreements)))
+            except GraphError:  # poses of a robot need what is left out
+                pass
+        return opened(*_agreeing(network, [each.neighbours for each in agreements]))
+    except BaseException:  # also Ctrl-C: no robot stays behind
+        network.workers.close()
+        raise
+
+
+def _placed(
+    network: CountedPool,
+    borders: Sequence[Border],
+    num_poses: int,
+    memory: float,
+    weighting: Weighting,
+    folder: Path,
+) -> tuple[Driver, IntArray]:
+    """Have robots with these borders take their places around a driver; and their sizes."""
+    sizes = np.array([border.counts for border in borders]).T
+    _check_connected(borders, num_poses - int(sizes[0].sum()), folder)
+    pairs = np.concatenate([border.pairs for border in borders])
+    owners = np.concatenate([border.owners for border in borders])
+    placements = place_poses(pairs, owners, len(borders), borders[0].middle)
+    can_run_soc = network.ask(take_cost, [weighting] * len(borders), Count.ROUND)
+    has_two_costs = not all(can_run_soc)
+    places = [(placement, has_two_costs) for placement in placements]
+    summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
+    return Driver(summaries, num_poses, lambda: network, memory), sizes
+
+
+def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) -> float:
+    """Scale of the errors among the own poses of most robots, where thresholds have to follow.
+
+    It is 1 where the errors are not clearly smaller than claimed, or robots have few closures of
+    their own.
+    """
+    requests = [(weighting, quantile)] * network.ledger.num_robots
+    scales = np.array(network.ask(tell_error_scale, requests, Count.PIGGYBACKED))
+    known = scales[np.isfinite(scales)]
+    scale = float(np.median(known)) if len(known) else 1.0
+    return scale if threshold_scale(scale) < 1.0 else 1.0
+
+
+def _agreements(network: CountedPool, quantile: float, scale: float) -> list[AgreeingCounts]:
+    """Have every two robots judge the edges between them, with errors of a scale."""
+    trajectories_sent = network.ask(
+        tell_trajectories, [None] * network.ledger.num_robots, Count.PIGGYBACKED
+    )
+    requests = [
+        (trajectories, quantile, scale) for trajectories in network.exchange(trajectories_sent)
+    ]
+    return network.ask(judge_closures, requests, Count.PIGGYBACKED)
+
+
+def strongest_neighbours(agreements: Sequence[AgreeingCounts]) -> list[IntArray]:
+    """Neighbours of every robot with whom most edges agree.
+
+    A wrong edge agrees with itself, and so two robots that have no right ones keep some. The pairs
+    of robots here are those of a spanning tree with the largest numbers of edges that agree, and
+    those with as many as the weakest of the tree.
+    """
+    num_robots = len(agreements)
+    a = np.repeat(np.arange(num_robots), [len(each.neighbours) for each in agreements])
+    b = np.concatenate([each.neighbours for each in agreements])
+    num = np.concatenate([each.num_agreeing for each in agreements])
+    tree = least_tree(a, b, num_robots, -num)
+    weakest = num[tree].min(initial=num.max(initial=0))
+    return [b[(a == robot) & (num >= weakest)] for robot in range(num_robots)]
+
+
+def _agreeing(network: CountedPool, neighbours: list[IntArray]) -> tuple[list[Border], int]:
+    """Have robots keep the edges to these neighbours that agree; borders, and how many go."""
+    return borders_of(network.ask(keep_agreeing, neighbours, Count.ROUND))
+
+
+def borders_of(parts: Sequence[ConsistentPart]) -> tuple[list[Border], int]:
+    """Borders of what is left, and how many edges are not."""
+    return [part.border for part in parts], sum(part.num_rejected for part in parts)
+
+
+def _own_weighting(borders: Sequence[Border]) -> Weighting:
+    """The cost that is the own one of all robots' files together, as `weighting.own_weighting`."""
+    is_F = all(border.is_isotropic for border in borders)
+    if is_F or any(border.has_indefinite for border in borders):
+        return Weighting.ISOTROPIC
+    return Weighting.INFORMATION
+
+
+class NumberedIds(NamedTuple):
+    """Numbers and owners of the ids that every file names.
+
+    Of the `num_poses` different ids `num_absent` are poses of robots without a file.
+    """
+
+    runs: list[OwnedRuns]
+    num_poses: int
+    num_absent: int
+
+
+def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> NumberedIds:
+    """Numbers and owners of the ids that every file names.
+
+    The ends of all runs cut the ids into intervals. All ids of an interval are named by the same
+    files, or by none.
+    """
+    runs = np.concatenate([np.concatenate(claim[1:3]) for claim in claims])
+    bounds = np.unique(np.concatenate([runs[:, 0], runs[:, 1] + 1]))
+    first = bounds[:-1]
+    size = np.diff(bounds)
+    # Whether a file has VERTEX lines of an interval, and names it at all: (files, intervals).
+    has_vertex = np.stack([_covers(vertices, bounds) for _, vertices, _, _ in claims])
+    has_edge_alone = np.stack([_covers(others, bounds) for _, _, others, _ in claims])
+    is_named = has_vertex | has_edge_alone
+    claimants = np.where(has_vertex.any(axis=0), has_vertex, is_named)
+    owner = claimants.argmax(axis=0)  # the first of them
+    known = is_named.any(axis=0)
+    _check_claims(claims, files, owner[known])
+    known_size = np.where(known, size, 0)
+    number = np.cumsum(known_size) - known_size
+    digits = most_digits(digits for *_, digits in claims)
+    owned = [OwnedRuns(first[named], number[named], owner[named], digits) for named in is_named]
+    # As `absent_ids`: a file without VERTEX lines places all that it names.
+    is_file_placed = np.array([len(vertices) > 0 for _, vertices, _, _ in claims])
+    is_placed = (has_vertex | (is_named & ~is_file_placed[:, None])).any(axis=0)
+    num_absent = int(known_size[~is_placed].sum())
+    return NumberedIds(owned, int(known_size.sum()), num_absent)
+
+
+def _covers(runs: IntArray, bounds: IntArray) -> BoolArray:
+    """Whether runs of ids cover the intervals between bounds, (intervals,)."""
+    start = np.searchsorted(bounds, runs[:, 0])
+    end = np.searchsorted(bounds, runs[:, 1] + 1)
+    num_started = np.bincount(start, minlength=len(bounds))
+    num_ended = np.bincount(end, minlength=len(bounds))
+    return np.asarray(np.cumsum(num_started - num_ended)[:-1] > 0)
+
+
+def _check_claims(claims: Sequence[Claim], files: Sequence[RobotFile], owners: IntArray) -> None:
+    """Refuse a file of another dimension than the first, and one without a pose of its own."""
+    d_of_first = claims[0][0]
+    for (robot, path), (d, *_) in zip(files, claims, strict=True):
+        if d != d_of_first:
+            raise FileFormatError(path, None, "2D beside 3D; put it into a folder of its own")
+        if robot not in owners:
+            problem = f"no pose in it is of this robot; remove it, or {READ_HERE}"
+            raise FileFormatError(path, None, problem)
+
+
+def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: Path) -> None:
+    """Raise a GraphError unless the robots' graphs together are connected.
+
+    Positions have to be connected by edges with tau > 0, rotations by edges with kappa > 0. A
+    component of one robot that has a shared pose is a vertex, as the shared poses are; the rest are
+    components of their own.
+    """
+    shared = np.concatenate([border.poses for border in borders])
+    poses, pose = np.unique(shared, return_inverse=True)
+    num_shared = [len(border.poses) for border in borders]
+    robot = np.repeat(np.arange(len(borders)), num_shared)
+    whats = ("graph falls", "positions fall", "rotations fall")
+    for kind, what in enumerate(whats):
+        label = np.concatenate([border.labels[kind] for border in borders])
+        parts, part = np.unique(np.stack([robot, label]), axis=1, return_inverse=True)
+        num_vertices = len(poses) + parts.shape[1]
+        tied = edge_counts(pose, len(poses) + part.ravel(), num_vertices)
+        count = num_without_edge + sum(int(border.alone[kind]) for border in borders)
+        if len(poses):
+            count += connected_components(tied)[0]
+        if count > 1:
+            problem = f"the {what} into {count} parts, no edge between"
+            raise GraphError(f"{folder}: {problem}; {SOLVE_PARTS}")

@@ -1,0 +1,239 @@
+"""SUBSTRUCTURED: the recursion of JOINT, with step (a) split by eliminating the robots' interiors.
+
+The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.joint`
+is the recursion to read.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pgo_models.certificates.dual_variables import multiplier_norms
+from pgo_models.geometry.rotations import Array, unstack_transposes
+from solvers.carry.counted_pool import Count
+from solvers.carry.moments import Moment
+from solvers.carry.serialization import COMPUTED_AGAIN
+from solvers.result import Measurement, Status
+from solvers.robots import recursion
+from solvers.robots.driver import Driver
+from solvers.robots.interface import InterfaceFactor
+from solvers.robots.records import Agree, Reduced, RescaleInterior, RightHandSide
+from solvers.soc.copies import Norms, subsampled
+from solvers.soc.recursion_block import Agreement, RecursionBlock
+from solvers.soc.safeguard import Due, SharedSteps, next_penalty
+from solvers.soc.soc import SOC
+
+# Poses that are enough to estimate the penalty's quantile, where robots have files of their own.
+ENOUGH_NORMS = 2**12
+
+
+@dataclass(frozen=True, eq=False)
+class SubstructuredState(SharedSteps):
+    """Iterate k: the driver's rows; those of the interiors are with the robots.
+
+    Parameters
+    ----------
+    block : RecursionBlock
+        Rows of the rotations of the cover.
+    right : sequence of RightHandSide
+        The robots' reduced right-hand sides of the next step (a).
+    moment : Moment or None
+        When the robots hold their rows of the iterate.
+    factor : InterfaceFactor or None
+        Of the driver's matrix of step (a), for this rho. A checkpoint has neither moment nor
+        factor.
+    objective : float
+        F at omega and the translations of step (a); nan where the step did not evaluate it.
+    """
+
+    block: RecursionBlock
+    right: Sequence[RightHandSide]
+    moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
+    factor: InterfaceFactor | None = field(default=None, metadata=COMPUTED_AGAIN)
+    objective: float = math.nan
+
+    @property
+    def x(self) -> Array:
+        """Solution of step (a) on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.x)
+
+    @property
+    def omega(self) -> Array:
+        """Rotations nearest to x + B on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.omega)
+
+    @property
+    def B(self) -> Array:
+        """Scaled multiplier of x = omega on the cover, (g, d, d)."""
+        return unstack_transposes(self.block.B)
+
+    @property
+    def rho(self) -> Array:
+        """Penalty of every rotation of the cover, (g,)."""
+        return self.block.rho[:: self.block.omega.shape[1]]
+
+
+@dataclass(frozen=True)
+class SubstructuredSOC:
+    """SOC by a driver and its robots, from the poses that they hold."""
+
+    soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are ignored
+
+    @property
+    def max_iterations(self) -> int:
+        """Maximal number of steps of a run."""
+        return self.soc.max_iterations
+
+    def init(self, driver: Driver, start: SubstructuredState | None) -> SubstructuredState:
+        """State 0: omega = the rotations that driver and robots hold, B = 0.
+
+        With `start` the run continues from that state, to which driver and robots were resumed.
+        """
+        if start is None:
+            state = self._penalized(driver, is_stationary=False)
+        else:
+            reduced = driver.ask(recursion.reduce_again, None, Count.PIGGYBACKED)
+            state = replace(start, factor=_factorize(driver, start.block, reduced))
+        return replace(state, moment=driver.moment())
+
+    def step(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
+        """One round, step (a) by elimination, and one all-reduce, steps (b) and (c)."""
+        driver.return_to(state.moment)
+        state = self._with_due_penalty(driver, state)
+        block, sums = _solve_a(driver, state)  # (a) R-step
+        merit = math.sqrt(sums[0])
+        if not math.isfinite(merit):
+            return replace(state.broken(), moment=driver.moment())
+        gamma, anderson = state.sums.coefficients(self.soc.acceleration, sums)
+        agreement = Agreement(gamma, state.is_best(merit))
+        block = block.extrapolated(agreement)  # s = x_ahead + B
+        block, own_squares = block.projected()  # (b) omega, (c) B = s - omega; as the robots do
+        orders = [Agree(agreement, part) for part in driver.scattered_rotations(block.omega)]
+        answers = driver.ask_each(recursion.agree, orders, Count.ALL_REDUCE)
+        squares = own_squares + np.sum([answer.sums for answer in answers], axis=0)
+        return replace(
+            state.after(merit, squares, state.size, anderson),
+            block=block,
+            right=[answer.right for answer in answers],
+            moment=driver.moment(),
+            objective=math.fsum(answer.measured for answer in answers),
+        )
+
+    def measure(self, driver: Driver, state: SubstructuredState) -> Measurement:
+        """F at omega and the translations of step (a), and the residuals."""
+        if math.isnan(state.primal_residual):
+            return driver.measured(Measurement(np.nan, np.nan, np.nan))
+        objective = state.objective
+        if math.isnan(objective):
+            driver.return_to(state.moment)
+            parts = driver.scattered_rotations(state.block.omega)
+            objective = math.fsum(driver.ask_each(recursion.cost, parts, Count.OFF))
+        return driver.measured(state.measurement(objective))
+
+    def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
+        """CONVERGED when R agrees with omega and omega has stopped moving, or as `stall_of` says.
+
+        Both hold within the tolerance in the norm of rho.
+        """
+        return self.soc.status_at(measurement) or self.soc.stall_of(state)
+
+    def finish(self, driver: Driver, state: SubstructuredState) -> None:
+        """Give driver and robots omega, and the best translations for it: two rounds."""
+        driver.return_to(state.moment)
+        _finish(driver, state)
+
+    def _penalized(self, driver: Driver, is_stationary: bool) -> SubstructuredState:
+        """State 0 at the poses that driver and robots hold: one round, for the penalties.
+
+        If the poses are stationary, B is the multiplier that belongs to them.
+        """
+        # Where robots have files of their own, every k-th pose stands for all in the quantile.
+        step = None
+        if not driver.has_whole and driver.num_poses >= ENOUGH_NORMS:
+            step = driver.num_poses // ENOUGH_NORMS
+        Lambda = driver.current.multipliers
+        answers = [*driver.ask(recursion.report_norms, step, Count.PIGGYBACKED)]
+        answers.append(subsampled(Norms(multiplier_norms(Lambda), driver.scale), step))
+        norms = np.concatenate([answer.norms for answer in answers])
+        scales = np.concatenate([answer.scale for answer in answers])
+        order = self.soc.penalty_order(norms / scales, is_stationary)
+        ratio = order.rho(norms, scales) / scales
+        block = order.block(driver.current.R, Lambda, driver.diagonal[driver.rotation_rows])
+        reduced = driver.ask(recursion.penalize, order)
+        # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
+        squared_size = driver.d * (step or 1) * float(ratio @ scales)
+        return SubstructuredState(
+            block=block,
+            right=[answer.right for answer in reduced],
+            factor=_factorize(driver, block, reduced),
+            ratio=ratio,
+            size=math.sqrt(squared_size),
+        )
+
+    def _with_due_penalty(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
+        """State with the penalty that the rule or the safeguard asks for, see `Joint`."""
+        due, factor = next_penalty(self.soc.penalty, state.ratio, state)
+        if due is Due.RAISE:
+            rescaled = self._rescaled(driver, state, factor, from_best=True)
+            return replace(rescaled, raises=state.raises + 1)
+        if due is Due.REFRESH:
+            _finish(driver, state)
+            fresh = self._penalized(driver, is_stationary=True)
+            return fresh.in_place_of(state)
+        if due is Due.RESCALE:
+            rescaled = self._rescaled(driver, state, factor, from_best=False)
+            return replace(rescaled, refreshes=state.refreshes + 1)
+        return state
+
+    def _rescaled(
+        self, driver: Driver, state: SubstructuredState, factor: float, from_best: bool
+    ) -> SubstructuredState:
+        """State with the penalty factor * rho and the same unscaled multiplier rho B."""
+        block = state.block.back_at_best() if from_best else state.block
+        block = block.rescaled(factor * block.rho)
+        order = RescaleInterior(factor, from_best)
+        reduced = driver.ask(recursion.rescale, order)
+        return replace(
+            state.rescaled(factor),
+            block=block,
+            right=[answer.right for answer in reduced],
+            factor=_factorize(driver, block, reduced),
+        )
+
+
+def _finish(driver: Driver, state: SubstructuredState) -> None:
+    """Go from an iterate, which driver and robots hold, to its poses."""
+    driver.current = replace(driver.current, R=state.omega)
+    parts = driver.scattered_rotations(state.block.omega)
+    driver.set_translations(driver.ask_each(recursion.finish, parts))
+
+
+def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock, Array]:
+    """Step (a): the driver's rows after it, and the sums over all parties."""
+    assert state.factor is not None
+    rows = driver.rotation_rows
+    block = state.block
+    b = np.zeros((len(driver.diagonal), driver.d))
+    b[rows] = (0.5 * block.rho)[:, None] * block.shift
+    x, parts, _ = state.factor.solve([right.b for right in state.right], b)
+    block, own_sums = block.after_solve(x[rows])
+    sums_of_robots = driver.ask_each(recursion.solve, parts)
+    return block, own_sums + np.sum(sums_of_robots, axis=0)
+
+
+def _factorize(
+    driver: Driver, block: RecursionBlock, reduced: Sequence[Reduced]
+) -> InterfaceFactor:
+    """Factor the driver's matrix of step (a).
+
+    It is the sum of the robots' Schur complements, of rho / 2 on the rows of rotations, and of the
+    grounding of pose 0.
+    """
+    rows = driver.rotation_rows[:, None]
+    half_penalty = (0.5 * block.rho)[:, None, None]
+    blocks_of_driver = [(rows, half_penalty), *driver.grounding_block()]
+    return driver.interface(1, driver.d).factorize(
+        [answer.schur for answer in reduced], blocks_of_driver
+    )

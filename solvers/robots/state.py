@@ -1,0 +1,77 @@
+"""What orders leave with a robot: its poses and cost, and the session of one algorithm.
+
+An algorithm that eliminates a matrix begins a session, in place of the one before, so that a robot
+holds one elimination at a time. What outlasts sessions is in `InteriorState`.
+"""
+
+from dataclasses import dataclass
+
+from pgo_models.certificates.handedness import HandednessTerms
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
+from solvers.robots.proof_of_robot import RobotProof
+from solvers.robots.records import Reweigh, RobotAscent
+from solvers.robots.system import System
+from solvers.soc.recursion_block import RecursionBlock
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxationSession:
+    """The chordal start: the relaxation of the rotations."""
+
+    system: System
+
+
+@dataclass(frozen=True, eq=False)
+class AveragingSession:
+    """The averaged start: the pull of a step of rotation averaging; its matrix is M_tt."""
+
+    pull: Array  # (p, k)
+
+
+@dataclass(frozen=True, eq=False)
+class RecursionSession:
+    """SOC: the system of step (a), and the rotations of the interior in the recursion."""
+
+    system: System
+    block: RecursionBlock
+    x: Array | None = None  # (side, d): of the last step (a); None before the first
+
+
+@dataclass(frozen=True, eq=False)
+class DescentSession:
+    """Newton, or a climb of the staircase: a direction, and the trial that it led to.
+
+    A climb has no system: its direction comes from a `ProofSession`.
+    """
+
+    system: System | None
+    step: tuple[Array, Array] | None = None  # (p, .), (p, d): of rotations, of translations
+    trial: Poses | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ProofSession:
+    """A bound, or inverse iteration: S eliminated, and the proof where one was begun."""
+
+    system: System
+    proof: RobotProof | None = None
+
+
+Session = RelaxationSession | AveragingSession | RecursionSession | DescentSession | ProofSession
+
+
+@dataclass(frozen=True, eq=False)
+class InteriorState:
+    """What orders leave with a robot; the p poses are those of its part."""
+
+    poses: Poses
+    saved: Poses  # those that `restore_poses` returns to
+    session: Session | None = None
+    # whether the current cost is the one that is solved, not the one that SOC is run on
+    is_final: bool = False
+    weights: Array | None = None  # (k,): of its edges, in a robust solve
+    reweighing: Reweigh | None = None  # how these weights came about
+    has_sent_laplacian: bool = False  # whether the driver has the matrix of the translations
+    terms: HandednessTerms | None = None  # of its edges, for proofs with them
+    ascent: RobotAscent | None = None  # the search for such terms

@@ -1,0 +1,117 @@
+"""Newton by driver and robots takes the steps of `solvers.riemannian.polish`."""
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from budget import examples
+from graphs import (
+    DIMENSIONS,
+    LOUD_NOISE,
+    MILD_NOISE,
+    SEEDS,
+    random_poses,
+    varied_graph,
+    varied_problem,
+)
+from hypothesis import given, settings, strategies as st
+from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis
+
+from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses, chordal_start
+from pgo_models.certificates.rounding_errors import rounding_level
+from pgo_models.geometry.rotations import tangent_dimension
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from solvers import Newton, Status, iterate, run
+from solvers.robots.driver import collect
+from solvers.robots.newton import SubstructuredNewton
+
+SIZES = st.integers(2, 20)
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+
+
+def near(problem: PGOProblem, seed: int, spread: float) -> Poses:
+    """The chordal start, moved at random."""
+    rng = np.random.default_rng(seed)
+    moves = [
+        spread * rng.standard_normal((problem.num_poses, k))
+        for k in (tangent_dimension(problem.d), problem.d)
+    ]
+    return chordal_start(problem).moved_along(*moves)
+
+
+def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, steps: int) -> None:
+    driver = driver_at(problem, parts, start)
+    central = iterate(replace(newton, secants=False), problem, start)
+    distributed = iterate(SubstructuredNewton(newton), driver)
+    for one, other in islice(zip(central, distributed, strict=True), steps + 1):
+        objective = one.polish.objective
+        assert other.k == one.k
+        assert other.objective == pytest.approx(objective, rel=1e-7, abs=1e-12)
+        # an optimum of zero: F is rounding, too
+        if objective <= 1e6 * rounding_level(problem, one.polish.poses):
+            break
+        assert other.decrement == pytest.approx(one.polish.decrement, rel=1e-5, abs=1e-13)
+        if one.polish.decrement <= 1e-10:  # what is left is rounding
+            break
+        assert other.moved == one.polish.moved
+    poses, _ = collect(driver)
+    assert driver.current.objective == pytest.approx(problem.objective(poses), rel=1e-10, abs=1e-20)
+
+
+@settings(max_examples=examples(30))
+@given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    noise=NOISES,
+    partitioner=PARTITIONERS,
+    backend=BACKENDS,
+    second_order=st.booleans(),
+    spread=st.sampled_from([0.0, 0.05, 0.5]),
+)
+def test_the_steps_are_the_central_ones(
+    seed: int,
+    n: int,
+    d: int,
+    noise: NoiseModel,
+    partitioner: Partitioner,
+    backend: CholeskyBackend,
+    second_order: bool,
+    spread: float,
+) -> None:
+    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    newton = Newton(second_order=second_order)
+    check(problem, partitioner(problem.graph, seed), near(problem, seed, spread), newton, 5)
+
+
+@pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
+def test_the_steps_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
+    problem = PGOProblem(graph)
+    check(problem, parts, near(problem, 0, 0.3), Newton(), 8)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_as_many_steps_to_the_same_optimum(d: int) -> None:
+    problem = varied_problem(2, 30, d, LOUD_NOISE)
+    start = chordal_start(problem)
+    central = run(Newton(secants=False), problem, start)
+    driver = driver_at(problem, metis(problem.graph, 4), start)
+    method = SubstructuredNewton()
+    states = []
+    for state in iterate(method, driver):
+        states.append(state)
+        if len(states) > 1 and method.converged(state, method.measure(driver, state)) is not None:
+            break
+    assert central.status is Status.CONVERGED
+    assert states[-1].decrement <= STATIONARY_DECREMENT
+    assert len(states) - 1 == central.iterations
+    assert driver.current.objective == pytest.approx(central.objective, rel=1e-13)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_far_from_any_minimum_the_steps_are_the_central_ones(d: int) -> None:
+    problem = varied_problem(4, 20, d, LOUD_NOISE)
+    check(problem, metis(problem.graph, 4), random_poses(20, d, 4), Newton(), 4)
