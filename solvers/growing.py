@@ -22,9 +22,8 @@ from pgo_models.problem.weighting import Weighting
 from solvers.carry.ledger import Ledger
 from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
 from solvers.place import Attempt, Place, Step
-from solvers.places import solution_by
 from solvers.plan import solve_at, unless_it_fails
-from solvers.request import Pipeline, SolveRequest
+from solvers.request import Pipeline, SolveRequest, solution_by
 from solvers.robots.settings import Robots
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC

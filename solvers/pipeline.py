@@ -1,7 +1,8 @@
 """solve(problem): from the start to the certificate, in one Solution.
 
-`solvers.plan` has the steps of a solve in their order, and `solvers.places` opens where they are
-taken. Here it is decided whether a solve is plain, robust or one with terms of its own.
+`solvers.plan` has the steps of a solve in their order, and a request (`solvers.request`) opens the
+place where they are taken. Here it is decided whether a solve is plain, robust or one with terms of
+its own.
 """
 
 from __future__ import annotations
@@ -20,9 +21,8 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.weighting import Weighting
 from solvers.loop import RunMonitor
-from solvers.places import solution_by
 from solvers.plan import solve_at
-from solvers.request import Pipeline, SolveRequest
+from solvers.request import Pipeline, SolveRequest, solution_by
 from solvers.result import Record
 from solvers.robots.settings import Robots
 from solvers.solution import Solution

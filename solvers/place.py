@@ -1,8 +1,7 @@
 """A place where a solve runs: the verbs that the plan of a solve needs, and what they pass on.
 
-`solvers.plan` says in which order they are called. A place is `solvers.here.Here`, or robots:
-`solvers.robots.place_with_graph`, `solvers.robots.place_without_driver` and
-`solvers.robots.place_with_files`.
+`solvers.plan` says in which order they are called. A place is `solvers.here.Here`, or robots
+with a driver (`solvers.robots.place`) or without one (`solvers.robots.place_without_driver`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,14 @@
-"""What a solve is asked for: the settings of its stages, and all else that `solve` is given."""
+"""What a solve is asked for: the settings of its stages, and all else that `solve` is given.
+
+A request opens the place where it is solved; places of robots are imported when they are asked for.
+The page of a solve (`solvers.plan.solve_at`) then has its best attempt, and so the solution.
+"""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -15,8 +21,10 @@ from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
 from solvers.handedness.search import HandednessSearch
+from solvers.here import Here
 from solvers.loop import RunMonitor
 from solvers.place import AUTO, Attempt, FirstStage, Place, Step
+from solvers.result import StageTable
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
@@ -28,6 +36,8 @@ from solvers.solution import Solution, choose_gauge, note_of
 if TYPE_CHECKING:  # what a solve in one place does not need
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
+
+Page = Callable[[Place, "Pipeline", Poses | None], Attempt]
 
 
 @dataclass(frozen=True)
@@ -175,6 +185,66 @@ class SolveRequest:
             self.problem.stacked(self.start)  # raises unless the poses fit
             object.__setattr__(self, "start", self.problem.graph.near_zero(self.start))
 
+    def with_partition(self) -> SolveRequest:
+        """The request with the robots that a number of them stands for."""
+        if self.robots is None:
+            return self
+        from solvers.robots.chosen_robots import robots_of_solve
+
+        owners = robots_of_solve(self.pipeline.soc, self.robots.owners, self.problem.graph)
+        return replace(self, robots=self.robots.with_owners(owners))
+
+    @contextmanager
+    def open_place(self, gnc: GNC | None = None) -> Iterator[Place]:
+        """Open the place of the request: robots if there are any, else this process.
+
+        With `gnc` the robots are given the thresholds of their edges, for a robust solve.
+        """
+        table = StageTable()
+        here = Here(self.monitor, table, self.problem, self.pipeline.gap)
+        robots = self.robots
+        if robots is None:
+            yield here
+            return
+        from solvers.carry.process import InProcess
+        from solvers.robots.checkpoint import Journal, run_fingerprint
+        from solvers.robots.place import PlaceOfRobots
+        from solvers.robots.place_with_graph import open_driver
+        from solvers.robots.place_without_driver import RobotsAlone
+
+        problem = self.problem
+        mark = run_fingerprint(problem, robots.partition, self._settings_of_run(robots), self.start)
+        engine = robots.engine if robots.engine is not None else InProcess()
+        thresholds = None if gnc is None else gnc.thresholds(problem)
+        journal = Journal(robots.checkpoint, mark, table)
+        opened = open_driver(problem, robots.partition, engine, robots.driver_memory, thresholds)
+        with closing(opened) as driver:
+            kind = PlaceOfRobots if robots.has_driver else RobotsAlone
+            yield kind(
+                self.monitor,
+                table,
+                driver,
+                journal,
+                problem.graph.name,
+                here.gap,
+                faults=robots.faults,
+                here=replace(here, where=", in one place"),
+                owners=robots.partition,
+            )
+
+    def _settings_of_run(self, robots: Robots) -> tuple[object, ...]:
+        """Settings that a checkpoint must have in common with the run that goes on from it."""
+        pipeline = self.pipeline
+        return (
+            pipeline.soc,
+            pipeline.newton,
+            pipeline.gap,
+            pipeline.growing,
+            pipeline.second_try,
+            robots.faults,
+            robots.has_driver,
+        )
+
     def _check_anchor(self, anchor: int) -> None:
         """Raise a SettingError unless the anchor is a pose with a rotation.
 
@@ -229,6 +299,15 @@ class SolveRequest:
                 "a robust solve needs a driver without faults, "
                 "and writes no checkpoint; leave that out"
             )
+
+
+def solution_by(page: Page, request: SolveRequest) -> Solution:
+    """Solution of a request by the steps of a page, at the place where it is to be solved."""
+    request = request.with_partition()
+    with request.open_place() as place:
+        best = page(place, request.pipeline, request.start)
+        place.finish(best)
+    return solution_of(request, place, best)
 
 
 def solution_of(request: SolveRequest, place: Place, best: Attempt) -> Solution:

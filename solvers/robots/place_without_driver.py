@@ -20,18 +20,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.initialization import spanning_tree, spanning_tree_start
+from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
-from solvers.carry.ledger import BYTES_PER_NUMBER, Traffic
-from solvers.here import Here
 from solvers.place import AnySOC, Attempt, Ending, OwnStart, Traits
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
@@ -39,6 +34,7 @@ from solvers.robots.asynchronous import AsynchronousSOC, AsynchronousState
 from solvers.robots.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.robots.driver import Driver
 from solvers.robots.place import PlaceOfRobots
+from solvers.robots.trees import robot_tree, tree_traffic
 from solvers.soc.consensus import ConsensusState, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.recursion_block import Rotations
@@ -51,13 +47,6 @@ NO_CERTIFICATE = (
     "no driver: Newton and the certificate were left out, "
     "and F >= 0 is all that is known of the optimum"
 )
-
-
-def note_without_driver(problem: PGOProblem) -> str:
-    """What a solution of robots without a driver lacks, and why its cost is F."""
-    if problem.graph.information is None or problem.weighting is not Weighting.ISOTROPIC:
-        return NO_CERTIFICATE
-    return f"{NO_CERTIFICATE}; the cost is F, as SOC alone needs one that is convex and quadratic"
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,22 +63,24 @@ class RobotsAlone(PlaceOfRobots):
     the robots do not wait.
     """
 
-    here: Here
-    robots: Partition
-
     @property
     def traits(self) -> Traits:
         """Traits of the graph; there are robots and no driver."""
-        return replace(self.here.traits, has_robots=True, has_driver=False)
+        return replace(self.known_here.traits, has_robots=True, has_driver=False)
 
     def note(self, best: Attempt) -> str:
-        """What a solution lacks for want of a driver."""
-        return note_without_driver(self.here.problem)
+        """What a solution lacks for want of a driver, and why its cost is F."""
+        problem = self.known_here.problem
+        if problem.graph.information is None or problem.weighting is not Weighting.ISOTROPIC:
+            return NO_CERTIFICATE
+        reason = "the cost is F, as SOC alone needs one that is convex and quadratic"
+        return f"{NO_CERTIFICATE}; {reason}"
 
     def start(self, start: Poses | OwnStart, soc: AnySOC | None) -> Attempt:
         """Start at given poses, or by CONSENSUS with relaxed rotations from a spanning tree."""
-        assert isinstance(soc, SOC)  # as `Pipeline` has checked
-        self.driver.network.tree = robot_tree(self.here.problem, self.robots)
+        assert isinstance(soc, SOC)  # as the request has checked
+        assert self.owners is not None
+        self.driver.network.tree = robot_tree(self.known_here.problem, self.owners)
         began = time.perf_counter()
         name = "given start"
         iterations = 0
@@ -98,26 +89,26 @@ class RobotsAlone(PlaceOfRobots):
             self.driver.hand_out(start)
             begun = Attempt(start)
         else:
-            name, begun, iterations, history = self._start_by_rounds(soc)
+            name, begun, iterations, history = self._start_by_rounds(soc, self.owners)
         poses = begun.known_poses
         if not self.journal.goes_on_with():
-            objective = self.here.problem.objective(poses)
+            objective = self.known_here.problem.objective(poses)
             seconds = time.perf_counter() - began
             self.table.add(Stage(name, begun.status, iterations, objective, seconds, history))
         self.monitor.poses_found.append(poses)
         return begun
 
-    def _start_by_rounds(self, soc: SOC) -> tuple[str, Attempt, int, History]:
+    def _start_by_rounds(self, soc: SOC, owners: Partition) -> tuple[str, Attempt, int, History]:
         """Start at a spanning tree, and run the chordal relaxation from there.
 
         The relaxation is two runs of CONSENSUS: with relaxed rotations, then with these rotations,
         projected and held. The poses of the tree are kept if they cost less.
         """
-        problem = self.here.problem
+        problem = self.known_here.problem
         driver = self.driver
         tree_poses = spanning_tree_start(problem.graph)
         driver.hand_out(tree_poses)
-        for traffic in tree_traffic(problem, self.robots):
+        for traffic in tree_traffic(problem, owners):
             driver.network.ledger = driver.network.ledger.after_round(traffic)
         loose = replace(
             soc, local_passes=1, tolerance=_START_TOLERANCE, max_iterations=_START_ROUNDS
@@ -138,8 +129,9 @@ class RobotsAlone(PlaceOfRobots):
         begun = Attempt(tree_poses, outcome.status)
         return "spanning tree", begun, iterations, outcome.history
 
-    def run_soc(self, attempt: Attempt, soc: SOC) -> Attempt:
+    def run_soc(self, attempt: Attempt, soc: AnySOC) -> Attempt:
         """Run SOC, asynchronously if there are faults, and keep the cheaper of start and end."""
+        assert isinstance(soc, SOC)  # as the request has checked
         began = time.perf_counter()
         goes_on = isinstance(attempt, StartInCopies)
         outcome: Outcome[AsynchronousState] | Outcome[ConsensusState]
@@ -149,7 +141,7 @@ class RobotsAlone(PlaceOfRobots):
         else:
             consensus = ConsensusSOC(soc, has_driver=False, goes_on=goes_on)
             outcome = self.journal.run(consensus, self.driver, self.monitor)
-        problem = self.here.problem
+        problem = self.known_here.problem
         end = collect_copies(self.driver)
         poses, status = cheaper_end(problem, attempt.known_poses, end, outcome, soc.tolerance)
         objective = problem.objective(poses)
@@ -166,16 +158,11 @@ class RobotsAlone(PlaceOfRobots):
 
     def certify(self, attempt: Attempt) -> Attempt:
         """Return the certificate with the bound F >= 0: another needs a driver."""
-        return self.here.without_bound(attempt)
-
-    @property
-    def has_poses(self) -> bool:
-        """Whether the robots have begun."""
-        return bool(self.table.stages)
+        return self.known_here.without_bound(attempt)
 
     def salvage(self, ending: Ending) -> Attempt:
         """The best poses known, with the bound F >= 0."""
-        return self.here.salvage(ending)
+        return self.known_here.salvage(ending)
 
 
 def cheaper_end(
@@ -204,41 +191,3 @@ def collect_copies(driver: Driver) -> Poses:
         R[answer.poses] = answer.R
         t[answer.poses] = answer.t
     return Poses(R, t)
-
-
-def robot_tree(problem: PGOProblem, robots: Partition) -> tuple[IntArray, IntArray]:
-    """Tree of the robots: all robots, parents first, and the parent of each.
-
-    It is a breadth-first tree of the graph of neighbours. The root is robot 0, which counts as its
-    own parent. Sums, and figures that are not summed up, go up the tree; what follows from them
-    goes down.
-    """
-    ends = robots.robot[problem.graph.i], robots.robot[problem.graph.j]
-    ones = np.ones(problem.graph.num_edges)
-    adjacency = csr_array((ones, ends), shape=(robots.num_robots, robots.num_robots))
-    order, parents = breadth_first_order(adjacency, 0, directed=False)
-    parents[0] = 0
-    return order, parents
-
-
-def tree_traffic(problem: PGOProblem, robots: Partition) -> list[Traffic]:
-    """Messages of every round in which poses are passed along a spanning tree of the graph.
-
-    A pose is sent along every edge of the tree that joins two robots. The round in which a robot
-    learns a pose is the number of such edges between the pose and the root.
-    """
-    order, parent, _ = spanning_tree(problem.graph, 0)
-    owner = robots.robot
-    child = order[1:]
-    crosses = owner[child] != owner[parent[child]]
-    round_of_pose = np.zeros(problem.num_poses, dtype=np.int64)
-    for pose, is_sent in zip(child.tolist(), crosses.tolist(), strict=True):
-        round_of_pose[pose] = round_of_pose[parent[pose]] + is_sent
-    bytes_of_pose = BYTES_PER_NUMBER * problem.d * (problem.d + 1)
-    rounds = []
-    for number in range(1, int(round_of_pose.max()) + 1):
-        sent = child[crosses & (round_of_pose[child] == number)]
-        ends = np.stack([owner[parent[sent]], owner[sent]])
-        links, num_poses = np.unique(ends, axis=1, return_counts=True)
-        rounds.append(Traffic(links[0], links[1], bytes_of_pose * num_poses))
-    return rounds

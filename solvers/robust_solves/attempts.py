@@ -25,7 +25,6 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import edge_residuals
 from solvers.carry.ledger import Ledger
 from solvers.place import Place
-from solvers.places import open_place
 from solvers.plan import solve_at
 from solvers.request import Pipeline, SolveRequest, solution_of
 from solvers.result import OUT_OF_TIME, Stage, Status
@@ -329,7 +328,7 @@ class PlacesOfEdges:
     @contextmanager
     def _opened(self, request: SolveRequest, gnc: GNC | None = None) -> Iterator[Place]:
         """Open the place of a request; what has crossed its network is accounted for at its end."""
-        with open_place(request, gnc) as place:
+        with request.open_place(gnc) as place:
             try:
                 yield place
             finally:

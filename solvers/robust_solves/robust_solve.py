@@ -19,7 +19,6 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.carry.ledger import Ledger
 from solvers.place import is_open
-from solvers.places import with_partition
 from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
 from solvers.robust.agreement import Agreement
@@ -154,7 +153,7 @@ class _RobustSolve:
         """Begin a robust solve of what is requested."""
         if not isinstance(robust, GNC | PCM):
             raise SettingError(f"robust is {robust!r:.60}; give GNC() or PCM()")
-        request = with_partition(request)
+        request = request.with_partition()
         problem = request.problem
         known = KnownEdges.of(problem.graph, robust.known)
         thresholds = chi2_thresholds(problem, robust.quantile)

@@ -37,7 +37,7 @@ from solvers.result import Record, Stage, StageTable, Status
 from solvers.robots.checkpoint import Journal
 from solvers.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.robots.paper import check_paper
-from solvers.robots.place_with_files import RobotsWithFiles
+from solvers.robots.place import PlaceOfRobots
 from solvers.robots.revision import Pass, revised
 from solvers.robots.revision_of_robot import ComesBack
 from solvers.robots.settings import Robots
@@ -279,8 +279,8 @@ class FilesOfRobots:
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         journal = Journal(None, {}, table)
         with closing(opened.driver):
-            place = RobotsWithFiles(
-                monitor, table, opened.driver, journal, None, name, pipeline.gap, opened.weighting
+            place = PlaceOfRobots(
+                monitor, table, opened.driver, journal, name, pipeline.gap, opened.weighting
             )
             first = pipeline
             if isinstance(
@@ -321,7 +321,7 @@ class _Answer:
     """What was found so far: robots with the edges kept, their place, and the attempt there."""
 
     opened: OpenedFiles
-    place: RobotsWithFiles
+    place: PlaceOfRobots
     best: Attempt
     rejected_by: str = FolderSolution.rejected_by
 

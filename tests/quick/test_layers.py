@@ -51,7 +51,6 @@ ORDER = {
         "solution",
         "request",
         "plan",
-        "places",
         "robust_solves",
         "solves",
         "pipeline",

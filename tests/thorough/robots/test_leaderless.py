@@ -53,9 +53,8 @@ from solvers.robots.place_with_graph import open_driver
 from solvers.robots.place_without_driver import (
     NO_CERTIFICATE,
     collect_copies,
-    robot_tree,
-    tree_traffic,
 )
+from solvers.robots.trees import robot_tree, tree_traffic
 from solvers.soc.recursion_block import Rotations
 
 TOLERANCE = 1e-6
