@@ -150,7 +150,7 @@ log = mission(robots, AWAY)
 
 def bound_of(known):
     """Lower bound that a robot knows; zero is one of any sum of squares."""
-    return 0.0 if known.outcome is None else known.outcome.certificate.lower_bound
+    return 0.0 if known.outcome is None else known.outcome.solution.lower_bound
 
 
 def error_of(now, group):
@@ -178,7 +178,8 @@ for second in range(10, 181, 10):
             print(f"{second:4}  {name:4}  {known.failure.split(';')[0]}")
         if known.outcome is None:
             continue
-        term, proven, sent = known.outcome.term, known.outcome.certificate, sum(known.sent.values())
+        term, proven = known.outcome.term, known.outcome.solution.certificate
+        sent = sum(known.sent.values())
         group = [n for n in names if now[n].outcome.term == term]
         print(
             f"{second:4}  {name:4}  {term.driver:6}  {proven.verdict.name}  {proven.lower_bound:7.3f}"
@@ -257,8 +258,8 @@ at_140 = log[139]
 edges_at_140 = np.flatnonzero(measured_in < 14)
 by_others = edges_at_140[measured_by[edges_at_140] > 0]
 one_machine = solved(world.edge_subgraph(by_others))
-bound_of_others = at_140["ben"].outcome.certificate.lower_bound
-num_named = at_140["ben"].outcome.num_absent_poses
+bound_of_others = at_140["ben"].outcome.solution.lower_bound
+num_named = at_140["ben"].outcome.solution.num_absent
 print(f"bound of ben, carl and dora {bound_of_others:.9f}")
 print(f"least cost, in one place    {one_machine.objective:.9f}")
 print(f"poses of anna that their edges name: {num_named}")
@@ -355,7 +356,7 @@ for name, interior in zip(names, interiors, strict=True):
     print(f"{name}: {len(interior)} poses inside, {36 - len(interior)} separators")
 least = np.linalg.eigvalsh(on_separators)[0]
 by_hand = np.trace(Lambda, axis1=1, axis2=2).sum()
-team_bound = log[-1]["ben"].outcome.certificate.lower_bound
+team_bound = log[-1]["ben"].outcome.solution.lower_bound
 print(f"{len(separators)} separators; smallest eigenvalue of their matrix {least:.4f}")
 print(f"bound by hand {by_hand:.9f}, of the team {team_bound:.9f}")
 
@@ -376,10 +377,10 @@ tables = {
 rounds = {}
 for title, entries in (("interface", log), ("measurements", log_of_sharing)):
     outcome = entries[-1]["ben"].outcome
-    rounds[title] = outcome.rounds
+    rounds[title] = outcome.solution.ledger.rounds
     print(
         f"{title:12} {tables[title].sum():5.0f} kB; solve {outcome.term.number}, the last one, "
-        f"took {outcome.rounds} rounds; bound {outcome.certificate.lower_bound:.9f}"
+        f"took {outcome.solution.ledger.rounds} rounds; bound {outcome.solution.lower_bound:.9f}"
     )
 draw_links(tables, names)
 
@@ -390,7 +391,7 @@ draw_links(tables, names)
 # - Nearly everything goes to and from a driver. Carl and Dora, who never drive, send each other 27 kB in
 #   the right matrix. These are greetings, with which robots notice each other: one every 1.25 seconds, a
 #   quarter of `patience`, and one at once when a robot has new measurements. All twelve links have about
-#   as many or more, so greetings are more than half of the 536 kB in that matrix. In the left one they
+#   as many or more, so greetings are more than half of the 553 kB in that matrix. In the left one they
 #   also tell each other, and nobody else, of the twelve edges between them: 2 to 3 kB.
 # - Ben's row and column are those of a driver, too, thanks to one minute without Anna.
 # - Dora has the most separators, and sends Anna the most in the left matrix. Sharing measurements
@@ -484,7 +485,7 @@ for second in (80, 83, 87, 140, 143):
 # outcomes = [without_dora[139][name].outcome for name in ("anna", "dora")]
 # assert [outcome.term.driver for outcome in outcomes] == ["anna", "dora"]
 # assert [outcome.covered for outcome in outcomes] == [("anna", "ben", "carl"), ("dora",)]
-# assert sum(outcome.certificate.lower_bound for outcome in outcomes) < optima[13]
+# assert sum(outcome.solution.lower_bound for outcome in outcomes) < optima[13]
 # ```
 #
 # </details>
@@ -502,7 +503,7 @@ for second in (80, 83, 87, 140, 143):
 # log_with_losses = mission(losing, ("nobody", 0, 0), lost=0.3)
 # ending = log_with_losses[-1]["ben"].outcome
 # assert ending.covered == tuple(names)
-# assert np.isclose(ending.certificate.lower_bound, optima[-1], rtol=1e-9)
+# assert np.isclose(ending.solution.lower_bound, optima[-1], rtol=1e-9)
 # ```
 #
 # </details>
@@ -520,8 +521,8 @@ for second in (80, 83, 87, 140, 143):
 # for name in ("anna", "ben"):
 #     outcome = patient[-1][name].outcome
 #     assert outcome.covered == tuple(names)
-#     assert np.isclose(outcome.certificate.lower_bound, optima[7], rtol=1e-9)
-#     assert outcome.certificate.lower_bound < optima[12]
+#     assert np.isclose(outcome.solution.lower_bound, optima[7], rtol=1e-9)
+#     assert outcome.solution.lower_bound < optima[12]
 # ```
 #
 # </details>
@@ -540,7 +541,7 @@ with NamedNumbers():
     for second in (*range(50, 81, 10), *range(150, 181, 10)):
         for known in log[second - 1].values():
             assert known.outcome.covered == tuple(names)
-            assert known.outcome.is_certified
+            assert known.outcome.solution.is_certified
             assert not known.failure
             assert np.isclose(bound_of(known), optima[second // 10 - 1], rtol=1e-9)
     for second in (110, 120, 130, 140):

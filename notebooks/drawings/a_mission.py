@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from plotly.graph_objects import Figure
 
-    from solvers.team.messages import TeamOutcome, Term
+    from solvers.team.messages import Ended, Term
 
 Trace = dict[str, object]
 Places = dict[int, "NDArray[np.float64]"]
@@ -30,7 +30,7 @@ _DARK = 0.55  # share of the largest number above which the letters on it are wh
 class Known(Protocol):
     """What a robot knows at a moment: outcome, why a later solve failed, and its poses by id."""
 
-    outcome: TeamOutcome | None
+    outcome: Ended | None
     failure: str
     poses: Mapping[int, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
@@ -193,9 +193,9 @@ def _places(
 
 def _bound(known: Known) -> float | None:
     """Lower bound that a robot knows."""
-    if known.outcome is None or known.outcome.certificate is None:
+    if known.outcome is None or known.outcome.solution is None:
         return None
-    return float(f"{known.outcome.certificate.lower_bound:.4g}")
+    return float(f"{known.outcome.solution.lower_bound:.4g}")
 
 
 def _proven_together(one: Known, other: Known) -> float:

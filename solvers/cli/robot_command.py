@@ -26,7 +26,7 @@ from solvers.cli.shell import (
 )
 
 if TYPE_CHECKING:
-    from solvers.team.messages import TeamOutcome
+    from solvers.team.messages import Ended
     from solvers.team.robot import Robot
 
 _INDENT = 13  # columns of the labels
@@ -169,7 +169,7 @@ class _Reporter:
     def __init__(self, is_silent: bool) -> None:
         self._is_silent = is_silent
         self._said: set[str] = set()
-        self._outcome: TeamOutcome | None = None
+        self._outcome: Ended | None = None
         self._failure = ""
 
     def __call__(self, robot: "Robot") -> None:

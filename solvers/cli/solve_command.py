@@ -587,9 +587,7 @@ def _solve_own_files(
     )
     if not display.quiet:
         typer.echo(f"{solution}")
-    # Nobody has checked the edges that pairwise consistency keeps.
-    is_certified = solution.certificate.is_certified and solution.num_rejected is None
-    return _exit_code(solution.status, is_certified, solution.num_absent)
+    return _exit_code(solution.status, solution.is_certified, solution.num_absent)
 
 
 def _save_and_show(

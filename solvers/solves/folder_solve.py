@@ -16,24 +16,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import SettingError
-from pgo_models.figures import rounded_up
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.g2o_folder import FILES_HERE
-from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
-from pgo_models.summaries import Summarised
 from solvers.carry.counted_pool import Count
-from solvers.carry.ledger import Ledger
 from solvers.carry.process import Engine, InProcess
 from solvers.carry.ray_engine import RayEngine
 from solvers.loop import RunMonitor
 from solvers.place import AUTO, Attempt, FirstStage
 from solvers.plan import solve_at
 from solvers.request import Pipeline
-from solvers.result import Record, Stage, StageTable, Status
+from solvers.result import Record, StageTable
 from solvers.robots.checkpoint import Journal
 from solvers.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.robots.paper import check_paper
@@ -42,6 +37,7 @@ from solvers.robots.revision import Pass, revised
 from solvers.robots.revision_of_robot import ComesBack
 from solvers.robots.settings import Robots
 from solvers.robots.setup import OpenedFiles, open_files
+from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
@@ -50,117 +46,7 @@ from solvers.robust_solves.attempts import TIGHT_SCALES, with_tight_thresholds
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
-from solvers.solution import joined_notes, note_of_absence, verdict_suffix
-
-
-@dataclass(frozen=True, eq=False)
-class FolderSolution(Summarised):
-    """What the driver knows of a solve by robots that have their own files.
-
-    The poses are in the files that the robots write, and not here.
-
-    Parameters
-    ----------
-    name : str
-        Name of the folder.
-    certificate : Certificate
-        Cost, lower bound, gap and verdict, without poses and multipliers.
-    sizes : IntArray, shape (2, num_robots)
-        How many poses, and edges, every robot has.
-    status : Status
-        How the run ended that found the poses, or what broke the solve off.
-    stages : tuple of Stage
-        What every stage did.
-    ledger : Ledger
-        What crossed the network.
-    frame : str
-        The frame of the poses that were written.
-    F : float
-        F of these poses, which is the cost unless that is chi2.
-    seconds : float
-        Wall time.
-    note : str
-        For whom it holds where robots are absent, why the cost is F and not chi2 where the files
-        have matrices, what failed, and what may find more.
-    num_absent : int
-        Number of poses of robots without a file, which edges of others name.
-    num_rejected : int, optional
-        Edges that the robots left out because they do not agree with others; None where none were
-        judged.
-    rejected_by : str
-        What they do not agree with.
-    num_bridges : int
-        Number of edges kept that are the only ones between two parts of the team, so that nothing
-        checks them. That a robot's own odometry may have gaps is not looked at.
-    """
-
-    name: str
-    certificate: Certificate
-    sizes: IntArray
-    status: Status
-    stages: tuple[Stage, ...]
-    ledger: Ledger
-    frame: str
-    F: float
-    seconds: float
-    note: str = ""
-    num_absent: int = 0
-    num_rejected: int | None = None
-    rejected_by: str = "do not agree pairwise with others"
-    num_bridges: int = 0
-
-    @property
-    def robust_text(self) -> str:
-        """What was left out, and what that is worth; empty where no edges were judged."""
-        if self.num_rejected is None:
-            return ""
-        kept = int(self.sizes[1].sum())
-        text = (
-            f"{self.num_rejected} of {kept + self.num_rejected} edges left out, which "
-            f"{self.rejected_by}; the answer is for those kept, and nobody has checked them"
-        )
-        if self.num_bridges:
-            text += f"; {text_of_bridges(self.num_bridges)}"
-        return text
-
-    def __str__(self) -> str:
-        num_poses, num_edges = self.sizes
-        graph = (
-            f"{self.name}: {num_poses.sum()} poses, {num_edges.sum()} edges, "
-            f"{self.certificate.poses.d}D"
-        )
-        robots = (
-            f"{len(num_poses)}, {num_poses.min()} to {num_poses.max()} poses each, "
-            "as their own files have them"
-        )
-        facts = [
-            ("graph", graph),
-            ("status", f"{self.status.name}: {self.status.value}"),
-            *self._facts_of_certificate(),
-            *self._other_cost(),
-            ("closures", self.robust_text),
-            ("note", self.note),
-            ("frame", self.frame),
-            ("seconds", f"{self.seconds:.3g}"),
-            ("robots", robots),
-            *self.ledger.facts(),
-        ]
-        return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
-
-    def _facts_of_certificate(self) -> list[tuple[str, str]]:
-        """Cost, bound, gap and verdict, which says for whom it holds."""
-        facts = dict(self.certificate.facts())
-        facts["verdict"] += verdict_suffix(self.num_absent)
-        if self.num_rejected is not None:
-            facts["verdict"] += ", for the edges that were kept"
-        return list(facts.items())
-
-    def _other_cost(self) -> list[tuple[str, str]]:
-        """F of the poses, where the cost is chi2."""
-        if self.certificate.weighting is Weighting.ISOTROPIC:
-            return []
-        F = rounded_up(self.F)
-        return [("F", f"{F} with two precisions an edge; the bound is on chi2 alone")]
+from solvers.solution import joined_notes, note_of_absence
 
 
 def solve_folder(
@@ -176,7 +62,7 @@ def solve_folder(
     verbose: bool = False,
     progress: bool | None = None,
     trust_folder: bool = False,
-) -> FolderSolution:
+) -> RobotsSolution:
     """Solve and certify a folder with one g2o file a robot, each read by its robot alone.
 
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it. An
@@ -218,7 +104,7 @@ def solve_folder(
 
     Returns
     -------
-    FolderSolution
+    RobotsSolution
         Cost, certificate and stages.
 
     Raises
@@ -270,7 +156,7 @@ class FilesOfRobots:
 
     def solved(
         self, pipeline: Pipeline, monitor: RunMonitor, out: Path | None = None
-    ) -> FolderSolution:
+    ) -> RobotsSolution:
         """The solution, which robots write to the folder `out`, if it is given."""
         table = StageTable()
         opened = open_files(
@@ -298,7 +184,8 @@ class FilesOfRobots:
             if out is not None:
                 nothing = [None] * len(self.files)
                 driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)
-        return FolderSolution(
+        is_judged = self.robust is not None
+        return RobotsSolution(
             name=name,
             certificate=best.proof,
             sizes=opened.sizes,
@@ -309,8 +196,9 @@ class FilesOfRobots:
             F=F,
             note=_note(self.weighting, opened, place.note(best)),
             num_absent=opened.num_absent,
-            num_rejected=None if self.robust is None else opened.num_rejected,
-            rejected_by=answer.rejected_by,
+            robust=_text_of_rejected(opened, answer.rejected_by) if is_judged else "",
+            is_held=not is_judged,
+            num_rejected=opened.num_rejected if is_judged else None,
             num_bridges=opened.num_bridges,
             seconds=time.perf_counter() - monitor.began,
         )
@@ -323,7 +211,7 @@ class _Answer:
     opened: OpenedFiles
     place: PlaceOfRobots
     best: Attempt
-    rejected_by: str = FolderSolution.rejected_by
+    rejected_by: str = "do not agree pairwise with others"
 
     @property
     def name_of_poses(self) -> str:
@@ -383,6 +271,18 @@ def _solved_from(answer: _Answer, start: str, pipeline: Pipeline) -> _Answer:
     """The answer solved for from poses that the robots have found, the start of this name."""
     place = replace(answer.place, kept=[], begins_at=start)
     return replace(answer, place=place, best=solve_at(place, pipeline, None))
+
+
+def _text_of_rejected(opened: OpenedFiles, rejected_by: str) -> str:
+    """What was left out, and what that is worth."""
+    num_edges = int(opened.sizes[1].sum()) + opened.num_rejected
+    text = (
+        f"{opened.num_rejected} of {num_edges} edges left out, which {rejected_by}; "
+        "the answer is for those kept, and nobody has checked them"
+    )
+    if opened.num_bridges:
+        text += f"; {text_of_bridges(opened.num_bridges)}"
+    return text
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:

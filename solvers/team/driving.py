@@ -20,15 +20,16 @@ from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.carry.counted_pool import Count, CountedPool
 from solvers.carry.messages import Idle, Worker, obey, raise_first_error
 from solvers.carry.process import DEFAULT_MEMORY
 from solvers.loop import RunMonitor
 from solvers.pipeline import solution_for
 from solvers.request import Pipeline, SolveRequest
+from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
-from solvers.solution import Solution
-from solvers.solves.folder_solve import FilesOfRobots, FolderSolution, check_robust
+from solvers.solves.folder_solve import FilesOfRobots, check_robust
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent, give_measurements, take_answer
 from solvers.team.messages import Ask, Reply, Term, error_of_message
 from solvers.team.wire import Order
@@ -59,7 +60,7 @@ class Drive:
     call: int = -1
     waiting: dict[str, Ask] = field(default_factory=dict)
     num_asked: dict[str, int] = field(default_factory=dict)
-    outcome: FolderSolution | Solution | PGOError | None = None
+    outcome: RobotsSolution | PGOError | None = None
     _answers: list[Any] = field(default_factory=list)
     _page: Any = None
 
@@ -106,17 +107,18 @@ class Drive:
         except _AbandonedError:
             pass
 
-    def _solved_by_robots(self) -> FolderSolution:
+    def _solved_by_robots(self) -> RobotsSolution:
         """The solution by robots with files of their own."""
         files = [(k, Path("team") / f"{name}.g2o") for k, name in enumerate(self.members)]
         check_robust(self.robust)
         job = FilesOfRobots("team", files, self, DEFAULT_MEMORY, self.weighting, robust=self.robust)
         return job.solved(self.pipeline, RunMonitor(progress=False))
 
-    def _solved_in_one_place(self) -> Solution:
+    def _solved_in_one_place(self) -> RobotsSolution:
         """The solution of the graph of all measurements; each robot is told of its poses."""
         nothing = [None] * len(self.members)
-        texts = self.ask(give_measurements, nothing)
+        network = CountedPool(self, len(self.members))
+        texts = network.ask(give_measurements, nothing, Count.ROUND)
         with warnings.catch_warnings():
             # Poses of absent robots have no estimate, which the outcome says in its own way.
             warnings.simplefilter("ignore", GraphWarning)
@@ -133,8 +135,8 @@ class Drive:
         )
         solution = solution_for(request)
         answers = [OwnAnswer.of(solution, robot) for robot in range(len(self.members))]
-        self.ask(take_answer, answers)
-        return solution
+        network.ask(take_answer, answers, Count.ROUND)
+        return RobotsSolution.of(solution, network.ledger)
 
     # An engine, and its pool of workers: the robots are there already.
 

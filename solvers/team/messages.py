@@ -8,8 +8,9 @@ from enum import IntEnum
 from typing import Any
 
 from pgo_models import errors
-from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import PGOError
+from solvers.result import History, Stage, Status
+from solvers.robots_solution import RobotsSolution
 from solvers.team.wire import Order
 
 _PLAIN_ERRORS = {
@@ -90,65 +91,44 @@ class LetterLost:
 
 
 @dataclass(frozen=True, eq=False)
-class TeamOutcome:
-    """How a solve of the team has ended.
+class Ended:
+    """A solve of the team has ended.
 
     Parameters
     ----------
     term : Term
         The solve.
-    certificate : Certificate, optional
-        Cost, bound, gap and verdict, without poses; None where the solve failed.
     revisions : dict of str to int
         Robots that took part, with how many lines of measurements each.
     absent : tuple of str
         Robots of the team that were not heard of.
-    num_absent_poses : int
-        Poses that edges name and no robot has: what is found holds for these edges all the same.
-    rounds : int
-        Rounds of the solve.
-    stages : tuple of str
-        Names of the stages of the solve.
-    note : str
-        What went wrong, or what the solution lacks.
-    robust : str
-        What a robust solve says of the edges that it kept, doubts first.
-    is_held : bool
-        Whether nothing speaks against these edges.
+    solution : RobotsSolution, optional
+        What was found; None where the solve failed.
+    failure : str
+        What went wrong; empty where nothing did.
     """
 
     term: Term
-    certificate: Certificate | None
     revisions: Mapping[str, int]
     absent: tuple[str, ...]
-    num_absent_poses: int = 0
-    rounds: int = 0
-    stages: tuple[str, ...] = ()
-    note: str = ""
-    robust: str = ""
-    is_held: bool = True
+    solution: RobotsSolution | None
+    failure: str = ""
 
     @property
     def covered(self) -> tuple[str, ...]:
-        """Robots whose measurements the certificate holds for."""
-        return () if self.certificate is None else tuple(sorted(self.revisions))
-
-    @property
-    def is_certified(self) -> bool:
-        """Whether the gap is within the one asked for, and nothing speaks against the edges kept.
-
-        This holds for the robots in `covered`.
-        """
-        return self.is_held and self.certificate is not None and self.certificate.is_certified
+        """Robots whose measurements the solution holds for."""
+        return () if self.solution is None else tuple(sorted(self.revisions))
 
     @property
     def text(self) -> str:
         """One line: the verdict, the gap, and the robots that it covers."""
-        if self.certificate is None:
-            return self.note
+        solution = self.solution
+        if solution is None:
+            return self.failure
         names = ", ".join(self.covered)
-        said = self.robust or self.certificate.verdict.name
-        return f"{said}, for {names}: gap {self.certificate.gap_text}, {self.rounds} rounds"
+        said = solution.robust or solution.verdict.name
+        gap = solution.certificate.gap_text
+        return f"{said}, for {names}: gap {gap}, {solution.ledger.rounds} rounds"
 
 
 @dataclass(frozen=True)
@@ -158,7 +138,8 @@ class Heard:
     term: Term
 
 
-MESSAGES = (Hello, Ask, Reply, Letter, LetterLost, TeamOutcome, Heard, Term)
+_OF_SOLUTION = (RobotsSolution, Stage, Status, History)
+MESSAGES = (Hello, Ask, Reply, Letter, LetterLost, Ended, Heard, Term, *_OF_SOLUTION)
 
 
 def error_as_message(error: PGOError) -> tuple[str, str]:

@@ -19,19 +19,16 @@ import numpy as np
 
 from pgo_models.errors import EngineError, PGOError, SettingError, door, extra_module
 from pgo_models.files import replace_when_done
-from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.serialization import deserialize, serialize
 from solvers.request import Pipeline
 from solvers.robots.own_file import READ_HERE
 from solvers.robots.setup import SOLVE_PARTS
+from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
-from solvers.robust.rejection import Support
-from solvers.solution import Solution
-from solvers.solves.folder_solve import FolderSolution
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent
 from solvers.team.driving import Drive
 from solvers.team.letters import LetterName, Letters
@@ -39,13 +36,13 @@ from solvers.team.measurements import Measurements
 from solvers.team.messages import (
     MESSAGES,
     Ask,
+    Ended,
     Heard,
     Hello,
     Letter,
     LetterLost,
     Priority,
     Reply,
-    TeamOutcome,
     Term,
     error_as_message,
 )
@@ -117,7 +114,7 @@ class Saved:
     sharing: Sharing
     measurements: Measurements
     term: Term
-    outcome: TeamOutcome | None
+    outcome: Ended | None
     known: OwnAnswer | None
 
 
@@ -166,9 +163,10 @@ class Robot:
 
     Attributes
     ----------
-    outcome : TeamOutcome, optional
-        How the last solve that succeeded has ended.
-    last : TeamOutcome, optional
+    outcome : Ended, optional
+        How the last solve that succeeded has ended: which one it was, who took part with which
+        measurements, and the `solution`.
+    last : Ended, optional
         How the last solve has ended, also if it has failed (`failure` says why).
     ledger : TeamLedger
         Bytes by robot.
@@ -201,8 +199,7 @@ class Robot:
     ...         robot.tick(now)
     ...         for message in robot.outbox():
     ...             robots[message.to].receive(message.data, now)
-    >>> outcome = robots["b"].outcome
-    >>> outcome.certificate.verdict.name, outcome.covered
+    >>> robots["b"].solution.verdict.name, robots["b"].covered
     ('CERTIFIED', ('a', 'b'))
     >>> sorted(robots["b"].poses)
     [2, 3]
@@ -253,11 +250,11 @@ class Robot:
         self._part: _Part | None = None
         self._drive: Drive | None = None
         self._tried: dict[str, int] | None = None  # revisions of the robots in the last solve
-        self._unheard: dict[str, TeamOutcome] = {}  # robots that have not confirmed the outcome
+        self._unheard: dict[str, Ended] = {}  # robots that have not confirmed the outcome
         self._out: list[Message] = []
         self._known: OwnAnswer | None = None
-        self.last: TeamOutcome | None = None
-        self.outcome: TeamOutcome | None = None
+        self.last: Ended | None = None
+        self.outcome: Ended | None = None
         self.ledger = TeamLedger()
 
     # Measurements
@@ -351,6 +348,11 @@ class Robot:
         return dict(zip(self._known.ids.tolist(), zip(poses.R, poses.t, strict=True), strict=True))
 
     @property
+    def solution(self) -> RobotsSolution | None:
+        """What the last solve that succeeded has found, for the robots that are `covered`."""
+        return None if self.outcome is None else self.outcome.solution
+
+    @property
     def covariances(self) -> dict[int, Array]:
         """Covariance (p, p) of every pose of this robot, by id, of teams that share measurements.
 
@@ -380,8 +382,7 @@ class Robot:
     @property
     def failure(self) -> str:
         """What went wrong in the last solve; empty if nothing did. `outcome` is one before it."""
-        is_failure = self.last is not None and self.last.certificate is None
-        return self.last.note if self.last is not None and is_failure else ""
+        return "" if self.last is None else self.last.failure
 
     @property
     def is_settled(self) -> bool:
@@ -397,7 +398,7 @@ class Robot:
     @property
     def is_certified(self) -> bool:
         """Whether the last outcome is certified, for the robots that it covers."""
-        return self.outcome is not None and self.outcome.is_certified
+        return self.solution is not None and self.solution.is_certified
 
     def facts(self) -> list[tuple[str, str]]:
         """Return what is known, as it is printed, with labels.
@@ -409,16 +410,16 @@ class Robot:
         """
         facts = [("robot", f"{self.name} of {', '.join(self.team)}")]
         facts.append(("failure", self.failure))
-        outcome = self.outcome
-        if outcome is None:
+        solution = self.solution
+        if solution is None:
             facts.append(("outcome", "none: no solve has succeeded"))
         else:
-            if outcome.certificate is not None:
-                facts += outcome.certificate.facts()
+            facts += solution.certificate.facts()
             left_out = ", ".join(f"{i} to {j}" for i, j in self.rejected)
-            facts += [("closures", outcome.robust), ("left out", left_out)]
-            facts += [("covered", ", ".join(outcome.covered)), ("note", outcome.note)]
-            facts += [("stages", ", ".join(outcome.stages)), ("rounds", str(outcome.rounds))]
+            facts += [("closures", solution.robust), ("left out", left_out)]
+            facts += [("covered", ", ".join(self.covered)), ("note", solution.note)]
+            facts += [("stages", ", ".join(_names_of_stages(solution)))]
+            facts += [("rounds", str(solution.ledger.rounds))]
         facts.append(("absent", ", ".join(self.absent)))
         sent = sum(self.ledger.sent.values())
         received = sum(self.ledger.received.values())
@@ -434,10 +435,10 @@ class Robot:
         dict
             Names, cost, bound, verdict, who is covered and absent, and bytes by robot.
         """
-        outcome = self.outcome
-        certificate = None if outcome is None else outcome.certificate
+        solution = self.solution
         known: dict[str, object] = {}
-        if certificate is not None:
+        if solution is not None:
+            certificate = solution.certificate
             known = {
                 "cost": certificate.cost,
                 "objective": certificate.objective,
@@ -451,12 +452,12 @@ class Robot:
             **known,
             "covered": list(self.covered),
             "absent": list(self.absent),
-            "rounds": 0 if outcome is None else outcome.rounds,
-            "stages": [] if outcome is None else list(outcome.stages),
-            "note": "" if outcome is None else outcome.note,
+            "rounds": 0 if solution is None else solution.ledger.rounds,
+            "stages": [] if solution is None else _names_of_stages(solution),
+            "note": "" if solution is None else solution.note,
             "failure": self.failure,
-            "revisions": {} if outcome is None else dict(outcome.revisions),
-            "robust": "" if outcome is None else outcome.robust,
+            "revisions": {} if self.outcome is None else dict(self.outcome.revisions),
+            "robust": "" if solution is None else solution.robust,
             "is_certified": self.is_certified,
             "rejected": [list(pair) for pair in self.rejected],
             "sent": dict(self.ledger.sent),
@@ -485,10 +486,11 @@ class Robot:
 
     def __repr__(self) -> str:
         size = f"{self.revision} lines"
-        if self.outcome is None or self.outcome.certificate is None:
+        solution = self.solution
+        if solution is None:
             return f"Robot({self.name!r}, {size}, {self.failure or 'no outcome yet'})"
-        held = "" if self.outcome.is_held else "DOUBTFUL, "
-        verdict = f"{held}{self.outcome.certificate.verdict.name}"
+        held = "" if solution.is_held else "DOUBTFUL, "
+        verdict = f"{held}{solution.verdict.name}"
         return f"Robot({self.name!r}, {size}, {verdict}, covered={self.covered})"
 
     # Messages
@@ -544,7 +546,7 @@ class Robot:
             self._take_letter(message)
         elif isinstance(message, LetterLost):
             self._repeat_letter(message)
-        elif isinstance(message, TeamOutcome):
+        elif isinstance(message, Ended):
             self._take_outcome(sender, message)
         elif isinstance(message, Heard):
             outcome = self._unheard.get(sender)
@@ -710,7 +712,7 @@ class Robot:
         self._drive = None
         absent = tuple(name for name in self.team if name not in drive.members)
         assert self._tried is not None
-        outcome = _outcome_of(drive, absent, self._tried)
+        outcome = _ended(drive, absent, self._tried)
         self._end_with(outcome)
         self._unheard = {name: outcome for name in drive.members[1:]}
         for name in self._unheard:
@@ -791,20 +793,20 @@ class Robot:
             return
         self._send_letter(self._part, lost.term, name)
 
-    def _take_outcome(self, sender: str, outcome: TeamOutcome) -> None:
+    def _take_outcome(self, sender: str, outcome: Ended) -> None:
         if outcome.term == self._term and outcome.term.driver == sender:
             if self.last is None or self.last.term != outcome.term:
-                if self._part is None and outcome.certificate is not None:
+                if self._part is None and outcome.solution is not None:
                     self._have_all_begin_again(outcome.term)  # its poses are lost
                     return
                 self._end_with(outcome)
             self._send(sender, Heard(outcome.term), Priority.NORMAL)
 
-    def _end_with(self, outcome: TeamOutcome) -> None:
+    def _end_with(self, outcome: Ended) -> None:
         """Keep an outcome and the poses with it; where a solve has failed, those before it."""
         self.last = outcome
         answer = None if self._part is None else self._part.agent.answer
-        if outcome.certificate is not None and answer is not None:
+        if outcome.solution is not None and answer is not None:
             self.outcome = outcome
             self._known = answer
 
@@ -895,6 +897,11 @@ class Robot:
 _SAVED = (Measurements, OwnAnswer, Saved, Sharing, Weighting)
 
 
+def _names_of_stages(solution: RobotsSolution) -> list[str]:
+    """Names of the stages that were taken."""
+    return [stage.name for stage in solution.stages if stage.was_taken]
+
+
 def _check_settings(
     name: str, team: tuple[str, ...], key: bytes, patience: float, retry: float
 ) -> None:
@@ -910,39 +917,12 @@ def _check_settings(
         raise SettingError(f"patience is {patience} and retry {retry}; give positive seconds")
 
 
-def _outcome_of(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, int]) -> TeamOutcome:
-    """The outcome of a solve that has ended."""
-    ended = drive.outcome
-    if isinstance(ended, FolderSolution):
-        return TeamOutcome(
-            drive.term,
-            ended.certificate,
-            revisions,
-            absent,
-            num_absent_poses=ended.num_absent,
-            rounds=ended.ledger.rounds,
-            stages=tuple(stage.name for stage in ended.stages if stage.was_taken),
-            note=ended.note,
-            robust=ended.robust_text,
-            is_held=ended.num_rejected is None,
-        )
-    if isinstance(ended, Solution):
-        d = ended.poses.d
-        nobodys = Poses.identity(0, d)
-        robust = ended.robust
-        return TeamOutcome(
-            drive.term,
-            replace(ended.certificate, poses=nobodys, Lambda=np.zeros((0, d, d))),
-            revisions,
-            absent,
-            num_absent_poses=len(ended.problem.graph.absent),
-            rounds=drive.call + 1,
-            stages=tuple(stage.name for stage in ended.stages if stage.was_taken),
-            note=ended.note,
-            robust="" if robust is None else robust.headline,
-            is_held=robust is None or robust.support is Support.CHECKED,
-        )
+def _ended(drive: Drive, absent: tuple[str, ...], revisions: Mapping[str, int]) -> Ended:
+    """How a solve has ended."""
+    outcome = drive.outcome
+    if isinstance(outcome, RobotsSolution):
+        return Ended(drive.term, revisions, absent, outcome.without_histories)
     # What robots with own files lack, a team that shares its measurements has; and parts may meet.
-    text = str(ended).replace(READ_HERE, "robots that share their measurements can")
+    text = str(outcome).replace(READ_HERE, "robots that share their measurements can")
     text = text.replace(SOLVE_PARTS, "an edge between them joins them")
-    return TeamOutcome(drive.term, None, revisions, absent, note=f"failed: {text}")
+    return Ended(drive.term, revisions, absent, None, failure=f"failed: {text}")

@@ -46,10 +46,10 @@ def carried(files: list[Path], sharing: solvers.Sharing) -> tuple[int, int]:
         robots[name].read(path)
     network = Network(robots, np.random.default_rng(0), delay=1e-3)
     network.run(300.0)
-    outcome = robots[names[0]].outcome
-    assert outcome is not None
-    assert outcome.is_certified, outcome.text
-    return network.carried, outcome.rounds
+    solution = robots[names[0]].solution
+    assert solution is not None
+    assert solution.is_certified, str(solution)
+    return network.carried, solution.ledger.rounds
 
 
 def main() -> None:

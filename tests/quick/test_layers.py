@@ -49,6 +49,7 @@ ORDER = {
         "robots",
         "reporting",
         "solution",
+        "robots_solution",
         "request",
         "plan",
         "robust_solves",

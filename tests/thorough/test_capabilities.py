@@ -24,14 +24,15 @@ from pgo_models import NoiseModel, PGOError, PoseGraph, Weighting, victoria_park
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import SweptScene
 from solvers.place import Automatic
+from solvers.result import Stage
 from solvers.riemannian.prefixes import GrowingStart
-from solvers.solves.folder_solve import FolderSolution
+from solvers.robots_solution import RobotsSolution
 from solvers.studies.tightness import noisy_scene
 
 PAGE = Path(__file__).parents[2] / "notebooks/site/guide/capabilities.md"
 WORKS = "yes"
 MISSING = "no"
-Answer = "Solution | FolderSolution | Apart"
+Answer = "Solution | RobotsSolution | Apart"
 
 
 def consensus(graph: PoseGraph) -> solvers.SOC:
@@ -97,13 +98,6 @@ def own_files(
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Name of a stage."""
-
-    name: str
-
-
-@dataclass(frozen=True)
 class Rejected:
     """Edges that were left out, (m,)."""
 
@@ -123,19 +117,19 @@ class Apart:
 
     @property
     def certificate(self) -> pgo.Certificate:
-        if self.robot.outcome is None or self.robot.outcome.certificate is None:
+        if self.robot.solution is None:
             raise pgo.PGOError(self.robot.failure)
-        return self.robot.outcome.certificate
+        return self.robot.solution.certificate
 
     @property
     def note(self) -> str:
-        assert self.robot.outcome is not None
-        return self.robot.outcome.note
+        assert self.robot.solution is not None
+        return self.robot.solution.note
 
     @property
     def stages(self) -> tuple[Stage, ...]:
-        assert self.robot.outcome is not None
-        return tuple(map(Stage, self.robot.outcome.stages))
+        assert self.robot.solution is not None
+        return self.robot.solution.stages
 
     @property
     def robust(self) -> Rejected:
@@ -241,7 +235,7 @@ def finds_a_wrong_edge(robust: solvers.GNC | solvers.PCM, place: Place) -> bool:
     measured = pgo.Poses(np.eye(2)[None], np.array([[30.0, 40.0]]))
     spoiled = graph.with_edges(np.array([2]), np.array([25]), measured, 100.0, 100.0)
     answer = place.solve(spoiled, robust=robust)
-    if isinstance(answer, FolderSolution):  # the robots know which ones
+    if isinstance(answer, RobotsSolution):  # the robots know which ones
         return bool(answer.num_rejected)
     rejection = getattr(answer, "robust", None)
     return rejection is not None and bool(rejection.rejected[-1])
@@ -249,7 +243,7 @@ def finds_a_wrong_edge(robust: solvers.GNC | solvers.PCM, place: Place) -> bool:
 
 def has_covariances(place: Place) -> bool:
     answer = place.solve(graph_with_matrices(), weighting=Weighting.ISOTROPIC)
-    if isinstance(answer, FolderSolution):
+    if isinstance(answer, RobotsSolution):
         raise pgo.PGOError("its solution has no poses, and so no covariances of them")
     return answer.marginals().shape == (8, 3, 3)
 
@@ -307,7 +301,7 @@ def extends(place: Place) -> bool:
     )
     if isinstance(answer, Apart):
         return answer.extended(grown)
-    if isinstance(answer, FolderSolution):
+    if isinstance(answer, RobotsSolution):
         raise pgo.PGOError("extend takes a Solution, which has poses")
     return solvers.extend(answer, grown).problem.graph.num_edges == grown.num_edges
 

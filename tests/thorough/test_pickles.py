@@ -143,7 +143,7 @@ MADE: dict[str, Make] = {
     "Record": lambda: run(solvers.Newton(), pgo.PGOProblem(GRAPH)).history.records[-1],
     "Run": lambda: run(solvers.SOC(), pgo.PGOProblem(GRAPH)),
     "Stage": lambda: solved().stages[0],
-    "FolderSolution": lambda: solvers.solve_folder("robots"),
+    "RobotsSolution": lambda: solvers.solve_folder("robots"),
     "Pipeline": solvers.Pipeline,
     "Solution": solved,
     "SOC": lambda: solvers.SOC(robots=pgo.partition(GRAPH, 3)),

@@ -29,7 +29,7 @@ UNUSED_BY_SOLVE = EXTRAS | {
     "scipy.stats",
     "solvers.baselines",
     "solvers.convex",
-    "solvers.robots",
+    "solvers.robots.driver",
     "solvers.solves.folder_solve",
     "solvers.reporting.report",
     "solvers.robust_solves",

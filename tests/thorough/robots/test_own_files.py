@@ -34,7 +34,7 @@ from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.scenes import observe
 from solvers import Coupling, Robots, solve_folder
 from solvers.result import Stage
-from solvers.solves.folder_solve import FolderSolution
+from solvers.robots_solution import RobotsSolution
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 LIMIT = 27.0  # MB beside the program itself
@@ -55,7 +55,7 @@ def tower(num_robots: int, poses_each: int) -> PoseGraph:
     return graph.with_robots(k // poses_each)
 
 
-def check_same(solution: FolderSolution, graph: PoseGraph, out: Path) -> None:
+def check_same(solution: RobotsSolution, graph: PoseGraph, out: Path) -> None:
     """Objective and bound of the central solve, and files with poses that have this objective."""
     weighting = solution.certificate.weighting
     problem = pgo.PGOProblem(graph, weighting=weighting)
@@ -320,7 +320,7 @@ def read_size(folder: Path) -> int:
     return read_g2o(folder).num_edges
 
 
-def solve_limited(folder: Path, out: Path) -> FolderSolution:
+def solve_limited(folder: Path, out: Path) -> RobotsSolution:
     solution = solve_folder(folder, robots=Robots(engine=LimitedProcesses(LIMIT)), out=out)
     return replace(solution, stages=solution.stages[-1:])
 

@@ -26,7 +26,7 @@ from solvers.robots.own_file import Told
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.agent import OwnAnswer
-from solvers.team.messages import MESSAGES, Ask, Heard, Letter, Reply, TeamOutcome
+from solvers.team.messages import MESSAGES, Ask, Ended, Heard, Letter, Reply
 from solvers.team.robot import Envelope, TeamLedger
 from solvers.team.wire import opened, sealed
 
@@ -53,8 +53,8 @@ def assert_is_the_optimum(
     poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for robot in robots.values():
         assert robot.outcome is not None
-        certificate = robot.outcome.certificate
-        assert certificate is not None, robot.outcome.note
+        assert robot.solution is not None, robot.failure
+        certificate = robot.solution.certificate
         assert certificate.is_certified
         assert certificate.lower_bound <= best.objective * (1 + 1e-12)
         terms.add(robot.outcome.term)
@@ -106,16 +106,15 @@ def test_peers_agree_and_the_answer_is_certified(d: int, pipeline: solvers.Pipel
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
     name = type(pipeline.soc).__name__
-    assert all(robot.last.stages[1] == name for robot in network.robots.values())
+    assert all(robot.solution.stages[1].name == name for robot in network.robots.values())
     expected = solvers.solve(
         pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC),
         pipeline,
         robots=pgo.partition(graph, 4),
     )
-    outcome = network.robots["r0"].outcome
-    assert outcome is not None
-    assert outcome.certificate is not None
-    assert outcome.certificate.objective == pytest.approx(expected.objective, rel=1e-9)
+    solution = network.robots["r0"].solution
+    assert solution is not None
+    assert solution.objective == pytest.approx(expected.objective, rel=1e-9)
 
 
 def test_what_two_robots_tell_each_other_does_not_pass_the_one_that_drives() -> None:
@@ -187,7 +186,7 @@ def test_a_robot_that_begins_anew_while_its_letter_is_waited_for_is_solved_with_
 def test_a_robot_that_begins_anew_before_it_has_heard_the_outcome_gets_its_poses() -> None:
     graph = world()
     robots = robots_of(graph, 3)
-    loses, ended = losing(TeamOutcome, (0,), receiver="r2")
+    loses, ended = losing(Ended, (0,), receiver="r2")
     network = Network(robots, np.random.default_rng(0), is_lost=loses)
     while not ended:
         network.wait(0.02)
@@ -301,10 +300,9 @@ def test_a_robot_that_never_comes_is_named_and_the_others_have_an_answer() -> No
         robot = robots[name]
         assert robot.absent == ("r2",)
         assert robot.covered == ("r0", "r1")
-        assert robot.outcome is not None
-        assert robot.outcome.certificate is not None
-        assert robot.outcome.certificate.is_certified
-        assert robot.outcome.num_absent_poses > 0
+        assert robot.solution is not None
+        assert robot.solution.is_certified
+        assert robot.solution.num_absent > 0
         assert not robot.is_settled
 
 
@@ -374,11 +372,11 @@ def test_a_team_that_shares_its_measurements_finds_wrong_ones_in_three_messages_
     found = {pair for robot in robots.values() for pair in robot.rejected}
     assert found == wrong
     for robot in robots.values():
-        assert robot.outcome is not None
-        assert robot.outcome.rounds == 2
+        assert robot.solution is not None
+        assert robot.solution.ledger.rounds == 2
         assert sorted(robot.covariances) == sorted(robot.poses)
         assert all(S.shape == (3, 3) for S in robot.covariances.values())
-        assert "closures hold the map" in robot.outcome.robust
+        assert "closures hold the map" in robot.solution.robust
         assert robot.is_certified
 
 
@@ -399,10 +397,9 @@ def test_doubts_of_a_robust_solve_reach_all_robots() -> None:
     network.run(30.0)
     assert network.is_settled
     for robot in robots.values():
-        assert robot.outcome is not None
-        assert robot.outcome.certificate is not None
+        assert robot.solution is not None
         assert not robot.is_certified
-        assert robot.outcome.robust.startswith("UNCHECKED")
+        assert robot.solution.robust.startswith("UNCHECKED")
 
 
 def test_sharing_measurements_takes_fewer_bytes_than_sharing_interfaces() -> None:
