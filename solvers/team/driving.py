@@ -9,7 +9,7 @@ a team that shares its measurements the driving robot solves alone, with all opt
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,12 +26,14 @@ from solvers.carry.process import DEFAULT_MEMORY
 from solvers.loop import RunMonitor
 from solvers.pipeline import solution_for
 from solvers.request import Pipeline, SolveRequest
+from solvers.robots.own_file import READ_HERE
+from solvers.robots.setup import SOLVE_PARTS
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.solves.folder_solve import FilesOfRobots, check_robust
 from solvers.team.agent import OwnAnswer, Sharing, TeamAgent, give_measurements, take_answer
-from solvers.team.messages import Ask, Reply, Term, error_of_message
+from solvers.team.messages import Ask, Ended, Reply, Term, error_of_message
 from solvers.team.wire import Order
 
 T = TypeVar("T")
@@ -95,6 +97,16 @@ class Drive:
         if self._page is not None and not self._page.dead:
             self._page.throw(_AbandonedError)
         self.waiting.clear()
+
+    def ended(self, absent: tuple[str, ...], revisions: Mapping[str, int]) -> Ended:
+        """How the solve has ended, without `absent` robots, by members with these revisions."""
+        outcome = self.outcome
+        if isinstance(outcome, RobotsSolution):
+            return Ended(self.term, revisions, absent, outcome.without_histories)
+        # What robots with own files lack, a team that shares its measurements has; parts may meet.
+        text = str(outcome).replace(READ_HERE, "robots that share their measurements can")
+        text = text.replace(SOLVE_PARTS, "an edge between them joins them")
+        return Ended(self.term, revisions, absent, None, failure=f"failed: {text}")
 
     def _solve(self) -> None:
         try:

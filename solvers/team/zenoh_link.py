@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 
 from pgo_models.errors import EngineError, extra_module
-from solvers.team.robot import Message, Robot
+from solvers.team.robot import Robot
+from solvers.team.session import Message
 
 # Seconds between two ticks, and for which a robot answers repeated messages at the end, in retries.
 _TICK = 0.05

@@ -27,7 +27,7 @@ from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.agent import OwnAnswer
 from solvers.team.messages import MESSAGES, Ask, Ended, Heard, Letter, Reply
-from solvers.team.robot import Envelope, TeamLedger
+from solvers.team.session import Envelope, TeamLedger
 from solvers.team.wire import opened, sealed
 
 pytest.importorskip("greenlet")

@@ -1,0 +1,468 @@
+"""The session of a robot with its team: who is there, which solve is on, what has no answer yet.
+
+It has no mathematics. It is given what arrives (`receive`) and the time (`tick`), and hands out
+what is to be sent (`outbox`). Messages may be lost, late, repeated, or come in any order. The robot
+whose name comes first among those that are awake drives, and the terms of solves only grow. What a
+robot brings into a solve is its `Member`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pgo_models.errors import EngineError, PGOError
+from solvers.team.agent import OwnAnswer, TeamAgent
+from solvers.team.driving import Drive
+from solvers.team.letters import LetterName, Letters
+from solvers.team.member import Member
+from solvers.team.messages import (
+    MESSAGES,
+    Ask,
+    Ended,
+    Heard,
+    Hello,
+    Letter,
+    LetterLost,
+    Priority,
+    Reply,
+    Term,
+    error_as_message,
+)
+from solvers.team.wire import WireError, opened, sealed
+
+PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
+RETRY = 1.0  # seconds after which a message without an answer is sent again
+# Patiences after which a robot that is there, and has not answered, is waited for no more.
+_MOST_PATIENCES = 10.0
+# Share of its patience after which a robot says again that it is there.
+_SHARE_OF_PATIENCE = 0.25
+
+
+class Message(NamedTuple):
+    """A message to be sent: the robot that it is for, its bytes, and what goes first."""
+
+    to: str
+    data: bytes
+    priority: Priority
+
+
+@dataclass(frozen=True, eq=False)
+class TeamLedger:
+    """Bytes that a robot has handed out for others and received from them, by robot.
+
+    `messages` counts those handed out, `dropped` those received that were none of the team.
+    """
+
+    sent: Mapping[str, int] = field(default_factory=dict)
+    received: Mapping[str, int] = field(default_factory=dict)
+    messages: int = 0
+    dropped: int = 0
+
+    def after_sending(self, message: Message) -> TeamLedger:
+        """Return the ledger after one more message."""
+        sent = _with_more(self.sent, message.to, len(message.data))
+        return replace(self, sent=sent, messages=self.messages + 1)
+
+    def after_receiving(self, robot: str, data: bytes) -> TeamLedger:
+        """Return the ledger after a message of another robot."""
+        return replace(self, received=_with_more(self.received, robot, len(data)))
+
+    def after_dropping(self) -> TeamLedger:
+        """Return the ledger after bytes that were no message of the team."""
+        return replace(self, dropped=self.dropped + 1)
+
+
+def _with_more(counts: Mapping[str, int], name: str, more: int) -> Mapping[str, int]:
+    return {**counts, name: counts.get(name, 0) + more}
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """A message and who it is from and to."""
+
+    sender: str
+    receiver: str
+    message: object
+
+
+@dataclass(eq=False)
+class Following:
+    """What a robot does in a solve: its agent obeys each order once. The last answer may be lost.
+
+    `waiting` is an order that waits for letters of other robots; `members` are all by their places.
+    """
+
+    agent: TeamAgent
+    revision: int
+    letters: Letters
+    members: tuple[str, ...]
+    call: int = -1
+    reply: Reply | None = None
+    waiting: Ask | None = None
+
+
+@dataclass(eq=False)
+class Presence:
+    """Who of the team is awake, with which measurements, and who is to be told hello.
+
+    `last_heard` is when each of the others was last heard of, and `revisions` those of their
+    measurements. `began` is the first moment that the robot itself was awake.
+    """
+
+    name: str
+    team: tuple[str, ...]
+    patience: float
+    retry: float
+    last_heard: dict[str, float] = field(default_factory=dict)
+    revisions: dict[str, int] = field(default_factory=dict)
+    began: float | None = None
+    _hello_at: float = -np.inf  # when hello was said to all, and to those that are not awake
+    _sought_at: float = -np.inf
+    _said_revision: int = -1
+
+    def awake(self, now: float) -> tuple[str, ...]:
+        """Robots that were heard of lately, and this one, in the order of their names."""
+        awake = []
+        for name in self.team:
+            last = self.last_heard.get(name, -np.inf)
+            if name == self.name or now - last <= self.patience:
+                awake.append(name)
+        return tuple(awake)
+
+    def is_complete(self, now: float, awake: tuple[str, ...]) -> bool:
+        """Whether everybody is awake, or was waited for."""
+        assert self.began is not None
+        return len(awake) == len(self.team) or now - self.began >= self.patience
+
+    def revisions_of(self, awake: tuple[str, ...], own: int) -> dict[str, int]:
+        """Revisions of the measurements of robots that are awake; this one has `own`."""
+        others = {name: self.revisions.get(name, 0) for name in awake if name != self.name}
+        return {self.name: own, **others}
+
+    def learn_revision(self, robot: str, revision: int) -> None:
+        """Take the revision of another robot, which a late message may have of before."""
+        self.revisions[robot] = max(revision, self.revisions.get(robot, 0))
+
+    def to_greet(self, now: float, awake: tuple[str, ...], revision: int) -> list[str]:
+        """Whom to say hello: often those not awake, now and then and with more lines all."""
+        is_due = now - self._hello_at >= _SHARE_OF_PATIENCE * self.patience
+        is_due |= self._said_revision != revision
+        seeks = now - self._sought_at >= self.retry
+        if is_due:
+            self._hello_at = now
+            self._said_revision = revision
+        if seeks:
+            self._sought_at = now
+        others = [name for name in self.team if name != self.name]
+        return [name for name in others if (is_due if name in awake else seeks)]
+
+
+class Session:
+    """The session of a robot with the others of its team, by their names.
+
+    `last` is how the last solve has ended, and `term` the last solve that is known of.
+    """
+
+    def __init__(
+        self,
+        member: Member,
+        team: tuple[str, ...],
+        key: bytes,
+        patience: float,
+        retry: float,
+    ) -> None:
+        self.name = member.name
+        self.team = team
+        self.retry = retry
+        self.ledger = TeamLedger()
+        self.term = Term(0, "")
+        self.last: Ended | None = None
+        self._member = member
+        self._key = key
+        self._presence = Presence(self.name, team, patience, retry)
+        self._sent_at: dict[str, float] = {}  # when the last ask or outcome was sent to each
+        self._waits_since: float | None = None  # for answers to the orders under way
+        self._following: Following | None = None
+        self._drive: Drive | None = None
+        self._tried: dict[str, int] | None = None  # revisions of the robots in the last solve
+        self._unheard: dict[str, Ended] = {}  # robots that have not confirmed the outcome
+        self._out: list[Message] = []
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the last solve was of the whole team and all that this robot has measured.
+
+        Nobody waits for this robot then.
+        """
+        last = self.last
+        if last is None or last.absent or last.revisions.get(self.name) != self._member.revision:
+            return False
+        return self._drive is None and not self._unheard and not self._out
+
+    def outbox(self) -> list[Message]:
+        """Hand out what is to be sent, what others wait for first."""
+        messages = sorted(self._out, key=lambda message: message.priority)
+        self._out = []
+        for message in messages:
+            self.ledger = self.ledger.after_sending(message)
+        return messages
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take what has arrived: in any order, and any number of times."""
+        try:
+            envelope = opened(self._key, data, (Envelope, OwnAnswer, *MESSAGES))
+            if not isinstance(envelope, Envelope) or envelope.receiver != self.name:
+                raise WireError("a message for another robot")
+            if envelope.sender not in self.team or envelope.sender == self.name:
+                raise WireError("a message of nobody in the team")
+        except WireError:
+            self.ledger = self.ledger.after_dropping()
+            return
+        sender = envelope.sender
+        self.ledger = self.ledger.after_receiving(sender, data)
+        self._presence.last_heard[sender] = now
+        self._take(sender, envelope.message, now)
+
+    def _take(self, sender: str, message: object, now: float) -> None:
+        """Update what is known of the team by a message, or obey the order in it."""
+        if isinstance(message, Hello):
+            self._presence.learn_revision(sender, message.revision)
+            self._learn_term(message.term)
+        elif isinstance(message, Ask):
+            self._obey(sender, message)
+        elif isinstance(message, Reply):
+            self._take_reply(sender, message, now)
+        elif isinstance(message, Letter):
+            self._take_letter(message)
+        elif isinstance(message, LetterLost):
+            self._repeat_letter(message)
+        elif isinstance(message, Ended):
+            self._take_outcome(sender, message)
+        elif isinstance(message, Heard):
+            outcome = self._unheard.get(sender)
+            if outcome is not None and outcome.term == message.term:
+                del self._unheard[sender]
+
+    def tick(self, now: float) -> None:
+        """Do what is due: say hello, begin a solve, repeat what was not answered, give up."""
+        presence = self._presence
+        if presence.began is None:
+            presence.began = now
+        awake = presence.awake(now)
+        for name in presence.to_greet(now, awake, self._member.revision):
+            self._say_hello(name, Priority.NORMAL)
+        if self._drive is not None:
+            self._go_on_driving(now, awake)
+        if self._drive is None and awake[0] == self.name and self._is_time(now, awake):
+            self._begin_drive(awake, now)
+        for name, outcome in list(self._unheard.items()):
+            if name not in awake:
+                del self._unheard[name]
+            elif now - self._sent_at.get(name, -np.inf) >= self.retry:
+                self._sent_at[name] = now
+                self._send(name, outcome, Priority.NORMAL)
+
+    def _say_hello(self, to: str, priority: Priority) -> None:
+        self._send(to, Hello(self._member.revision, self.term), priority)
+
+    def _send(self, to: str, message: object, priority: Priority) -> None:
+        data = sealed(self._key, Envelope(self.name, to, message))
+        self._out.append(Message(to, data, priority))
+
+    def _learn_term(self, term: Term) -> None:
+        """Give up a solve that another robot has overtaken, and solve again if this one drives."""
+        if term > self.term:
+            self.term = term
+            self._following = None
+            self._tried = None
+            self._unheard.clear()
+            self._give_up()
+
+    def _give_up(self) -> None:
+        if self._drive is not None:
+            self._drive.abandon()
+            self._drive = None
+            self._tried = None
+
+    # Driving
+
+    def _is_time(self, now: float, awake: tuple[str, ...]) -> bool:
+        """Whether a solve should begin: everybody is there or was waited for, and something is new.
+
+        Robots without measurements are waited for, too.
+        """
+        revisions = self._presence.revisions_of(awake, self._member.revision)
+        is_new = min(revisions.values()) > 0 and revisions != self._tried
+        return is_new and self._presence.is_complete(now, awake)
+
+    def _begin_drive(self, awake: tuple[str, ...], now: float) -> None:
+        own_revision = self._member.revision
+        self._tried = self._presence.revisions_of(awake, own_revision)
+        self._unheard.clear()  # of the last outcome: there will be another one
+        self.term = Term(self.term.number + 1, self.name)
+        agent = self._member.new_agent(0)
+        assert agent is not None  # as it has measurements
+        members = (self.name, *(name for name in awake if name != self.name))
+        self._following = Following(agent, own_revision, Letters(0), members)
+        self._drive = self._member.new_drive(self.term, members, agent)
+        self._drive.begin()
+        self._after_step(now)
+
+    def _go_on_driving(self, now: float, awake: tuple[str, ...]) -> None:
+        """Ask again where no answer came, and give up where a robot has gone.
+
+        A robot that is there and does not answer, as one that cannot read the order, ends the
+        solve with an error.
+        """
+        assert self._drive is not None
+        if not set(self._drive.needed) <= set(awake):
+            self._give_up()
+            return
+        if self._waits_since is None:  # a step may have taken longer than any patience
+            self._waits_since = now
+        if now - self._waits_since > _MOST_PATIENCES * self._presence.patience:
+            self._end_without_answers(now)
+            return
+        for name, ask in self._drive.waiting.items():
+            if now - self._sent_at.get(name, -np.inf) >= self.retry:
+                self._sent_at[name] = now
+                self._send(name, ask, Priority.URGENT)
+
+    def _end_without_answers(self, now: float) -> None:
+        """End the solve with an error in place of the answers that are missing."""
+        assert self._drive is not None
+        assert self._waits_since is not None
+        seconds = now - self._waits_since
+        error = error_as_message(
+            EngineError(
+                f"it is there, and has not answered for {seconds:.0f} seconds; "
+                "see whether all robots have the same version, and what their ledgers have dropped"
+            )
+        )
+        for name, ask in list(self._drive.waiting.items()):
+            self._drive.take(
+                name, Reply(ask.term, ask.call, self._presence.revisions.get(name, 0), None, error)
+            )
+        self._after_step(now)
+
+    def _take_reply(self, sender: str, reply: Reply, now: float) -> None:
+        if self._drive is not None and reply.term == self._drive.term:
+            if self._tried is not None:
+                self._tried[sender] = reply.revision
+            before = self._drive.call
+            self._drive.take(sender, reply)
+            if self._drive.call != before or self._drive.outcome is not None:
+                self._after_step(now)
+
+    def _after_step(self, now: float) -> None:
+        """Send what the page of the solve asks for, or its outcome if it has ended."""
+        drive = self._drive
+        assert drive is not None
+        self._waits_since = None
+        for name, ask in drive.waiting.items():
+            self._sent_at[name] = now
+            self._send(name, ask, Priority.URGENT)
+        if drive.outcome is None:
+            return
+        self._drive = None
+        absent = tuple(name for name in self.team if name not in drive.members)
+        assert self._tried is not None
+        outcome = drive.ended(absent, self._tried)
+        self._end_with(outcome)
+        self._unheard = {name: outcome for name in drive.members[1:]}
+        for name in self._unheard:
+            self._sent_at[name] = now
+            self._send(name, outcome, Priority.NORMAL)
+
+    # Following
+
+    def _obey(self, sender: str, ask: Ask) -> None:
+        """Obey an order once, and answer it as often as it is asked."""
+        if ask.term.driver != sender or ask.term < self.term:
+            self._say_hello(sender, Priority.NORMAL)
+            return
+        if ask.term > self.term:
+            self._learn_term(ask.term)
+        if ask.call > (0 if self._following is None else self._following.call + 1):
+            self._have_all_begin_again(ask.term)
+            return
+        if self._following is None:
+            agent = self._member.new_agent(ask.place)
+            if agent is None:
+                return
+            letters = Letters(ask.place)
+            self._following = Following(agent, self._member.revision, letters, ask.members)
+        part = self._following
+        if ask.call == part.call + 1:
+            lost = self._answer(part, ask)
+            if part.waiting is not None:  # asked again: the letters should be here by now
+                for name in lost:
+                    message = LetterLost(ask.term, name.call, part.letters.place)
+                    self._send(part.members[name.other], message, Priority.URGENT)
+            part.waiting = ask if lost else None
+        elif ask.call == part.call and part.reply is not None:
+            self._send(sender, part.reply, Priority.URGENT)
+
+    def _have_all_begin_again(self, term: Term) -> None:
+        """Tell the robot that drives that this one has begun anew and has lost its part."""
+        self.term = Term(term.number + 1, self.name)
+        self._say_hello(term.driver, Priority.URGENT)
+
+    def _answer(self, part: Following, ask: Ask) -> set[LetterName]:
+        """Obey an order and send the answer, and letters with it, unless letters are missing."""
+        request, missing = part.letters.put_in(ask.request)
+        if missing:
+            return missing
+        part.call = ask.call
+        try:
+            answer = ask.order.function()(part.agent, request)
+        except PGOError as error:
+            part.reply = Reply(ask.term, ask.call, part.revision, None, error_as_message(error))
+        else:
+            answer, letters = part.letters.take_out(ask.call, answer)
+            part.reply = Reply(ask.term, ask.call, part.revision, answer)
+            for name in letters:
+                self._send_letter(part, ask.term, name)
+        self._send(ask.term.driver, part.reply, Priority.URGENT)
+        return missing
+
+    def _send_letter(self, part: Following, term: Term, name: LetterName) -> None:
+        letter = Letter(term, name.call, part.letters.place, part.letters.sent[name])
+        self._send(part.members[name.other], letter, Priority.URGENT)
+
+    def _take_letter(self, letter: Letter) -> None:
+        """Keep a letter, and obey the order that has waited for it."""
+        part = self._following
+        if part is None or letter.term != self.term:
+            return
+        part.letters.received[LetterName(letter.place, letter.call)] = letter.content
+        if part.waiting is not None and not self._answer(part, part.waiting):
+            part.waiting = None
+
+    def _repeat_letter(self, lost: LetterLost) -> None:
+        """Send a letter again."""
+        if lost.term != self.term:
+            return
+        name = LetterName(lost.place, lost.call)
+        if self._following is None or name not in self._following.letters.sent:
+            self._have_all_begin_again(lost.term)
+            return
+        self._send_letter(self._following, lost.term, name)
+
+    def _take_outcome(self, sender: str, outcome: Ended) -> None:
+        if outcome.term == self.term and outcome.term.driver == sender:
+            if self.last is None or self.last.term != outcome.term:
+                if self._following is None and outcome.solution is not None:
+                    self._have_all_begin_again(outcome.term)  # its poses are lost
+                    return
+                self._end_with(outcome)
+            self._send(sender, Heard(outcome.term), Priority.NORMAL)
+
+    def _end_with(self, outcome: Ended) -> None:
+        """Remember how a solve has ended, and have the robot take what was found."""
+        self.last = outcome
+        self._member.end_with(outcome, None if self._following is None else self._following.agent)
