@@ -106,8 +106,7 @@ def raise_first_error(answers: list[Any]) -> list[Any]:
 def count_bytes(record: object) -> int:
     """Count the bytes that a request or an answer carries between a worker and the driver.
 
-    A number takes eight bytes, an array its `nbytes`, a text those of UTF-8, and a token those of
-    its message.
+    A number takes eight bytes, an array its `nbytes`, and a token those of its message.
 
     A mapping holds messages for other workers, which are counted when they are exchanged. Fields
     whose names begin with `measured` are off the ledger.
@@ -118,8 +117,6 @@ def count_bytes(record: object) -> int:
         return 0
     if isinstance(record, Token):
         return record.num_bytes
-    if isinstance(record, str):
-        return len(record.encode())
     if isinstance(record, tuple):
         return sum(count_bytes(item) for item in record)
     fields = getattr(type(record), "__dataclass_fields__", None)

@@ -75,9 +75,8 @@ from solvers.robots.interior import Interior
 from solvers.robots.records import (
     CostParts,
     ReducedTranslations,
-    Reweigh,
+    Reweighed,
 )
-from solvers.robots.reweighting import reweigh
 from solvers.robots.subdomain_blocks import Widths
 from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.subgraph import RobotSummary
@@ -287,9 +286,8 @@ class Driver:
             answers = self.ask(current_poses.choose_cost, final, Count.PIGGYBACKED)
             self.current = self.with_cost(self.current, answers)
 
-    def reweigh(self, order: Reweigh) -> None:
-        """Weigh the robots' edges by their residuals at the current poses."""
-        answers = self.ask(reweigh, order)
+    def take_weights(self, answers: Sequence[Reweighed]) -> None:
+        """Take the cost of robots that have weighed their edges anew, at the current poses."""
         self._laplacian = None  # its matrix has the weights of before
         self.diagonal = self.gather_diagonal([answer.diagonal for answer in answers])
         self.current = self.with_cost(self.current, [answer.at for answer in answers])

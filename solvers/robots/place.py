@@ -563,7 +563,7 @@ class PlaceOfRobots(Place):
         else:
             driver.hand_out(start)
         driver.choose_cost(final=True)
-        finished = self.monitor.run(SharedGNC.of(gnc, problem.graph), driver)
+        finished = self.monitor.run(SharedGNC.of(gnc, driver, problem.graph, has_map=False), driver)
         return inliers_of(problem, gnc, driver, finished)
 
     def move_to_frame(self, best: Attempt) -> tuple[Attempt, str, float]:

@@ -1,15 +1,24 @@
 """Graduated non-convexity by robots with own files, from what pairwise consistency has found.
 
 The robots hold more edges again, each with the threshold of its cost, at the poses that were found
-without them. From there they run the algorithm of `solvers.robust.gnc`. The edges within their
+without them. From there they run the algorithm of `solvers.robots.reweigh`. The edges within their
 thresholds at the end are kept if the truncated cost has fallen, and those that robots need to hold
 together; else those that were kept before, or agree pairwise. Where the poses are of a certified
 map, the edges that come back are those near it: the others begin a short schedule without weight,
 and would join all robots to each other.
+
+The orders to robots, below, are given in this sequence:
+
+1. `tell_solved` and `judge_near`, if only edges near the map come back;
+2. `take_back`, and the orders that place the robot anew;
+3. `tell_cover` and `go_to_solved`;
+4. the orders of `solvers.robots.reweigh`;
+5. `tell_links`, `tell_kept` and `keep`, or `go_back` if the map is no better.
 """
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,33 +26,46 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pgo_models.errors import FAILURES, GraphError
-from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.pose_graph import least_tree
+from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray, least_tree
+from pgo_models.problem.thresholds import chi2_thresholds
+from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
 from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
 from solvers.result import Stage
 from solvers.robots import current_poses
-from solvers.robots.driver import Driver
-from solvers.robots.own_file import Border
-from solvers.robots.revision_of_robot import (
-    ComesBack,
-    Links,
-    TakenBack,
-    go_back,
-    go_to_solved,
-    judge_near,
-    keep,
-    take_back,
-    tell_cover,
-    tell_kept,
-    tell_links,
-    tell_solved,
+from solvers.robots.agent import held_poses, order_interior
+from solvers.robots.consistency import (
+    ConsistentPart,
+    edges_between,
+    everything_of,
+    go_on_with,
+    joined_of,
+    neighbours_of,
+    own_odometry,
+    with_edges,
 )
-from solvers.robots.reweigh import SharedGNC, stage_of
-from solvers.robots.reweighting import sum_truncated
+from solvers.robots.driver import Driver
+from solvers.robots.own_file import Border, FileAgent, JoinedFile, PlacedFile, border_of
+from solvers.robots.reweigh import SharedGNC, stage_of, sum_truncated
 from solvers.robots.setup import OpenedFiles
+from solvers.robust.chains import is_whole
 from solvers.robust.gnc import GNC
+from solvers.soc.subgraph import PartProblem
+
+# Edges come back that cost at most so many times their thresholds at a map: most others begin
+# without weight. With ten times one right closure of CSAIL stayed out, in each of six runs.
+_NEAR = 100.0
+
+
+class ComesBack(enum.Enum):
+    """Which edges a pass judges anew."""
+
+    EVERYTHING = "everything"
+    AGREEING = "what agrees pairwise"
+    NEAR = "what is near the map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +119,7 @@ def _judged(
     driver = opened.with_edges(borders, 0).driver
     go_to_poses_found(driver)
     before = _truncated_cost(driver, opened.threshold_scale)
-    finished = monitor.run(SharedGNC.of_files(gnc, driver, job.has_map), driver)
+    finished = monitor.run(SharedGNC.of(gnc, driver, None, job.has_map), driver)
     stage = stage_of(gnc, finished)
     if finished.status in BROKEN_OFF:
         return stage, None
@@ -166,3 +188,236 @@ def go_to_poses_found(driver: Driver) -> None:
 def _truncated_cost(driver: Driver, scale: float) -> float:
     """Truncated cost of all edges at the current poses, with scaled thresholds."""
     return math.fsum(driver.ask(sum_truncated, scale))
+
+
+# Orders to robots, and what they say.
+
+
+@dataclass(frozen=True, eq=False)
+class TakenBack:
+    """Which edges come back, the cost that is solved, and the quantile of the thresholds.
+
+    What to go back to is what agrees pairwise, if it `is_first`, and the edges before in later
+    passes. `near` says which edges to each neighbour of a lower number are near the map, as that
+    neighbour has decided.
+    """
+
+    comes_back: ComesBack
+    weighting: Weighting
+    quantile: float
+    is_first: bool
+    near: Mapping[int, BoolArray]
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPoses:
+    """Poses that were found, and their numbers in the whole graph, (k,)."""
+
+    numbers: IntArray
+    poses: Poses
+
+
+@dataclass(frozen=True, eq=False)
+class OwnCover:
+    """Own poses in the cover, and their numbers in the whole graph, (h,)."""
+
+    numbers: IntArray
+    poses: Poses
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Edges between robots: the owners of their ends, (k, 2), and costs over thresholds, (k,)."""
+
+    owners: IntArray
+    ratio: Array
+
+
+def tell_solved(agent: FileAgent, _: None) -> Mapping[int, SolvedPoses]:
+    """Order: tell every neighbour of the own poses found that edges between the two touch."""
+    placed = agent.known(PlacedFile)
+    everything = everything_of(placed.joined)
+    solved = _own_poses_of(placed)
+    own_poses = np.flatnonzero(everything.owners == agent.robot)
+    messages = {}
+    for other in neighbours_of(everything, agent.robot):
+        between = edges_between(everything, agent.robot, other)
+        ends = np.concatenate([everything.graph.i[between], everything.graph.j[between]])
+        places = np.flatnonzero(np.isin(own_poses, ends))
+        messages[other] = SolvedPoses(everything.numbers[own_poses[places]], solved[places])
+    return messages
+
+
+def judge_near(
+    agent: FileAgent, request: tuple[Mapping[int, SolvedPoses], Weighting, float]
+) -> Mapping[int, BoolArray]:
+    """Order: find the edges near the map, with the poses of neighbours; those kept stay.
+
+    Of an edge between two robots the one of the lower number decides, and tells the other, so that
+    both have the same edges.
+    """
+    received, weighting, quantile = request
+    placed = agent.known(PlacedFile)
+    everything = everything_of(placed.joined)
+    graph = everything.graph
+    is_own = everything.owners == agent.robot
+    R = np.tile(np.eye(graph.d), (graph.num_poses, 1, 1))
+    t = np.zeros((graph.num_poses, graph.d))
+    solved = _own_poses_of(placed)
+    R[is_own], t[is_own] = solved.R, solved.t
+    for theirs in received.values():
+        places = np.searchsorted(everything.numbers, theirs.numbers)
+        R[places], t[places] = theirs.poses.R, theirs.poses.t
+    problem = PartProblem(graph, weighting=weighting)
+    near = problem.edge_costs(Poses(R, t)) <= _NEAR * chi2_thresholds(problem, quantile)
+    near[placed.joined.edges] = True
+    agent.record = replace(placed, near=near)
+    return {
+        other: near[edges_between(everything, agent.robot, other)]
+        for other in neighbours_of(everything, agent.robot)
+        if other > agent.robot
+    }
+
+
+def take_back(agent: FileAgent, request: TakenBack) -> Border:
+    """Order: hold the edges that come back, with thresholds, and remember what to go back to.
+
+    Own odometry is known to be right.
+    """
+    robot = agent.robot
+    placed = agent.known(PlacedFile)
+    everything = everything_of(placed.joined)
+    solved = _own_poses_of(placed)
+    assert everything.agrees is not None
+    if request.comes_back is ComesBack.AGREEING:
+        candidates = everything.agrees
+    elif request.comes_back is ComesBack.NEAR:
+        assert placed.near is not None
+        candidates = placed.near.copy()
+        for other, near in request.near.items():
+            candidates[edges_between(everything, robot, other)] = near
+    else:
+        candidates = np.ones(everything.graph.num_edges, dtype=bool)
+    before = placed.joined
+    if request.is_first:
+        before = with_edges(everything, robot, everything.agrees)
+    joined = with_edges(everything, robot, candidates)
+    graph = joined.graph
+    thresholds = chi2_thresholds(PartProblem(graph, weighting=request.weighting), request.quantile)
+    known = own_odometry(graph, joined.owners == robot) & is_whole(graph)
+    joined = replace(
+        joined,
+        before=replace(before, solved=solved, before=None),
+        thresholds=np.where(known, np.inf, thresholds),
+        solved=solved,
+    )
+    agent.record = joined
+    return border_of(robot, joined)
+
+
+def tell_cover(agent: FileAgent, _: None) -> OwnCover:
+    """Order: return the own poses that were found, of those in the cover."""
+    placed = agent.known(PlacedFile)
+    subgraph = placed.subgraph
+    own_separators = np.flatnonzero(subgraph.is_own)
+    in_cover = np.flatnonzero(subgraph.is_separator[own_separators])
+    return OwnCover(subgraph.poses[own_separators[in_cover]], _solved(placed.joined)[in_cover])
+
+
+def go_to_solved(agent: FileAgent, cover: Poses) -> None:
+    """Order: go to the poses that were found; the driver sends those of the cover."""
+    placed = agent.known(PlacedFile)
+    subgraph = placed.subgraph
+    if agent.interior is None:
+        return
+    everywhere = held_poses(agent, cover)
+    R = everywhere.R.copy()
+    t = everywhere.t.copy()
+    solved = _solved(placed.joined)
+    R[subgraph.is_own] = solved.R
+    t[subgraph.is_own] = solved.t
+    places = np.searchsorted(subgraph.poses, agent.interior.part.poses)
+    order_interior(current_poses.set_poses, agent, Poses(R[places], t[places]))
+
+
+def tell_links(agent: FileAgent, request: tuple[float, Poses]) -> Links:
+    """Order: judge the edges that the robot counts; return those of them that join two robots.
+
+    The request is the scale of the thresholds, and the poses of the cover.
+    """
+    scale, cover = request
+    placed = agent.known(PlacedFile)
+    joined = placed.joined
+    graph = joined.graph
+    subgraph = placed.subgraph
+    ratio = np.zeros(graph.num_edges)
+    if agent.interior is not None:
+        part = agent.interior.whole
+        assert part.edges is not None
+        ratio[part.edges] = part.ratios(agent.interior.poses, scale)
+    own_poses = held_poses(agent, cover)[np.flatnonzero(subgraph.is_own)]
+    links = _counted_links(placed)
+    agent.record = replace(placed, joined=replace(joined, solved=own_poses), within=ratio <= 1.0)
+    owners = np.stack([joined.owners[graph.i[links]], joined.owners[graph.j[links]]], axis=1)
+    return Links(owners, ratio[links])
+
+
+def tell_kept(agent: FileAgent, is_held: BoolArray) -> Mapping[int, BoolArray]:
+    """Order: keep the links that hold robots together, too, (k,); tell neighbours what is kept.
+
+    Each is told of the edges that both have, (2, k), whether this robot counts and keeps it.
+    """
+    placed = agent.known(PlacedFile)
+    joined = placed.joined
+    subgraph = placed.subgraph
+    assert placed.within is not None
+    kept = placed.within.copy()
+    kept[_counted_links(placed)[is_held]] = True
+    agent.record = replace(placed, within=kept)
+    messages = {}
+    for other in neighbours_of(joined, agent.robot):
+        between = edges_between(joined, agent.robot, other)
+        messages[other] = np.stack([subgraph.is_counted[between], kept[between]])
+    return messages
+
+
+def _counted_links(placed: PlacedFile) -> IntArray:
+    """Edges to other robots that this robot counts."""
+    graph = placed.joined.graph
+    owners = placed.joined.owners
+    is_link = owners[graph.i] != owners[graph.j]
+    return np.flatnonzero(is_link & placed.subgraph.is_counted)
+
+
+def keep(agent: FileAgent, received: Mapping[int, BoolArray]) -> ConsistentPart:
+    """Order: leave out the edges that are not kept by the robot that counts them."""
+    placed = agent.known(PlacedFile)
+    joined = placed.joined
+    assert placed.within is not None
+    kept = placed.within.copy()
+    for other, (is_counted, is_kept) in received.items():
+        between = edges_between(joined, agent.robot, other)
+        kept[between[is_counted]] = is_kept[is_counted]
+    everything = everything_of(joined)
+    stays = np.zeros(everything.graph.num_edges, dtype=bool)
+    stays[joined.edges[kept]] = True
+    remaining = with_edges(everything, agent.robot, stays)
+    return go_on_with(agent, replace(remaining, solved=joined.solved, before=joined.before))
+
+
+def go_back(agent: FileAgent, _: None) -> ConsistentPart:
+    """Order: go back to the edges before, or to what agrees pairwise, at the poses found before."""
+    before = joined_of(agent).before
+    assert before is not None
+    return go_on_with(agent, before)
+
+
+def _own_poses_of(placed: PlacedFile) -> Poses:
+    """Poses of the robot at the end of the last solve."""
+    return placed.kept[np.flatnonzero(placed.subgraph.is_own)]
+
+
+def _solved(joined: JoinedFile) -> Poses:
+    """Own poses that were found."""
+    assert joined.solved is not None
+    return joined.solved

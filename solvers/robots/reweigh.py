@@ -1,7 +1,9 @@
 """Graduated non-convexity by driver and robots.
 
 The algorithm is that of `solvers.robust.gnc`. `SharedEdges` answers what it asks of the edges by
-orders to the robots: residuals and weights stay with them, the control is sent, and sums return.
+orders to the robots, which are at the end of this file: residuals and weights stay with them, the
+control is sent, and sums return. `solvers.robots.revision` is about edges that robots with own
+files take back for it.
 """
 
 from __future__ import annotations
@@ -11,21 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, connecting_edges
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.carry.counted_pool import Count
 from solvers.result import Measurement, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
+from solvers.robots.current_poses import describe
 from solvers.robots.driver import Driver, collect
+from solvers.robots.interior import Interior
 from solvers.robots.newton import SubstructuredNewton, SubstructuredNewtonState
-from solvers.robots.records import Reweigh
-from solvers.robots.reweighting import (
-    count_below,
-    count_doubted,
-    edges_within,
-    sum_ratios,
-)
+from solvers.robots.records import Reweigh, Reweighed
 from solvers.robust.chains import is_whole
 from solvers.robust.gnc import (
     GNC,
@@ -103,7 +102,7 @@ class SharedEdges:
         """Edges with the weights that belong to their residuals."""
         self.driver.return_to(self.newton.moment)
         order = self._order(loss, mu, scale)
-        self.driver.reweigh(order)
+        self.driver.take_weights(self.driver.ask(reweigh, order))
         return replace(self, newton=self._method.init(self.driver, None), weighed=order)
 
     def newton_step(self) -> SharedEdges:
@@ -138,24 +137,19 @@ class SharedGNC:
     has_map: bool = False
 
     @classmethod
-    def of(cls, gnc: GNC, graph: PoseGraph) -> SharedGNC:
-        """The method for a graph, which says which weights are negligible.
+    def of(cls, gnc: GNC, driver: Driver, graph: PoseGraph | None, has_map: bool) -> SharedGNC:
+        """The method for robots, some of whose edges are known to be right.
 
         A wrong edge can cost so much that even a small share of its weight bends the map. So it
-        has none where whole motions among the known inliers connect all poses.
+        has none where whole motions among the known inliers connect all poses of the `graph`.
+        Known inliers of robots with own files, whose graph no process has, leave robots apart.
         """
-        known = KnownEdges.of(graph, gnc.known).edges
-        least_weight = negligible_weight(float((~known).sum()), graph.num_poses)
-        apart = connecting_edges(graph, known & is_whole(graph), np.zeros(graph.num_edges))
-        is_held = len(apart) == 0 and not graph.is_world_loose
-        return cls(gnc, least_weight, 0.0 if is_held else _LEFT_OUT_SHARE * least_weight)
-
-    @classmethod
-    def of_files(cls, gnc: GNC, driver: Driver, has_map: bool) -> SharedGNC:
-        """The method for robots with own files, where known inliers leave robots apart."""
-        num_doubted = math.fsum(driver.ask(count_doubted, None, Count.PIGGYBACKED))
+        count = Count.PIGGYBACKED if graph is None else Count.OFF  # which the graph says, too
+        num_doubted = math.fsum(driver.ask(count_doubted, None, count))
         least_weight = negligible_weight(num_doubted, driver.num_poses)
-        return cls(gnc, least_weight, _LEFT_OUT_SHARE * least_weight, has_map)
+        is_held = graph is not None and _is_held(graph, gnc)
+        left_out = 0.0 if is_held else _LEFT_OUT_SHARE * least_weight
+        return cls(gnc, least_weight, left_out, has_map)
 
     @property
     def max_iterations(self) -> int:
@@ -181,6 +175,13 @@ class SharedGNC:
     def converged(self, state: SharedGNCState, measurement: Measurement) -> Status | None:
         """How a run in one place would end."""
         return ending(self.gnc, state.schedule)
+
+
+def _is_held(graph: PoseGraph, gnc: GNC) -> bool:
+    """Whether whole motions among the known inliers connect all poses of a graph."""
+    known = KnownEdges.of(graph, gnc.known).edges
+    apart = connecting_edges(graph, known & is_whole(graph), np.zeros(graph.num_edges))
+    return len(apart) == 0 and not graph.is_world_loose
 
 
 def inliers_of(
@@ -211,3 +212,58 @@ def stage_of(gnc: GNC, finished: Outcome[SharedGNCState]) -> Stage:
         finished.history,
         gnc,
     )
+
+
+# Orders to a robot's interior.
+
+
+def reweigh(interior: Interior, order: Reweigh) -> tuple[Interior, Reweighed]:
+    """Weights for the residuals at the current poses, and the cost with them."""
+    ratio = interior.whole.ratios(interior.poses, order.scale)
+    weights = order.loss.weights(ratio, order.mu)
+    weights = np.where(weights > order.least, weights, order.left_out)
+    weights = np.where(interior.is_known, 1.0, weights)
+    state = replace(
+        interior.state,
+        weights=weights,
+        reweighing=order,
+        session=None,
+        has_sent_laplacian=False,
+    )
+    following = interior.in_state_of(state)
+    _, diagonal = describe(following, None)
+    return following, Reweighed(diagonal, following.evaluation(interior.poses))
+
+
+def sum_ratios(interior: Interior, order: Reweigh) -> tuple[Interior, RatioSums]:
+    """Sums over the edges at the current poses."""
+    return interior, interior.ratio_sums(interior.poses, order)
+
+
+def count_doubted(interior: Interior, _: None) -> tuple[Interior, float]:
+    """Number of edges that are not known to be right."""
+    return interior, float(np.sum(~interior.is_known))
+
+
+def sum_truncated(interior: Interior, scale: float) -> tuple[Interior, float]:
+    """Sum of the costs, of which each counts its scaled threshold at most."""
+    costs = interior.whole.costs(interior.poses)
+    return interior, float(np.minimum(costs, scale * interior.thresholds).sum())
+
+
+def count_below(interior: Interior, request: tuple[float, Array]) -> tuple[Interior, IntArray]:
+    """Numbers of edges, without the known ones, whose r^2 / c^2 is at most each of some bounds.
+
+    The request has the scale of the thresholds c^2, and the bounds, ascending.
+    """
+    scale, bounds = request
+    ratio = interior.whole.ratios(interior.poses, scale)
+    ratios = np.sort(ratio[~interior.is_known])
+    return interior, np.searchsorted(ratios, bounds, side="right")
+
+
+def edges_within(interior: Interior, scale: float) -> tuple[Interior, IntArray]:
+    """Numbers of the edges within their scaled thresholds, for the result."""
+    assert interior.whole.edges is not None
+    ratio = interior.whole.ratios(interior.poses, scale)
+    return interior, interior.whole.edges[ratio <= 1.0]

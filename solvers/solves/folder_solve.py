@@ -25,7 +25,7 @@ from solvers.carry.counted_pool import Count
 from solvers.carry.process import Engine, InProcess
 from solvers.carry.ray_engine import RayEngine
 from solvers.loop import RunMonitor
-from solvers.place import AUTO, Attempt, FirstStage
+from solvers.place import AUTO, FirstStage
 from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import Record, StageTable
@@ -33,8 +33,6 @@ from solvers.robots.checkpoint import Journal
 from solvers.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.robots.paper import check_paper
 from solvers.robots.place import PlaceOfRobots
-from solvers.robots.revision import Pass, revised
-from solvers.robots.revision_of_robot import ComesBack
 from solvers.robots.settings import Robots
 from solvers.robots.setup import OpenedFiles, open_files
 from solvers.robots_solution import RobotsSolution
@@ -42,7 +40,7 @@ from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
 from solvers.robust.rejection import text_of_bridges
-from solvers.robust_solves.attempts import TIGHT_SCALES, with_tight_thresholds
+from solvers.robust_solves.passes import RobotsAnswer, answer_after_passes, answer_before_passes
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
@@ -168,15 +166,11 @@ class FilesOfRobots:
             place = PlaceOfRobots(
                 monitor, table, opened.driver, journal, name, pipeline.gap, opened.weighting
             )
-            first = pipeline
-            if isinstance(
-                self.robust, GNC
-            ):  # which goes on from it, whether it is certified or not
-                first = replace(pipeline.with_newton_alone(pipeline.newton), soc=pipeline.soc)
-                place = replace(place, is_on_the_way=True)
-            answer = _Answer(opened, place, solve_at(place, first, None))
             if isinstance(self.robust, GNC):
-                answer = _after_passes(answer, self.robust, pipeline)
+                answer = answer_before_passes(opened, place, pipeline)
+                answer = answer_after_passes(answer, self.robust, pipeline)
+            else:
+                answer = RobotsAnswer(opened, place, solve_at(place, pipeline, None))
             opened = answer.opened
             place = answer.place
             driver = opened.driver
@@ -202,75 +196,6 @@ class FilesOfRobots:
             num_bridges=opened.num_bridges,
             seconds=time.perf_counter() - monitor.began,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """What was found so far: robots with the edges kept, their place, and the attempt there."""
-
-    opened: OpenedFiles
-    place: PlaceOfRobots
-    best: Attempt
-    rejected_by: str = "do not agree pairwise with others"
-
-    @property
-    def name_of_poses(self) -> str:
-        """Name of the robots' poses, for the stage that starts at them."""
-        return self.place.begins_at or "poses found before GNC"
-
-
-def _after_passes(answer: _Answer, gnc: GNC, pipeline: Pipeline) -> _Answer:
-    """The answer after passes of GNC, each from the map of the one before.
-
-    From a certified map one last pass judges the edges near it, with the settings that have found
-    it. Without one there are passes with what agrees pairwise, with all edges, and with all edges
-    and tight thresholds; those that agree are all there are where the settings say so. Thresholds
-    follow the errors. The last map has the other steps of the pipeline, if it is not certified.
-    """
-    newton_alone = pipeline.with_newton_alone(pipeline.newton)
-    scale = answer.opened.threshold_scale
-    settings = gnc if scale == 1.0 else with_tight_thresholds(gnc, scale)
-    tight = [with_tight_thresholds(settings, factor) for factor in TIGHT_SCALES]
-    all_edges, near = ComesBack.EVERYTHING, ComesBack.NEAR
-    if gnc.consistent:
-        all_edges = near = ComesBack.AGREEING
-    without_map = [(settings, ComesBack.AGREEING)]
-    without_map += [(each, all_edges) for each in (settings, *tight)]
-    is_first = True
-    while not answer.best.is_out_of_time:
-        has_map = answer.best.proof.is_certified
-        if has_map:
-            comes_back = near
-        elif without_map:
-            settings, comes_back = without_map.pop(0)
-        else:
-            break
-        answer = _after_pass(answer, Pass(settings, comes_back, has_map, is_first), newton_alone)
-        if has_map:
-            break
-        is_first = False
-    if not (answer.best.proof.is_certified or answer.best.is_out_of_time):
-        answer = replace(answer, place=replace(answer.place, is_on_the_way=False))
-        answer = _solved_from(answer, answer.name_of_poses, replace(pipeline, soc=None))
-    return answer
-
-
-def _after_pass(answer: _Answer, job: Pass, pipeline: Pipeline) -> _Answer:
-    """The answer after a pass, with the edges before where that finds nothing better."""
-    revision = revised(answer.opened, job, answer.place.monitor)
-    answer.place.table.add(revision.stage)
-    place = replace(answer.place, driver=revision.opened.driver)
-    start = "poses of GNC" if revision.is_better else answer.name_of_poses
-    answer = replace(answer, opened=revision.opened, place=place)
-    if revision.is_better:
-        answer = replace(answer, rejected_by="the map of the others contradicts")
-    return _solved_from(answer, start, pipeline)
-
-
-def _solved_from(answer: _Answer, start: str, pipeline: Pipeline) -> _Answer:
-    """The answer solved for from poses that the robots have found, the start of this name."""
-    place = replace(answer.place, kept=[], begins_at=start)
-    return replace(answer, place=place, best=solve_at(place, pipeline, None))
 
 
 def _text_of_rejected(opened: OpenedFiles, rejected_by: str) -> str:

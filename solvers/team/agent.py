@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -98,14 +99,14 @@ class TeamAgent(FileAgent):
         return OwnAnswer(ids, self.record.answer[own_poses], None, self.record.joined.rejected)
 
 
-def give_measurements(agent: TeamAgent, _: None) -> str:
-    """Return the lines of the robot; a SettingError if it does not share them."""
+def give_measurements(agent: TeamAgent, _: None) -> NDArray[np.uint8]:
+    """Return the lines of the robot in UTF-8; a SettingError if it does not share them."""
     if agent.sharing is not Sharing.MEASUREMENTS:
         raise SettingError(
             f"{agent.path.stem} shares its interface alone; "
             "give sharing=Sharing.MEASUREMENTS to all robots, or to none"
         )
-    return agent.text
+    return np.frombuffer(agent.text.encode("utf-8"), dtype=np.uint8)
 
 
 def take_answer(agent: TeamAgent, answer: OwnAnswer) -> None:

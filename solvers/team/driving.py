@@ -135,7 +135,7 @@ class Drive:
             # Poses of absent robots have no estimate, which the outcome says in its own way.
             warnings.simplefilter("ignore", GraphWarning)
             files = [
-                parse_lines(Path("team") / f"{name}.g2o", [text])
+                parse_lines(Path("team") / f"{name}.g2o", [text.tobytes().decode("utf-8")])
                 for name, text in zip(self.members, texts, strict=True)
             ]
             graph = graph_of_robots(Path("team"), files, RotationWeight.SE_SYNC, is_folder=True)

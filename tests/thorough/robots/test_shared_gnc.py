@@ -19,7 +19,7 @@ from solvers.result import Stage
 from solvers.robots import current_poses
 from solvers.robots.agent import CLASSES, Agent, order_interior
 from solvers.robots.records import Reweigh
-from solvers.robots.reweighting import reweigh
+from solvers.robots.reweigh import reweigh
 from solvers.robust.known import odometry
 from solvers.robust.weighted_edges import first_poses
 from solvers.soc.subgraph import split_graph
