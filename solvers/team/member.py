@@ -1,17 +1,42 @@
-"""What a robot of a team brings into its solves, and keeps of them."""
+"""What a robot of a team brings into its solves, how it solves when it drives, and what it keeps.
+
+Robots that share their interface solve as robots with own files do. In a team that shares its
+measurements the robot that drives solves alone, with all options of `solve`.
+"""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
+from pathlib import Path
 
+from pgo_models.errors import GraphWarning, PGOError
+from pgo_models.graphs.g2o import graph_of_robots
+from pgo_models.graphs.g2o_parser import parse_lines
+from pgo_models.graphs.precisions import RotationWeight
+from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.request import Pipeline
+from solvers.carry.counted_pool import Count, CountedPool
+from solvers.carry.process import DEFAULT_MEMORY
+from solvers.loop import RunMonitor
+from solvers.pipeline import solution_for
+from solvers.request import Pipeline, SolveRequest
+from solvers.robots.own_file import READ_HERE
+from solvers.robots.setup import SOLVE_PARTS
+from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
-from solvers.team.agent import OwnAnswer, Sharing, TeamAgent
+from solvers.solves.folder_solve import FilesOfRobots, check_robust
+from solvers.team.agent import (
+    OwnAnswer,
+    Sharing,
+    TeamAgent,
+    give_measurements,
+    take_answer,
+)
 from solvers.team.driving import Drive
 from solvers.team.measurements import Measurements
-from solvers.team.messages import Ended, Term
+from solvers.team.messages import Ended
 
 
 @dataclass(eq=False)
@@ -42,9 +67,47 @@ class Member:
             return None
         return TeamAgent(place, self.name, self.measurements.text(), self.sharing)
 
-    def new_drive(self, term: Term, members: tuple[str, ...], agent: TeamAgent) -> Drive:
-        """A solve of the term that it drives, by the robots `members`, the first of which it is."""
-        return Drive(term, members, agent, self.pipeline, self.weighting, self.robust)
+    def solve(self, drive: Drive) -> RobotsSolution:
+        """Solve with the robots of a drive, in the way that the measurements are shared."""
+        try:
+            if self.sharing is Sharing.MEASUREMENTS:
+                return self._solve_in_one_place(drive)
+            return self._solve_by_robots(drive)
+        except PGOError as error:
+            raise PGOError(_with_ways_out_of_teams(str(error))) from error
+
+    def _solve_by_robots(self, drive: Drive) -> RobotsSolution:
+        """The solution by robots with files of their own."""
+        files = list(enumerate(map(_path_of, drive.members)))
+        check_robust(self.robust)
+        job = FilesOfRobots(
+            "team", files, drive, DEFAULT_MEMORY, self.weighting, robust=self.robust
+        )
+        return job.solved(self.pipeline, RunMonitor(progress=False))
+
+    def _solve_in_one_place(self, drive: Drive) -> RobotsSolution:
+        """The solution of the graph of all measurements; each robot is told of its poses."""
+        num_robots = len(drive.members)
+        network = CountedPool(drive, num_robots)
+        texts = network.ask(give_measurements, [None] * num_robots, Count.ROUND)
+        with warnings.catch_warnings():
+            # Poses of absent robots have no estimate, which the outcome says in its own way.
+            warnings.simplefilter("ignore", GraphWarning)
+            files = [
+                parse_lines(_path_of(name), [text.tobytes().decode("utf-8")])
+                for name, text in zip(drive.members, texts, strict=True)
+            ]
+            graph = graph_of_robots(Path("team"), files, RotationWeight.SE_SYNC, is_folder=True)
+        request = SolveRequest(
+            PGOProblem(graph, weighting=self.weighting),
+            self.pipeline,
+            robust=self.robust,
+            monitor=RunMonitor(progress=False),
+        )
+        solution = solution_for(request)
+        answers = [OwnAnswer.of(solution, robot) for robot in range(num_robots)]
+        network.ask(take_answer, answers, Count.ROUND)
+        return RobotsSolution.of(solution, network.ledger)
 
     def end_with(self, ended: Ended, agent: TeamAgent | None) -> None:
         """Keep an outcome and the poses with it; where a solve has failed, those before it.
@@ -55,3 +118,14 @@ class Member:
         if ended.solution is not None and answer is not None:
             self.outcome = ended
             self.known = answer
+
+
+def _path_of(name: str) -> Path:
+    """Name of the lines of a robot, as of a file in a folder."""
+    return Path("team") / f"{name}.g2o"
+
+
+def _with_ways_out_of_teams(text: str) -> str:
+    """A sentence on an error of robots with own files, with what a team can do about it."""
+    text = text.replace(READ_HERE, "robots that share their measurements can")
+    return text.replace(SOLVE_PARTS, "an edge between them joins them")

@@ -308,7 +308,7 @@ class Session:
         assert agent is not None  # as it has measurements
         members = (self.name, *(name for name in awake if name != self.name))
         self._following = Following(agent, own_revision, Letters(0), members)
-        self._drive = self._member.new_drive(self.term, members, agent)
+        self._drive = Drive(self.term, members, agent, self._member.solve)
         self._drive.begin()
         self._after_step(now)
 
