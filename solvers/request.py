@@ -225,11 +225,9 @@ class SolveRequest:
                 table,
                 driver,
                 journal,
-                problem.graph.name,
-                here.gap,
-                faults=robots.faults,
-                here=replace(here, where=", in one place"),
-                owners=robots.partition,
+                replace(here, where=", in one place"),
+                robots.partition,
+                robots.faults,
             )
 
     def _settings_of_run(self, robots: Robots) -> tuple[object, ...]:

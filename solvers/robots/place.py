@@ -1,43 +1,28 @@
-"""The place where robots solve, with a driver: beside the graph of all robots, or without it.
+"""The place where robots solve with a driver, beside the graph of all robots or without it.
 
 Robots hold the poses between two steps, and an attempt has none until its certificate is found.
-Where this process has the whole graph, it collects the poses then, and takes the steps that robots
-lack (`PlaceOfRobots.here`). Robots that have read their own files keep the poses of the cheapest
-attempt so far. The driver then knows the interface between the robots (`solvers.robots.setup`), and
-of the answer its cost and bound. A certificate is of the poses that the robots keep, and has
-neither poses nor multipliers itself. A bound holds for all poses, and so belongs to whatever they
-keep.
-
-Without a driver there is `solvers.robots.place_without_driver`.
+Where this process has the graph, it collects the poses then, and takes the steps that robots lack
+(`solvers.here`). Elsewhere the robots keep the answer (`solvers.robots.kept_answers`). Without a
+driver there is `solvers.robots.place_without_driver`.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from pgo_models.certificates.certificate import (
     BoundSource,
-    Certificate,
     certify_with,
-    judge_cost,
 )
-from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.handedness import distinct_pairs
-from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound
-from pgo_models.certificates.rounding_errors import ObjectiveRounding
-from pgo_models.errors import PGOError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
-from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
 from solvers.carry.faults import Faults
 from solvers.carry.ledger import Ledger
@@ -47,7 +32,6 @@ from solvers.handedness.hull_lagrangian import HullLagrangian
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.here import Here
 from solvers.place import (
-    BROKEN_OFF,
     AnySOC,
     Attempt,
     Ending,
@@ -65,20 +49,17 @@ from solvers.robots.asynchronous import AsynchronousSOC
 from solvers.robots.checkpoint import Journal
 from solvers.robots.climb import SubstructuredStaircase, round_lifted
 from solvers.robots.consensus import ConsensusSOC
-from solvers.robots.driver import CoverPoses, Driver, collect
+from solvers.robots.driver import Driver, collect
 from solvers.robots.handedness import (
     RobotsPoint,
     begin_without_terms,
     hand_out_terms,
     return_to_best,
 )
+from solvers.robots.kept_answers import KeptAnswers
 from solvers.robots.newton import SubstructuredNewton
 from solvers.robots.own_file import (
     READ_HERE,
-    Answer,
-    keep_answer,
-    move_answer,
-    return_to_answer,
 )
 from solvers.robots.paper import PaperByRobots
 from solvers.robots.proof import best_bound_distributed, best_bound_with_terms
@@ -111,23 +92,8 @@ class AttemptWithFaults(Attempt):
 
 
 @dataclass(frozen=True, eq=False)
-class KeptAnswer:
-    """The cheapest poses so far, which robots with own files keep, as the driver knows them.
-
-    `cover` are the poses of the driver, `status` how the run ended that found them.
-    """
-
-    objective: float
-    decrement: float
-    rounding: ObjectiveRounding
-    robots: Sequence[Answer]
-    cover: CoverPoses
-    status: Status
-
-
-@dataclass(frozen=True, eq=False)
 class PlaceOfRobots(Place):
-    """A solve of the graph `name` by robots and their driver, to a relative `gap`.
+    """A solve by robots and their driver.
 
     Parameters
     ----------
@@ -135,21 +101,14 @@ class PlaceOfRobots(Place):
         The driver, with the network of its robots.
     journal : Journal
         Checkpoints. Where one is of a later stage, what comes before it is passed over.
-    name : str
-        Name of the graph.
-    gap : float
-        The relative gap to certify.
-    weighting : Weighting
-        The cost that a certificate of what robots keep is of.
+    answers : Here or KeptAnswers
+        A solve of the graph of all robots in this process, where poses are collected for a
+        certificate, and steps are taken that robots lack: the name of their stages says so. Or
+        answers that the robots keep, of which this process knows no poses.
+    owners : Partition, optional
+        Who owns which poses of the graph in this process.
     faults : Faults, optional
         What goes wrong between the robots of a CONSENSUS stage, which then does not wait.
-    here : Here, optional
-        A solve of the graph of all robots in this process, which then takes the steps that robots
-        lack. The name of their stages says so.
-    owners : Partition, optional
-        Who owns which poses of that graph.
-    kept : list of KeptAnswer
-        Without that graph: the answers that the robots have kept, of which the last is current.
     begins_at : str, optional
         Name of a start at poses that the robots have found before; their own start unless given.
     is_on_the_way : bool
@@ -159,15 +118,22 @@ class PlaceOfRobots(Place):
 
     driver: Driver
     journal: Journal
-    name: str
-    gap: float
-    weighting: Weighting = Weighting.ISOTROPIC
-    faults: Faults | None = None
-    here: Here | None = None
+    answers: Here | KeptAnswers
     owners: Partition | None = None
-    kept: list[KeptAnswer] = field(default_factory=list)
+    faults: Faults | None = None
     begins_at: str | None = None
     is_on_the_way: bool = False
+
+    @property
+    def here(self) -> Here | None:
+        """The solve of the graph of all robots in this process, if it has that graph."""
+        return self.answers if isinstance(self.answers, Here) else None
+
+    @property
+    def known_here(self) -> Here:
+        """The solve in this process, where it is known that there is one: see `lacks`."""
+        assert isinstance(self.answers, Here)
+        return self.answers
 
     # What the page asks
 
@@ -220,12 +186,6 @@ class PlaceOfRobots(Place):
         """Remove the checkpoint of a solve that has ended well."""
         if best.status.is_success:
             self.journal.end()
-
-    @property
-    def known_here(self) -> Here:
-        """The solve in this process, where it is known that there is one: see `lacks`."""
-        assert self.here is not None
-        return self.here
 
     # An attempt
 
@@ -371,16 +331,18 @@ class PlaceOfRobots(Place):
     def certify(self, attempt: Attempt) -> Attempt:
         """Prove the certificate of the current poses by driver and robots.
 
-        Beside the graph the poses are collected, and the whole problem serves for their cost alone.
-        Elsewhere the robots keep them if they are the cheapest so far, and the certificate is of
-        what the robots keep.
+        Where this process has the graph, the poses are collected, and the whole problem serves for
+        their cost alone.
         """
-        if self.here is None:
-            return self._certify_kept(attempt)
-        here = self.here
+        driver = self.driver
+        goes_on = self.is_on_the_way and not attempt.is_out_of_time
+        most_lost = self.answers.gap * driver.current.objective if goes_on else None
         with self.monitor.showing("certificate"):
-            bound = best_bound_distributed(self.driver, here.gap)
-            poses, Lambda = collect(self.driver)
+            bound = best_bound_distributed(driver, self.answers.gap, most_lost)
+            if isinstance(self.answers, KeptAnswers):
+                return self.answers.certify(attempt, bound)
+            here = self.answers
+            poses, Lambda = collect(driver)
             certificate = certify_with(
                 here.problem, poses, Lambda, here.gap, attempt.decrement, BoundSource.GIVEN, bound
             )
@@ -390,98 +352,37 @@ class PlaceOfRobots(Place):
         self.journal.end_attempt((poses, certificate))
         return replace(attempt, poses=poses, certificate=certificate)
 
-    def _certify_kept(self, attempt: Attempt) -> Attempt:
-        """Find a bound, and have the robots keep the current poses if these are the cheapest."""
-        driver = self.driver
-        goes_on = self.is_on_the_way and not attempt.is_out_of_time
-        most_lost = self.gap * driver.current.objective if goes_on else None
-        bound = best_bound_distributed(driver, self.gap, most_lost)
-        source = BoundSource.GIVEN
-        dual = attempt.dual_bound
-        if dual is not None and dual.lower_bound > bound.value:
-            bound = dual.bound
-            source = BoundSource.RELAXATION
-        if not self.kept or driver.current.objective < self.kept[-1].objective:
-            robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
-            answer = KeptAnswer(
-                driver.current.objective,
-                attempt.decrement,
-                _sum_of_roundings([robot.rounding for robot in robots]),
-                robots,
-                driver.current,
-                attempt.status,
-            )
-            self.kept.append(answer)
-        return replace(attempt, certificate=self._certificate_of_kept(bound, source))
-
-    def _certificate_of_kept(self, bound: LowerBound, source: BoundSource) -> Certificate:
-        """Certificate of the poses that the robots keep."""
-        kept = self.kept[-1]
-        no_poses = Poses.identity(0, self.driver.d)
-        judgement = judge_cost(self.name, kept.objective, kept.rounding, bound, self.gap)
-        return Certificate(
-            objective=judgement.objective,
-            bound=judgement.bound,
-            gap=judgement.gap,
-            rounding_level=kept.rounding.level,
-            stationarity=kept.decrement,
-            source=source,
-            poses=no_poses,
-            poses_objective=kept.objective,
-            Lambda=no_poses.R,
-            wanted_gap=self.gap,
-            verdict=judgement.verdict,
-            weighting=self.weighting,
-            objective_error=kept.rounding.error,
-            fit=kept.rounding.fit,
-            weights_error=kept.rounding.weights_error,
-        )
-
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the cheaper poses with the best bound that either has."""
-        if self.here is not None:
-            return self.here.better(best, other)
-        highest = max(best.proof, other.proof, key=lambda known: known.lower_bound)
-        certificate = self._certificate_of_kept(highest.bound, highest.source)
-        status = other.status if other.status in BROKEN_OFF else self.kept[-1].status
-        return replace(best, certificate=certificate, status=status)
+        return self.answers.better(best, other)
 
     @property
     def has_poses(self) -> bool:
-        """Whether the robots have begun, or where no process has the graph, have kept any."""
-        return bool(self.kept if self.here is None else self.table.stages)
+        """Whether the robots have begun and, where no process has the graph, have kept any."""
+        if isinstance(self.answers, KeptAnswers):
+            return bool(self.answers.answers)
+        return bool(self.table.stages)
 
     def salvage(self, ending: Ending) -> Attempt:
-        """The best poses known, those of the robots among them, with the bound F >= 0.
-
-        A PGOError where robots with own files have kept none, as a matrix had no factor before.
-        """
-        if self.here is not None:
-            if ending in (Stage.interruption, Stage.silence):
-                self.monitor.poses_found.append(collect(self.driver)[0])
-            return self.here.salvage(ending)
-        if not self.kept:
-            raise PGOError(f"{self.name}: weights too far apart for doubles; see pgo info FILE")
-        stage = ending(self.kept[-1].objective)
-        self.table.add(stage)
-        certificate = self._certificate_of_kept(NO_BOUND, BoundSource.GIVEN)
-        return Attempt(status=stage.status, certificate=certificate)
+        """The best poses known, those of the robots among them, with the bound F >= 0."""
+        robots_have_poses = ending in (Stage.interruption, Stage.silence)
+        if self.here is not None and robots_have_poses:
+            self.monitor.poses_found.append(collect(self.driver)[0])
+        return self.answers.salvage(ending)
 
     # Steps after the first attempt
 
     def start_again(self) -> Poses | None:
         """The optimum of F, found in one place, where the cost is another; else SOC runs again."""
-        return None if self.here is None else self.here.start_again()
+        return self.answers.start_again()
 
     def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Have the robots climb the staircase from the best poses, and round its solution."""
         driver = self.driver
-        if self.here is not None:
-            driver.set_poses(best.known_poses)
+        if isinstance(self.answers, KeptAnswers):
+            self.answers.go_back()
         else:
-            kept = self.kept[-1]
-            driver.network.ask(return_to_answer, [None] * len(kept.robots), Count.PIGGYBACKED)
-            driver.current = kept.cover
+            driver.set_poses(best.known_poses)
         self.journal.stop_writing()
         driver.save_poses()
         finished = self.monitor.run(SubstructuredStaircase(staircase), driver)
@@ -565,42 +466,3 @@ class PlaceOfRobots(Place):
         driver.choose_cost(final=True)
         finished = self.monitor.run(SharedGNC.of(gnc, driver, problem.graph, has_map=False), driver)
         return inliers_of(problem, gnc, driver, finished)
-
-    def move_to_frame(self, best: Attempt) -> tuple[Attempt, str, float]:
-        """Have the robots move the answer to its frame; which that is, and F there.
-
-        A frame far away rounds the poses, so that their cost is found anew: the certificate is of
-        the poses that are written.
-        """
-        kept = self.kept[-1]
-        turn, shift, frame = _frame(kept.robots)
-        network = self.driver.network
-        parts = network.ask(move_answer, [(turn, shift)] * len(kept.robots), Count.ROUND)
-        objective = math.fsum(part.cost for part in parts)
-        rounding = _sum_of_roundings([part.rounding for part in parts])
-        self.kept.append(replace(kept, objective=objective, rounding=rounding))
-        certificate = self._certificate_of_kept(best.proof.bound, best.proof.source)
-        F = math.fsum(part.F for part in parts)
-        return replace(best, certificate=certificate), frame, F
-
-
-def _sum_of_roundings(parts: Sequence[ObjectiveRounding]) -> ObjectiveRounding:
-    """How accurately a sum is known of whose parts that is known."""
-    level = math.fsum(part.level for part in parts)
-    error = math.fsum(part.error for part in parts)
-    weights_error = max(part.weights_error for part in parts)
-    return ObjectiveRounding(level, error, Fit.of_all(part.fit for part in parts), weights_error)
-
-
-def _frame(answers: Sequence[Answer]) -> tuple[Array, Array, str]:
-    """Motion (R, t) to the frame of the answer, and which frame that is."""
-    first = min(answers, key=lambda answer: (not answer.held[0], answer.held[1]))
-    d = first.given.shape[1]
-    target = np.concatenate([np.zeros((1, d)), np.eye(d)])
-    where = "at the identity"
-    if np.isfinite(first.given).all():
-        target = first.given
-        where = "where its file has it"
-    R = target[1:].T @ first.solved[1:]
-    t = target[0] - R @ first.solved[0]
-    return R, t, f"pose {first.held[2]} {where}"

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from solvers.place import Attempt
 from solvers.plan import solve_at
 from solvers.request import Pipeline
+from solvers.robots.kept_answers import KeptAnswers
 from solvers.robots.place import PlaceOfRobots
 from solvers.robots.revision import ComesBack, Pass, revised
 from solvers.robots.setup import OpenedFiles
@@ -29,13 +30,21 @@ class RobotsAnswer:
     rejected_by: str = "do not agree pairwise with others"
 
     @property
+    def kept(self) -> KeptAnswers:
+        """What the robots keep."""
+        assert isinstance(self.place.answers, KeptAnswers)
+        return self.place.answers
+
+    @property
     def name_of_poses(self) -> str:
         """Name of the robots' poses, for the stage that starts at them."""
         return self.place.begins_at or "poses found before GNC"
 
     def solved_from(self, start: str, pipeline: Pipeline) -> RobotsAnswer:
         """The answer solved for from poses that the robots have found, the start of this name."""
-        place = replace(self.place, kept=[], begins_at=start)
+        driver = self.opened.driver
+        anew = replace(self.kept, driver=driver, answers=[])
+        place = replace(self.place, driver=driver, answers=anew, begins_at=start)
         return replace(self, place=place, best=solve_at(place, pipeline, None))
 
 
@@ -88,9 +97,8 @@ def _after_pass(answer: RobotsAnswer, job: Pass, pipeline: Pipeline) -> RobotsAn
     """The answer after a pass, with the edges before where that finds nothing better."""
     revision = revised(answer.opened, job, answer.place.monitor)
     answer.place.table.add(revision.stage)
-    place = replace(answer.place, driver=revision.opened.driver)
     start = "poses of GNC" if revision.is_better else answer.name_of_poses
-    answer = replace(answer, opened=revision.opened, place=place)
+    answer = replace(answer, opened=revision.opened)
     if revision.is_better:
         answer = replace(answer, rejected_by="the map of the others contradicts")
     return answer.solved_from(start, pipeline)

@@ -30,6 +30,7 @@ from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import Record, StageTable
 from solvers.robots.checkpoint import Journal
+from solvers.robots.kept_answers import KeptAnswers
 from solvers.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.robots.paper import check_paper
 from solvers.robots.place import PlaceOfRobots
@@ -163,18 +164,16 @@ class FilesOfRobots:
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         journal = Journal(None, {}, table)
         with closing(opened.driver):
-            place = PlaceOfRobots(
-                monitor, table, opened.driver, journal, name, pipeline.gap, opened.weighting
-            )
+            answers = KeptAnswers(opened.driver, table, name, pipeline.gap, opened.weighting)
+            place = PlaceOfRobots(monitor, table, opened.driver, journal, answers)
             if isinstance(self.robust, GNC):
                 answer = answer_before_passes(opened, place, pipeline)
                 answer = answer_after_passes(answer, self.robust, pipeline)
             else:
                 answer = RobotsAnswer(opened, place, solve_at(place, pipeline, None))
             opened = answer.opened
-            place = answer.place
             driver = opened.driver
-            best, frame, F = place.move_to_frame(answer.best)
+            best, frame, F = answer.kept.move_to_frame(answer.best)
             if out is not None:
                 nothing = [None] * len(self.files)
                 driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)
@@ -188,7 +187,7 @@ class FilesOfRobots:
             ledger=driver.network.ledger,
             frame=frame,
             F=F,
-            note=_note(self.weighting, opened, place.note(best)),
+            note=_note(self.weighting, opened, answer.place.note(best)),
             num_absent=opened.num_absent,
             robust=_text_of_rejected(opened, answer.rejected_by) if is_judged else "",
             is_held=not is_judged,
