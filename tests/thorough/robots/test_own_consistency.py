@@ -132,7 +132,7 @@ def test_the_only_edge_between_two_robots_is_told(tmp_path: Path) -> None:
         for robust in (solvers.PCM(), solvers.GNC()):
             solution = solvers.solve_folder(folder, robust=robust, trust_folder=True)
             assert solution.num_bridges == num_bridges
-            told = "one edge is the only one between two parts of the map" in solution.robust_text
+            told = "one edge is the only one between two parts of the map" in solution.robust
             assert told == bool(num_bridges)
 
 
@@ -148,10 +148,9 @@ def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_pa
     told = {pair for robot in robots.values() for pair in robot.rejected}
     assert told == {(int(i), int(j)) for i, j in wrong}
     for robot in robots.values():
-        assert robot.outcome is not None
-        assert robot.outcome.certificate is not None
-        assert robot.outcome.certificate.is_certified
+        assert robot.solution is not None
+        assert robot.solution.certificate.is_certified
         assert not robot.is_certified  # nobody has checked the edges that are kept
-        assert robot.outcome.robust.startswith(f"{num_wrong} of {graph.num_edges} edges left out")
+        assert robot.solution.robust.startswith(f"{num_wrong} of {graph.num_edges} edges left out")
     with pytest.raises(SettingError, match=r"other known edges need sharing=Sharing\.MEASUREMENTS"):
         solvers.Robot("a", list(robots), KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))

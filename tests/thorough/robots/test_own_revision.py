@@ -101,7 +101,6 @@ def test_a_team_that_keeps_its_measurements_does_the_same(tmp_path: Path) -> Non
     network = Network(robots, np.random.default_rng(0), lost=0.1)
     network.run(300.0)
     for robot in robots.values():
-        assert robot.outcome is not None
-        assert robot.outcome.certificate is not None
-        assert robot.outcome.certificate.objective == pytest.approx(folder.certificate.objective)
+        assert robot.solution is not None
+        assert robot.solution.certificate.objective == pytest.approx(folder.certificate.objective)
         assert not robot.is_certified  # nobody has checked the edges that are kept
