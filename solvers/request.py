@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -194,18 +194,19 @@ class SolveRequest:
         owners = robots_of_solve(self.pipeline.soc, self.robots.owners, self.problem.graph)
         return replace(self, robots=self.robots.with_owners(owners))
 
-    @contextmanager
-    def open_place(self, gnc: GNC | None = None) -> Iterator[Place]:
+    def open_place(self, gnc: GNC | None = None) -> AbstractContextManager[Place]:
         """Open the place of the request: robots if there are any, else this process.
 
         With `gnc` the robots are given the thresholds of their edges, for a robust solve.
         """
-        table = StageTable()
-        here = Here(self.monitor, table, self.problem, self.pipeline.gap)
-        robots = self.robots
-        if robots is None:
-            yield here
-            return
+        here = Here(self.monitor, StageTable(), self.problem, self.pipeline.gap)
+        if self.robots is None:
+            return nullcontext(here)
+        return self._open_robots(self.robots, replace(here, where=", in one place"), gnc)
+
+    @contextmanager
+    def _open_robots(self, robots: Robots, here: Here, gnc: GNC | None) -> Iterator[Place]:
+        """The robots of one graph, with a driver or alone."""
         from solvers.carry.process import InProcess
         from solvers.robots.checkpoint import Journal, run_fingerprint
         from solvers.robots.place import PlaceOfRobots
@@ -213,22 +214,15 @@ class SolveRequest:
         from solvers.robots.place_without_driver import RobotsAlone
 
         problem = self.problem
-        mark = run_fingerprint(problem, robots.partition, self._settings_of_run(robots), self.start)
+        owners = robots.partition
+        mark = run_fingerprint(problem, owners, self._settings_of_run(robots), self.start)
+        journal = Journal(robots.checkpoint, mark, here.table)
         engine = robots.engine if robots.engine is not None else InProcess()
         thresholds = None if gnc is None else gnc.thresholds(problem)
-        journal = Journal(robots.checkpoint, mark, table)
-        opened = open_driver(problem, robots.partition, engine, robots.driver_memory, thresholds)
-        with closing(opened) as driver:
-            kind = PlaceOfRobots if robots.has_driver else RobotsAlone
-            yield kind(
-                self.monitor,
-                table,
-                driver,
-                journal,
-                replace(here, where=", in one place"),
-                robots.partition,
-                robots.faults,
-            )
+        driver = open_driver(problem, owners, engine, robots.driver_memory, thresholds)
+        kind = PlaceOfRobots if robots.has_driver else RobotsAlone
+        with closing(driver):
+            yield kind(self.monitor, here.table, driver, journal, here, owners, robots.faults)
 
     def _settings_of_run(self, robots: Robots) -> tuple[object, ...]:
         """Settings that a checkpoint must have in common with the run that goes on from it."""

@@ -235,7 +235,8 @@ class PlaceOfRobots(Place):
         began = time.perf_counter()
         with self.monitor.showing(name):
             go_to_start()
-            objective = self._final_objective()
+            driver.choose_cost(final=True)
+            objective = driver.current.objective
             driver.choose_cost(final=False)
         seconds = time.perf_counter() - began
         self.table.add(Stage(name, Status.CONVERGED, 0, objective, seconds, History()))
@@ -253,21 +254,12 @@ class PlaceOfRobots(Place):
         finished = self._run_coupling(soc)
         if not driver.current.objective <= driver.saved.objective:
             driver.restore_poses()
-        objective = self._final_objective()
+        driver.choose_cost(final=True)
         seconds = time.perf_counter() - began
         name = type(soc).__name__
         if driver.is_final:
             name = f"{name}, convex"
-        stage = Stage(
-            name,
-            finished.status,
-            finished.iterations,
-            objective,
-            seconds,
-            finished.history,
-            soc,
-        )
-        self.table.add(stage)
+        self._add_stage(name, replace(finished, seconds=seconds), soc)
         if self.faults is None:
             return replace(attempt, status=finished.status)
         rounds = driver.network.ledger.rounds
@@ -280,27 +272,15 @@ class PlaceOfRobots(Place):
 
     def _run_coupling(self, soc: AnySOC) -> Outcome[Any]:
         """Run the coupling that the settings name, or the paper's; its factors go with it."""
-        driver = self.driver
-        if isinstance(soc, PaperSOC):
-            by_paper = PaperByRobots(soc)
-            ended = self.journal.run(by_paper, driver, self.monitor)
-            by_paper.finish(driver, ended.state)
-            return ended
-        if soc.effective_coupling is not Coupling.CONSENSUS:
-            substructured = SubstructuredSOC(soc)
-            finished = self.journal.run(substructured, driver, self.monitor)
-            substructured.finish(driver, finished.state)
-            return finished
-        if self.faults is None:
-            consensus = ConsensusSOC(soc)
-            waiting = self.journal.run(consensus, driver, self.monitor)
-            consensus.finish(driver, waiting.state)
-            return waiting
-        # No checkpoint can hold the messages that are under way.
-        asynchronous = AsynchronousSOC(soc, self.faults)
-        impatient = self.monitor.run(asynchronous, driver)
-        asynchronous.finish(driver, impatient.state)
-        return impatient
+        coupling = _coupling_of(soc, self.faults)
+        finished: Outcome[Any]
+        if isinstance(coupling, AsynchronousSOC):
+            # No checkpoint can hold the messages that are under way.
+            finished = self.monitor.run(coupling, self.driver)
+        else:
+            finished = self.journal.run(coupling, self.driver, self.monitor)
+        coupling.finish(self.driver, finished.state)
+        return finished
 
     def run_newton(self, attempt: Attempt, newton: Newton) -> Attempt:
         """Run Newton from the current poses."""
@@ -310,8 +290,8 @@ class PlaceOfRobots(Place):
         self._add_stage("Newton", finished, newton)
         return replace(attempt, status=finished.status, decrement=finished.state.decrement)
 
-    def _add_stage(self, name: str, finished: Outcome[Any], method: Newton | Staircase) -> None:
-        """Write down a run that has ended at the current poses."""
+    def _add_stage(self, name: str, finished: Outcome[Any], method: object) -> None:
+        """Write down a run that has ended at the current poses, with the settings of its method."""
         stage = Stage(
             name,
             finished.status,
@@ -322,11 +302,6 @@ class PlaceOfRobots(Place):
             method,
         )
         self.table.add(stage)
-
-    def _final_objective(self) -> float:
-        """The cost that is solved, at the current poses; the driver stays with that cost."""
-        self.driver.choose_cost(final=True)
-        return self.driver.current.objective
 
     def certify(self, attempt: Attempt) -> Attempt:
         """Prove the certificate of the current poses by driver and robots.
@@ -466,3 +441,12 @@ class PlaceOfRobots(Place):
         driver.choose_cost(final=True)
         finished = self.monitor.run(SharedGNC.of(gnc, driver, problem.graph, has_map=False), driver)
         return inliers_of(problem, gnc, driver, finished)
+
+
+def _coupling_of(soc: AnySOC, faults: Faults | None) -> Any:  # noqa: ANN401 - methods of any state
+    """The method by which robots run SOC: the coupling that the settings name, or the paper's."""
+    if isinstance(soc, PaperSOC):
+        return PaperByRobots(soc)
+    if soc.effective_coupling is not Coupling.CONSENSUS:
+        return SubstructuredSOC(soc)
+    return ConsensusSOC(soc) if faults is None else AsynchronousSOC(soc, faults)

@@ -210,16 +210,8 @@ class TakenBack:
 
 
 @dataclass(frozen=True, eq=False)
-class SolvedPoses:
+class NumberedPoses:
     """Poses that were found, and their numbers in the whole graph, (k,)."""
-
-    numbers: IntArray
-    poses: Poses
-
-
-@dataclass(frozen=True, eq=False)
-class OwnCover:
-    """Own poses in the cover, and their numbers in the whole graph, (h,)."""
 
     numbers: IntArray
     poses: Poses
@@ -233,7 +225,7 @@ class Links:
     ratio: Array
 
 
-def tell_solved(agent: FileAgent, _: None) -> Mapping[int, SolvedPoses]:
+def tell_solved(agent: FileAgent, _: None) -> Mapping[int, NumberedPoses]:
     """Order: tell every neighbour of the own poses found that edges between the two touch."""
     placed = agent.known(PlacedFile)
     everything = everything_of(placed.joined)
@@ -244,12 +236,12 @@ def tell_solved(agent: FileAgent, _: None) -> Mapping[int, SolvedPoses]:
         between = edges_between(everything, agent.robot, other)
         ends = np.concatenate([everything.graph.i[between], everything.graph.j[between]])
         places = np.flatnonzero(np.isin(own_poses, ends))
-        messages[other] = SolvedPoses(everything.numbers[own_poses[places]], solved[places])
+        messages[other] = NumberedPoses(everything.numbers[own_poses[places]], solved[places])
     return messages
 
 
 def judge_near(
-    agent: FileAgent, request: tuple[Mapping[int, SolvedPoses], Weighting, float]
+    agent: FileAgent, request: tuple[Mapping[int, NumberedPoses], Weighting, float]
 ) -> Mapping[int, BoolArray]:
     """Order: find the edges near the map, with the poses of neighbours; those kept stay.
 
@@ -315,13 +307,13 @@ def take_back(agent: FileAgent, request: TakenBack) -> Border:
     return border_of(robot, joined)
 
 
-def tell_cover(agent: FileAgent, _: None) -> OwnCover:
+def tell_cover(agent: FileAgent, _: None) -> NumberedPoses:
     """Order: return the own poses that were found, of those in the cover."""
     placed = agent.known(PlacedFile)
     subgraph = placed.subgraph
     own_separators = np.flatnonzero(subgraph.is_own)
     in_cover = np.flatnonzero(subgraph.is_separator[own_separators])
-    return OwnCover(subgraph.poses[own_separators[in_cover]], _solved(placed.joined)[in_cover])
+    return NumberedPoses(subgraph.poses[own_separators[in_cover]], _solved(placed.joined)[in_cover])
 
 
 def go_to_solved(agent: FileAgent, cover: Poses) -> None:
