@@ -259,12 +259,8 @@ class Session:
             self._go_on_driving(now, awake)
         if self._drive is None and awake[0] == self.name and self._is_time(now, awake):
             self._begin_drive(awake, now)
-        for name, outcome in list(self._unheard.items()):
-            if name not in awake:
-                del self._unheard[name]
-            elif now - self._sent_at.get(name, -np.inf) >= self.retry:
-                self._sent_at[name] = now
-                self._send(name, outcome, Priority.NORMAL)
+        self._unheard = {name: ended for name, ended in self._unheard.items() if name in awake}
+        self._send_again(self._unheard, Priority.NORMAL, now)
 
     def _say_hello(self, to: str, priority: Priority) -> None:
         self._send(to, Hello(self._member.revision, self.term), priority)
@@ -272,6 +268,13 @@ class Session:
     def _send(self, to: str, message: object, priority: Priority) -> None:
         data = sealed(self._key, Envelope(self.name, to, message))
         self._out.append(Message(to, data, priority))
+
+    def _send_again(self, waiting: Mapping[str, object], priority: Priority, now: float) -> None:
+        """Send what was not answered, by receiver, once and then whenever it is due."""
+        for name, message in waiting.items():
+            if now - self._sent_at.get(name, -np.inf) >= self.retry:
+                self._sent_at[name] = now
+                self._send(name, message, priority)
 
     def _learn_term(self, term: Term) -> None:
         """Give up a solve that another robot has overtaken, and solve again if this one drives."""
@@ -327,10 +330,7 @@ class Session:
         if now - self._waits_since > _MOST_PATIENCES * self._presence.patience:
             self._end_without_answers(now)
             return
-        for name, ask in self._drive.waiting.items():
-            if now - self._sent_at.get(name, -np.inf) >= self.retry:
-                self._sent_at[name] = now
-                self._send(name, ask, Priority.URGENT)
+        self._send_again(self._drive.waiting, Priority.URGENT, now)
 
     def _end_without_answers(self, now: float) -> None:
         """End the solve with an error in place of the answers that are missing."""
@@ -363,9 +363,8 @@ class Session:
         drive = self._drive
         assert drive is not None
         self._waits_since = None
-        for name, ask in drive.waiting.items():
-            self._sent_at[name] = now
-            self._send(name, ask, Priority.URGENT)
+        self._sent_at.clear()
+        self._send_again(drive.waiting, Priority.URGENT, now)
         if drive.outcome is None:
             return
         self._drive = None
@@ -373,10 +372,8 @@ class Session:
         assert self._tried is not None
         outcome = drive.ended(absent, self._tried)
         self._end_with(outcome)
-        self._unheard = {name: outcome for name in drive.members[1:]}
-        for name in self._unheard:
-            self._sent_at[name] = now
-            self._send(name, outcome, Priority.NORMAL)
+        self._unheard = dict.fromkeys(drive.members[1:], outcome)
+        self._send_again(self._unheard, Priority.NORMAL, now)
 
     # Following
 
