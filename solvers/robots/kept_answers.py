@@ -48,30 +48,28 @@ class KeptAnswer:
 class KeptAnswers:
     """Answers to the graph `name` that robots have kept, for a cost, to a relative `gap`.
 
-    The last one of them is what the robots keep now.
+    The last of those `kept` is what the robots keep now.
     """
 
-    driver: Driver
     table: StageTable
     name: str
     gap: float
     weighting: Weighting
-    answers: list[KeptAnswer] = field(default_factory=list)
+    kept: list[KeptAnswer] = field(default_factory=list)
 
-    def certify(self, attempt: Attempt, bound: LowerBound) -> Attempt:
+    def certify(self, driver: Driver, attempt: Attempt, bound: LowerBound) -> Attempt:
         """Have the robots keep the current poses if they are the cheapest, and certify the kept."""
         source = BoundSource.GIVEN
         dual = attempt.dual_bound
         if dual is not None and dual.lower_bound > bound.value:
             bound = dual.bound
             source = BoundSource.RELAXATION
-        if not self.answers or self.driver.current.objective < self.answers[-1].objective:
-            self._keep(attempt)
+        if not self.kept or driver.current.objective < self.kept[-1].objective:
+            self._keep(driver, attempt)
         return replace(attempt, certificate=self._certificate(bound, source))
 
-    def _keep(self, attempt: Attempt) -> None:
+    def _keep(self, driver: Driver, attempt: Attempt) -> None:
         """Have the robots keep the current poses."""
-        driver = self.driver
         robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
         answer = KeptAnswer(
             driver.current.objective,
@@ -81,12 +79,12 @@ class KeptAnswers:
             driver.current,
             attempt.status,
         )
-        self.answers.append(answer)
+        self.kept.append(answer)
 
     def _certificate(self, bound: LowerBound, source: BoundSource) -> Certificate:
         """Certificate of the poses that the robots keep."""
-        kept = self.answers[-1]
-        no_poses = Poses.identity(0, self.driver.d)
+        kept = self.kept[-1]
+        no_poses = Poses.identity(0, kept.cover.R.shape[2])
         judgement = judge_cost(self.name, kept.objective, kept.rounding, bound, self.gap)
         return Certificate(
             objective=judgement.objective,
@@ -110,15 +108,15 @@ class KeptAnswers:
         """Return the poses that the robots keep, with the best bound that either has."""
         highest = max(best.proof, other.proof, key=lambda known: known.lower_bound)
         certificate = self._certificate(highest.bound, highest.source)
-        status = other.status if other.status in BROKEN_OFF else self.answers[-1].status
+        status = other.status if other.status in BROKEN_OFF else self.kept[-1].status
         return replace(best, certificate=certificate, status=status)
 
-    def go_back(self) -> None:
+    def go_back(self, driver: Driver) -> None:
         """Have robots and driver return to the poses that the robots keep."""
-        kept = self.answers[-1]
+        kept = self.kept[-1]
         nothing = [None] * len(kept.robots)
-        self.driver.network.ask(return_to_answer, nothing, Count.PIGGYBACKED)
-        self.driver.current = kept.cover
+        driver.network.ask(return_to_answer, nothing, Count.PIGGYBACKED)
+        driver.current = kept.cover
 
     def start_again(self) -> Poses | None:
         """A second attempt runs SOC once more."""
@@ -126,26 +124,26 @@ class KeptAnswers:
 
     def salvage(self, ending: Ending) -> Attempt:
         """The poses that the robots keep; a PGOError where a matrix had no factor before any."""
-        if not self.answers:
+        if not self.kept:
             raise PGOError(f"{self.name}: weights too far apart for doubles; see pgo info FILE")
-        stage = ending(self.answers[-1].objective)
+        stage = ending(self.kept[-1].objective)
         self.table.add(stage)
         certificate = self._certificate(NO_BOUND, BoundSource.GIVEN)
         return Attempt(status=stage.status, certificate=certificate)
 
-    def move_to_frame(self, best: Attempt) -> tuple[Attempt, str, float]:
+    def move_to_frame(self, driver: Driver, best: Attempt) -> tuple[Attempt, str, float]:
         """Have the robots move the answer to its frame; which that is, and F there.
 
         A frame far away rounds the poses, so that their cost is found anew: the certificate is of
         the poses that are written.
         """
-        kept = self.answers[-1]
+        kept = self.kept[-1]
         turn, shift, frame = _frame(kept.robots)
-        network = self.driver.network
+        network = driver.network
         parts = network.ask(move_answer, [(turn, shift)] * len(kept.robots), Count.ROUND)
         objective = math.fsum(part.cost for part in parts)
         rounding = _sum_of_roundings([part.rounding for part in parts])
-        self.answers.append(replace(kept, objective=objective, rounding=rounding))
+        self.kept.append(replace(kept, objective=objective, rounding=rounding))
         certificate = self._certificate(best.proof.bound, best.proof.source)
         F = math.fsum(part.F for part in parts)
         return replace(best, certificate=certificate), frame, F

@@ -315,7 +315,7 @@ class PlaceOfRobots(Place):
         with self.monitor.showing("certificate"):
             bound = best_bound_distributed(driver, self.answers.gap, most_lost)
             if isinstance(self.answers, KeptAnswers):
-                return self.answers.certify(attempt, bound)
+                return self.answers.certify(driver, attempt, bound)
             here = self.answers
             poses, Lambda = collect(driver)
             certificate = certify_with(
@@ -335,7 +335,7 @@ class PlaceOfRobots(Place):
     def has_poses(self) -> bool:
         """Whether the robots have begun and, where no process has the graph, have kept any."""
         if isinstance(self.answers, KeptAnswers):
-            return bool(self.answers.answers)
+            return bool(self.answers.kept)
         return bool(self.table.stages)
 
     def salvage(self, ending: Ending) -> Attempt:
@@ -355,7 +355,7 @@ class PlaceOfRobots(Place):
         """Have the robots climb the staircase from the best poses, and round its solution."""
         driver = self.driver
         if isinstance(self.answers, KeptAnswers):
-            self.answers.go_back()
+            self.answers.go_back(driver)
         else:
             driver.set_poses(best.known_poses)
         self.journal.stop_writing()

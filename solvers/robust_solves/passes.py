@@ -42,9 +42,8 @@ class RobotsAnswer:
 
     def solved_from(self, start: str, pipeline: Pipeline) -> RobotsAnswer:
         """The answer solved for from poses that the robots have found, the start of this name."""
-        driver = self.opened.driver
-        anew = replace(self.kept, driver=driver, answers=[])
-        place = replace(self.place, driver=driver, answers=anew, begins_at=start)
+        anew = replace(self.kept, kept=[])
+        place = replace(self.place, driver=self.opened.driver, answers=anew, begins_at=start)
         return replace(self, place=place, best=solve_at(place, pipeline, None))
 
 

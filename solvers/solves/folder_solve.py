@@ -164,7 +164,7 @@ class FilesOfRobots:
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         journal = Journal(None, {}, table)
         with closing(opened.driver):
-            answers = KeptAnswers(opened.driver, table, name, pipeline.gap, opened.weighting)
+            answers = KeptAnswers(table, name, pipeline.gap, opened.weighting)
             place = PlaceOfRobots(monitor, table, opened.driver, journal, answers)
             if isinstance(self.robust, GNC):
                 answer = answer_before_passes(opened, place, pipeline)
@@ -173,7 +173,7 @@ class FilesOfRobots:
                 answer = RobotsAnswer(opened, place, solve_at(place, pipeline, None))
             opened = answer.opened
             driver = opened.driver
-            best, frame, F = answer.kept.move_to_frame(answer.best)
+            best, frame, F = answer.kept.move_to_frame(driver, answer.best)
             if out is not None:
                 nothing = [None] * len(self.files)
                 driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)
