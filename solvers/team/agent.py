@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
@@ -99,7 +98,7 @@ class TeamAgent(FileAgent):
         return OwnAnswer(ids, self.record.answer[own_poses], None, self.record.joined.rejected)
 
 
-def give_measurements(agent: TeamAgent, _: None) -> NDArray[np.uint8]:
+def give_measurements(agent: TeamAgent, _: None) -> IntArray:
     """Return the lines of the robot in UTF-8; a SettingError if it does not share them."""
     if agent.sharing is not Sharing.MEASUREMENTS:
         raise SettingError(
