@@ -2,7 +2,7 @@
 
 Robots hold the poses between two steps, and an attempt has none until its certificate is found.
 Where this process has the graph, it collects the poses then, and takes the steps that robots lack
-(`solvers.here`). Elsewhere the robots keep the answer (`solvers.robots.kept_answers`). Without a
+(`solvers.here`). Elsewhere the robots keep the answer (`solvers.robots.kept_answer`). Without a
 driver there is `solvers.robots.place_without_driver`.
 """
 
@@ -56,7 +56,7 @@ from solvers.robots.handedness import (
     hand_out_terms,
     return_to_best,
 )
-from solvers.robots.kept_answers import KeptAnswers
+from solvers.robots.kept_answer import AnswerAtRobots
 from solvers.robots.newton import SubstructuredNewton
 from solvers.robots.own_file import (
     READ_HERE,
@@ -101,10 +101,10 @@ class PlaceOfRobots(Place):
         The driver, with the network of its robots.
     journal : Journal
         Checkpoints. Where one is of a later stage, what comes before it is passed over.
-    answers : Here or KeptAnswers
-        A solve of the graph of all robots in this process, where poses are collected for a
-        certificate, and steps are taken that robots lack: the name of their stages says so. Or
-        answers that the robots keep, of which this process knows no poses.
+    holder : Here or AnswerAtRobots
+        Who holds the answer: this process, which has the graph of all robots, collects the poses
+        for a certificate, and takes the steps that robots lack (the names of their stages say so),
+        or the robots, of whose poses this process knows nothing.
     owners : Partition, optional
         Who owns which poses of the graph in this process.
     faults : Faults, optional
@@ -118,7 +118,7 @@ class PlaceOfRobots(Place):
 
     driver: Driver
     journal: Journal
-    answers: Here | KeptAnswers
+    holder: Here | AnswerAtRobots
     owners: Partition | None = None
     faults: Faults | None = None
     begins_at: str | None = None
@@ -127,13 +127,13 @@ class PlaceOfRobots(Place):
     @property
     def here(self) -> Here | None:
         """The solve of the graph of all robots in this process, if it has that graph."""
-        return self.answers if isinstance(self.answers, Here) else None
+        return self.holder if isinstance(self.holder, Here) else None
 
     @property
     def known_here(self) -> Here:
         """The solve in this process, where it is known that there is one: see `lacks`."""
-        assert isinstance(self.answers, Here)
-        return self.answers
+        assert isinstance(self.holder, Here)
+        return self.holder
 
     # What the page asks
 
@@ -311,12 +311,12 @@ class PlaceOfRobots(Place):
         """
         driver = self.driver
         goes_on = self.is_on_the_way and not attempt.is_out_of_time
-        most_lost = self.answers.gap * driver.current.objective if goes_on else None
+        most_lost = self.holder.gap * driver.current.objective if goes_on else None
         with self.monitor.showing("certificate"):
-            bound = best_bound_distributed(driver, self.answers.gap, most_lost)
-            if isinstance(self.answers, KeptAnswers):
-                return self.answers.certify(driver, attempt, bound)
-            here = self.answers
+            bound = best_bound_distributed(driver, self.holder.gap, most_lost)
+            if isinstance(self.holder, AnswerAtRobots):
+                return self.holder.certify(driver, attempt, bound)
+            here = self.holder
             poses, Lambda = collect(driver)
             certificate = certify_with(
                 here.problem, poses, Lambda, here.gap, attempt.decrement, BoundSource.GIVEN, bound
@@ -329,13 +329,13 @@ class PlaceOfRobots(Place):
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the cheaper poses with the best bound that either has."""
-        return self.answers.better(best, other)
+        return self.holder.better(best, other)
 
     @property
     def has_poses(self) -> bool:
         """Whether the robots have begun and, where no process has the graph, have kept any."""
-        if isinstance(self.answers, KeptAnswers):
-            return bool(self.answers.kept)
+        if isinstance(self.holder, AnswerAtRobots):
+            return self.holder.kept is not None
         return bool(self.table.stages)
 
     def salvage(self, ending: Ending) -> Attempt:
@@ -343,19 +343,19 @@ class PlaceOfRobots(Place):
         robots_have_poses = ending in (Stage.interruption, Stage.silence)
         if self.here is not None and robots_have_poses:
             self.monitor.poses_found.append(collect(self.driver)[0])
-        return self.answers.salvage(ending)
+        return self.holder.salvage(ending)
 
     # Steps after the first attempt
 
     def start_again(self) -> Poses | None:
         """The optimum of F, found in one place, where the cost is another; else SOC runs again."""
-        return self.answers.start_again()
+        return self.holder.start_again()
 
     def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Have the robots climb the staircase from the best poses, and round its solution."""
         driver = self.driver
-        if isinstance(self.answers, KeptAnswers):
-            self.answers.go_back(driver)
+        if isinstance(self.holder, AnswerAtRobots):
+            self.holder.go_back(driver)
         else:
             driver.set_poses(best.known_poses)
         self.journal.stop_writing()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from solvers.place import Attempt
 from solvers.plan import solve_at
 from solvers.request import Pipeline
-from solvers.robots.kept_answers import KeptAnswers
+from solvers.robots.kept_answer import AnswerAtRobots
 from solvers.robots.place import PlaceOfRobots
 from solvers.robots.revision import ComesBack, Pass, revised
 from solvers.robots.setup import OpenedFiles
@@ -30,10 +30,10 @@ class RobotsAnswer:
     rejected_by: str = "do not agree pairwise with others"
 
     @property
-    def kept(self) -> KeptAnswers:
-        """What the robots keep."""
-        assert isinstance(self.place.answers, KeptAnswers)
-        return self.place.answers
+    def holder(self) -> AnswerAtRobots:
+        """The robots, as holders of the answer."""
+        assert isinstance(self.place.holder, AnswerAtRobots)
+        return self.place.holder
 
     @property
     def name_of_poses(self) -> str:
@@ -42,8 +42,8 @@ class RobotsAnswer:
 
     def solved_from(self, start: str, pipeline: Pipeline) -> RobotsAnswer:
         """The answer solved for from poses that the robots have found, the start of this name."""
-        anew = replace(self.kept, kept=[])
-        place = replace(self.place, driver=self.opened.driver, answers=anew, begins_at=start)
+        anew = replace(self.holder, kept=None)
+        place = replace(self.place, driver=self.opened.driver, holder=anew, begins_at=start)
         return replace(self, place=place, best=solve_at(place, pipeline, None))
 
 

@@ -30,7 +30,7 @@ from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import Record, StageTable
 from solvers.robots.checkpoint import Journal
-from solvers.robots.kept_answers import KeptAnswers
+from solvers.robots.kept_answer import AnswerAtRobots
 from solvers.robots.own_file import READ_HERE, RobotFile, write_answer
 from solvers.robots.paper import check_paper
 from solvers.robots.place import PlaceOfRobots
@@ -164,8 +164,8 @@ class FilesOfRobots:
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         journal = Journal(None, {}, table)
         with closing(opened.driver):
-            answers = KeptAnswers(table, name, pipeline.gap, opened.weighting)
-            place = PlaceOfRobots(monitor, table, opened.driver, journal, answers)
+            holder = AnswerAtRobots(table, name, pipeline.gap, opened.weighting)
+            place = PlaceOfRobots(monitor, table, opened.driver, journal, holder)
             if isinstance(self.robust, GNC):
                 answer = answer_before_passes(opened, place, pipeline)
                 answer = answer_after_passes(answer, self.robust, pipeline)
@@ -173,7 +173,7 @@ class FilesOfRobots:
                 answer = RobotsAnswer(opened, place, solve_at(place, pipeline, None))
             opened = answer.opened
             driver = opened.driver
-            best, frame, F = answer.kept.move_to_frame(driver, answer.best)
+            best, frame, F = answer.holder.move_to_frame(driver, answer.best)
             if out is not None:
                 nothing = [None] * len(self.files)
                 driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)

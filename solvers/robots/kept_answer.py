@@ -1,4 +1,4 @@
-"""Answers that robots keep where no process has the graph: the poses of the cheapest attempt.
+"""The answer that robots keep where no process has the graph: the poses of the cheapest attempt.
 
 The driver knows the interface between the robots (`solvers.robots.setup`), and of the answer its
 cost and bound. A certificate is of the poses that the robots keep, is made of their sums, and has
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,18 +44,24 @@ class KeptAnswer:
     status: Status
 
 
-@dataclass(frozen=True, eq=False)
-class KeptAnswers:
-    """Answers to the graph `name` that robots have kept, for a cost, to a relative `gap`.
+@dataclass(eq=False)
+class AnswerAtRobots:
+    """The answer to the graph `name`, for a cost and to a relative `gap`, which the robots hold.
 
-    The last of those `kept` is what the robots keep now.
+    What they keep now is `kept`. Like the robots it changes whenever an attempt is cheaper.
     """
 
     table: StageTable
     name: str
     gap: float
     weighting: Weighting
-    kept: list[KeptAnswer] = field(default_factory=list)
+    kept: KeptAnswer | None = None
+
+    @property
+    def known(self) -> KeptAnswer:
+        """What the robots keep, where it is known that they keep something."""
+        assert self.kept is not None
+        return self.kept
 
     def certify(self, driver: Driver, attempt: Attempt, bound: LowerBound) -> Attempt:
         """Have the robots keep the current poses if they are the cheapest, and certify the kept."""
@@ -64,14 +70,14 @@ class KeptAnswers:
         if dual is not None and dual.lower_bound > bound.value:
             bound = dual.bound
             source = BoundSource.RELAXATION
-        if not self.kept or driver.current.objective < self.kept[-1].objective:
+        if self.kept is None or driver.current.objective < self.kept.objective:
             self._keep(driver, attempt)
         return replace(attempt, certificate=self._certificate(bound, source))
 
     def _keep(self, driver: Driver, attempt: Attempt) -> None:
         """Have the robots keep the current poses."""
         robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
-        answer = KeptAnswer(
+        self.kept = KeptAnswer(
             driver.current.objective,
             attempt.decrement,
             _sum_of_roundings([robot.rounding for robot in robots]),
@@ -79,11 +85,10 @@ class KeptAnswers:
             driver.current,
             attempt.status,
         )
-        self.kept.append(answer)
 
     def _certificate(self, bound: LowerBound, source: BoundSource) -> Certificate:
         """Certificate of the poses that the robots keep."""
-        kept = self.kept[-1]
+        kept = self.known
         no_poses = Poses.identity(0, kept.cover.R.shape[2])
         judgement = judge_cost(self.name, kept.objective, kept.rounding, bound, self.gap)
         return Certificate(
@@ -108,12 +113,12 @@ class KeptAnswers:
         """Return the poses that the robots keep, with the best bound that either has."""
         highest = max(best.proof, other.proof, key=lambda known: known.lower_bound)
         certificate = self._certificate(highest.bound, highest.source)
-        status = other.status if other.status in BROKEN_OFF else self.kept[-1].status
+        status = other.status if other.status in BROKEN_OFF else self.known.status
         return replace(best, certificate=certificate, status=status)
 
     def go_back(self, driver: Driver) -> None:
         """Have robots and driver return to the poses that the robots keep."""
-        kept = self.kept[-1]
+        kept = self.known
         nothing = [None] * len(kept.robots)
         driver.network.ask(return_to_answer, nothing, Count.PIGGYBACKED)
         driver.current = kept.cover
@@ -124,9 +129,9 @@ class KeptAnswers:
 
     def salvage(self, ending: Ending) -> Attempt:
         """The poses that the robots keep; a PGOError where a matrix had no factor before any."""
-        if not self.kept:
+        if self.kept is None:
             raise PGOError(f"{self.name}: weights too far apart for doubles; see pgo info FILE")
-        stage = ending(self.kept[-1].objective)
+        stage = ending(self.kept.objective)
         self.table.add(stage)
         certificate = self._certificate(NO_BOUND, BoundSource.GIVEN)
         return Attempt(status=stage.status, certificate=certificate)
@@ -137,13 +142,13 @@ class KeptAnswers:
         A frame far away rounds the poses, so that their cost is found anew: the certificate is of
         the poses that are written.
         """
-        kept = self.kept[-1]
+        kept = self.known
         turn, shift, frame = _frame(kept.robots)
         network = driver.network
         parts = network.ask(move_answer, [(turn, shift)] * len(kept.robots), Count.ROUND)
         objective = math.fsum(part.cost for part in parts)
         rounding = _sum_of_roundings([part.rounding for part in parts])
-        self.kept.append(replace(kept, objective=objective, rounding=rounding))
+        self.kept = replace(kept, objective=objective, rounding=rounding)
         certificate = self._certificate(best.proof.bound, best.proof.source)
         F = math.fsum(part.F for part in parts)
         return replace(best, certificate=certificate), frame, F
