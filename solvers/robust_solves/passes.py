@@ -47,24 +47,22 @@ class RobotsAnswer:
         return replace(self, place=place, best=solve_at(place, pipeline, None))
 
 
-def answer_before_passes(
-    opened: OpenedFiles, place: PlaceOfRobots, pipeline: Pipeline
+def answer_by_passes(
+    opened: OpenedFiles, place: PlaceOfRobots, gnc: GNC, pipeline: Pipeline
 ) -> RobotsAnswer:
-    """The answer from which passes go on, whether it is certified or not: a first attempt alone."""
-    place = replace(place, is_on_the_way=True)
-    first = replace(pipeline.with_newton_alone(pipeline.newton), soc=pipeline.soc)
-    return RobotsAnswer(opened, place, solve_at(place, first, None))
+    """The answer by a first attempt, and passes of GNC, each from the map of the one before.
 
-
-def answer_after_passes(answer: RobotsAnswer, gnc: GNC, pipeline: Pipeline) -> RobotsAnswer:
-    """The answer after passes of GNC, each from the map of the one before.
-
-    From a certified map one last pass judges the edges near it, with the settings that have found
-    it. Without one there are passes with what agrees pairwise, with all edges, and with all edges
-    and tight thresholds; those that agree are all there are where the settings say so. Thresholds
-    follow the errors. The last map has the other steps of the pipeline, if it is not certified.
+    The first attempt is of what agrees pairwise, and is gone on from whether it is certified or
+    not. From a certified map one last pass judges the edges near it, with the settings that have
+    found it. Without one there are passes with what agrees pairwise, with all edges, and with all
+    edges and tight thresholds; those that agree are all there are where the settings say so.
+    Thresholds follow the errors. The last map has the other steps of the pipeline, if it is not
+    certified.
     """
     newton_alone = pipeline.with_newton_alone(pipeline.newton)
+    place = replace(place, is_on_the_way=True)
+    best = solve_at(place, replace(newton_alone, soc=pipeline.soc), None)
+    answer = RobotsAnswer(opened, place, best)
     scale = answer.opened.threshold_scale
     settings = gnc if scale == 1.0 else with_tight_thresholds(gnc, scale)
     tight = [with_tight_thresholds(settings, factor) for factor in TIGHT_SCALES]

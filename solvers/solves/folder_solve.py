@@ -41,7 +41,7 @@ from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
 from solvers.robust.rejection import text_of_bridges
-from solvers.robust_solves.passes import RobotsAnswer, answer_after_passes, answer_before_passes
+from solvers.robust_solves.passes import RobotsAnswer, answer_by_passes
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
@@ -167,8 +167,7 @@ class FilesOfRobots:
             holder = AnswerAtRobots(table, name, pipeline.gap, opened.weighting)
             place = PlaceOfRobots(monitor, table, opened.driver, journal, holder)
             if isinstance(self.robust, GNC):
-                answer = answer_before_passes(opened, place, pipeline)
-                answer = answer_after_passes(answer, self.robust, pipeline)
+                answer = answer_by_passes(opened, place, self.robust, pipeline)
             else:
                 answer = RobotsAnswer(opened, place, solve_at(place, pipeline, None))
             opened = answer.opened
