@@ -1,4 +1,9 @@
-"""CONSENSUS by robots on a network: `solvers.soc.consensus`, from the poses that they hold."""
+"""CONSENSUS by robots on a network: `solvers.soc.consensus`, from the poses that they hold.
+
+`ConsensusSOC` waits: an iteration is one exchange and one all-reduce. `AsynchronousSOC` does not
+wait: every robot continues with the newest rows that it has received. The fixed-point map is the
+same, over-relaxed, and damped where values are old (Peng et al. 2016, ARock).
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -8,14 +13,22 @@ from typing import TypeVar
 
 import numpy as np
 
+from pgo_models.errors import SettingError, check_settings
+from pgo_models.geometry.rotations import Array
 from solvers.carry.counted_pool import Count
-from solvers.carry.faults import LossyChannel
+from solvers.carry.faults import Faults, LossyChannel
+from solvers.carry.moments import Moment
 from solvers.result import Measurement, Status
 from solvers.robots.agent import C, begin_copies, finish_copies, order_copies
 from solvers.robots.driver import Driver
-from solvers.soc.consensus import Consensus, ConsensusState, ask_all
+from solvers.soc.consensus import (
+    Consensus,
+    ConsensusState,
+    ask_all,
+    objective_and_gradient,
+)
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import Rows
+from solvers.soc.copies import Rows, TurnSettings
 from solvers.soc.recursion_block import Rotations
 from solvers.soc.soc import SOC
 
@@ -133,6 +146,152 @@ class ConsensusSOC:
         return self._method.converged(state, measurement)
 
     def finish(self, driver: Driver, state: ConsensusState) -> None:
+        """Give driver and robots omega, and the best translations for it: two rounds."""
+        driver.return_to(state.moment)
+        RobotsOfDriver(driver).finish()
+
+
+@dataclass(frozen=True, eq=False)
+class AsynchronousState:
+    """Round k: what the robots reported, and the messages under way.
+
+    The rows of the robots are with them, which hold them at a moment.
+    """
+
+    k: int
+    moment: Moment
+    size: float  # ||omega||_rho
+    channel: LossyChannel[Array]
+    rows: list[Rows]  # what has arrived for the next turn of every robot, by sender
+    # F and its relative gradient. Every robot evaluates its part at its own poses, beside its
+    # copies of the others' poses; in a confirmed state, beside the others' poses themselves.
+    objective: float
+    gradient: float
+    rotation_square: float  # as in `ConsensusState`
+    primal_residual: float = np.inf
+    dual_residual: float = np.inf
+    quiet: int = 0  # number of rounds in a row with residuals within tolerance
+    waited: int = 0  # age in rounds of the oldest rows that a robot has of a neighbour
+    # Whether the gradient is within tolerance at the poses that the robots hold.
+    is_confirmed: bool = False
+
+
+@dataclass(frozen=True)
+class AsynchronousSOC:
+    """SOC by robots that do not wait for each other; a round is one turn of every robot."""
+
+    # Settings. Of these penalties, local passes, tolerance and limit are used; the acceleration is
+    # not, since it needs sums over all robots.
+    soc: SOC = field(default_factory=SOC)
+    faults: Faults = field(default_factory=Faults)
+    alpha: float = 1.8  # over-relaxation, in (0, 2)
+    damping: float = 1.0  # fraction of a step that is taken, in (0, 1]
+    has_driver: bool = True  # as in `ConsensusSOC`
+    goes_on: bool = False  # as in `ConsensusSOC`
+
+    def __post_init__(self) -> None:
+        check_settings(self, relaxation=["alpha"])
+        if not 0 < self.damping <= 1:
+            raise SettingError(f"damping must be in (0, 1], got {self.damping}")
+
+    @property
+    def max_iterations(self) -> int:
+        """Maximal number of rounds of a run."""
+        return self.soc.max_iterations
+
+    def init(self, driver: Driver, start: None) -> AsynchronousState:
+        """State 0: the penalties and the first rows arrive without faults.
+
+        Raises a SettingError if there is no robot with the number of the silent one.
+        """
+        robots = RobotsOfDriver(driver, self.has_driver, self.goes_on)
+        silent = self.faults.silent_robot
+        if silent is not None and silent >= robots.num_robots:
+            raise SettingError(f"silent_robot is {silent}; give 0 to {robots.num_robots - 1}")
+        state = Consensus(self.soc).init(robots)
+        settings = TurnSettings(self.alpha, self.damping)
+        sent = ask_all(robots, ConsensusRobot.announce, settings, Count.PIGGYBACKED)
+        rows = robots.exchange(sent)
+        return AsynchronousState(
+            k=0,
+            moment=driver.moment(),
+            size=state.size,
+            channel=LossyChannel(self.faults),
+            rows=rows,
+            objective=state.objective,
+            gradient=state.gradient,
+            rotation_square=state.rotation_square,
+        )
+
+    def step(self, driver: Driver, state: AsynchronousState) -> AsynchronousState:
+        """One turn of every robot, with the rows that have arrived.
+
+        If it may be the last one, a round follows that confirms it.
+        """
+        driver.return_to(state.moment)
+        robots = RobotsOfDriver(driver)
+        turns = robots.ask(ConsensusRobot.turn, state.rows, Count.PIGGYBACKED)
+        squares = np.sum([turn.sums for turn in turns], axis=0)
+        if not np.isfinite(squares).all():
+            broken = replace(state, primal_residual=np.nan, dual_residual=np.nan)
+            return replace(broken, k=state.k + 1, moment=driver.moment())
+        primal = math.sqrt(squares[0]) / state.size
+        dual = math.sqrt(squares[1]) / state.size
+        objective, gradient = objective_and_gradient(
+            [turn.stationarity for turn in turns], state.rotation_square
+        )
+        is_within = max(primal, dual, gradient) <= self.soc.tolerance
+        channel = state.channel.copy()
+        following = replace(
+            state,
+            k=state.k + 1,
+            channel=channel,
+            rows=robots.exchange([turn.rows for turn in turns], channel),
+            objective=objective,
+            gradient=gradient,
+            primal_residual=primal,
+            dual_residual=dual,
+            quiet=state.quiet + 1 if is_within else 0,
+            waited=max(turn.waited for turn in turns),
+        )
+        oldest_in_use = following.waited + self.faults.max_delay
+        if following.quiet > oldest_in_use:
+            following = self._confirmed(robots, following)
+        return replace(following, moment=driver.moment())
+
+    def _confirmed(self, robots: RobotsOfDriver, state: AsynchronousState) -> AsynchronousState:
+        """State with the gradient at the poses that the robots hold.
+
+        The robots send each other these poses until all have arrived.
+        """
+        sent = ask_all(robots, ConsensusRobot.held_rows, None, Count.PIGGYBACKED)
+        rows = robots.exchange(sent)
+        parts = robots.ask(ConsensusRobot.stationarity_beside, rows, Count.ALL_REDUCE)
+        objective, gradient = objective_and_gradient(parts, state.rotation_square)
+        state = replace(state, objective=objective, gradient=gradient)
+        if gradient <= self.soc.tolerance:
+            return replace(state, is_confirmed=True)
+        return replace(state, quiet=0)
+
+    def measure(self, driver: Driver, state: AsynchronousState) -> Measurement:
+        """F of the poses that the robots hold, and two residuals.
+
+        The primal residual is that of the recursion, the dual one the relative gradient of F.
+        """
+        if math.isnan(state.primal_residual):
+            return driver.measured(Measurement(math.nan, math.nan, math.nan))
+        return driver.measured(Measurement(state.objective, state.primal_residual, state.gradient))
+
+    def converged(self, state: AsynchronousState, measurement: Measurement) -> Status | None:
+        """CONVERGED when a last round has confirmed that residuals and gradient are small enough.
+
+        They have to be within tolerance since before the oldest rows in use were sent. In the last
+        round all robots send each other the poses that they hold, and the relative gradient of F
+        there has to be within tolerance, too.
+        """
+        return Status.CONVERGED if state.is_confirmed else None
+
+    def finish(self, driver: Driver, state: AsynchronousState) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""
         driver.return_to(state.moment)
         RobotsOfDriver(driver).finish()

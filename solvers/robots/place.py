@@ -45,10 +45,9 @@ from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
-from solvers.robots.asynchronous import AsynchronousSOC
 from solvers.robots.checkpoint import Journal
 from solvers.robots.climb import SubstructuredStaircase, round_lifted
-from solvers.robots.consensus import ConsensusSOC
+from solvers.robots.consensus import AsynchronousSOC, ConsensusSOC
 from solvers.robots.driver import Driver, collect
 from solvers.robots.handedness import (
     RobotsPoint,

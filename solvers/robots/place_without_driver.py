@@ -30,8 +30,12 @@ from solvers.carry.counted_pool import Count
 from solvers.place import AnySOC, Attempt, Ending, OwnStart, Traits
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
-from solvers.robots.asynchronous import AsynchronousSOC, AsynchronousState
-from solvers.robots.consensus import ConsensusSOC, RobotsOfDriver
+from solvers.robots.consensus import (
+    AsynchronousSOC,
+    AsynchronousState,
+    ConsensusSOC,
+    RobotsOfDriver,
+)
 from solvers.robots.driver import Driver
 from solvers.robots.place import PlaceOfRobots
 from solvers.robots.trees import robot_tree, tree_traffic

@@ -78,7 +78,7 @@ class Robots:
         (`solvers.robots.place_without_driver`), which finds poses and no certificate.
     faults : Faults, optional
         What goes wrong between the robots of a CONSENSUS stage, which then does not wait
-        (`solvers.robots.asynchronous`).
+        (`solvers.robots.consensus`).
     checkpoint : Checkpoint, optional
         File to which the solve writes what it needs to go on after it was broken off, and from
         which it goes on.

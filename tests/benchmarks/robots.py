@@ -39,8 +39,7 @@ from solvers.carry.counted_pool import Count
 from solvers.carry.process import Engine
 from solvers.loop import run
 from solvers.result import History, Record, Run
-from solvers.robots.asynchronous import AsynchronousSOC, AsynchronousState
-from solvers.robots.consensus import RobotsOfDriver
+from solvers.robots.consensus import AsynchronousSOC, AsynchronousState, RobotsOfDriver
 from solvers.robots.place_with_graph import open_driver
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot

@@ -43,9 +43,8 @@ from solvers import (
 from solvers.carry.process import Engine
 from solvers.handedness.ascent import HandednessAscent
 from solvers.loop import Method
-from solvers.robots.asynchronous import AsynchronousSOC
 from solvers.robots.climb import SubstructuredStaircase
-from solvers.robots.consensus import ConsensusSOC
+from solvers.robots.consensus import AsynchronousSOC, ConsensusSOC
 from solvers.robots.driver import Driver
 from solvers.robots.handedness import RobotsPoint, begin_without_terms
 from solvers.robots.newton import SubstructuredNewton

@@ -35,8 +35,7 @@ from solvers import (
 )
 from solvers.carry.counted_pool import Count
 from solvers.carry.ledger import Ledger
-from solvers.robots.asynchronous import AsynchronousSOC
-from solvers.robots.consensus import RobotsOfDriver
+from solvers.robots.consensus import AsynchronousSOC, RobotsOfDriver
 from solvers.robots.driver import Driver
 from solvers.soc.consensus import LocalConsensus, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
