@@ -24,6 +24,8 @@ from solvers.handedness.search import HandednessSearch
 from solvers.here import Here
 from solvers.loop import RunMonitor
 from solvers.place import AUTO, Attempt, FirstStage, Place, Step
+from solvers.reporting.gauge import choose_gauge
+from solvers.reporting.notes import note_of
 from solvers.result import StageTable
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
@@ -31,7 +33,7 @@ from solvers.riemannian.staircase import Staircase
 from solvers.robots.settings import Robots
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
-from solvers.solution import Solution, choose_gauge, note_of
+from solvers.solution import Solution
 
 if TYPE_CHECKING:  # what a solve in one place does not need
     from solvers.robust.consistency import PCM

@@ -21,31 +21,17 @@ from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.carry.ledger import Ledger
-from solvers.reporting.gauge import choose_gauge as choose_gauge
-from solvers.reporting.json_records import (
-    certificate_json as certificate_json,
-    network_json,
-    stage_json,
-    write_json as write_json,
-)
-from solvers.reporting.notes import (
-    joined_notes as joined_notes,
-    note_of as note_of,
-    note_of_absence as note_of_absence,
-    note_of_coupling as note_of_coupling,
-    note_of_weights as note_of_weights,
-    verdict_suffix as verdict_suffix,
-)
+from solvers.reporting.json_records import certificate_json, network_json, stage_json, write_json
+from solvers.reporting.notes import verdict_suffix
 from solvers.reporting.result_files import (
-    check_format as check_format,
-    check_target as check_target,
+    check_format,
     write_poses,
 )
 from solvers.reporting.two_costs import (
     Facts,
-    both_costs as both_costs,
-    facts_of_unknowns as facts_of_unknowns,
-    other_cost as other_cost,
+    both_costs,
+    facts_of_unknowns,
+    other_cost,
 )
 from solvers.reporting.versions import installed_versions
 from solvers.result import Stage, Status

@@ -36,15 +36,10 @@ from solvers.cli.shell import (
     save_then_show,
     wrapped,
 )
+from solvers.reporting.json_records import certificate_json, write_json
+from solvers.reporting.notes import verdict_suffix
+from solvers.reporting.two_costs import both_costs, facts_of_unknowns, other_cost
 from solvers.reporting.versions import installed_versions
-from solvers.solution import (
-    both_costs,
-    certificate_json,
-    facts_of_unknowns,
-    other_cost,
-    verdict_suffix,
-    write_json,
-)
 from solvers.solves.given_poses import certify
 
 _INDENT = 13  # columns of the labels of a certificate

@@ -28,7 +28,8 @@ from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.cli.inputs import Dropped, GraphOptions, indefinite_matrices, kept_edges, load_graph
 from solvers.cli.shell import command_to_type, wrapped
 from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
-from solvers.solution import Solution, note_of_weights
+from solvers.reporting.notes import note_of_weights
+from solvers.solution import Solution
 
 if TYPE_CHECKING:  # what commands that solve nothing do not need
     from solvers.studies.readings import ReadingComparison

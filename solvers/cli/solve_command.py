@@ -78,11 +78,12 @@ from solvers.cli.shell import (
 )
 from solvers.pipeline import solve
 from solvers.progress.bars import JobBar
+from solvers.reporting.result_files import check_format, check_target
 from solvers.request import Pipeline
 from solvers.result import Status
 from solvers.robots.settings import Checkpoint, Robots
 from solvers.soc.soc import SOC, WARM_START
-from solvers.solution import Solution, check_format, check_target
+from solvers.solution import Solution
 
 if TYPE_CHECKING:
     from solvers.robust.consistency import PCM

@@ -19,6 +19,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.carry.ledger import Ledger
 from solvers.place import is_open
+from solvers.reporting.notes import joined_notes
 from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Status
 from solvers.robust.agreement import Agreement
@@ -40,7 +41,7 @@ from solvers.robust_solves.attempts import (
     plans_in_order,
 )
 from solvers.robust_solves.choice import Choice
-from solvers.solution import Solution, joined_notes
+from solvers.solution import Solution
 
 # A plain solve comes first on a large graph where this share of closures is at most so many times
 # beyond its thresholds at the chordal start.

@@ -20,9 +20,10 @@ from pgo_models.figures import gap_above, scaled_above, scaled_below
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
 from solvers.convex.extended_soc import with_priors
+from solvers.reporting.notes import joined_notes, note_of_absence, note_of_coupling
 from solvers.request import SolveRequest
 from solvers.result import OUT_OF_TIME, Stage
-from solvers.solution import Solution, joined_notes, note_of_absence, note_of_coupling
+from solvers.solution import Solution
 
 
 def solve_extended(

@@ -27,6 +27,7 @@ from solvers.carry.ray_engine import RayEngine
 from solvers.loop import RunMonitor
 from solvers.place import AUTO, FirstStage
 from solvers.plan import solve_at
+from solvers.reporting.notes import joined_notes, note_of_absence
 from solvers.request import Pipeline
 from solvers.result import Record, StageTable
 from solvers.robots.checkpoint import Journal
@@ -45,7 +46,6 @@ from solvers.robust_solves.passes import RobotsAnswer, answer_by_passes
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
 from solvers.soc.soc import SOC
-from solvers.solution import joined_notes, note_of_absence
 
 
 def solve_folder(
