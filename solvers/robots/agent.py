@@ -30,7 +30,7 @@ from solvers.robots.system import System
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, ReceivedRows, Rows, TurnSettings, Waiting
-from solvers.soc.paper_block import PaperIterate
+from solvers.soc.paper import PaperIterate
 from solvers.soc.paper_robot import PaperCopies, PaperPenalty, PaperRobot
 from solvers.soc.r_step import RStep
 from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings

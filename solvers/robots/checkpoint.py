@@ -44,8 +44,7 @@ from solvers.robots.soc import SubstructuredState
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus import ConsensusState
 from solvers.soc.copies import SeparatorPenalty
-from solvers.soc.paper import PaperSOC, PaperStop
-from solvers.soc.paper_block import CommonPenalty
+from solvers.soc.paper import CommonPenalty, PaperSOC, PaperStop
 from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
 from solvers.soc.r_step import RStep
 from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings

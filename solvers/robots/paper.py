@@ -25,8 +25,7 @@ from solvers.result import Measurement, Status
 from solvers.robots.agent import begin_paper
 from solvers.robots.consensus import RobotsOfDriver
 from solvers.robots.driver import Driver
-from solvers.soc.paper import PaperSOC
-from solvers.soc.paper_block import CommonPenalty
+from solvers.soc.paper import CommonPenalty, PaperSOC
 from solvers.soc.paper_robot import PaperPenalty, PaperReply, PaperRobot
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RStep

@@ -18,7 +18,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.problem.matrices import inner, norm
 from solvers.soc.copies import CopyLayout, Rows
-from solvers.soc.paper_block import Blocks, PaperIterate
+from solvers.soc.paper import Blocks, PaperIterate
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, RStep
 
@@ -60,7 +60,7 @@ class PaperReply:
     Parameters
     ----------
     squares : (3,) array
-        Sums over its own poses: ||omega - R||^2, ||omega - omega_last||^2 and the square of p_res.
+        Those of `PaperIterate.squares`.
     rows : mapping
         R^T of the poses that a neighbour holds, for every neighbour.
     """
@@ -153,9 +153,7 @@ class PaperRobot:
         rho = self.state.penalty.rho
         last = self._completed(rows)
         own_iterate = last.of(self.layout.own_poses)
-        gradient = 2.0 * self._blocks.pull(own_iterate.R, last.R) + rho * stack_transposes(
-            own_iterate.B
-        )
+        gradient = self._blocks.gradient(own_iterate, last.R, rho)
         last_figures = PaperLast(float(norm(gradient) ** 2), self._cost_at(last.omega))
         factor = penalty.rho / rho
         following = self._with(last=last.with_scaled_penalty(factor), penalty=penalty)
@@ -206,10 +204,8 @@ class PaperRobot:
         assert state.last is not None
         own_iterate = state.last.of(self.layout.own_poses)
         ahead = self._blocks.iteration(self.step_a, state.penalty.rho, own_iterate, state.last.R)
-        primal = norm(ahead.omega - ahead.R) ** 2
-        change = norm(ahead.omega - own_iterate.omega) ** 2
-        squares = np.array([primal, change, ahead.p_res_square])
-        return self._with(ahead=ahead), PaperReply(squares, self._sent(ahead.R))
+        reply = PaperReply(ahead.squares(own_iterate), self._sent(ahead.R))
+        return self._with(ahead=ahead), reply
 
     def _cost_at(self, R: Array) -> float:
         """<R, L R> over own rows, from R of the robot's and its neighbours' poses, (n_a, d, d)."""
