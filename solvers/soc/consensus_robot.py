@@ -27,7 +27,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.stationarity import gradient_squares, rotation_squares
 from solvers.soc import copies
-from solvers.soc.anderson import AndersonSums, over_relax
+from solvers.soc.anderson import AndersonSums
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
 from solvers.soc.recursion_block import (
@@ -171,10 +171,10 @@ class ConsensusRobot:
         Where robots accelerate alone the rows are extrapolated already, and of the sums only the
         merit is returned.
         """
-        X, omega, _B, drift = self._solved_after_local_passes()
-        x = np.where(self.layout.held, X, 0.0)
         before = self.block
-        step = before.step_of_map(x, omega, drift)
+        X, local = self._solved_after_local_passes()
+        x = np.where(self.layout.held, X, 0.0)
+        step = before.step_of_map(x, local, before.settings.alpha)
         # Neighbours have s, or the first time with these penalties omega.
         known = before.omega if before.anderson.image is None else before.s
         image, sent = self._as_sent(before.s + step, known, before.settings.bytes_per_number)
@@ -277,9 +277,9 @@ class ConsensusRobot:
         block = before
         if has_all:
             block = replace(before, omega=self._agreed_omega(waiting.newest))  # (b), (c)
-        X, omega, B, _ = self._with(block=block)._solved_after_local_passes()  # (a)
+        X, local = self._with(block=block)._solved_after_local_passes()  # (a)
         alpha = 1.0 + waiting.excess * (waiting.settings.alpha - 1.0)
-        change = over_relax(np.where(self.layout.held, X, 0.0), omega, alpha) + B - block.s
+        change = block.step_of_map(np.where(self.layout.held, X, 0.0), local, alpha)
         weight = np.sqrt(block.rho)[:, None]
         primal = weight * change
         dual = weight * (block.omega - before.omega)
@@ -405,25 +405,11 @@ class ConsensusRobot:
         subproblem = self.layout.subproblem(self.block.rho)
         return replace(self, step_a=prepare(subproblem, self.layout.r_step))
 
-    def _solved_after_local_passes(self) -> tuple[Array, Array, Array, Array | float]:
-        """X of step (a), with omega, B and the change of their sum in the local passes before it.
-
-        A local pass does (a) to (c) on the poses that no other robot holds.
-        """
+    def _solved_after_local_passes(self) -> tuple[Array, RecursionBlock]:
+        """X of step (a), and the block that the local passes before it have led to."""
         assert self.step_a is not None
-        block = self.block
-        private = self.layout.private
-        omega = block.omega.copy()
-        B = block.B
-        drift = np.zeros((1, 1))
-        passes = block.settings.local_passes - 1
-        if passes and private.any() and block.is_finite:
-            for _ in range(passes):
-                s = (self.step_a.solve(omega - B) + B)[private]  # (a)
-                omega[private] = nearest_rotations(s)  # (b)
-                B[private] = s - omega[private]  # (c)
-            drift = omega + B - block.s
-        return self.step_a.solve(omega - B), omega, B, drift
+        local = self.block.after_local_passes(self.step_a.solve, self.layout.private)
+        return self.step_a.solve(local.shift), local
 
     def _agreed_omega(self, received: copies.Rows) -> Array:
         """Step (b): omega and the mean translations, from s and the neighbours' rows.

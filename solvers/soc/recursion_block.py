@@ -9,12 +9,14 @@ squares and of products for the acceleration.
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pgo_models.geometry.rotations import (
     Array,
+    BoolArray,
     project_to_rotations,
     stack_transposes,
     unstack_transposes,
@@ -112,16 +114,34 @@ class RecursionBlock:
 
     def after_solve(self, x: Array) -> tuple[RecursionBlock, Array]:
         """Block with the x of step (a), (rows, d), and this party's sums for the acceleration."""
-        step = self.step_of_map(x, self.omega)
+        step = self.step_of_map(x, self, self.settings.alpha)
         return self.after_map(x, step, self.s + step)
 
-    def step_of_map(self, x: Array, omega: Array, drift: Array | float = 0.0) -> Array:
+    def after_local_passes(
+        self, solve: Callable[[Array], Array], private: BoolArray
+    ) -> RecursionBlock:
+        """Block after all but the last of the local passes: (a) to (c) on private rows, (rows,).
+
+        No other party holds these rows. `solve` is step (a), from omega - B.
+        """
+        passes = self.settings.local_passes - 1
+        if not (passes and private.any() and self.is_finite):
+            return self
+        omega = self.omega.copy()
+        s = self.s.copy()
+        for _ in range(passes):
+            x = solve(2.0 * omega - s)  # (a)
+            s[private] += (x - omega)[private]  # s = x + B
+            omega[private] = nearest_rotations(s[private])  # (b), and (c) B = s - omega
+        return replace(self, omega=omega, s=s)
+
+    def step_of_map(self, x: Array, local: RecursionBlock, alpha: float) -> Array:
         """Step from s of the fixed-point map, (rows, d), where step (a) gives x.
 
-        After local passes, `omega` is the one that they led to and `drift` their change of omega +
-        B, both (rows, d).
+        `local` is the block after local passes, from which step (a) started; this block itself if
+        there were none.
         """
-        return over_relax(x, omega, self.settings.alpha) - omega + drift
+        return over_relax(x, local.omega, alpha) - local.omega + (local.s - self.s)
 
     def after_map(self, x: Array, step: Array, image: Array) -> tuple[RecursionBlock, Array]:
         """Block with x, and the sums, where the fixed-point map takes s to `image` = s + step."""
