@@ -159,22 +159,20 @@ class SubstructuredSOC:
         norms = np.concatenate([answer.norms for answer in answers])
         scales = np.concatenate([answer.scale for answer in answers])
         order = self.soc.penalty_order(norms / scales, is_stationary)
-        ratio = order.rho(norms, scales) / scales
         block = order.block(driver.current.R, Lambda, driver.diagonal[driver.rotation_rows])
         reduced = driver.ask(recursion.penalize, order)
         # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
-        squared_size = driver.d * (step or 1) * float(ratio @ scales)
+        squared_size = driver.d * (step or 1) * float(order.rho(norms, scales).sum())
         return SubstructuredState(
             block=block,
             right=[answer.right for answer in reduced],
             factor=_factorize(driver, block, reduced),
-            ratio=ratio,
             size=math.sqrt(squared_size),
         )
 
     def _with_due_penalty(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
         """State with the penalty that the rule or the safeguard asks for, see `Joint`."""
-        due, factor = next_penalty(self.soc.penalty, state.ratio, state)
+        due, factor = next_penalty(self.soc.penalty, state)
         if due is Due.RAISE:
             rescaled = self._rescaled(driver, state, factor, from_best=True)
             return replace(rescaled, raises=state.raises + 1)

@@ -166,7 +166,7 @@ class Consensus:
             separators = before.separators
         else:
             separators = self._separators_of_stiffness(float(np.median(stiffness)))
-        replies = ask_all(robots, ConsensusRobot.start, separators, Count.GATHER)
+        replies = ask_all(robots, ConsensusRobot.start, separators, Count.ALL_REDUCE)
         return _first_state(separators, replies)
 
     def step(self, robots: AskedRobots, state: ConsensusState) -> ConsensusState:
@@ -223,7 +223,7 @@ class Consensus:
         """
         if self.rotations is not Rotations.PROJECTED:
             return state
-        due, factor = next_penalty(self.soc.penalty, state.ratio, state)
+        due, factor = next_penalty(self.soc.penalty, state)
         if due is Due.RAISE:
             rescaled = self._rescaled(robots, state, factor, from_best=True)
             return replace(rescaled, raises=state.raises + 1)
@@ -293,7 +293,6 @@ def _first_state(separators: SeparatorPenalty, replies: Sequence[InitReply]) -> 
     rotation_square = math.fsum(part.rotations for part in parts if part.rotations is not None)
     objective, gradient = objective_and_gradient(parts, rotation_square)
     return ConsensusState(
-        ratio=np.concatenate([reply.ratio for reply in replies]),
         size=math.sqrt(math.fsum(reply.size for reply in replies)),
         separators=separators,
         objective=objective,

@@ -160,7 +160,7 @@ class ConsensusRobot:
         rotations = float(rotation_squares(layout.full_problem)[own_poses].sum())
         stationarity = replace(following.stationarity(None)[1], rotations=rotations)
         size = d * float(rho[own_poses].sum())
-        reply = copies.InitReply(size, (rho / self._scale)[own_poses], stationarity)
+        reply = copies.InitReply(size, stationarity)
         return following._prepared(), reply
 
     # The recursion.

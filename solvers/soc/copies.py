@@ -76,7 +76,6 @@ class InitReply:
     """What a robot reports of its own poses when it is ready for the first step."""
 
     size: float  # ||omega||_rho^2
-    ratio: Array  # rho_i / m_i
     stationarity: Stationarity
 
 

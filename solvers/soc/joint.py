@@ -194,7 +194,7 @@ class Joint:
         from the multipliers at omega, RESCALE multiplies rho by the factor. RECHECK concerns the
         translation penalty, which JOINT does not have.
         """
-        due, factor = next_penalty(self.soc.penalty, state.rho / rotation_scale(problem), state)
+        due, factor = next_penalty(self.soc.penalty, state)
         if due is Due.RAISE and state.best is not None:
             omega = project_to_rotations(state.best)
             at_best = replace(state, omega=omega, B=state.best - omega)

@@ -24,11 +24,8 @@ from solvers.soc.separator_stiffness import is_recheck_due
 MAX_RAISES = 20
 # The recursion has diverged when the merit is so many times the smallest one.
 _DIVERGED = 10.0
-# It cycles when so many steps have brought no new smallest merit, ...
+# It cycles when so many steps have brought no new smallest merit.
 _PATIENCE = 20
-# ... unless the median of rho_i / m_i is at least this. 4 ||Lambda_i|| is enough of a penalty, and
-# at an optimum that can be certified ||Lambda_i|| is about m_i at most.
-_SAFE_RATIO = 4.0
 # The run has stalled when so many iterations have not brought the larger residual down to this
 # share of the smallest one before. Runs that converge on public graphs take 39 at most (M3500).
 _STALL_ITERATIONS = 100
@@ -119,21 +116,19 @@ class Steps(Summarised):
 class SharedSteps(Steps):
     """Steps of a recursion whose rows are spread over robots: what all robots know."""
 
-    ratio: Array  # (n,): rho_i / m_i of all poses, in no order
     size: float  # ||omega||_rho
 
     def rescaled(self, factor: float) -> Self:
         """State after all robots have multiplied rho by `factor`; the acceleration starts anew."""
-        ratio = factor * self.ratio
         size = math.sqrt(factor) * self.size
-        return replace(self, ratio=ratio, size=size, sums=AndersonSums(), merits=())
+        return replace(self, size=size, sums=AndersonSums(), merits=())
 
 
-def next_penalty(rule: PenaltyRule, ratio: Array, steps: Steps) -> tuple[Due, float]:
-    """What is due before the next step, and the factor on rho; `ratio` is rho_i / m_i, (n,)."""
+def next_penalty(rule: PenaltyRule, steps: Steps) -> tuple[Due, float]:
+    """What is due before the next step, and the factor on rho."""
     merits = steps.merits
     can_raise = steps.raises < MAX_RAISES
-    if can_raise and (has_diverged(merits) or is_cycling(merits, ratio)):
+    if can_raise and (has_diverged(merits) or is_cycling(merits)):
         return Due.RAISE, 2.0
     if isinstance(rule, MultiplierPenalty):
         return _due_of_multipliers(rule, steps), 1.0
@@ -175,9 +170,9 @@ def has_diverged(merits: tuple[float, ...]) -> bool:
     return len(merits) >= 2 and merits[-1] > _DIVERGED * min(merits)
 
 
-def is_cycling(merits: tuple[float, ...], ratio: Array) -> bool:
-    """Whether 20 steps brought no new smallest merit while rho_i / m_i is small in the median."""
+def is_cycling(merits: tuple[float, ...]) -> bool:
+    """Whether 20 steps brought no new smallest merit."""
     if len(merits) < 2:
         return False
     steps_since_smallest = len(merits) - 1 - merits.index(min(merits))
-    return steps_since_smallest >= _PATIENCE and bool(np.median(ratio) < _SAFE_RATIO)
+    return steps_since_smallest >= _PATIENCE

@@ -19,7 +19,6 @@ from robots import (
 from pgo_models import NoiseModel, PGOProblem, PoseGraph, chordal_start
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.stationarity import rotation_scale
 from solvers import SOC, BalancedPenalty, Coupling, MultiplierPenalty, Status, iterate, run
 from solvers.robots.driver import Driver, collect
 from solvers.robots.soc import SubstructuredSOC, SubstructuredState
@@ -71,8 +70,8 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[
                 getattr(other, letter), getattr(expected, letter)[cover], rtol=0, atol=1e-6
             )
         np.testing.assert_allclose(other.rho, expected.rho[cover], rtol=1e-6, atol=0)
-        ratio = expected.rho / rotation_scale(problem)
-        np.testing.assert_allclose(np.sort(other.ratio), np.sort(ratio), rtol=1e-6, atol=0)
+        size = np.sqrt(problem.d * expected.rho.sum())
+        np.testing.assert_allclose(other.size, size, rtol=1e-6, atol=0)
     SubstructuredSOC(soc).finish(driver, distributed[-1])
     poses, _ = collect(driver)
     expected = soc.poses(problem, central[-1])
