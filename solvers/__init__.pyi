@@ -74,8 +74,8 @@ from solvers.studies.tightness import (
     SweptScene as SweptScene,
     noise_sweep as noise_sweep,
 )
-from solvers.team.agent import Sharing as Sharing
 from solvers.team.robot import Robot as Robot
+from solvers.team.sharing import Sharing as Sharing
 
 __all__ = [
     "Measurement",

@@ -98,8 +98,8 @@ def robot_command(
     as_json: JsonOption = False,
 ) -> None:
     """Run `pgo robot`."""
-    from solvers.team.agent import Sharing  # greenlet and Zenoh are of an extra
     from solvers.team.robot import Robot
+    from solvers.team.sharing import Sharing  # greenlet and Zenoh are of an extra
     from solvers.team.zenoh_link import ZenohLink, carry
 
     if out is not None:

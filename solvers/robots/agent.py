@@ -1,14 +1,15 @@
 """One robot as an engine runs it: its interior for the driver, and its copies for CONSENSUS."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.geometry.poses import Poses
+from pgo_models.graphs.g2o_parser import G2OLines, parse_lines, read_lines
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.relaxations.low_rank import LiftedPoses
@@ -38,6 +39,7 @@ from solvers.soc.subgraph import Subgraph
 
 Q = TypeVar("Q")
 A = TypeVar("A")
+K = TypeVar("K")
 # A robot that holds what its neighbours send: of CONSENSUS, or of Algorithm 1 of the paper.
 Copies = ConsensusRobot | PaperRobot
 C = TypeVar("C", ConsensusRobot, PaperRobot)
@@ -109,20 +111,80 @@ CLASSES = (
 )
 
 
-class BaseAgent(ABC):
-    """A robot that obeys orders: an order replaces its state by the one that the order returns."""
+@dataclass(frozen=True, eq=False)
+class OwnLines:
+    """The measurements that a robot has, as lines of g2o: `text`, or else the file at the path."""
 
-    def __init__(self, backend: CholeskyBackend | None, interior: Interior | None) -> None:
+    robot: int
+    path: Path
+    text: str | None = None
+    is_shared: bool = False  # whether the robot gives the lines to the one that drives
+
+    def read(self) -> G2OLines:
+        """Return the lines; errors are those of `read_lines`."""
+        if self.text is None:
+            return read_lines(self.path)
+        return parse_lines(self.path, [self.text])
+
+
+class Agent:
+    """A robot that obeys orders: an order replaces its state by the one that the order returns.
+
+    It is given its part of a graph, or lines of its own, of which the orders of the set-up make its
+    part (`solvers.robots.own_file`). After that nothing differs.
+
+    Parameters
+    ----------
+    source : Subgraph or OwnLines
+        What it is given.
+    backend : CholeskyBackend, optional
+        What factors its matrices.
+
+    Attributes
+    ----------
+    robot : int
+        Number of the robot.
+    interior, copies
+        As in `Held`.
+    record
+        What the last order has left that is about its own lines.
+    """
+
+    def __init__(self, source: Subgraph | OwnLines, backend: CholeskyBackend | None = None) -> None:
+        self.robot = source.robot
         self.backend = backend
-        # As in `Held`.
-        self.interior: Interior | None = interior
+        self.interior: Interior | None = None
         self.copies: Copies | None = None
         self.moments: dict[int, Held] = {}
+        self.record: object = None
+        self._own_lines: OwnLines | None = None
+        self._subgraph: Subgraph | None = None
+        if isinstance(source, Subgraph):
+            self.take_part(source)
+        else:
+            self._own_lines = source
 
     @property
-    @abstractmethod
+    def own_lines(self) -> OwnLines:
+        """The lines of a robot that has its own."""
+        assert self._own_lines is not None
+        return self._own_lines
+
+    @property
     def subgraph(self) -> Subgraph:
-        """Its part of the graph."""
+        """Its part of the graph, once that is known."""
+        assert self._subgraph is not None
+        return self._subgraph
+
+    def take_part(self, subgraph: Subgraph) -> None:
+        """Begin with a part of the graph."""
+        self._subgraph = subgraph
+        self.interior = interior_of(subgraph, self.backend)
+
+    def known(self, kind: type[K]) -> K:
+        """Return the record that the order before has left."""
+        assert isinstance(self.record, kind)
+        return self.record
 
     def recall(self, recall: Recall) -> None:
         """Forget, keep, and return to moments."""
@@ -169,19 +231,6 @@ class BaseAgent(ABC):
         return CopyLayout(self.subgraph, self.backend)
 
 
-class Agent(BaseAgent):
-    """A robot that was given its part of the graph."""
-
-    def __init__(self, subgraph: Subgraph, backend: CholeskyBackend | None) -> None:
-        super().__init__(backend, interior_of(subgraph, backend))
-        self._subgraph = subgraph
-
-    @property
-    def subgraph(self) -> Subgraph:
-        """The part of the graph that it was given."""
-        return self._subgraph
-
-
 def _states(held: Held) -> HeldStates:
     interior = held.interior.state if held.interior is not None else None
     copies = held.copies.state if held.copies is not None else None
@@ -192,7 +241,7 @@ def _states(held: Held) -> HeldStates:
 
 
 def order_interior(
-    order: Callable[[Interior, Q], tuple[Interior, A]], agent: BaseAgent, request: Q
+    order: Callable[[Interior, Q], tuple[Interior, A]], agent: Agent, request: Q
 ) -> A | None:
     """Give the interior an order; None if the robot counts no edge."""
     if agent.interior is None:
@@ -201,7 +250,7 @@ def order_interior(
     return answer
 
 
-def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: BaseAgent, request: Q) -> A:
+def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: Agent, request: Q) -> A:
     """Give the copies an order, which is of their kind: a method began with these."""
     copies: Any = agent.copies
     assert copies is not None
@@ -209,20 +258,20 @@ def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: BaseAgent, request
     return answer
 
 
-def begin_copies(agent: BaseAgent, cover: Poses) -> Rows:
+def begin_copies(agent: Agent, cover: Poses) -> Rows:
     """Start the copies at the current poses, of which the driver sends those of the cover."""
     if not isinstance(agent.copies, ConsensusRobot):
         agent.copies = ConsensusRobot(agent._layout, CopiesState())
     return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
 
 
-def begin_paper(agent: BaseAgent, cover: Poses) -> Rows:
+def begin_paper(agent: Agent, cover: Poses) -> Rows:
     """Start Algorithm 1 at the current poses, of which the driver sends those of the cover."""
     agent.copies = PaperRobot(agent._layout, PaperCopies())
     return order_copies(PaperRobot.begin, agent, held_poses(agent, cover))
 
 
-def held_poses(agent: BaseAgent, cover: Poses) -> Poses:
+def held_poses(agent: Agent, cover: Poses) -> Poses:
     """Current poses of all that the robot holds, (n_a).
 
     Other robots' poses are at the identity unless they are in the cover.
@@ -243,7 +292,7 @@ def held_poses(agent: BaseAgent, cover: Poses) -> Poses:
     return Poses(R, t)
 
 
-def finish_copies(agent: BaseAgent, _: None) -> CoverRotations:
+def finish_copies(agent: Agent, _: None) -> CoverRotations:
     """Take omega for the rotations of the interior; return those of the own poses in the cover."""
     assert agent.copies is not None
     subgraph = agent.subgraph

@@ -23,10 +23,10 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import edge_residuals
 from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
+from solvers.robots.agent import Agent
 from solvers.robots.own_file import (
     Border,
     CostedFile,
-    FileAgent,
     JoinedFile,
     PlacedFile,
     border_of,
@@ -87,7 +87,7 @@ class ConsistentPart:
     num_rejected: int  # where an edge between two robots counts with one of them
 
 
-def tell_trajectories(agent: FileAgent, _: None) -> Mapping[int, Trajectory]:
+def tell_trajectories(agent: Agent, _: None) -> Mapping[int, Trajectory]:
     """Order: tell every neighbour of the own poses that edges between the two touch."""
     return _trajectories(agent.robot, agent.known(JoinedFile))
 
@@ -113,7 +113,7 @@ def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
     return trajectories
 
 
-def tell_error_scale(agent: FileAgent, request: tuple[Weighting, float]) -> float:
+def tell_error_scale(agent: Agent, request: tuple[Weighting, float]) -> float:
     """Order: return the scale of the errors among own poses; nan where too few edges tell it.
 
     It multiplies the covariances that the matrices claim: the lower quartile of the squared
@@ -142,7 +142,7 @@ def tell_error_scale(agent: FileAgent, request: tuple[Weighting, float]) -> floa
 
 
 def judge_closures(
-    agent: FileAgent, request: tuple[Mapping[int, Trajectory], float, float]
+    agent: Agent, request: tuple[Mapping[int, Trajectory], float, float]
 ) -> AgreeingCounts:
     """Order: find what agrees, with the neighbours' trajectories, a quantile and an error scale."""
     received, quantile, scale = request
@@ -184,7 +184,7 @@ def _own_part(joined: JoinedFile, robot: int) -> tuple[PoseGraph | None, BoolArr
     return graph.edge_subgraph(among_own) if len(among_own) else None, odometry, among_own
 
 
-def keep_agreeing(agent: FileAgent, neighbours: IntArray) -> ConsistentPart:
+def keep_agreeing(agent: Agent, neighbours: IntArray) -> ConsistentPart:
     """Order: leave out what does not agree, and all edges to other robots than these neighbours.
 
     It may be given again.
@@ -197,7 +197,7 @@ def keep_agreeing(agent: FileAgent, neighbours: IntArray) -> ConsistentPart:
     return go_on_with(agent, with_edges(everything, agent.robot, kept))
 
 
-def joined_of(agent: FileAgent) -> JoinedFile:
+def joined_of(agent: Agent) -> JoinedFile:
     """What is joined of the robot, whether it has a cost and a place yet or not."""
     record = agent.record
     assert isinstance(record, JoinedFile | CostedFile | PlacedFile)
@@ -228,7 +228,7 @@ def with_edges(everything: JoinedFile, robot: int, kept: BoolArray) -> JoinedFil
     )
 
 
-def go_on_with(agent: FileAgent, remaining: JoinedFile) -> ConsistentPart:
+def go_on_with(agent: Agent, remaining: JoinedFile) -> ConsistentPart:
     """Go on with what is left, and report it."""
     everything = everything_of(remaining)
     graph = everything.graph

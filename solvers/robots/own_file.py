@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -30,7 +30,7 @@ from pgo_models.graphs.g2o_folder import (
     measured_edges,
     placed_poses,
 )
-from pgo_models.graphs.g2o_parser import G2OLines, read_lines
+from pgo_models.graphs.g2o_parser import G2OLines
 from pgo_models.graphs.g2o_rows import information_of, measurements_of, poses_of
 from pgo_models.graphs.pose_graph import (
     WORLD_ID,
@@ -46,9 +46,9 @@ from pgo_models.problem.weighting import (
     convex_cost,
     is_isotropic,
 )
-from solvers.robots.agent import BaseAgent, held_poses, order_interior
+from solvers.robots.agent import Agent, held_poses, order_interior
 from solvers.robots.current_poses import set_poses
-from solvers.robots.interior import Interior, interior_of
+from solvers.robots.interior import Interior
 from solvers.soc.subgraph import PartProblem, Placement, RobotSummary, Subgraph
 
 READ_HERE = (
@@ -56,7 +56,6 @@ READ_HERE = (
 )
 
 
-RobotFile = tuple[int, Path]  # a robot and its file, on the machine where the robot runs
 # What a file names: d, the ids of its VERTEX lines, and the ids that only its edges name; see
 # `_runs`. And the digits that it is written with.
 Claim = tuple[int, IntArray, IntArray, WrittenDigits]
@@ -224,10 +223,9 @@ class CostedFile:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFile:
-    """After `place_cover`: its subgraph, as a robot has it that was given one."""
+    """After `place_cover`: its agent has its subgraph, as one that was given it."""
 
     joined: JoinedFile
-    subgraph: Subgraph
     answer: Poses | None = None  # the poses that were kept
     # Of a robust solve: edges within their thresholds, (m_a,), as far as this robot counts them,
     # and edges of everything that are near the map.
@@ -241,42 +239,15 @@ class PlacedFile:
         return self.answer
 
 
-FileRecord = ReadFile | NumberedFile | JoinedFile | CostedFile | PlacedFile
-F = TypeVar("F", bound=FileRecord)
-
-
-class FileAgent(BaseAgent):
-    """A robot that loads its own file; `record` is what it knows since the last order below."""
-
-    def __init__(self, source: RobotFile) -> None:
-        super().__init__(backend=None, interior=None)
-        self.robot, self.path = source
-        self.record: FileRecord | None = None
-
-    def lines(self) -> G2OLines:
-        """Lines of its file."""
-        return read_lines(self.path)
-
-    def known(self, kind: type[F]) -> F:
-        """What the order before has left."""
-        assert isinstance(self.record, kind)
-        return self.record
-
-    @property
-    def subgraph(self) -> Subgraph:
-        """Its part of the graph, once the cover is placed."""
-        return self.known(PlacedFile).subgraph
-
-
-def read_file(agent: FileAgent, _: None) -> Claim:
+def read_file(agent: Agent, _: None) -> Claim:
     """Read the file, and return the ids in it.
 
     Errors are those of `read_lines`, and a GraphError for priors and landmarks.
     """
-    lines = agent.lines()
+    lines = agent.own_lines.read()
     if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():
         raise GraphError(
-            f"{agent.path} has priors or landmarks, which all robots share; {READ_HERE}"
+            f"{agent.own_lines.path} has priors or landmarks, which all robots share; {READ_HERE}"
         )
     agent.record = ReadFile(lines)
     ids_of_edges_alone = np.setdiff1d(lines.edge_ids, lines.vertex_ids)
@@ -284,7 +255,7 @@ def read_file(agent: FileAgent, _: None) -> Claim:
     return lines.d, runs_of_vertices, _runs(ids_of_edges_alone), lines.digits
 
 
-def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Told]:
+def number_poses(agent: Agent, runs: OwnedRuns) -> Mapping[int, Told]:
     """Take numbers and owners for the ids; return what others are to be told of their poses.
 
     They are messages, by the number of the other robot.
@@ -307,7 +278,7 @@ def number_poses(agent: FileAgent, runs: OwnedRuns) -> Mapping[int, Told]:
     return messages
 
 
-def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) -> Border:
+def join_neighbours(agent: Agent, request: tuple[Mapping[int, Told], bool]) -> Border:
     """Make the graph of the robot: its own edges, and those that others have of its poses.
 
     FIX lines of its own poses count. The request is what others told the robot, and whether the
@@ -323,7 +294,8 @@ def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) 
     edges = _joined_edges([part.edges for part in parts])
     if not len(edges.numbers):
         raise GraphError(
-            f"{agent.path}: no edge touches a pose of this robot; add one, or remove the file"
+            f"{agent.own_lines.path}: no edge touches a pose of this robot; "
+            "add one, or remove the file"
         )
     numbers, first, ends = np.unique(edges.numbers, return_index=True, return_inverse=True)
     owners = edges.owners.ravel()[first]
@@ -345,7 +317,7 @@ def join_neighbours(agent: FileAgent, request: tuple[Mapping[int, Told], bool]) 
         information=information,
         ids=ids,
         fixed=fixed,
-        name=agent.path.stem,
+        name=agent.own_lines.path.stem,
         written_error=written_errors(measurements_of(lines.d, edges.rows), known.digits),
         weights_error=lines.weights_error,
     )
@@ -405,7 +377,7 @@ def border_of(robot: int, joined: JoinedFile) -> Border:
     )
 
 
-def take_cost(agent: FileAgent, weighting: Weighting) -> bool:
+def take_cost(agent: Agent, weighting: Weighting) -> bool:
     """Learn which cost is solved: F or chi2. Return whether SOC can run on the robot's part of it.
 
     A GraphError for a matrix that chi2 cannot have, and where chi2 is one of rotations alone.
@@ -415,14 +387,14 @@ def take_cost(agent: FileAgent, weighting: Weighting) -> bool:
     try:
         cost = problem.weights
     except GraphError as error:
-        raise GraphError(f"{agent.path}: {error}") from error
+        raise GraphError(f"{agent.own_lines.path}: {error}") from error
     if not cost.has_translations:
-        raise GraphError(f"{agent.path}: no edge measures a translation; {READ_HERE}")
+        raise GraphError(f"{agent.own_lines.path}: no edge measures a translation; {READ_HERE}")
     agent.record = CostedFile(joined, problem)
     return cost.is_quadratic and cost.is_convex
 
 
-def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary:
+def place_cover(agent: Agent, place: tuple[Placement, bool]) -> RobotSummary:
     """Learn which poses the driver solves for, and which robots hold which of them.
 
     `place` also says whether SOC runs on another cost than the one that is solved. From now on the
@@ -444,12 +416,12 @@ def place_cover(agent: FileAgent, place: tuple[Placement, bool]) -> RobotSummary
         *known, *placement.of(*known), edges, weights, final, thresholds=joined.thresholds
     )
     subgraph = subgraph.for_driver()
-    agent.record = PlacedFile(joined, subgraph)
-    agent.interior = interior_of(subgraph, agent.backend)
+    agent.record = PlacedFile(joined)
+    agent.take_part(subgraph)
     return replace(subgraph.summary, part=None)
 
 
-def keep_answer(agent: FileAgent, cover: Poses) -> Answer:
+def keep_answer(agent: Agent, cover: Poses) -> Answer:
     """Keep the current poses for the answer; the driver sends those of the cover."""
     placed = agent.known(PlacedFile)
     joined = placed.joined
@@ -457,7 +429,7 @@ def keep_answer(agent: FileAgent, cover: Poses) -> Answer:
     agent.record = replace(placed, answer=answer)
     interior = agent.interior
     fixed = joined.graph.fixed
-    holding = int(fixed[0] if len(fixed) else np.argmax(placed.subgraph.is_own))
+    holding = int(fixed[0] if len(fixed) else np.argmax(agent.subgraph.is_own))
     rounding = NO_ROUNDING
     if interior is not None:
         rounding = objective_rounding(interior.problem, interior.poses)
@@ -467,14 +439,14 @@ def keep_answer(agent: FileAgent, cover: Poses) -> Answer:
     return Answer(rounding, (len(fixed) > 0, number, pose_id), solved, joined.given)
 
 
-def return_to_answer(agent: FileAgent, _: None) -> None:
+def return_to_answer(agent: Agent, _: None) -> None:
     """Return to the poses that were kept; the driver does likewise."""
     if agent.interior is not None:
-        answer = _interior_answer(agent.known(PlacedFile), agent.interior)
+        answer = _interior_answer(agent, agent.interior)
         order_interior(set_poses, agent, answer)
 
 
-def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> MovedAnswer:
+def move_answer(agent: Agent, motion: tuple[Array, Array]) -> MovedAnswer:
     """Move the poses that were kept by (R, t); return the part of the cost there."""
     placed = agent.known(PlacedFile)
     placed = replace(placed, answer=placed.kept.moved(*motion))
@@ -482,23 +454,24 @@ def move_answer(agent: FileAgent, motion: tuple[Array, Array]) -> MovedAnswer:
     if agent.interior is None:
         return MovedAnswer(0.0, NO_ROUNDING, 0.0)
     problem = agent.interior.problem
-    poses = _interior_answer(placed, agent.interior)
+    poses = _interior_answer(agent, agent.interior)
     graph = problem.graph
     F = PartProblem(graph, problem.backend, Weighting.ISOTROPIC).objective(poses)
     return MovedAnswer(problem.objective(poses), objective_rounding(problem, poses), F)
 
 
-def _interior_answer(placed: PlacedFile, interior: Interior) -> Poses:
+def _interior_answer(agent: Agent, interior: Interior) -> Poses:
     """Poses that were kept, of those that the interior's problem has."""
-    return placed.kept[np.searchsorted(placed.subgraph.poses, interior.part.poses)]
+    kept = agent.known(PlacedFile).kept
+    return kept[np.searchsorted(agent.subgraph.poses, interior.part.poses)]
 
 
-def write_answer(folder: Path, agent: FileAgent, _: None) -> None:
+def write_answer(folder: Path, agent: Agent, _: None) -> None:
     """Write the poses that were kept, and the robot's edges."""
     make_folder(folder)
     placed = agent.known(PlacedFile)
     path = folder / f"{agent.robot}.g2o"
-    write_g2o(placed.joined.graph, path, placed.kept, placed.subgraph.is_own)
+    write_g2o(placed.joined.graph, path, placed.kept, agent.subgraph.is_own)
 
 
 def _runs(ids: IntArray) -> IntArray:

@@ -36,7 +36,7 @@ from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
 from solvers.result import Stage
 from solvers.robots import current_poses
-from solvers.robots.agent import held_poses, order_interior
+from solvers.robots.agent import Agent, held_poses, order_interior
 from solvers.robots.consistency import (
     ConsistentPart,
     edges_between,
@@ -48,7 +48,7 @@ from solvers.robots.consistency import (
     with_edges,
 )
 from solvers.robots.driver import Driver
-from solvers.robots.own_file import Border, FileAgent, JoinedFile, PlacedFile, border_of
+from solvers.robots.own_file import Border, JoinedFile, PlacedFile, border_of
 from solvers.robots.reweigh import SharedGNC, stage_of, sum_truncated
 from solvers.robots.setup import OpenedFiles
 from solvers.robust.chains import is_whole
@@ -225,11 +225,11 @@ class Links:
     ratio: Array
 
 
-def tell_solved(agent: FileAgent, _: None) -> Mapping[int, NumberedPoses]:
+def tell_solved(agent: Agent, _: None) -> Mapping[int, NumberedPoses]:
     """Order: tell every neighbour of the own poses found that edges between the two touch."""
     placed = agent.known(PlacedFile)
     everything = everything_of(placed.joined)
-    solved = _own_poses_of(placed)
+    solved = _own_poses_of(agent)
     own_poses = np.flatnonzero(everything.owners == agent.robot)
     messages = {}
     for other in neighbours_of(everything, agent.robot):
@@ -241,7 +241,7 @@ def tell_solved(agent: FileAgent, _: None) -> Mapping[int, NumberedPoses]:
 
 
 def judge_near(
-    agent: FileAgent, request: tuple[Mapping[int, NumberedPoses], Weighting, float]
+    agent: Agent, request: tuple[Mapping[int, NumberedPoses], Weighting, float]
 ) -> Mapping[int, BoolArray]:
     """Order: find the edges near the map, with the poses of neighbours; those kept stay.
 
@@ -255,7 +255,7 @@ def judge_near(
     is_own = everything.owners == agent.robot
     R = np.tile(np.eye(graph.d), (graph.num_poses, 1, 1))
     t = np.zeros((graph.num_poses, graph.d))
-    solved = _own_poses_of(placed)
+    solved = _own_poses_of(agent)
     R[is_own], t[is_own] = solved.R, solved.t
     for theirs in received.values():
         places = np.searchsorted(everything.numbers, theirs.numbers)
@@ -271,7 +271,7 @@ def judge_near(
     }
 
 
-def take_back(agent: FileAgent, request: TakenBack) -> Border:
+def take_back(agent: Agent, request: TakenBack) -> Border:
     """Order: hold the edges that come back, with thresholds, and remember what to go back to.
 
     Own odometry is known to be right.
@@ -279,7 +279,7 @@ def take_back(agent: FileAgent, request: TakenBack) -> Border:
     robot = agent.robot
     placed = agent.known(PlacedFile)
     everything = everything_of(placed.joined)
-    solved = _own_poses_of(placed)
+    solved = _own_poses_of(agent)
     assert everything.agrees is not None
     if request.comes_back is ComesBack.AGREEING:
         candidates = everything.agrees
@@ -307,19 +307,19 @@ def take_back(agent: FileAgent, request: TakenBack) -> Border:
     return border_of(robot, joined)
 
 
-def tell_cover(agent: FileAgent, _: None) -> NumberedPoses:
+def tell_cover(agent: Agent, _: None) -> NumberedPoses:
     """Order: return the own poses that were found, of those in the cover."""
     placed = agent.known(PlacedFile)
-    subgraph = placed.subgraph
+    subgraph = agent.subgraph
     own_separators = np.flatnonzero(subgraph.is_own)
     in_cover = np.flatnonzero(subgraph.is_separator[own_separators])
     return NumberedPoses(subgraph.poses[own_separators[in_cover]], _solved(placed.joined)[in_cover])
 
 
-def go_to_solved(agent: FileAgent, cover: Poses) -> None:
+def go_to_solved(agent: Agent, cover: Poses) -> None:
     """Order: go to the poses that were found; the driver sends those of the cover."""
     placed = agent.known(PlacedFile)
-    subgraph = placed.subgraph
+    subgraph = agent.subgraph
     if agent.interior is None:
         return
     everywhere = held_poses(agent, cover)
@@ -332,7 +332,7 @@ def go_to_solved(agent: FileAgent, cover: Poses) -> None:
     order_interior(current_poses.set_poses, agent, Poses(R[places], t[places]))
 
 
-def tell_links(agent: FileAgent, request: tuple[float, Poses]) -> Links:
+def tell_links(agent: Agent, request: tuple[float, Poses]) -> Links:
     """Order: judge the edges that the robot counts; return those of them that join two robots.
 
     The request is the scale of the thresholds, and the poses of the cover.
@@ -341,30 +341,30 @@ def tell_links(agent: FileAgent, request: tuple[float, Poses]) -> Links:
     placed = agent.known(PlacedFile)
     joined = placed.joined
     graph = joined.graph
-    subgraph = placed.subgraph
+    subgraph = agent.subgraph
     ratio = np.zeros(graph.num_edges)
     if agent.interior is not None:
         part = agent.interior.whole
         assert part.edges is not None
         ratio[part.edges] = part.ratios(agent.interior.poses, scale)
     own_poses = held_poses(agent, cover)[np.flatnonzero(subgraph.is_own)]
-    links = _counted_links(placed)
+    links = _counted_links(agent)
     agent.record = replace(placed, joined=replace(joined, solved=own_poses), within=ratio <= 1.0)
     owners = np.stack([joined.owners[graph.i[links]], joined.owners[graph.j[links]]], axis=1)
     return Links(owners, ratio[links])
 
 
-def tell_kept(agent: FileAgent, is_held: BoolArray) -> Mapping[int, BoolArray]:
+def tell_kept(agent: Agent, is_held: BoolArray) -> Mapping[int, BoolArray]:
     """Order: keep the links that hold robots together, too, (k,); tell neighbours what is kept.
 
     Each is told of the edges that both have, (2, k), whether this robot counts and keeps it.
     """
     placed = agent.known(PlacedFile)
     joined = placed.joined
-    subgraph = placed.subgraph
+    subgraph = agent.subgraph
     assert placed.within is not None
     kept = placed.within.copy()
-    kept[_counted_links(placed)[is_held]] = True
+    kept[_counted_links(agent)[is_held]] = True
     agent.record = replace(placed, within=kept)
     messages = {}
     for other in neighbours_of(joined, agent.robot):
@@ -373,15 +373,16 @@ def tell_kept(agent: FileAgent, is_held: BoolArray) -> Mapping[int, BoolArray]:
     return messages
 
 
-def _counted_links(placed: PlacedFile) -> IntArray:
+def _counted_links(agent: Agent) -> IntArray:
     """Edges to other robots that this robot counts."""
+    placed = agent.known(PlacedFile)
     graph = placed.joined.graph
     owners = placed.joined.owners
     is_link = owners[graph.i] != owners[graph.j]
-    return np.flatnonzero(is_link & placed.subgraph.is_counted)
+    return np.flatnonzero(is_link & agent.subgraph.is_counted)
 
 
-def keep(agent: FileAgent, received: Mapping[int, BoolArray]) -> ConsistentPart:
+def keep(agent: Agent, received: Mapping[int, BoolArray]) -> ConsistentPart:
     """Order: leave out the edges that are not kept by the robot that counts them."""
     placed = agent.known(PlacedFile)
     joined = placed.joined
@@ -397,16 +398,16 @@ def keep(agent: FileAgent, received: Mapping[int, BoolArray]) -> ConsistentPart:
     return go_on_with(agent, replace(remaining, solved=joined.solved, before=joined.before))
 
 
-def go_back(agent: FileAgent, _: None) -> ConsistentPart:
+def go_back(agent: Agent, _: None) -> ConsistentPart:
     """Order: go back to the edges before, or to what agrees pairwise, at the poses found before."""
     before = joined_of(agent).before
     assert before is not None
     return go_on_with(agent, before)
 
 
-def _own_poses_of(placed: PlacedFile) -> Poses:
+def _own_poses_of(agent: Agent) -> Poses:
     """Poses of the robot at the end of the last solve."""
-    return placed.kept[np.flatnonzero(placed.subgraph.is_own)]
+    return agent.known(PlacedFile).kept[np.flatnonzero(agent.subgraph.is_own)]
 
 
 def _solved(joined: JoinedFile) -> Poses:

@@ -25,6 +25,7 @@ from pgo_models.graphs.written_digits import most_digits
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count, CountedPool
 from solvers.carry.process import Engine
+from solvers.robots.agent import Agent, OwnLines
 from solvers.robots.consistency import (
     AgreeingCounts,
     ConsistentPart,
@@ -38,9 +39,7 @@ from solvers.robots.own_file import (
     READ_HERE,
     Border,
     Claim,
-    FileAgent,
     OwnedRuns,
-    RobotFile,
     join_neighbours,
     number_poses,
     place_cover,
@@ -128,7 +127,7 @@ class OpenedFiles:
 
 
 def open_files(
-    files: Sequence[RobotFile],
+    files: Sequence[OwnLines],
     engine: Engine,
     memory: float,
     weighting: Weighting,
@@ -145,7 +144,7 @@ def open_files(
     the graph is not connected, or has a matrix that chi2 cannot have. All messages but the start of
     the robots are counted.
     """
-    network = CountedPool(engine.open(FileAgent, files), len(files))
+    network = CountedPool(engine.open(Agent, files), len(files))
     try:
         claims = network.ask(read_file, [None] * len(files), Count.ROUND)
         numbered = number_ids(claims, files)
@@ -156,7 +155,7 @@ def open_files(
         has_indefinite = any(border.has_indefinite for border in borders)
         if weighting is Weighting.OWN:
             weighting = _own_weighting(borders)
-        folder = files[0][1].parent
+        folder = files[0].path.parent
         scale = 1.0  # of the errors
         if isinstance(robust, GNC):
             scale = _error_scale(network, weighting, robust.quantile)
@@ -279,7 +278,7 @@ class NumberedIds(NamedTuple):
     num_absent: int
 
 
-def number_ids(claims: Sequence[Claim], files: Sequence[RobotFile]) -> NumberedIds:
+def number_ids(claims: Sequence[Claim], files: Sequence[OwnLines]) -> NumberedIds:
     """Numbers and owners of the ids that every file names.
 
     The ends of all runs cut the ids into intervals. All ids of an interval are named by the same
@@ -317,15 +316,15 @@ def _covers(runs: IntArray, bounds: IntArray) -> BoolArray:
     return np.asarray(np.cumsum(num_started - num_ended)[:-1] > 0)
 
 
-def _check_claims(claims: Sequence[Claim], files: Sequence[RobotFile], owners: IntArray) -> None:
+def _check_claims(claims: Sequence[Claim], files: Sequence[OwnLines], owners: IntArray) -> None:
     """Refuse a file of another dimension than the first, and one without a pose of its own."""
     d_of_first = claims[0][0]
-    for (robot, path), (d, *_) in zip(files, claims, strict=True):
+    for file, (d, *_) in zip(files, claims, strict=True):
         if d != d_of_first:
-            raise FileFormatError(path, None, "2D beside 3D; put it into a folder of its own")
-        if robot not in owners:
+            raise FileFormatError(file.path, None, "2D beside 3D; put it into a folder of its own")
+        if file.robot not in owners:
             problem = f"no pose in it is of this robot; remove it, or {READ_HERE}"
-            raise FileFormatError(path, None, problem)
+            raise FileFormatError(file.path, None, problem)
 
 
 def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: Path) -> None:

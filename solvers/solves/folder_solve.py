@@ -30,9 +30,10 @@ from solvers.plan import solve_at
 from solvers.reporting.notes import joined_notes, note_of_absence
 from solvers.request import Pipeline
 from solvers.result import Record, StageTable
+from solvers.robots.agent import OwnLines
 from solvers.robots.checkpoint import Journal
 from solvers.robots.kept_answer import AnswerAtRobots
-from solvers.robots.own_file import READ_HERE, RobotFile, write_answer
+from solvers.robots.own_file import READ_HERE, write_answer
 from solvers.robots.paper import check_paper
 from solvers.robots.place import PlaceOfRobots
 from solvers.robots.settings import Robots
@@ -128,7 +129,7 @@ def solve_folder(
     check_robust(robust)
     if weighting is Weighting.ROTATIONS:
         raise SettingError(f"robots with files of their own solve for poses; {READ_HERE}")
-    files = list(enumerate(g2o_files(folder)))
+    files = [OwnLines(robot, path) for robot, path in enumerate(g2o_files(folder))]
     if out is not None:
         check_g2o_folder(out, len(files))
     engine = _engine_of_robots(robots.engine, len(files))
@@ -146,7 +147,7 @@ class FilesOfRobots:
     """
 
     name: str
-    files: list[RobotFile]
+    files: list[OwnLines]
     engine: Engine
     memory: float
     weighting: Weighting

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 from pgo_models.errors import PGOError, extra_module
 from solvers.carry.messages import Idle, Worker, obey, raise_first_error
+from solvers.robots.agent import Agent
 from solvers.robots_solution import RobotsSolution
-from solvers.team.agent import Sharing, TeamAgent
 from solvers.team.messages import Ask, Ended, Reply, Term, error_of_message
 from solvers.team.wire import Order
 
@@ -38,7 +38,7 @@ class Drive:
 
     term: Term
     members: tuple[str, ...]
-    agent: TeamAgent
+    agent: Agent
     solve: Callable[[Drive], RobotsSolution]
     call: int = -1
     waiting: dict[str, Ask] = field(default_factory=dict)
@@ -53,8 +53,7 @@ class Drive:
 
         Robots that share their interface wait for letters of each other, too.
         """
-        shares_all = self.agent.sharing is Sharing.MEASUREMENTS
-        return list(self.waiting) if shares_all else self.members[1:]
+        return list(self.waiting) if self.agent.own_lines.is_shared else self.members[1:]
 
     def begin(self) -> None:
         """Run the solve until it waits for answers, or ends."""

@@ -21,22 +21,23 @@ from solvers.carry.process import DEFAULT_MEMORY
 from solvers.loop import RunMonitor
 from solvers.pipeline import solution_for
 from solvers.request import Pipeline, SolveRequest
+from solvers.robots.agent import Agent, OwnLines
 from solvers.robots.own_file import READ_HERE
 from solvers.robots.setup import SOLVE_PARTS
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.solves.folder_solve import FilesOfRobots, check_robust
-from solvers.team.agent import (
-    OwnAnswer,
-    Sharing,
-    TeamAgent,
-    give_measurements,
-    take_answer,
-)
 from solvers.team.driving import Drive
 from solvers.team.measurements import Measurements
 from solvers.team.messages import Ended
+from solvers.team.sharing import (
+    OwnAnswer,
+    Sharing,
+    answer_of,
+    give_measurements,
+    take_answer,
+)
 
 
 @dataclass(eq=False)
@@ -61,11 +62,13 @@ class Member:
         """How many lines its measurements are, so that others notice when it has more."""
         return len(self.measurements.lines)
 
-    def new_agent(self, place: int) -> TeamAgent | None:
+    def new_agent(self, place: int) -> Agent | None:
         """Its part in a solve, with its measurements as they are now; None where it has none."""
         if self.measurements.d is None:
             return None
-        return TeamAgent(place, self.name, self.measurements.text(), self.sharing)
+        is_shared = self.sharing is Sharing.MEASUREMENTS
+        path = Path(f"{self.name}.g2o")
+        return Agent(OwnLines(place, path, self.measurements.text(), is_shared))
 
     def solve(self, drive: Drive) -> RobotsSolution:
         """Solve with the robots of a drive, in the way that the measurements are shared."""
@@ -78,7 +81,7 @@ class Member:
 
     def _solve_by_robots(self, drive: Drive) -> RobotsSolution:
         """The solution by robots with files of their own."""
-        files = list(enumerate(map(_path_of, drive.members)))
+        files = [OwnLines(place, _path_of(name)) for place, name in enumerate(drive.members)]
         check_robust(self.robust)
         job = FilesOfRobots(
             "team", files, drive, DEFAULT_MEMORY, self.weighting, robust=self.robust
@@ -109,12 +112,12 @@ class Member:
         network.ask(take_answer, answers, Count.ROUND)
         return RobotsSolution.of(solution, network.ledger)
 
-    def end_with(self, ended: Ended, agent: TeamAgent | None) -> None:
+    def end_with(self, ended: Ended, agent: Agent | None) -> None:
         """Keep an outcome and the poses with it; where a solve has failed, those before it.
 
         The agent was its part in the solve.
         """
-        answer = None if agent is None else agent.answer
+        answer = None if agent is None else answer_of(agent)
         if ended.solution is not None and answer is not None:
             self.outcome = ended
             self.known = answer

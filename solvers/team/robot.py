@@ -24,11 +24,11 @@ from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
-from solvers.team.agent import OwnAnswer, Sharing
 from solvers.team.measurements import Measurements
 from solvers.team.member import Member
 from solvers.team.messages import MESSAGES, Ended, Term
 from solvers.team.session import PATIENCE, RETRY, Message, Session, TeamLedger
+from solvers.team.sharing import OwnAnswer, Sharing
 from solvers.team.wire import packed, records_of_rooms, unpacked
 
 _FEWEST_KEY_BYTES = 16  # 128 bits, which nobody can guess

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pgo_models.errors import EngineError, PGOError
-from solvers.team.agent import OwnAnswer, TeamAgent
+from solvers.robots.agent import Agent
 from solvers.team.driving import Drive
 from solvers.team.letters import LetterName, Letters
 from solvers.team.member import Member
@@ -32,6 +32,7 @@ from solvers.team.messages import (
     Term,
     error_as_message,
 )
+from solvers.team.sharing import OwnAnswer
 from solvers.team.wire import WireError, opened, sealed
 
 PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
@@ -96,7 +97,7 @@ class Following:
     `waiting` is an order that waits for letters of other robots; `members` are all by their places.
     """
 
-    agent: TeamAgent
+    agent: Agent
     revision: int
     letters: Letters
     members: tuple[str, ...]

@@ -50,7 +50,7 @@ _MODULES_OF_ORDERS = (
     "solvers.robots.",
     "solvers.carry.moments",
     "solvers.soc.",
-    "solvers.team.agent",
+    "solvers.team.sharing",
 )
 
 

@@ -18,7 +18,6 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers.robots.own_file import PlacedFile
-from solvers.robots.setup import open_files
 from solvers.robust.consistency import pairwise_consistent
 
 
@@ -54,15 +53,14 @@ def test_the_robots_keep_what_pairwise_consistency_of_the_whole_graph_keeps(
     folder = tmp_path_factory.mktemp("world")
     graph = world(seed, d, kind, folder)
     expected = consistent(graph)
-    files = [(k, folder / f"{k}.g2o") for k in range(graph.num_robots)]
     engine = Recording()
-    opened = open_files(
-        files, engine, 4e9, pgo.Weighting.OWN, trust_folder=True, robust=solvers.PCM()
+    solution = solvers.solve_folder(
+        folder, robust=solvers.PCM(), robots=solvers.Robots(engine=engine), trust_folder=True
     )
     parts = [agent.known(PlacedFile).joined.graph for agent in engine.agents]
     kept = set().union(*(edges_of(part) for part in parts))
     assert kept == edges_of(graph.without_edges(~expected))
-    assert opened.num_rejected == (~expected).sum()
+    assert solution.num_rejected == (~expected).sum()
     for a, part in enumerate(parts):  # both robots keep the same
         for b, other in enumerate(parts):
             own = {int(pose) for pose in graph.pose_ids[graph.robots == a]}

@@ -25,9 +25,9 @@ from solvers.carry.messages import Token
 from solvers.robots.own_file import Told
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
-from solvers.team.agent import OwnAnswer
 from solvers.team.messages import MESSAGES, Ask, Ended, Heard, Letter, Reply
 from solvers.team.session import Envelope, TeamLedger
+from solvers.team.sharing import OwnAnswer
 from solvers.team.wire import opened, sealed
 
 pytest.importorskip("greenlet")

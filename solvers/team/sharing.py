@@ -1,4 +1,4 @@
-"""The part of a robot in a solve of its team, and the orders that robots with own files lack.
+"""What robots of a team share, what each knows at the end, and the orders of teams alone.
 
 A team may share its measurements. The robot that drives then asks the others for their lines,
 solves the whole graph in one place, and sends every robot its own poses.
@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.g2o_parser import G2OLines, parse_lines
 from pgo_models.graphs.pose_graph import IntArray
-from solvers.robots.own_file import FileAgent, PlacedFile
+from solvers.robots.agent import Agent
+from solvers.robots.own_file import PlacedFile
 from solvers.solution import Solution
 
 
@@ -69,45 +68,29 @@ class OwnAnswer:
         return cls(graph.pose_ids[own_poses], solution.poses[own_poses], covariances, rejected)
 
 
-class TeamAgent(FileAgent):
-    """A robot with lines in place of a file; `answer` is what it knows of its poses at the end."""
-
-    def __init__(self, number: int, name: str, text: str, sharing: Sharing) -> None:
-        super().__init__((number, Path(f"{name}.g2o")))
-        self.text = text
-        self.sharing = sharing
-        self._answer_of_driver: OwnAnswer | None = None
-
-    def lines(self) -> G2OLines:
-        """Lines of the robot's measurements."""
-        return parse_lines(self.path, [self.text])
-
-    def take(self, answer: OwnAnswer) -> None:
-        """Keep the answer that the driving robot has sent."""
-        self._answer_of_driver = answer
-
-    @property
-    def answer(self) -> OwnAnswer | None:
-        """What is known of its poses; None before the end of a solve."""
-        if self._answer_of_driver is not None or not isinstance(self.record, PlacedFile):
-            return self._answer_of_driver
-        if self.record.answer is None:
-            return None
-        own_poses = np.flatnonzero(self.record.subgraph.is_own)
-        ids = self.record.joined.graph.pose_ids[own_poses]
-        return OwnAnswer(ids, self.record.answer[own_poses], None, self.record.joined.rejected)
+def answer_of(agent: Agent) -> OwnAnswer | None:
+    """Return what the agent of a robot knows of its poses; None before the end of a solve."""
+    if isinstance(agent.record, OwnAnswer):
+        return agent.record
+    if not isinstance(agent.record, PlacedFile) or agent.record.answer is None:
+        return None
+    joined = agent.record.joined
+    own_poses = np.flatnonzero(agent.subgraph.is_own)
+    ids = joined.graph.pose_ids[own_poses]
+    return OwnAnswer(ids, agent.record.answer[own_poses], None, joined.rejected)
 
 
-def give_measurements(agent: TeamAgent, _: None) -> IntArray:
+def give_measurements(agent: Agent, _: None) -> IntArray:
     """Return the lines of the robot in UTF-8; a SettingError if it does not share them."""
-    if agent.sharing is not Sharing.MEASUREMENTS:
+    own_lines = agent.own_lines
+    if own_lines.text is None or not own_lines.is_shared:
         raise SettingError(
-            f"{agent.path.stem} shares its interface alone; "
+            f"{own_lines.path.stem} shares its interface alone; "
             "give sharing=Sharing.MEASUREMENTS to all robots, or to none"
         )
-    return np.frombuffer(agent.text.encode("utf-8"), dtype=np.uint8)
+    return np.frombuffer(own_lines.text.encode("utf-8"), dtype=np.uint8)
 
 
-def take_answer(agent: TeamAgent, answer: OwnAnswer) -> None:
+def take_answer(agent: Agent, answer: OwnAnswer) -> None:
     """Learn what was found of the robot's poses."""
-    agent.take(answer)
+    agent.record = answer
