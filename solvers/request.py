@@ -212,8 +212,8 @@ class SolveRequest:
         from solvers.carry.process import InProcess
         from solvers.robots.checkpoint import Journal, run_fingerprint
         from solvers.robots.place import PlaceOfRobots
-        from solvers.robots.place_with_graph import open_driver
         from solvers.robots.place_without_driver import RobotsAlone
+        from solvers.robots.setup import open_driver
 
         problem = self.problem
         owners = robots.partition

@@ -28,7 +28,7 @@ from solvers.robots.agent import Agent
 from solvers.robots.driver import Driver
 from solvers.robots.elimination import Cut, Elimination
 from solvers.robots.interface import Interface, Separators
-from solvers.robots.place_with_graph import open_driver
+from solvers.robots.setup import open_driver
 from solvers.robots.subdomain_blocks import SubdomainBlocks
 from solvers.soc import subgraph
 from solvers.soc.subdomains import Subdomains

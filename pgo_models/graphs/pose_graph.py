@@ -1261,12 +1261,6 @@ def middle_node(adjacency: csr_array) -> int:
     return path[len(path) // 2]
 
 
-def poses_by_distance(graph: PoseGraph, pose: int) -> IntArray:
-    """Poses of a connected graph, (n,), by their number of edges to a pose, which is the first."""
-    order = breadth_first_order(graph.adjacency, pose, return_predecessors=False)
-    return np.asarray(order)
-
-
 def connecting_edges(graph: PoseGraph, kept: BoolArray, ratio: Array) -> IntArray:
     """Edges that connect the components of the kept edges, with the smallest ratios.
 

@@ -143,8 +143,6 @@ class Driver:
         Which of two costs is the current one, where a graph has two: the cost that is asked for
         (`Part.final`; chi2, or one that is not convex), or the convex quadratic cost near it that
         SOC minimizes instead (`PGOProblem.convex_part`). False where there is one cost.
-    grounded_position : int
-        Position in `cover` of the pose that is fixed when a bound is proved.
     has_translations : bool
         Whether translations are among the unknowns (`PGOProblem.has_translations`).
     robots_with_edges : ndarray of int
@@ -159,7 +157,6 @@ class Driver:
         num_poses: int,
         open_pool: Callable[[], WorkerPool | CountedPool],
         memory: float = DEFAULT_MEMORY,
-        grounded_position: int | None = None,
         backend: CholeskyBackend | None = None,
     ) -> None:
         """Start the robots, unless `open_pool` returns a pool whose robots are at work already.
@@ -167,8 +164,7 @@ class Driver:
         `memory` is the largest number of bytes that the interface may take; a SettingError if it
         would take more. The value 0 selects a run without a driver (`robots_alone`): no interface
         is built or solved, and this object only carries the messages of the robots and adds up.
-        Bounds are grounded in the middle of the cover unless a position is given. `backend` factors
-        the interface.
+        `backend` factors the interface.
         """
         self.num_poses = num_poses
         self.d = summaries[0].d
@@ -184,9 +180,6 @@ class Driver:
         self._laplacian: InterfaceFactor | None = None
 
         self._interfaces: dict[Widths, Interface] = {}
-        if grounded_position is None:
-            grounded_position = self._separators.middle
-        self.grounded_position = grounded_position
         if memory != 0:
             self.interface(*self.tangent).check_memory(memory)
         self._moments: WeakKeyDictionary[Moment, HeldByDriver] = WeakKeyDictionary()
@@ -197,6 +190,11 @@ class Driver:
         except BaseException:  # also Ctrl-C: no robot stays behind
             self.network.workers.close()
             raise
+
+    @property
+    def grounded_position(self) -> int:
+        """Position in `cover` of the pose that is fixed when a bound is proved, in its middle."""
+        return self._separators.middle
 
     def _read_cover(self, summaries: Sequence[RobotSummary]) -> None:
         """Take the cover, and what every robot holds of it, from the robots' summaries."""

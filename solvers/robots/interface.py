@@ -113,7 +113,7 @@ class Separators:
         """Number of pairs of poses in the factor."""
         return int(self.analysis.counts.in_row.sum())
 
-    @property
+    @cached_property
     def middle(self) -> int:
         """Position in the cover of a pose in the middle, by the number of coupled pairs between.
 

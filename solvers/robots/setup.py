@@ -1,17 +1,20 @@
-"""Robots that load their own files, and a driver that learns only the interface between them.
+"""Robots and their driver are set up: each is given its edges of a graph in memory, or has its own.
 
-The driver learns the ids of poses as runs of consecutive ids, so that it can number the poses, and
-of the edges between robots their ends, of which it computes a vertex cover. Measurements between
-two robots are messages between these robots, which the process of the driver delivers: they pass
-through its memory, and nothing of the driver reads them. A pose belongs to the first file with a
-VERTEX line of it, or else to the first file that names it. An edge that stands in several files
-counts once, as in `read_g2o`. What robots do is in `solvers.robots.own_file`.
+`open_driver` cuts a graph that this process has. `open_files` has robots read their own lines, and
+the driver learns only the interface between them. It learns the ids of poses as runs of consecutive
+ids, so that it can number the poses, and of the edges between robots their ends, of which it
+computes a vertex cover. Measurements between two robots are messages between these robots, which
+the process of the driver delivers: they pass through its memory, and nothing of the driver reads
+them. A pose belongs to the first file with a VERTEX line of it, or else to the first file that
+names it. An edge that stands in several files counts once, as in `read_g2o`. What robots do is in
+`solvers.robots.own_file`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,12 +22,15 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import FileFormatError, GraphError
-from pgo_models.geometry.rotations import BoolArray
-from pgo_models.graphs.pose_graph import IntArray, edge_counts, least_tree
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.partitioning import Partition
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, least_tree
 from pgo_models.graphs.written_digits import most_digits
+from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count, CountedPool
-from solvers.carry.process import Engine
+from solvers.carry.ledger import BYTES_PER_NUMBER
+from solvers.carry.process import DEFAULT_MEMORY, Engine
 from solvers.robots.agent import Agent, OwnLines
 from solvers.robots.consistency import (
     AgreeingCounts,
@@ -50,9 +56,36 @@ from solvers.robust.bridges import bridges
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.revision import threshold_scale
-from solvers.soc.subgraph import place_poses
+from solvers.soc.subgraph import place_poses, split_graph
 
 SOLVE_PARTS = "solve each part in a folder of its own"
+
+
+def open_driver(
+    problem: PGOProblem,
+    robots: Partition,
+    engine: Engine,
+    memory: float = DEFAULT_MEMORY,
+    thresholds: Array | None = None,
+) -> Driver:
+    """Driver and robots for a problem.
+
+    A robust solve gives the `thresholds`, (m,), of its edges.
+    """
+    subgraphs = split_graph(problem, robots, thresholds)
+    if memory != 0:
+        subgraphs = tuple(subgraph.for_driver() for subgraph in subgraphs)
+    summaries = [subgraph.summary for subgraph in subgraphs]
+    start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
+    driver = Driver(summaries, problem.num_poses, start, memory, problem.backend)
+    ledger = driver.network.ledger
+    driver.network.ledger = replace(ledger, graph_bytes=_bytes_of_edges(problem.graph))
+    return driver
+
+
+def _bytes_of_edges(graph: PoseGraph) -> int:
+    """Bytes of a list of all edges, each a relative pose and the two precisions of F."""
+    return BYTES_PER_NUMBER * graph.num_edges * (graph.d * (graph.d + 1) // 2 + 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +15,6 @@ from pgo_models.graphs.pose_graph import (
     IntArray,
     PoseGraph,
     middle_pose,
-    poses_by_distance,
     written_error_of,
 )
 from pgo_models.graphs.separators import cover_of_edges
@@ -416,10 +414,3 @@ def _poses_in_common(holds: csc_array, robot: int) -> tuple[tuple[int, IntArray]
         column = holds.indices[holds.indptr[other] : holds.indptr[other + 1]]
         common.append((other, np.sort(column)))
     return tuple(common)
-
-
-def middle_separator(graph: PoseGraph, summaries: Sequence[RobotSummary]) -> int:
-    """Position in the cover of the pose that is nearest to the middle of the graph."""
-    cover = np.unique(np.concatenate([robot.cover for robot in summaries]))
-    order = poses_by_distance(graph, middle_pose(graph))
-    return int(np.searchsorted(cover, order[np.argmax(np.isin(order, cover))]))

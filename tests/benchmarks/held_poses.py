@@ -12,8 +12,8 @@ from solvers import InProcess
 from solvers.loop import run
 from solvers.result import Record
 from solvers.robots.consensus import ConsensusSOC
-from solvers.robots.place_with_graph import open_driver
 from solvers.robots.place_without_driver import collect_copies
+from solvers.robots.setup import open_driver
 from solvers.soc.consensus import ConsensusState
 
 MOST_ITERATIONS = 400

@@ -37,8 +37,8 @@ from solvers.loop import run
 from solvers.result import Record
 from solvers.robots.consensus import ConsensusSOC
 from solvers.robots.driver import Driver
-from solvers.robots.place_with_graph import open_driver
 from solvers.robots.place_without_driver import collect_copies
+from solvers.robots.setup import open_driver
 
 REFERENCE = json.loads((Path(__file__).parents[2] / "data" / "reference.json").read_text())
 GRAPHS = ("smallGrid3D", "sphere2500", "intel", "kitti_07", "kitti_00")

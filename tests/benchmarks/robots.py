@@ -40,7 +40,7 @@ from solvers.carry.process import Engine
 from solvers.loop import run
 from solvers.result import History, Record, Run
 from solvers.robots.consensus import AsynchronousSOC, AsynchronousState, RobotsOfDriver
-from solvers.robots.place_with_graph import open_driver
+from solvers.robots.setup import open_driver
 from solvers.soc.consensus import ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 

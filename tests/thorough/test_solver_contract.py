@@ -48,8 +48,8 @@ from solvers.robots.consensus import AsynchronousSOC, ConsensusSOC
 from solvers.robots.driver import Driver
 from solvers.robots.handedness import RobotsPoint, begin_without_terms
 from solvers.robots.newton import SubstructuredNewton
-from solvers.robots.place_with_graph import open_driver
 from solvers.robots.reweigh import SharedGNC
+from solvers.robots.setup import open_driver
 from solvers.robots.soc import SubstructuredSOC
 from solvers.soc.anderson import Anderson
 

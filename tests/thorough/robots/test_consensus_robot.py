@@ -24,9 +24,9 @@ from solvers import SOC, Coupling, Pipeline, Robots, Solution, solve
 from solvers.carry.ledger import DRIVER
 from solvers.robots import descent, handedness_of_robot as handedness, start, translations
 from solvers.robots.agent import begin_copies
+from solvers.robots.interface import Separators
 from solvers.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.subgraph import middle_separator
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 
@@ -81,8 +81,10 @@ class Watching(Recording):
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         answers = super().ask(order, requests)
         summaries = [share.summary for share in self.shares]
-        cover = np.unique(np.concatenate([summary.cover for summary in summaries]))
-        grounded = cover[middle_separator(self.graph, summaries)]
+        grounded = -1
+        if any(summary.coupled is not None for summary in summaries):
+            separators = Separators.of(summaries)
+            grounded = separators.cover[separators.middle]
         if name_of(order) == "describe":
             self.secrets: list[list[Array]] = [[] for _ in self.agents]
         for agent in self.agents:

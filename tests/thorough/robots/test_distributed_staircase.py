@@ -18,7 +18,7 @@ from pgo_models.certificates.certificate import BoundSource
 from solvers import InProcess, Staircase, Status, run
 from solvers.robots.climb import SubstructuredStaircase, round_lifted
 from solvers.robots.driver import Driver, collect
-from solvers.robots.place_with_graph import open_driver
+from solvers.robots.setup import open_driver
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
 

@@ -39,8 +39,8 @@ from solvers import InProcess, Pipeline, Robots, Solution, solve
 from solvers.place import AUTO, FirstStage
 from solvers.robots import descent, recursion, start, translations
 from solvers.robots.driver import collect
-from solvers.robots.place_with_graph import open_driver
 from solvers.robots.proof_orders import fits_part, move_proof, prove_interior
+from solvers.robots.setup import open_driver
 
 SIZES = st.integers(2, 24)
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

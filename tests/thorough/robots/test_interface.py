@@ -11,8 +11,8 @@ from pgo_models import PartitionMethod, PGOProblem, PoseGraph, grid_world, parti
 from pgo_models.graphs.partitioning import Partition
 from solvers import InProcess, Pipeline, Robots, solve
 from solvers.robots.interface import Separators
-from solvers.robots.place_with_graph import open_driver
 from solvers.robots.proof import best_bound_distributed
+from solvers.robots.setup import open_driver
 from solvers.soc.subgraph import split_graph
 
 

@@ -49,11 +49,11 @@ from solvers import (
 from solvers.carry.ledger import DRIVER
 from solvers.result import Record
 from solvers.robots.consensus import ConsensusSOC
-from solvers.robots.place_with_graph import open_driver
 from solvers.robots.place_without_driver import (
     NO_CERTIFICATE,
     collect_copies,
 )
+from solvers.robots.setup import open_driver
 from solvers.robots.trees import robot_tree, tree_traffic
 from solvers.soc.recursion_block import Rotations
 

@@ -15,7 +15,7 @@ from pgo_models.errors import SettingError
 from solvers import BalancedPenalty, FixedPenalty, InProcess, PaperSOC, RStep, iterate
 from solvers.robots.driver import collect
 from solvers.robots.paper import PaperByRobots
-from solvers.robots.place_with_graph import open_driver
+from solvers.robots.setup import open_driver
 from solvers.soc.penalty import BoydPenalty, PenaltyRule
 
 RULES = [BalancedPenalty(), BoydPenalty(), FixedPenalty(3.0)]

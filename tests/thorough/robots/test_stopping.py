@@ -40,8 +40,8 @@ from solvers import (
 )
 from solvers.result import History, Outcome, Record
 from solvers.robots.consensus import ConsensusSOC
-from solvers.robots.place_with_graph import open_driver
 from solvers.robots.place_without_driver import cheaper_end, collect_copies
+from solvers.robots.setup import open_driver
 
 ROUNDING = 1e-6  # relative, of a gradient that is evaluated twice
 LOSSY = Faults(loss=0.2, max_delay=2, seed=1)

@@ -11,7 +11,7 @@ from robots import PARTITIONERS, Partitioner, metis
 from solvers import SOC, InProcess, Status, iterate, run
 from solvers.carry.ledger import DRIVER
 from solvers.robots.consensus import ConsensusSOC
-from solvers.robots.place_with_graph import open_driver
+from solvers.robots.setup import open_driver
 from solvers.soc.rounding import RowChange
 
 BYTES = st.sampled_from([1, 2])
