@@ -18,15 +18,11 @@ from solvers.carry.moments import Recall
 from solvers.carry.serialization import deserialize, serialize
 from solvers.robots.interior import Interior, interior_of
 from solvers.robots.proof_of_robot import RobotProof
+from solvers.robots.proof_orders import ProofSession
 from solvers.robots.records import Reweigh, RobotAscent
-from solvers.robots.state import (
-    AveragingSession,
-    DescentSession,
-    InteriorState,
-    ProofSession,
-    RecursionSession,
-    RelaxationSession,
-)
+from solvers.robots.recursion import RecursionSession
+from solvers.robots.start import AveragingSession
+from solvers.robots.state import DescentSession, InteriorState, Session
 from solvers.robots.system import System
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
@@ -103,7 +99,7 @@ CLASSES = (
     Reweigh,
     RobotAscent,
     System,
-    RelaxationSession,
+    Session,
     AveragingSession,
     RecursionSession,
     DescentSession,

@@ -3,6 +3,15 @@
 `solvers.riemannian.climb` decides when a rank ends, and how. `solvers.riemannian.staircase` takes
 products with Q, each of which would be two rounds; here a step is the elimination of the Hessian at
 lifted poses (`pgo_models.relaxations.low_rank`), as in `solvers.robots.newton`.
+
+Where Newton is at a stationary point of a rank, the driver proves a bound
+(`solvers.robots.proof`). If the bound is loose, the robots keep their elimination of
+S + eta blockdiag(0, I), and inverse iteration with it finds the direction down: one round for the
+first vector, and one for every further one (`follow_direction`). The robots then append a dimension
+to their poses (`go_upwards`) and try lengths along the direction (`try_climb`), a round each.
+`round_lifted` ends the staircase with two rounds more.
+
+The driver's method stands first; the robot's orders (Rosen et al. 2019) are below it.
 """
 
 import math
@@ -21,11 +30,18 @@ from solvers.result import Measurement, Status
 from solvers.riemannian.climb import ClimbEnding, DualBound, climb, staircase_status
 from solvers.riemannian.newton import Newton, newton_status
 from solvers.riemannian.staircase import Staircase
-from solvers.robots import climbing
 from solvers.robots.driver import CoverPoses, Driver, collect
-from solvers.robots.newton import SubstructuredNewton, SubstructuredNewtonState
+from solvers.robots.interior import Interior
+from solvers.robots.newton import (
+    Move,
+    SubstructuredNewton,
+    SubstructuredNewtonState,
+    moved,
+)
 from solvers.robots.proof import eliminate_S, prove_with_eta
-from solvers.robots.records import Move
+from solvers.robots.records import CostParts, ReducedTranslations, RightHandSide
+from solvers.robots.state import DescentSession
+from solvers.robots.translations import reduce_translations
 
 # Decrement at which an indefinite Hessian is left by a climb, not by descent, while the rank is
 # below d + _LOW: a ring wound up has plateaus that take 50 steps, and every further rank costs.
@@ -128,7 +144,7 @@ def round_lifted(driver: Driver) -> None:
     R = driver.current.R
     if R.shape[1] == d:
         return
-    gram = sum(driver.ask(climbing.gram, None), gram_matrix(R))
+    gram = sum(driver.ask(sum_gram, None), gram_matrix(R))
     _, vectors = np.linalg.eigh(gram)
     V = vectors[:, -d:]
     orientations = np.sign(np.linalg.det(V.T @ R))
@@ -136,7 +152,7 @@ def round_lifted(driver: Driver) -> None:
         V[:, 0] *= -1.0
     rounded = project_to_rotations(V.T @ R)
     driver.current = replace(driver.current, R=rounded, t=driver.current.t @ V)
-    driver.set_translations(driver.ask(climbing.round_to, V))
+    driver.set_translations(driver.ask(round_to, V))
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,8 +211,8 @@ class EliminatedClimb:
         """Return the direction of the smallest eigenvalue; all poses go to the next dimension."""
         driver = self.driver
         x, moves, length = _direction(driver, proven.eta)
-        values = driver.ask_each(climbing.climb, moves)
-        value_on_cover = climbing.pulled(driver.current.multipliers, x[len(driver.cover) :])
+        values = driver.ask_each(go_upwards, moves)
+        value_on_cover = pulled(driver.current.multipliers, x[len(driver.cover) :])
         value = math.fsum([*values, -value_on_cover])
         flat = append_dimension(poses_from(driver.current.R, driver.current.t))
         force = np.concatenate(
@@ -209,7 +225,7 @@ class EliminatedClimb:
     def evaluate(self, direction: CoverDirection, length: float) -> tuple[float, CoverPoses]:
         """Return F after a move along the direction, and the poses there."""
         driver = self.driver
-        answers = driver.ask(climbing.try_climb, length)
+        answers = driver.ask(try_climb, length)
         moved = direction.flat.moved_along(length * direction.w, length * direction.v)
         trial = driver.with_cost(replace(driver.current, R=moved.R, t=moved.t), answers)
         return trial.objective, trial
@@ -234,7 +250,7 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
     no_translations = np.zeros((g, 1))
     rng = np.random.default_rng(g)
     vector_on_cover = np.concatenate([no_translations, rng.standard_normal((d * g, 1))])
-    answers = driver.ask(climbing.begin_direction, None)
+    answers = driver.ask(begin_direction, None)
     value = math.inf
     scale = 1.0
     for _ in range(_MOST_POWERS):
@@ -250,9 +266,94 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
         if abs(value - last_value) <= _SETTLED * value:
             break
         moves = [Move(part, scale) for part in parts]
-        answers = driver.ask_each(climbing.follow_direction, moves)
+        answers = driver.ask_each(follow_direction, moves)
         vector_on_cover = np.concatenate([no_translations, scale * x[g:]])
     own_blocks = vector_on_cover[g:].reshape(-1, d)
     own_largest = float(np.sum(own_blocks**2, axis=1).max())
     largest = max([own_largest, *(answer.largest for answer in answers)])
     return scale * x, [Move(part, scale) for part in parts], norm / math.sqrt(largest)
+
+
+# The robot's orders.
+
+
+@dataclass(frozen=True, eq=False)
+class PowerStep:
+    """Right-hand side of the next inverse iteration, and figures of the interior part of v."""
+
+    right: RightHandSide
+    square: float  # squared norm of the interior part
+    largest: float  # largest squared norm of a block
+
+
+def begin_direction(robot: Interior, _: None) -> tuple[Interior, PowerStep]:
+    """Begin inverse iteration at a random direction of the interior's rotations."""
+    rng = np.random.default_rng(robot.part.poses[0])
+    num_rows = len(robot.interior_rows)
+    v = rng.standard_normal(num_rows)
+    return _power_step(robot, v)
+
+
+def follow_direction(robot: Interior, order: Move) -> tuple[Interior, PowerStep]:
+    """Take one inverse iteration, from its solution on the boundary, times a length."""
+    x = robot.system.back_substitute(order.x)
+    v = order.length * x[robot.interior_rows, 0]
+    return _power_step(robot, v)
+
+
+def go_upwards(robot: Interior, order: Move) -> tuple[Interior, float]:
+    """Go to one dimension more, with a direction x in it; answer the robot's part of x^T S x.
+
+    The order has the solution on the boundary that gives x, and the length that it is scaled by.
+    """
+    x = order.length * robot.system.back_substitute(order.x)
+    poses = append_dimension(robot.poses)
+    Lambda = robot.multipliers()[robot.part.interior]
+    own_rows = x[robot.interior_rows]
+    objective = robot.problem.objective_stacked(x)
+    value = objective - pulled(Lambda, own_rows)
+    descent = DescentSession(step=poses.upwards(x[:, 0]))
+    return robot.in_session(descent).at_poses(poses), value
+
+
+def pulled(Lambda: Array, x: Array) -> float:
+    """Compute sum_i x_i^T Lambda_i x_i of Lambda, (n, d, d), and rows x, (d n, 1)."""
+    d = Lambda.shape[-1]
+    blocks = x.reshape(-1, d)
+    return float(np.einsum("na,nab,nb->", blocks, Lambda, blocks))
+
+
+def try_climb(robot: Interior, length: float) -> tuple[Interior, CostParts]:
+    """Move a length along the direction: a trial, and the parts of F there."""
+    trial = moved(robot, length)
+    following = robot.at_trial(trial)
+    return following, following.evaluation(trial)
+
+
+def sum_gram(robot: Interior, _: None) -> tuple[Interior, Array]:
+    """Compute the sum of R_i R_i^T over the interior, (r, r)."""
+    interior = robot.part.interior
+    return robot, gram_matrix(robot.poses.R[interior])
+
+
+def round_to(robot: Interior, V: Array) -> tuple[Interior, ReducedTranslations]:
+    """Project the poses V^T R_i to rotations; then as `reduce_translations`."""
+    poses = robot.poses
+    R = project_to_rotations(V.T @ poses.R)
+    rounded = Poses(R, poses.t @ V)
+    state = replace(robot.state, poses=rounded, saved=rounded, session=None)
+    return reduce_translations(robot.with_state(state), None)
+
+
+def _power_step(robot: Interior, v: Array) -> tuple[Interior, PowerStep]:
+    """Reduce the right-hand side that is v on the rotations of the interior, zero elsewhere."""
+    problem = robot.part.problem
+    b = np.zeros((problem.side, 1))
+    b[robot.interior_rows, 0] = v
+    following, right = robot.with_right(b)
+    blocks = v.reshape(-1, problem.d)
+    squares = np.sum(blocks**2, axis=1)
+    square = float(squares.sum())
+    largest = float(squares.max(initial=0.0))
+    step = PowerStep(right, square, largest)
+    return following, step

@@ -6,7 +6,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.robots.interior import Interior
 from solvers.robots.records import CostParts, InteriorPoses
-from solvers.robots.state import DescentSession
 
 
 def describe(robot: Interior, _: None) -> tuple[Interior, Array]:
@@ -42,10 +41,8 @@ def restore_poses(robot: Interior, _: None) -> tuple[Interior, None]:
 
 
 def accept(robot: Interior, _: None) -> tuple[Interior, None]:
-    """Go to the trial of a descent."""
-    trial = robot.session(DescentSession).trial
-    assert trial is not None
-    return robot.at_poses(trial), None
+    """Go to the poses that the session tries."""
+    return robot.at_poses(robot.trial), None
 
 
 def result(robot: Interior, _: None) -> tuple[Interior, InteriorPoses]:

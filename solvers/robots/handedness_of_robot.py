@@ -22,7 +22,6 @@ from solvers.robots.records import (
     VectorsAnswer,
     VectorsOrder,
 )
-from solvers.robots.state import ProofSession
 
 
 def take_closed_form(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
@@ -79,7 +78,7 @@ def begin_vectors(robot: Interior, count: int) -> tuple[Interior, VectorsAnswer]
 
 def follow_vectors(robot: Interior, order: VectorsOrder) -> tuple[Interior, VectorsAnswer]:
     """Take one inverse iteration of X C, from its solution on the boundary."""
-    system = robot.session(ProofSession).system
+    system = robot.system
     b = system.b @ order.C
     X = replace(system, b=b).back_substitute(order.x)
     return _with_vectors(robot, X, b)
@@ -132,9 +131,7 @@ def _with_vectors(robot: Interior, X: Array, b: Array) -> tuple[Interior, Vector
     X_E = X[rows]
     right_hand_side = np.zeros_like(X)
     right_hand_side[rows] = X_E
-    session = robot.session(ProofSession)
-    system, right = session.system.with_right(right_hand_side)
-    following = robot.in_session(replace(session, system=system))
+    following, right = robot.with_right(right_hand_side)
     following = _with_ascent(following, replace(_ascent(robot), X=X))
     return following, VectorsAnswer(right.b, X_E.T @ b[rows], X_E.T @ X_E)
 

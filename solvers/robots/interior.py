@@ -22,13 +22,8 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
-from solvers.robots.records import CostParts, Reweigh
-from solvers.robots.state import (
-    AveragingSession,
-    DescentSession,
-    InteriorState,
-    Session,
-)
+from solvers.robots.records import CostParts, Reweigh, RightHandSide
+from solvers.robots.state import InteriorState, Session
 from solvers.robots.subdomain_blocks import Widths
 from solvers.robots.system import FactoredPart, System
 from solvers.robust.weighted_edges import RatioSums
@@ -96,13 +91,26 @@ class Interior:
         assert isinstance(session, kind)
         return session
 
+    @property
+    def system(self) -> System:
+        """The system of the session, with the interior eliminated."""
+        session = self.session(Session)
+        assert session.system is not None
+        return session.system
+
+    @property
+    def trial(self) -> Poses:
+        """The poses that the session tries."""
+        session = self.session(Session)
+        assert session.trial is not None
+        return session.trial
+
     def with_state(self, state: InteriorState) -> Interior:
         """The robot in another state, with the same weights."""
         following = replace(self, state=state)
         evaluated = [following.at(state.poses)]
-        session = state.session
-        if isinstance(session, DescentSession) and session.trial is not None:
-            evaluated.append(following.at(session.trial))
+        if state.session is not None and state.session.trial is not None:
+            evaluated.append(following.at(state.session.trial))
         return replace(following, evaluated=tuple(evaluated))
 
     def at_poses(self, poses: Poses) -> Interior:
@@ -117,15 +125,22 @@ class Interior:
         """The robot with another session, or none."""
         return self.with_state(replace(self.state, session=session))
 
+    def with_right(self, b: Array) -> tuple[Interior, RightHandSide]:
+        """The robot whose session's system has the right-hand side b, and b reduced."""
+        system, right = self.system.with_right(b)
+        return self.in_session(replace(self.session(Session), system=system)), right
+
+    def at_trial(self, trial: Poses) -> Interior:
+        """The robot whose session tries these poses."""
+        return self.in_session(replace(self.session(Session), trial=trial))
+
     def in_state_of(self, state: InteriorState) -> Interior:
         """The robot in a state of a snapshot, or with other weights, and the factors there."""
         part = self.whole if state.weights is None else self.whole.weighted(state.weights)
         factored = self.factored.with_weights_of(part)
         session = state.session
-        if session is not None and not isinstance(session, AveragingSession):
-            system = session.system
-            if system is not None:
-                session = replace(session, system=factored.eliminated_again(system))
+        if session is not None and session.system is not None:
+            session = replace(session, system=factored.eliminated_again(session.system))
         return replace(self, factored=factored).with_state(replace(state, session=session))
 
     # The cost at poses.

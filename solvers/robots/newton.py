@@ -1,8 +1,21 @@
 """Newton's method by a driver and its robots: `newton_step` on matrices eliminated to separators.
 
-The rules are those of `solvers.riemannian.newton_step`; here are its algebra, which asks the
-robots for their parts and solves for the separators, and the method that the loop runs.
+The rules are those of `solvers.riemannian.newton_step`. A step of Newton goes as follows.
+
+1. The driver asks every robot for its part of H y = g, with the interior eliminated
+   (`reduce_model`). H is the matrix of a `ModelOrder` at the current poses, and g the gradient
+   there. The message goes with the next round.
+2. The driver sums up the parts, adds its own blocks, and solves for y on the cover (`model_at`).
+3. It sends every robot y on its boundary. The robot solves for its interior, and tries the move
+   along -y. A straight move is one round (`move_straight`). Otherwise the robots turn their
+   rotations (`move`) and the best translations are solved for (`evaluate_trial`): two rounds.
+4. The robots answer F and the gradient at the trial, reduced by the same factor. The driver either
+   accepts the trial (`Driver.accept`), or tries another length (`turn`, `go_straight`).
+
+The driver's method stands first; the robot's orders are below it.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -11,10 +24,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pgo_models.errors import NotPositiveDefiniteError
+from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.hessian import TangentLayout
-from pgo_models.relaxations.low_rank import LiftedPoses, poses_from
+from pgo_models.relaxations.low_rank import (
+    LiftedPoses,
+    gradient_at,
+    hessian_at,
+    poses_from,
+    tangent_widths,
+)
 from solvers.carry.counted_pool import Count
 from solvers.carry.moments import Moment
 from solvers.carry.serialization import COMPUTED_AGAIN
@@ -29,10 +49,17 @@ from solvers.riemannian.newton_step import (
     stationary_tolerance,
 )
 from solvers.riemannian.polish import MOST_FITTING_STEPS, NEARLY_EXACT
-from solvers.robots import descent
 from solvers.robots.driver import CoverPoses, Driver
 from solvers.robots.interface import InterfaceFactor
-from solvers.robots.records import Move, Reduced, RightHandSide, TrialEvaluation
+from solvers.robots.interior import Interior
+from solvers.robots.records import (
+    CostParts,
+    Reduced,
+    ReducedTranslations,
+    RightHandSide,
+)
+from solvers.robots.state import DescentSession
+from solvers.robots.translations import reduced_translations, translations
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -140,9 +167,9 @@ class EliminatedAlgebra:
         driver = self.driver
         if length == 1.0:
             moves = [Move(part, length) for part in model.parts]
-            answers = driver.ask_each(descent.move_straight, moves)
+            answers = driver.ask_each(move_straight, moves)
         else:
-            answers = driver.ask(descent.go_straight, length, Count.PIGGYBACKED)
+            answers = driver.ask(go_straight, length, Count.PIGGYBACKED)
         R, t = self._moved(model, length)
         return self._trial(R, t, answers)
 
@@ -151,11 +178,11 @@ class EliminatedAlgebra:
         driver = self.driver
         if length == 1.0:
             moves = [Move(part, length) for part in model.parts]
-            turned = driver.ask_each(descent.move, moves)
+            turned = driver.ask_each(move, moves)
         else:
-            turned = driver.ask(descent.turn, length, Count.PIGGYBACKED)
+            turned = driver.ask(turn, length, Count.PIGGYBACKED)
         t, parts = driver.best_translations(turned)
-        answers = driver.ask_each(descent.evaluate_trial, parts)
+        answers = driver.ask_each(evaluate_trial, parts)
         return self._trial(self._moved(model, length)[0], t, answers)
 
     def _moved(self, model: Model, length: float) -> tuple[Array, Array]:
@@ -243,7 +270,7 @@ def model_at(driver: Driver, order: ModelOrder) -> Model | None:
 
     None when a robot's interior, or the sum of what they reduce to, is not positive definite.
     """
-    answers = driver.ask(descent.model, order, Count.PIGGYBACKED)
+    answers = driver.ask(reduce_model, order, Count.PIGGYBACKED)
     reduced = [answer for answer in answers if answer is not None]
     if len(reduced) < len(answers):
         return None
@@ -286,3 +313,116 @@ def _solved(
     y, parts, energy = factor.solve([part.b for part in right])
     square = math.fsum(part.energy for part in right) + energy
     return Model(order, factor, at, y, parts, square)
+
+
+# The robot's orders.
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """H^-1 g on the boundary, (w g, 1), and how far to go along minus it."""
+
+    x: Array
+    length: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrialEvaluation:
+    """`CostParts` at a trial, and the reduced gradient there."""
+
+    at: CostParts
+    gradient: RightHandSide
+
+
+def reduce_model(robot: Interior, order: ModelOrder) -> tuple[Interior, Reduced | None]:
+    """Eliminate the matrix of the order, and the gradient; None where K_II is not definite.
+
+    The robot grounds and damps the rows of its interior, the driver those of the separators.
+    """
+    Lambda = None
+    if order.second_order:
+        identity = np.eye(robot.part.problem.d)
+        Lambda = robot.multipliers() - order.eta * identity
+        Lambda[robot.part.boundary] = 0.0  # the driver knows the whole force there
+    H = hessian_at(robot.at(robot.poses), Lambda)
+    layout = _layout(robot)
+    diagonal = H.diagonal()
+    grounded = diagonal.copy()
+    if robot.factored.grounds:
+        # A motion of all poses together changes no cost, so that H is singular, and the gradient
+        # orthogonal to it: with pose 0 stiffer the solution leaves that pose where it is, and,
+        # without damping, solves the system without the stiffness, too.
+        zero = np.zeros(1, dtype=np.int64)
+        v = layout.translations(zero)[0]
+        w = layout.rotations(zero)[0]
+        of_pose = np.concatenate([v, w])
+        grounded[of_pose] += abs(diagonal[of_pose])
+    widths = tangent_widths(robot.poses.R)
+    interior = robot.factored.cut(widths).interior
+    diagonal[interior] = grounded[interior] * (1.0 + order.damping)
+    H.setdiag(diagonal)
+    try:
+        eliminated, system = robot.eliminate(H, widths, _gradient(robot, robot.poses))
+    except NotPositiveDefiniteError:
+        return robot, None
+    return eliminated.in_session(DescentSession(system=system)), system.reduced(system.right)
+
+
+def move(robot: Interior, order: Move) -> tuple[Interior, ReducedTranslations]:
+    """Direction -H^-1 g from H^-1 g on the boundary; then `turn`."""
+    return turn(_directed(robot, order), order.length)
+
+
+def move_straight(robot: Interior, order: Move) -> tuple[Interior, TrialEvaluation]:
+    """Direction -H^-1 g from H^-1 g on the boundary; then `go_straight`."""
+    return go_straight(_directed(robot, order), order.length)
+
+
+def turn(robot: Interior, length: float) -> tuple[Interior, ReducedTranslations]:
+    """Turn a length along the direction: the right-hand side of the best translations there."""
+    trial = moved(robot, length).with_translations(robot.poses.t)
+    return reduced_translations(robot.at_trial(trial), trial.R)
+
+
+def go_straight(robot: Interior, length: float) -> tuple[Interior, TrialEvaluation]:
+    """Move a length along the direction, translations too: F, force and gradient there."""
+    return _evaluated(robot, moved(robot, length))
+
+
+def evaluate_trial(robot: Interior, t: Array) -> tuple[Interior, TrialEvaluation]:
+    """Take the trial's best translations, t on the boundary: F, force and gradient there."""
+    trial = robot.trial
+    return _evaluated(robot, trial.with_translations(translations(robot, trial.R, t)))
+
+
+def moved(robot: Interior, length: float) -> Poses:
+    """Return the current poses, moved a length along the direction."""
+    step = robot.session(DescentSession).step
+    assert step is not None
+    w, v = step
+    return robot.poses.moved_along(length * w, length * v)
+
+
+def _directed(robot: Interior, order: Move) -> Interior:
+    """The robot with the direction that belongs to H^-1 g on the boundary."""
+    step = -robot.system.back_substitute(order.x)[:, 0]
+    session = replace(robot.session(DescentSession), step=_layout(robot).split(step))
+    return robot.in_session(session)
+
+
+def _evaluated(robot: Interior, trial: Poses) -> tuple[Interior, TrialEvaluation]:
+    """Evaluate a trial; its gradient is reduced by the last factor."""
+    at_trial = robot.at_trial(trial)
+    following, gradient = at_trial.with_right(_gradient(at_trial, trial))
+    return following, TrialEvaluation(following.evaluation(trial), gradient)
+
+
+def _gradient(robot: Interior, poses: Poses) -> Array:
+    """Gradient of the current cost at poses, (unknowns, 1)."""
+    w, v = gradient_at(robot.at(poses))
+    return _layout(robot).join(w, v)[:, None]
+
+
+def _layout(robot: Interior) -> TangentLayout:
+    """Layout of the unknowns of a move from the current poses."""
+    return TangentLayout(robot.part.problem.num_poses, *tangent_widths(robot.poses.R))

@@ -1,7 +1,7 @@
 """What a robot does for its part of the lower bound: eliminate S, begin a proof, and move it."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,10 +9,17 @@ from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from solvers.robots.interior import Interior
-from solvers.robots.proof_of_robot import begin_proof, verify_interior
+from solvers.robots.proof_of_robot import RobotProof, begin_proof, verify_interior
 from solvers.robots.records import ProofAnswer, ProofOrder, ProofStep
-from solvers.robots.state import ProofSession
+from solvers.robots.state import Session
 from solvers.robots.system import System
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProofSession(Session):
+    """A bound, or inverse iteration: S eliminated, and the proof where one was begun."""
+
+    proof: RobotProof | None = None
 
 
 def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofAnswer]:
@@ -44,7 +51,7 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     factored = factored.with_cut(robot.widths, elimination.cut)
     no_right = np.zeros((problem.side, 0))
     system = System.of(matrix, robot.widths, no_right, elimination)
-    session = ProofSession(system)
+    session = ProofSession(system=system)
     following = replace(robot, factored=factored).in_session(session)
     sizes = elimination.schur_row_sums(order.diagonal)
     if order.point is None:
@@ -72,7 +79,7 @@ def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
     """Move X by -S_r^-1 G, from its rows on the boundary: parts of the bound there."""
     session = robot.session(ProofSession)
     assert session.proof is not None
-    moved = session.proof.moved(session.system.back_substitute(x))
+    moved = session.proof.moved(robot.system.back_substitute(x))
     return _evaluated(robot.in_session(replace(session, proof=moved)))
 
 
@@ -88,11 +95,9 @@ def _trace(problem: PGOProblem, Lambda: Array, lost: float) -> float:
 
 def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:
     """Evaluate the proof at its X, and reduce S X without the rows that are left out."""
-    session = robot.session(ProofSession)
-    proof = session.proof
+    proof = robot.session(ProofSession).proof
     assert proof is not None
     sums, product = proof.evaluated(robot.tangent_problem, robot.boundary_rows)
-    system, right = session.system.with_right(product)
-    following = robot.in_session(replace(session, system=system))
+    following, right = robot.with_right(product)
     b = np.where(proof.fixed[:, None] > 0, 0.0, right.b)
     return following, ProofStep(sums, replace(right, b=b))

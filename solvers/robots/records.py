@@ -77,14 +77,6 @@ class Reweighed:
     at: CostParts
 
 
-@dataclass(frozen=True, eq=False)
-class TrialEvaluation:
-    """`CostParts` at a trial, and the reduced gradient there."""
-
-    at: CostParts
-    gradient: RightHandSide
-
-
 @dataclass(frozen=True)
 class RescaleInterior:
     """Change of the penalty in SOC."""
@@ -108,14 +100,6 @@ class Agreed:
     sums: Array  # (2,): squared residuals
     right: RightHandSide  # of the next step (a)
     measured: float  # part of F at omega
-
-
-@dataclass(frozen=True, eq=False)
-class Move:
-    """H^-1 g on the boundary, (w g, 1), and how far to go along minus it."""
-
-    x: Array
-    length: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ adds the penalties of the separators.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,11 +22,19 @@ from solvers.robots.records import (
     ReducedTranslations,
     RescaleInterior,
 )
-from solvers.robots.state import RecursionSession
+from solvers.robots.state import Session
 from solvers.robots.translations import reduce_translations
 from solvers.soc.copies import Norms, subsampled
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import RecursionBlock
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecursionSession(Session):
+    """SOC: the system of step (a), and the rotations of the interior in the recursion."""
+
+    block: RecursionBlock
+    x: Array | None = None  # (side, d): of the last step (a); None before the first
 
 
 def report_norms(robot: Interior, step: int | None) -> tuple[Interior, Norms]:
@@ -59,7 +67,7 @@ def rescale(robot: Interior, order: RescaleInterior) -> tuple[Interior, Reduced]
 def solve(robot: Interior, x: Array) -> tuple[Interior, Array]:
     """Step (a) in the interior, from x on the boundary; the sums for the acceleration."""
     session = robot.session(RecursionSession)
-    X = session.system.back_substitute(x)
+    X = robot.system.back_substitute(x)
     block, sums = session.block.after_solve(X[robot.interior_rows])
     return robot.in_session(replace(session, block=block, x=X)), sums
 
@@ -72,8 +80,8 @@ def agree(robot: Interior, order: Agree) -> tuple[Interior, Agreed]:
     session = robot.session(RecursionSession)
     block = session.block.extrapolated(order.agreement)  # s = x_ahead + B
     block, sums = block.projected()  # (b) omega, (c) B = s - omega
-    system, right = session.system.with_right(_pull(robot, block))
-    following = robot.in_session(replace(session, block=block, system=system))
+    following = robot.in_session(replace(session, block=block))
+    following, right = following.with_right(_pull(robot, block))
     _, measured = cost(following, order.measured_at)
     return following, Agreed(sums, right, measured)
 
@@ -94,8 +102,7 @@ def finish(robot: Interior, omega: Array) -> tuple[Interior, ReducedTranslations
 
 def reduce_again(robot: Interior, _: None) -> tuple[Interior, Reduced]:
     """Send the matrix and the right-hand side again, to a driver that was started again."""
-    system = robot.session(RecursionSession).system
-    return robot, system.reduced(system.right)
+    return robot, robot.system.reduced(robot.system.right)
 
 
 def _factorized(
@@ -111,7 +118,7 @@ def _factorized(
         data[problem.diagonal_positions[0]] *= 2.0
     K = problem.with_pattern_of_M(data)
     eliminated, system = robot.eliminate(K, robot.widths, _pull(robot, block))
-    following = eliminated.in_session(RecursionSession(system, block, x))
+    following = eliminated.in_session(RecursionSession(system=system, block=block, x=x))
     return following, system.reduced(system.right)
 
 

@@ -1,5 +1,7 @@
 """Orders of the start: the chordal relaxation, and in the plane a step of rotation averaging."""
 
+from dataclasses import dataclass
+
 from pgo_models.geometry.rotations import (
     Array,
     exp_map,
@@ -9,8 +11,15 @@ from pgo_models.geometry.rotations import (
 from pgo_models.problem.initialization import averaging_pull, relaxed_rotations
 from solvers.robots.interior import Interior
 from solvers.robots.records import Reduced, ReducedTranslations
-from solvers.robots.state import AveragingSession, RelaxationSession
+from solvers.robots.state import Session
 from solvers.robots.translations import reduced_by_laplacian
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AveragingSession(Session):
+    """The averaged start: the pull of a step of rotation averaging; its matrix is M_tt."""
+
+    pull: Array  # (p, k)
 
 
 def chordal(robot: Interior, _: None) -> tuple[Interior, Reduced]:
@@ -21,20 +30,19 @@ def chordal(robot: Interior, _: None) -> tuple[Interior, Reduced]:
     matrix, b = relaxed_rotations(part.problem, fixed)
     of_rotations = matrix[p:, p:].tocsc()
     eliminated, system = robot.eliminate(of_rotations, (part.problem.d,), b[p:])
-    return eliminated.in_session(RelaxationSession(system)), system.reduced(system.right)
+    return eliminated.in_session(Session(system)), system.reduced(system.right)
 
 
 def project(robot: Interior, x: Array) -> tuple[Interior, None]:
     """Back-substitute the relaxation, and go to its rotations, projected."""
-    system = robot.session(RelaxationSession).system
-    relaxed = unstack_transposes(system.back_substitute(x))
+    relaxed = unstack_transposes(robot.system.back_substitute(x))
     return robot.in_session(None).at_rotations(project_to_rotations(relaxed)), None
 
 
 def average(robot: Interior, stiffness: float) -> tuple[Interior, ReducedTranslations]:
     """Pull of a step of rotation averaging, and its matrix, M_tt, once."""
     pull = averaging_pull(robot.part.problem, robot.poses.R, stiffness)
-    return reduced_by_laplacian(robot.in_session(AveragingSession(pull)), pull)
+    return reduced_by_laplacian(robot.in_session(AveragingSession(pull=pull)), pull)
 
 
 def turn_by(robot: Interior, angles: Array) -> tuple[Interior, None]:

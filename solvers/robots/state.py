@@ -9,56 +9,19 @@ from dataclasses import dataclass
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from solvers.robots.proof_of_robot import RobotProof
 from solvers.robots.records import Reweigh, RobotAscent
 from solvers.robots.system import System
-from solvers.soc.recursion_block import RecursionBlock
 
 
 @dataclass(frozen=True, eq=False)
-class RelaxationSession:
-    """The chordal start: the relaxation of the rotations."""
+class Session:
+    """What an algorithm leaves for its next order; each has what it needs beside it in a subclass.
 
-    system: System
-
-
-@dataclass(frozen=True, eq=False)
-class AveragingSession:
-    """The averaged start: the pull of a step of rotation averaging; its matrix is M_tt."""
-
-    pull: Array  # (p, k)
-
-
-@dataclass(frozen=True, eq=False)
-class RecursionSession:
-    """SOC: the system of step (a), and the rotations of the interior in the recursion."""
-
-    system: System
-    block: RecursionBlock
-    x: Array | None = None  # (side, d): of the last step (a); None before the first
-
-
-@dataclass(frozen=True, eq=False)
-class DescentSession:
-    """Newton, or a climb of the staircase: a direction, and the trial that it led to.
-
-    A climb has no system: its direction comes from a `ProofSession`.
+    The session of an algorithm that tries poses has them as `trial`, which `accept` goes to.
     """
 
-    system: System | None
-    step: tuple[Array, Array] | None = None  # (p, .), (p, d): of rotations, of translations
+    system: System | None = None
     trial: Poses | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ProofSession:
-    """A bound, or inverse iteration: S eliminated, and the proof where one was begun."""
-
-    system: System
-    proof: RobotProof | None = None
-
-
-Session = RelaxationSession | AveragingSession | RecursionSession | DescentSession | ProofSession
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,3 +38,13 @@ class InteriorState:
     has_sent_laplacian: bool = False  # whether the driver has the matrix of the translations
     terms: HandednessTerms | None = None  # of its edges, for proofs with them
     ascent: RobotAscent | None = None  # the search for such terms
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DescentSession(Session):
+    """Newton, or a climb of the staircase: a direction, and the trial that it led to.
+
+    A climb has no system: its direction comes from a proof's.
+    """
+
+    step: tuple[Array, Array] | None = None  # (p, .), (p, d): of rotations, of translations

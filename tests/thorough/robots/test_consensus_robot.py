@@ -22,7 +22,7 @@ from pgo_models import NoiseModel, PoseGraph, exp_map, grid, partition
 from pgo_models.geometry.rotations import Array, tangent_dimension
 from solvers import SOC, Coupling, Pipeline, Robots, Solution, solve
 from solvers.carry.ledger import DRIVER
-from solvers.robots import descent, handedness_of_robot as handedness, start, translations
+from solvers.robots import handedness_of_robot as handedness, newton, start, translations
 from solvers.robots.agent import begin_copies
 from solvers.robots.interface import Separators
 from solvers.robots.proof_orders import fits_part, move_proof, prove_interior
@@ -35,9 +35,9 @@ ROUNDS = (  # orders that are, or end, a round
     *(
         start.project,
         translations.set_translations,
-        descent.move,
-        descent.evaluate_trial,
-        descent.move_straight,
+        newton.move,
+        newton.evaluate_trial,
+        newton.move_straight,
         fits_part,
         prove_interior,
     ),
@@ -180,7 +180,7 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     # of SOC, 2 a move of Newton, 2 for the proof.
     assert (
         solution.ledger.rounds
-        == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(descent.move) + 2
+        == 2 + (2 + 1 + stage.iterations + 2) + 2 * engine.times(newton.move) + 2
     )
     assert solution.ledger.all_reduces == 3 + 1 + stage.iterations
 

@@ -37,7 +37,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
 from solvers import InProcess, Pipeline, Robots, Solution, solve
 from solvers.place import AUTO, FirstStage
-from solvers.robots import descent, recursion, start, translations
+from solvers.robots import newton, recursion, start, translations
 from solvers.robots.driver import collect
 from solvers.robots.proof_orders import fits_part, move_proof, prove_interior
 from solvers.robots.setup import open_driver
@@ -162,7 +162,7 @@ def test_the_ledger_counts_what_was_sent(
             recursion.rescale,
             recursion.solve,
         ),
-        *(recursion.finish, descent.move, descent.evaluate_trial, descent.move_straight, *PROOF),
+        *(recursion.finish, newton.move, newton.evaluate_trial, newton.move_straight, *PROOF),
     )
     assert ledger.rounds == engine.times(*counted)
     assert ledger.all_reduces == engine.times(recursion.agree)
