@@ -17,8 +17,7 @@ from solvers.carry.messages import Snapshot
 from solvers.carry.moments import Recall
 from solvers.carry.serialization import deserialize, serialize
 from solvers.robots.interior import Interior, interior_of
-from solvers.robots.proof_of_robot import RobotProof
-from solvers.robots.proof_orders import ProofSession
+from solvers.robots.proof_of_robot import ProofSession, RobotProof
 from solvers.robots.records import Reweigh, RobotAscent
 from solvers.robots.recursion import RecursionSession
 from solvers.robots.start import AveragingSession

@@ -30,9 +30,16 @@ from solvers.carry.counted_pool import Count
 from solvers.robots.driver import Driver
 from solvers.robots.handedness_of_robot import report_terms, take_closed_form
 from solvers.robots.interface import Interface, InterfaceFactor
-from solvers.robots.proof_of_robot import ProofSums
-from solvers.robots.proof_orders import fits_part, move_proof, prove_interior
-from solvers.robots.records import ProofAnswer, ProofOrder, ProofStep, TermsAnswer
+from solvers.robots.proof_of_robot import (
+    ProofAnswer,
+    ProofOrder,
+    ProofStep,
+    ProofSums,
+    fits_part,
+    move_proof,
+    prove_interior,
+)
+from solvers.robots.records import TermsAnswer
 
 # Robots do not know the softest energy of S, which a margin has to take little of
 # (`definiteness.prove_stored`). So margins are tried from the first one on, each a share of the one

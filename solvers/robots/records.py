@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pgo_models.geometry.rotations import Array
-from solvers.robots.proof_of_robot import ProofSums
 from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.copies import OwnPoses
@@ -103,19 +102,6 @@ class Agreed:
 
 
 @dataclass(frozen=True, eq=False)
-class ProofOrder:
-    """How S is eliminated for a proof."""
-
-    eta: float
-    share: float  # at least so much of the diagonal is subtracted
-    fixed: Array  # ((d+1) g,): 1 for rows on the boundary that are left out
-    diagonal: Array  # ((d+1) g,): of S there, summed over robots, or more
-    point: Array | None  # ((d+1) g, d): X there, where a proof begins
-    is_grounded: bool  # whether a pose is left out, not the translation of pose 0 alone
-    with_terms: bool  # whether S is that of the cost less the robots' handedness terms
-
-
-@dataclass(frozen=True, eq=False)
 class RobotAscent:
     """Where a robot is in an ascent of handedness terms, with the k pairs that its edges join."""
 
@@ -151,24 +137,6 @@ class TermsAnswer:
 
     num_pairs: int
     diagonal: Array  # ((d+1) g,): of M less the terms, on the boundary
-
-
-@dataclass(frozen=True, eq=False)
-class ProofStep:
-    """Parts of the bound, and the right-hand side of the next move."""
-
-    sums: ProofSums
-    right: RightHandSide
-
-
-@dataclass(frozen=True, eq=False)
-class ProofAnswer:
-    """S with the interior eliminated for a proof."""
-
-    schur: Array | None  # None where the interior is not definite
-    sizes: Array | None  # ((d+1) g,): `row_sums` of it
-    trace: float  # part of tr(Lambda)
-    step: ProofStep | None  # the first one, where the proof begins at a point
 
 
 @dataclass(frozen=True, eq=False)

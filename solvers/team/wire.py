@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pgo_models.errors import PGOError
 from solvers.carry.serialization import deserialize, serialize
 
-_MARK = b"PGO1"  # the last character is the version
+_MARK = b"PGO2"  # the last character is the version
 _SEAL_BYTES = 32  # of HMAC-SHA256
 _LENGTH_BYTES = 4  # of the length of the description, which precedes it
 _LEVEL = 1  # of the compression: numbers hardly shrink, trees do

@@ -25,7 +25,7 @@ from solvers.carry.ledger import DRIVER
 from solvers.robots import handedness_of_robot as handedness, newton, start, translations
 from solvers.robots.agent import begin_copies
 from solvers.robots.interface import Separators
-from solvers.robots.proof_orders import fits_part, move_proof, prove_interior
+from solvers.robots.proof_of_robot import fits_part, move_proof, prove_interior
 from solvers.soc.consensus_robot import ConsensusRobot
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])

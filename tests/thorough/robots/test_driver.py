@@ -39,7 +39,7 @@ from solvers import InProcess, Pipeline, Robots, Solution, solve
 from solvers.place import AUTO, FirstStage
 from solvers.robots import newton, recursion, start, translations
 from solvers.robots.driver import collect
-from solvers.robots.proof_orders import fits_part, move_proof, prove_interior
+from solvers.robots.proof_of_robot import fits_part, move_proof, prove_interior
 from solvers.robots.setup import open_driver
 
 SIZES = st.integers(2, 24)

@@ -52,8 +52,8 @@ from solvers.robots.proof import (
     prove_grounded,
     prove_with_eta,
 )
-from solvers.robots.proof_of_robot import ProofSums
-from solvers.robots.records import ProofStep, RightHandSide
+from solvers.robots.proof_of_robot import ProofStep, ProofSums
+from solvers.robots.records import RightHandSide
 
 
 @settings(max_examples=examples(12))

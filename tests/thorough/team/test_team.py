@@ -476,7 +476,7 @@ def test_messages_without_the_key_changed_ones_and_those_for_others_are_dropped(
     (false,), (right,) = stranger.outbox(), robots["r0"].outbox()
     changed = right.data[:-1] + bytes([right.data[-1] ^ 1])
     receiver = robots["r1"]
-    for data in (false.data, changed, b"", b"PGO1", right.data[:40], b"PGO0" + right.data[4:]):
+    for data in (false.data, changed, b"", b"PGO2", right.data[:40], b"PGO0" + right.data[4:]):
         receiver.receive(data, 0.0)
     assert receiver.ledger.messages == 0
     assert receiver.ledger.dropped == 6
