@@ -68,15 +68,27 @@ print("differs from the library by", np.abs(by_svd - pgo.project_to_rotations(Y)
 
 # %% [markdown]
 # *Procrustes' problem*, $\min \lVert A X - C \rVert_F^2$ s.t. $X^\top X = I$, has the same closed
-# form, with $Y = A^\top C$. SOC does not use this: it only needs a convex objective. It finds the
-# same solution.
+# form with $Y = A^\top C$, if $X$ is square, because then $\lVert A X \rVert_F$ does not depend on
+# $X$. With fewer columns than rows it does, and there is no closed form. SOC only needs a convex
+# objective. It finds the closed form where there is one, and a better $X$ where there is none.
+
 
 # %%
+def cost_by_svd(A, C):
+    U, _, Vt = np.linalg.svd(A.T @ C, full_matrices=False)
+    return np.linalg.norm(A @ U @ Vt - C) ** 2
+
+
+def cost_by_soc(A, C):
+    return solvers.solve_orthogonal(procrustes(A, C), np.random.default_rng(0)).objective
+
+
 A, C = rng.standard_normal((8, 3)), rng.standard_normal((8, 3))
-U, _, Vt = np.linalg.svd(A.T @ C)
-found = solvers.solve_orthogonal(procrustes(A, C), np.random.default_rng(0))
-closed_form = np.linalg.norm(A @ U @ Vt - C) ** 2
-print(f"closed form {closed_form:.8f}, SOC {found.objective:.8f}")
+closed_form, found = cost_by_svd(A, C), cost_by_soc(A, C)
+print(f"X is 3 by 3: U V^T costs {closed_form:.8f}, the X of SOC {found:.8f}")
+A_wide, C_thin = rng.standard_normal((30, 8)), rng.standard_normal((30, 3))
+no_closed_form, found_thin = cost_by_svd(A_wide, C_thin), cost_by_soc(A_wide, C_thin)
+print(f"X is 8 by 3: U V^T costs {no_closed_form:.2f}, the X of SOC {found_thin:.2f}")
 
 # %% [markdown]
 # ## Algorithm 1 by hand
@@ -423,7 +435,8 @@ solvers.certify(ring_problem, stuck.poses)
 # %%
 with NamedNumbers():
     assert np.allclose(by_svd, pgo.project_to_rotations(Y))
-    assert np.isclose(found.objective, closed_form, rtol=1e-6)
+    assert np.isclose(found, closed_form, rtol=1e-6)
+    assert found_thin < 0.9 * no_closed_form
     assert max(differences.values()) < 1e-6
     assert min(moved[factor] for factor in (0.5, 0.9, 0.99)) > 0.1
     assert max(moved[factor] for factor in (1.01, 1.1, 2.0)) < 1e-4

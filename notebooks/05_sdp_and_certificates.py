@@ -174,9 +174,10 @@ for name, (objective, difference, lambda_min) in rows.items():
     print(f"   lambda_min(S) {lambda_min:9.1e}")
 
 # %% [markdown]
-# $F - \operatorname{tr} \Lambda$ is zero *everywhere*, even at random rotations. The reason is that
-# $\operatorname{tr} \Lambda = \sum_i \operatorname{tr}((M X)_i R_i) = \operatorname{tr}(X^\top M X)$,
-# which is $F$ if the translations are the best ones. So this number contains no information.
+# $F - \operatorname{tr} \Lambda$ is zero for *all* rotations, even for random ones. The reason is
+# that $\operatorname{tr} \Lambda = \sum_i \operatorname{tr}((M X)_i R_i)$ has all of
+# $\operatorname{tr}(X^\top M X) = F$ but the rows of translations, and at the best translations these
+# rows of $M X$ are zero. So this number contains no information.
 #
 # What distinguishes the optimum is that its $\Lambda$ is *feasible*: $\lambda_{\min}(S) \ge 0$. At
 # the optimum of a tight problem, $d$ eigenvalues are exactly zero ($S Y = 0$), so in floating point
@@ -415,6 +416,13 @@ with NamedNumbers():
     assert float(changed.bound) < answer.lower_bound
     assert relaxed.rank.rank == 3
     assert all(abs(difference) < 1e-8 * objective for objective, difference, _ in rows.values())
+    shifted_poses = pgo.Poses(answer.poses.R, answer.poses.t + rng.standard_normal((n, d)))
+    stacked_rows = shifted_poses.stacked()
+    away = problem.objective(shifted_poses)
+    assert np.isclose(np.trace(stacked_rows.T @ problem.M @ stacked_rows), away)
+    assert (
+        abs(away - np.trace(pgo.multipliers(problem, shifted_poses), axis1=1, axis2=2).sum()) > 1.0
+    )
     assert rows["8 poses, optimum"][2] > -1e-6
     assert rows["ring, optimum"][2] > -1e-6
     assert rows["8 poses, random"][2] < -1.0

@@ -218,11 +218,12 @@ print(f"gap   {gap_by_hand:.10f} by hand, {certificate.gap:.10f} by the library"
 # r_t = R_{ij}^\top \bigl( R_i^\top (t_j - t_i) - t_{ij} \bigr),$$
 #
 # for a rotation error by the angle $\theta$ about the axis $a$, with $s = a \sin\theta$. The
-# rotation term is already quadratic in the rotations. The rest is a convex function of $r_t$ and
-# the rotation error, and so it lies above its tangent at any point; the tangent is quadratic in the
-# poses. At the minimum of $\chi^2$ both have the same value, so the certificate of the quadratic
-# function proves the minimum of $\chi^2$. As an example, the robot closes its loops with a camera
-# whose errors are ten times larger in depth than sideways:
+# rotation term is already quadratic in the rotations. Without a coupling block $I_{tr}$, as here, the
+# rest is a convex function of $r_t$. (With one it is not convex, and a part of the rotation term is
+# moved to it that [makes it so](site/proved.md).) So it lies above its tangent at any point; the
+# tangent is quadratic in the poses. At the minimum of $\chi^2$ both have the same value, so the
+# certificate of the quadratic function proves the minimum of $\chi^2$. As an example, the robot closes
+# its loops with a camera whose errors are ten times larger in depth than sideways:
 
 # %%
 information = graph.information.copy()
@@ -533,6 +534,20 @@ with NamedNumbers():
     for cost, below in near.values():
         assert below <= cost * (1 + 1e-9)
     assert (on_line[:, 1] <= on_line[:, 0] * (1 + 1e-9)).all()
+    # With a coupling block the rest alone is not convex, and the tangent is below chi2 all the same.
+    coupled_blocks = information.copy()
+    coupled_blocks[:, 0, 2] = coupled_blocks[:, 2, 0] = 0.5 * np.sqrt(
+        information[:, 0, 0] * information[:, 2, 2]
+    )
+    rest = coupled_blocks[0].copy()
+    rest[2, 2] = 0.0
+    assert np.linalg.eigvalsh(rest)[0] < 0.0 < np.linalg.eigvalsh(coupled_blocks[0])[0]
+    coupled = pgo.PGOProblem(replace(seen, information=coupled_blocks))
+    below_coupled = coupled.tangent_at(by_chi2.poses)
+    for step in (-0.5, 1e-2, 0.5):
+        R = by_chi2.poses.R @ pgo.exp_map(step * turns)
+        away = pgo.Poses(R, by_chi2.poses.t + step * moves)
+        assert below_coupled.objective(away) < coupled.objective(away)
     assert in_the_world.is_certified
     assert surveyed.is_certified
     assert rejected == survey.index(mistaken)

@@ -151,8 +151,10 @@ print(
 #
 # $$w = \min\Bigl(1, \max\Bigl(0, \frac{c}{r} \sqrt{\mu (\mu + 1)} - \mu\Bigr)\Bigr).$$
 #
-# For $\mu = 1 / (2 \max_e r_e^2 / c_e^2 - 1)$ (their remark 5) the surrogate is convex in $r$
-# wherever a residual is; every doubling brings it closer to the truncated cost.
+# With $\mu = 1 / (2 \max_e r_e^2 / c_e^2 - 1)$ (their remark 5) no weight is zero yet. The surrogate
+# is $r^2$ up to $r = c \sqrt{\mu / (\mu + 1)}$. From there to where the weight is zero its second
+# derivative is $-2 \mu$: it is not convex, but for a small $\mu$ nearly straight. Every doubling brings
+# it closer to the truncated cost.
 #
 # Four surrogates beside the square of least squares:
 
@@ -634,6 +636,11 @@ with NamedNumbers():
     assert greedy.is_certified
     assert greedy.edge_residuals.overall > greedy.edge_residuals.overall_allowed
     assert pgo.absolute_trajectory_error(greedy.poses, truth) > errors["least squares"]
+    mu_first, ratio_first, weights_first, _ = steps[0]
+    assert (weights_first > 0.0).all()
+    of_largest = np.sqrt(ratio_first.max()) + np.array([-1e-3, 0.0, 1e-3])
+    bend = np.diff(solvers.RobustLoss.TRUNCATED.surrogate(of_largest**2, mu_first), 2) / 1e-3**2
+    assert np.isclose(bend[0], -2.0 * mu_first, rtol=1e-3)
     assert (rejected == is_wrong).all()
     assert (robust.robust.rejected == rejected).all()
     assert robust.is_certified

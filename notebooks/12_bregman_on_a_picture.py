@@ -154,13 +154,18 @@ print(f"differs from ours by {difference:.0e} in 10 iterations")
 # equation (4) with $\mathcal{K} = I$: denoise $f + b$ with too *large* a weight,
 # add $b \leftarrow b + f - u$, and stop when $\lVert f - u \rVert$ is the size of the noise.
 
-# %%
-b, iterates = np.zeros_like(noisy), []
-for _ in range(12):
-    u, _ = denoised(noisy + b, 0.6, iterations=80)
-    b = b + noisy - u
-    iterates.append(u)
 
+# %%
+def bregman_iterates(weight, count):
+    b, iterates = np.zeros_like(noisy), []
+    for _ in range(count):
+        u, _ = denoised(noisy + b, weight, iterations=80)
+        b = b + noisy - u
+        iterates.append(u)
+    return iterates
+
+
+iterates = bregman_iterates(0.6, 12)
 to_data = np.array([root_mean_square(u - noisy) for u in iterates])
 quality = np.array([decibel(u) for u in iterates])
 stop = int(np.argmax(to_data <= noise_std))
@@ -182,10 +187,11 @@ film_of_iterates(iterates, noisy, clean, noise_std)
 
 # %% [markdown]
 # The weight 0.07 of the first section was chosen with knowledge of the truth, and no other does
-# much better. Here any weight that is too large works, only the size of the noise has to be known,
-# and the result is within half a decibel. The next figure shows $f - u$, drawn about a medium grey.
-# The first iterate has lost most of the picture; in the fourth nearly all that is taken away is
-# noise.
+# much better. Here any weight that is too large works, and only the size of the noise has to be
+# known. Compared with 0.07 this costs 0.4 dB with the weight 0.6, 0.5 dB with 0.15 and 0.8 dB with 2.4.
+#
+# The next figure shows $f - u$, drawn about a medium grey. The first iterate has lost most of the
+# picture; in the fourth nearly all that is taken away is noise.
 
 # %%
 show_pictures(
@@ -401,7 +407,12 @@ with NamedNumbers():
     assert quality[stop] > quality[-1]
     assert np.all(np.diff(to_data) <= 0)
     assert quality[stop] > quality.max() - 0.5
-    assert quality[stop] > decibel(smooth) - 0.5
+    lost = {0.6: decibel(smooth) - quality[stop]}
+    for weight_too_large, count in ((0.15, 2), (2.4, 13)):
+        last, before_last = bregman_iterates(weight_too_large, count)[:-3:-1]
+        assert root_mean_square(last - noisy) <= noise_std < root_mean_square(before_last - noisy)
+        lost[weight_too_large] = decibel(smooth) - decibel(last)
+    assert np.allclose([lost[0.6], lost[0.15], lost[2.4]], [0.4, 0.5, 0.8], atol=0.05)
     assert (stop, int(np.argmax(quality))) == (3, 4)
     assert lasso(runs["FISTA"][50], weight) < lasso(runs["ISTA"][50], weight)
     assert min(decibel(u) for u in filled.values()) > decibel(f) + 5
