@@ -19,9 +19,8 @@ from solvers.carry.serialization import deserialize, serialize
 from solvers.robots.interior import Interior, interior_of
 from solvers.robots.proof_of_robot import ProofSession, RobotProof
 from solvers.robots.records import Reweigh, RobotAscent
-from solvers.robots.recursion import RecursionSession
 from solvers.robots.start import AveragingSession
-from solvers.robots.state import DescentSession, InteriorState, Session
+from solvers.robots.state import DescentSession, InteriorState, RecursionSession, Session
 from solvers.robots.system import System
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot

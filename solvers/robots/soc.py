@@ -1,8 +1,23 @@
 """SUBSTRUCTURED: the recursion of JOINT, with step (a) split by eliminating the robots' interiors.
 
 The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.joint`
-is the recursion to read.
+is the recursion to read. Step (a) is K x = b with K = M + D/2 and b = D/2 (omega - B), where M has
+a robot's edges and D the penalties of its interior, zero on the rows of all other poses and of
+translations. The driver adds the penalties of the separators. An iteration goes as follows.
+
+1. The driver sums up the robots' right-hand sides, with their interiors eliminated, and solves for
+   x on the cover.
+2. Every robot is sent x on its boundary and solves for its interior (`solve`). It answers the sums
+   for the acceleration. Steps 1 and 2 are a round.
+3. Every robot is sent what the acceleration has chosen. It takes steps (b) and (c) in closed form
+   (`agree`), and answers sums of the residuals, which are an all-reduce, and its right-hand side of
+   the next step (a).
+
+Where rho changes the robots factor again (`rescale`), as at the start (`penalize`). The driver's
+method stands first; the robot's orders are below it.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -11,16 +26,26 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms
-from pgo_models.geometry.rotations import Array, unstack_transposes
+from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from solvers.carry.counted_pool import Count
 from solvers.carry.moments import Moment
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
-from solvers.robots import recursion
 from solvers.robots.driver import Driver
 from solvers.robots.interface import InterfaceFactor
-from solvers.robots.records import Agree, Reduced, RescaleInterior, RightHandSide
+from solvers.robots.interior import Interior
+from solvers.robots.records import (
+    Agree,
+    Agreed,
+    Reduced,
+    ReducedTranslations,
+    RescaleInterior,
+    RightHandSide,
+)
+from solvers.robots.state import RecursionSession
+from solvers.robots.translations import reduce_translations
 from solvers.soc.copies import Norms, subsampled
+from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.safeguard import Due, SharedSteps, next_penalty
 from solvers.soc.soc import SOC
@@ -94,7 +119,7 @@ class SubstructuredSOC:
         if start is None:
             state = self._penalized(driver, is_stationary=False)
         else:
-            reduced = driver.ask(recursion.reduce_again, None, Count.PIGGYBACKED)
+            reduced = driver.ask(reduce_again, None, Count.PIGGYBACKED)
             state = replace(start, factor=_factorize(driver, start.block, reduced))
         return replace(state, moment=driver.moment())
 
@@ -111,7 +136,7 @@ class SubstructuredSOC:
         block = block.extrapolated(agreement)  # s = x_ahead + B
         block, own_squares = block.projected()  # (b) omega, (c) B = s - omega; as the robots do
         orders = [Agree(agreement, part) for part in driver.scattered_rotations(block.omega)]
-        answers = driver.ask_each(recursion.agree, orders, Count.ALL_REDUCE)
+        answers = driver.ask_each(agree, orders, Count.ALL_REDUCE)
         squares = own_squares + np.sum([answer.sums for answer in answers], axis=0)
         return replace(
             state.after(merit, squares, state.size, anderson),
@@ -129,7 +154,7 @@ class SubstructuredSOC:
         if math.isnan(objective):
             driver.return_to(state.moment)
             parts = driver.scattered_rotations(state.block.omega)
-            objective = math.fsum(driver.ask_each(recursion.cost, parts, Count.OFF))
+            objective = math.fsum(driver.ask_each(cost, parts, Count.OFF))
         return driver.measured(state.measurement(objective))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
@@ -154,13 +179,13 @@ class SubstructuredSOC:
         if not driver.has_whole and driver.num_poses >= ENOUGH_NORMS:
             step = driver.num_poses // ENOUGH_NORMS
         Lambda = driver.current.multipliers
-        answers = [*driver.ask(recursion.report_norms, step, Count.PIGGYBACKED)]
+        answers = [*driver.ask(report_norms, step, Count.PIGGYBACKED)]
         answers.append(subsampled(Norms(multiplier_norms(Lambda), driver.scale), step))
         norms = np.concatenate([answer.norms for answer in answers])
         scales = np.concatenate([answer.scale for answer in answers])
         order = self.soc.penalty_order(norms / scales, is_stationary)
         block = order.block(driver.current.R, Lambda, driver.diagonal[driver.rotation_rows])
-        reduced = driver.ask(recursion.penalize, order)
+        reduced = driver.ask(penalize, order)
         # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
         squared_size = driver.d * (step or 1) * float(order.rho(norms, scales).sum())
         return SubstructuredState(
@@ -192,7 +217,7 @@ class SubstructuredSOC:
         block = state.block.back_at_best() if from_best else state.block
         block = block.rescaled(factor * block.rho)
         order = RescaleInterior(factor, from_best)
-        reduced = driver.ask(recursion.rescale, order)
+        reduced = driver.ask(rescale, order)
         return replace(
             state.rescaled(factor),
             block=block,
@@ -205,7 +230,7 @@ def _finish(driver: Driver, state: SubstructuredState) -> None:
     """Go from an iterate, which driver and robots hold, to its poses."""
     driver.current = replace(driver.current, R=state.omega)
     parts = driver.scattered_rotations(state.block.omega)
-    driver.set_translations(driver.ask_each(recursion.finish, parts))
+    driver.set_translations(driver.ask_each(finish, parts))
 
 
 def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock, Array]:
@@ -217,7 +242,7 @@ def _solve_a(driver: Driver, state: SubstructuredState) -> tuple[RecursionBlock,
     b[rows] = (0.5 * block.rho)[:, None] * block.shift
     x, parts, _ = state.factor.solve([right.b for right in state.right], b)
     block, own_sums = block.after_solve(x[rows])
-    sums_of_robots = driver.ask_each(recursion.solve, parts)
+    sums_of_robots = driver.ask_each(solve, parts)
     return block, own_sums + np.sum(sums_of_robots, axis=0)
 
 
@@ -235,3 +260,108 @@ def _factorize(
     return driver.interface(1, driver.d).factorize(
         [answer.schur for answer in reduced], blocks_of_driver
     )
+
+
+# The robot's orders.
+
+
+def report_norms(robot: Interior, step: int | None) -> tuple[Interior, Norms]:
+    """||Lambda_i||_2 and m_i of the interior poses, of every step-th one."""
+    Lambda = robot.multipliers()[robot.part.interior]
+    problem = robot.part.problem
+    positions = problem.diagonal_positions[robot.interior_rows]
+    diagonal = problem.M.data[positions].reshape(-1, problem.d)
+    norms = Norms(multiplier_norms(Lambda), np.asarray(diagonal.mean(axis=1)))
+    return robot, subsampled(norms, step)
+
+
+def penalize(robot: Interior, order: PenaltyOrder) -> tuple[Interior, Reduced]:
+    """Set rho_i, factor M + D/2; omega is at the poses, B zero or stationary."""
+    interior = robot.part.interior
+    problem = robot.part.problem
+    diagonal = problem.M.data[problem.diagonal_positions][robot.interior_rows]
+    Lambda = robot.multipliers()[interior]
+    block = order.block(robot.poses.R[interior], Lambda, diagonal)
+    return _factorized(robot, block)
+
+
+def rescale(robot: Interior, order: RescaleInterior) -> tuple[Interior, Reduced]:
+    """Multiply rho, from the best iterate on if asked to, and factor again."""
+    session = robot.session(RecursionSession)
+    block = session.block.back_at_best() if order.from_best else session.block
+    return _factorized(robot, block.rescaled(order.factor * block.rho), session.x)
+
+
+def solve(robot: Interior, x: Array) -> tuple[Interior, Array]:
+    """Step (a) in the interior, from x on the boundary; the sums for the acceleration."""
+    session = robot.session(RecursionSession)
+    X = robot.system.back_substitute(x)
+    block, sums = session.block.after_solve(X[robot.interior_rows])
+    return robot.in_session(replace(session, block=block, x=X)), sums
+
+
+def agree(robot: Interior, order: Agree) -> tuple[Interior, Agreed]:
+    """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a).
+
+    With them goes the answer of `cost`.
+    """
+    session = robot.session(RecursionSession)
+    block = session.block.extrapolated(order.agreement)  # s = x_ahead + B
+    block, sums = block.projected()  # (b) omega, (c) B = s - omega
+    following = robot.in_session(replace(session, block=block))
+    following, right = following.with_right(_pull(robot, block))
+    _, measured = cost(following, order.measured_at)
+    return following, Agreed(sums, right, measured)
+
+
+def cost(robot: Interior, omega: Array) -> tuple[Interior, float]:
+    """Part of F at omega, here its rows of the boundary, and the translations of step (a)."""
+    problem = robot.part.problem
+    x = robot.session(RecursionSession).x
+    X = problem.stacked(robot.poses) if x is None else x.copy()
+    X[problem.num_poses :] = stack_transposes(_rotations(robot, omega))
+    return robot, problem.objective_stacked(X)
+
+
+def finish(robot: Interior, omega: Array) -> tuple[Interior, ReducedTranslations]:
+    """Take omega for the rotations; then `reduce_translations`."""
+    return reduce_translations(robot.at_rotations(_rotations(robot, omega)), None)
+
+
+def reduce_again(robot: Interior, _: None) -> tuple[Interior, Reduced]:
+    """Send the matrix and the right-hand side again, to a driver that was started again."""
+    return robot, robot.system.reduced(robot.system.right)
+
+
+def _factorized(
+    robot: Interior, block: RecursionBlock, x: Array | None = None
+) -> tuple[Interior, Reduced]:
+    """Eliminate M + D/2 for the penalties of a block."""
+    problem = robot.part.problem
+    data = problem.M.data.copy()
+    positions = problem.diagonal_positions[robot.interior_rows]
+    data[positions] += 0.5 * block.rho
+    if robot.factored.grounds:
+        # As in `Driver.grounding_block`: a shift of all translations costs nothing.
+        data[problem.diagonal_positions[0]] *= 2.0
+    K = problem.with_pattern_of_M(data)
+    eliminated, system = robot.eliminate(K, robot.widths, _pull(robot, block))
+    following = eliminated.in_session(RecursionSession(system=system, block=block, x=x))
+    return following, system.reduced(system.right)
+
+
+def _pull(robot: Interior, block: RecursionBlock) -> Array:
+    """Compute D/2 (omega - B), (side, d)."""
+    problem = robot.part.problem
+    b = np.zeros((problem.side, problem.d))
+    b[robot.interior_rows] = (0.5 * block.rho)[:, None] * block.shift
+    return b
+
+
+def _rotations(robot: Interior, omega: Array) -> Array:
+    """Return omega of the part's poses, (p, d, d), from the block and the driver's rows."""
+    block = robot.session(RecursionSession).block
+    R = np.empty_like(robot.poses.R)
+    R[robot.part.interior] = unstack_transposes(block.omega)
+    R[robot.part.boundary] = unstack_transposes(omega)
+    return R

@@ -11,6 +11,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.robots.records import Reweigh, RobotAscent
 from solvers.robots.system import System
+from solvers.soc.recursion_block import RecursionBlock
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,3 +49,11 @@ class DescentSession(Session):
     """
 
     step: tuple[Array, Array] | None = None  # (p, .), (p, d): of rotations, of translations
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecursionSession(Session):
+    """SOC: the system of step (a), and the rotations of the interior in the recursion."""
+
+    block: RecursionBlock
+    x: Array | None = None  # (side, d): of the last step (a); None before the first

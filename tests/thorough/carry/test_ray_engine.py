@@ -31,7 +31,7 @@ from solvers.carry import ray_engine
 from solvers.carry.ray_engine import connect
 from solvers.carry.recovery import Recovery
 from solvers.cli import app as cli
-from solvers.robots import recursion
+from solvers.robots import soc as substructured
 from solvers.robots.agent import Agent, order_interior
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.soc import WARM_START
@@ -213,7 +213,8 @@ def test_errors_of_robots_arrive_as_what_they_are(graph):
             NotPositiveDefiniteError, match=r"^the matrix has nan or inf; check the weights"
         ):
             pool.ask(
-                partial(order_interior, recursion.penalize), [PenaltyOrder(np.nan, np.nan, np.nan)]
+                partial(order_interior, substructured.penalize),
+                [PenaltyOrder(np.nan, np.nan, np.nan)],
             )
     finally:
         pool.close()

@@ -46,7 +46,7 @@ from solvers import (
     run,
     solve,
 )
-from solvers.robots import recursion
+from solvers.robots import soc as substructured
 from solvers.robots.consensus import ConsensusSOC, RobotsOfDriver
 from solvers.robots.driver import Driver, collect
 from solvers.soc.anderson import Anderson
@@ -240,7 +240,7 @@ def test_solve_and_soc_have_the_same_robots() -> None:
     engine = Recording()
     solution = solve(graph, pipeline, robots=Robots(3, engine=engine))  # so many are SOC's
     assert solution.robots is three
-    assert engine.times(ConsensusRobot.turn, recursion.penalize) == 0
+    assert engine.times(ConsensusRobot.turn, substructured.penalize) == 0
     assert engine.times(ConsensusRobot.step) == solution.stages[1].iterations > 0
     same = Partition(three.robot.copy(), three.method)
     assert solve(graph, pipeline, robots=same).gap == solution.gap

@@ -37,7 +37,7 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
 from solvers import InProcess, Pipeline, Robots, Solution, solve
 from solvers.place import AUTO, FirstStage
-from solvers.robots import newton, recursion, start, translations
+from solvers.robots import newton, soc as substructured, start, translations
 from solvers.robots.driver import collect
 from solvers.robots.proof_of_robot import fits_part, move_proof, prove_interior
 from solvers.robots.setup import open_driver
@@ -158,14 +158,14 @@ def test_the_ledger_counts_what_was_sent(
             start.project,
             start.turn_by,
             translations.set_translations,
-            recursion.penalize,
-            recursion.rescale,
-            recursion.solve,
+            substructured.penalize,
+            substructured.rescale,
+            substructured.solve,
         ),
-        *(recursion.finish, newton.move, newton.evaluate_trial, newton.move_straight, *PROOF),
+        *(substructured.finish, newton.move, newton.evaluate_trial, newton.move_straight, *PROOF),
     )
     assert ledger.rounds == engine.times(*counted)
-    assert ledger.all_reduces == engine.times(recursion.agree)
+    assert ledger.all_reduces == engine.times(substructured.agree)
     last = solution.stages[-1].history.records[-1].measurement
     assert last.rounds == ledger.rounds - engine.times(*PROOF)
 
