@@ -21,8 +21,16 @@ PAGE_CONFIG: dict[str, object] = {
 # Plotly's slider answers the pointer alone. With the figure in focus the arrows step, Home and End
 # go to the first and the last frame, and the space bar plays and stops. What the figure shows is
 # read out from its description and from a line that follows the slider.
+# Plotly draws before a page is laid out, and then hears of changes of the window alone: here every
+# figure follows the width of what it is in. An animation that another one breaks off is a promise
+# that is rejected, which is no error.
 FILM_KEYS = """
 document.querySelectorAll('.plotly-graph-div').forEach(function (film) {
+  if (!film.dataset.followsWidth) {
+    film.dataset.followsWidth = 'yes';
+    const fit = function () { Plotly.Plots.resize(film).catch(function () {}); };
+    new ResizeObserver(fit).observe(film.parentElement);
+  }
   const layout = film.layout || {};
   const steps = layout.sliders && layout.sliders.length ? layout.sliders[0].steps : [];
   const description = layout.meta && layout.meta.description;
@@ -43,7 +51,8 @@ document.querySelectorAll('.plotly-graph-div').forEach(function (film) {
   const say = function (frame) { status.textContent = frame; };
   const show = function (k) {
     const frame = steps[Math.max(0, Math.min(steps.length - 1, k))].args[0][0];
-    Plotly.animate(film, [frame], steps[0].args[1]).then(function () { say(frame); });
+    const shown = Plotly.animate(film, [frame], steps[0].args[1]);
+    shown.then(function () { say(frame); }, function () {});
   };
   film.on('plotly_sliderchange', function (event) { say(event.step.args[0][0]); });
   film.addEventListener('keydown', function (event) {
@@ -53,7 +62,7 @@ document.querySelectorAll('.plotly-graph-div').forEach(function (film) {
     if (event.key === ' ') {
       const buttons = layout.updatemenus[0].buttons;
       isPlaying = !isPlaying;
-      Plotly.animate(film, ...buttons[isPlaying ? 0 : 1].args);
+      Plotly.animate(film, ...buttons[isPlaying ? 0 : 1].args).catch(function () {});
       event.preventDefault();
     }
   });
@@ -68,8 +77,10 @@ def save_page(figure: Figure, path: Path | str) -> None:
     written below it. Errors are those of `replace_when_done`.
     """
     body = figure_html(figure, script=True, height="92vh")
+    title = figure.layout.title.text or Path(path).stem
     page = (
-        '<!DOCTYPE html><html><head><meta charset="utf-8" />'
+        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8" />'
+        f"<title>{html.escape(title)}</title>"
         '<meta name="viewport" content="width=device-width, initial-scale=1" />'
         f"</head><body>{body}</body></html>"
     )

@@ -195,7 +195,7 @@ PICTURE = f"JSON.stringify({FILM}._fullData.map(d => [d.x, d.y]))"
 STATUS = "document.querySelector('.film-status').textContent"
 
 
-@pytest.mark.parametrize("width", [1150, 390])
+@pytest.mark.parametrize("width", [390, 768, 1280, 1920])
 def test_a_film_of_a_notebook_is_seen_and_moves_by_a_key(width, browser, site):
     with browser.showing(width, "light"):
         browser.open(site / "notebooks" / "01_quickstart.html")
@@ -211,6 +211,9 @@ def test_a_film_of_a_notebook_is_seen_and_moves_by_a_key(width, browser, site):
         )
         assert 0 <= left < right <= width
         assert height > 200
+        # Plotly draws before the page is laid out, and then follows the column.
+        drawn = f"{FILM}.querySelector('.main-svg').clientWidth"
+        browser.wait_for(f"{drawn} === {FILM}.clientWidth")
         first = browser.value(PICTURE)
         browser.value(f"{FILM}.focus()")
         for kind in ("keyDown", "keyUp"):
@@ -220,6 +223,10 @@ def test_a_film_of_a_notebook_is_seen_and_moves_by_a_key(width, browser, site):
         browser.wait_for(f"{PICTURE} !== {json.dumps(first)}")
         slider = f"{FILM}._fullLayout.sliders[0]"
         assert browser.value(f"{slider}.active === {slider}.steps.length - 1")
+        for kind in ("keyDown", "keyUp", "keyDown", "keyUp"):  # play and stop
+            key = {"type": kind, "key": " ", "code": "Space", "windowsVirtualKeyCode": 32}
+            browser.call("Input.dispatchKeyEvent", key)
+        browser.value("new Promise(done => setTimeout(done, 500))")
         opened_without_complaint(browser)
 
 

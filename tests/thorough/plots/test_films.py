@@ -131,6 +131,7 @@ def test_a_film_needs_methods_and_translations() -> None:
 def test_a_page_says_in_words_what_a_film_shows(tmp_path) -> None:
     film = pgo.animate([[POINT], [POINT]], ["a", "b"], description="A point <stays>.")
     save_page(film, tmp_path / "film.html")
+    assert "<title>" in (tmp_path / "film.html").read_text()
     text = (tmp_path / "film.html").read_text(encoding="utf-8")
     assert "<p>A point &lt;stays&gt;.</p>" in text
     assert json.dumps("A point <stays>.").replace("<", "\\u003c").replace(">", "\\u003e") in text
