@@ -265,7 +265,7 @@ class RunMonitor:
             raise SettingError(f"time_limit is {self.time_limit}; give positive seconds")
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds that are left, always positive.
 
         A run compares them with the clock after its first state.

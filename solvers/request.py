@@ -131,7 +131,7 @@ class Pipeline:
         Parameters
         ----------
         step : Step
-            A step of `solvers.plan` after the first attempt.
+            A step of `solvers.plan` that is taken where the settings ask for it (`improved`).
 
         Returns
         -------
@@ -142,9 +142,7 @@ class Pipeline:
         search = self.handedness
         has_relaxation = self.staircase is not None
         return {
-            Step.AGAIN: True,
             Step.GROWING: self.growing is not None,
-            Step.LAST_STEPS: True,
             Step.SECOND: self.second_try,
             Step.STAIRCASE: has_relaxation,
             Step.SMALLER_MATRICES: has_relaxation,

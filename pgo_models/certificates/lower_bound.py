@@ -526,7 +526,7 @@ class ProofPoint(Protocol):
         """Value of the certificate, tr(X'^T S X') + tr(Lambda) + constant."""
 
     @property
-    def left(self) -> float:
+    def estimated_loss(self) -> float:
         """Estimate of the loss tr(G_r^T S_r^-1 G_r): `quadratic_loss` without an error of G_r."""
 
     @property
@@ -547,11 +547,11 @@ def move_until_settled(point: P, move: Callable[[P], tuple[P, float]]) -> P:
         of_value = SETTLED * abs(point.value)
         of_gains = NEGLIGIBLE * gained
         of_rounding = HIDDEN * point.quadratic
-        if point.left <= max(of_value, of_gains, of_rounding):
+        if point.estimated_loss <= max(of_value, of_gains, of_rounding):
             break
         moved, gain = move(point)
         gained += gain
-        if not moved.left < point.left:
+        if not moved.estimated_loss < point.estimated_loss:
             break
         point = moved
     return point
@@ -568,11 +568,11 @@ class _Point:
     X: Array
     low: Array
     product: Array
-    # Of the certificate. None at the first point, whose losses are not known: `left` is infinite
-    # there, so that the first point is moved in any case.
+    # Of the certificate. None at the first point, whose losses are not known: `estimated_loss` is
+    # infinite there, so that the first point is moved in any case.
     evaluation: Evaluation | None
     value: float = 0.0
-    left: float = math.inf
+    estimated_loss: float = math.inf
     quadratic: float = 0.0
 
 
@@ -604,7 +604,7 @@ def _moved(
     free = proof.free
     product, product_error = unknowns.gradient(evaluation.product, evaluation.product_error)
     slack = proof.slack[free]
-    left = quadratic_loss(product[free], 0.0, slack)
+    estimated_loss = quadratic_loss(product[free], 0.0, slack)
     quadratic = quadratic_loss(product[free], product_error[free], slack)
     moved = _Point(
         X=X,
@@ -612,7 +612,7 @@ def _moved(
         product=evaluation.product,
         evaluation=evaluation,
         value=evaluation.value,
-        left=left,
+        estimated_loss=estimated_loss,
         quadratic=quadratic,
     )
     return moved, gain

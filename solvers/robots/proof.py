@@ -217,9 +217,9 @@ class CoverProof:
         return self.sums.value
 
     @property
-    def left(self) -> float:
+    def estimated_loss(self) -> float:
         """About what is lost to G = S X."""
-        return self.sums.left
+        return self.sums.estimated_loss
 
     @property
     def quadratic(self) -> float:
@@ -269,14 +269,14 @@ def _sum_up(
     value_error = exact_sum(part.value_error for part in parts)
     value_error += blocks.value_error + UNIT_ROUNDOFF * abs(value)
     slack = proof.slack[free]
-    loss = exact_sum(part.left for part in parts)
+    loss = exact_sum(part.estimated_loss for part in parts)
     loss += central.quadratic_loss(product[free], 0.0, slack)
     quadratic = exact_sum(part.quadratic for part in parts)
     quadratic += central.quadratic_loss(product[free], error[free], slack)
     return ProofSums(
         value=value,
         value_error=OUTWARD * value_error,
-        left=loss,
+        estimated_loss=loss,
         quadratic=OUTWARD * quadratic,
         squared_distances=exact_sum(part.squared_distances for part in parts),
         product=product_on_cover,

@@ -50,7 +50,7 @@ class ProofSums:
     value: float
     value_error: float
     # sums of |G|^2 and (|G| + its error)^2 over slack in the interior, G the rows of S X
-    left: float
+    estimated_loss: float
     quadratic: float
     squared_distances: float  # which an eta costs
     # ((d+1) g, d): rows of S X on the boundary, and their errors
@@ -217,7 +217,7 @@ class RobotProof:
         sums = ProofSums(
             value=at_X.value,
             value_error=at_X.value_error + OUTWARD * lost,
-            left=quadratic_loss(G, 0.0, self.slack),
+            estimated_loss=quadratic_loss(G, 0.0, self.slack),
             quadratic=quadratic_loss(G, error, self.slack),
             squared_distances=squared_distances(self.X[rotations], self.start[rotations]),
             product=at_X.product[boundary],

@@ -456,7 +456,7 @@ class _RobustSolve:
 
     def _has_time(self) -> bool:
         monitor = self.places.request.monitor
-        return monitor.left >= _LAST_SHARE * monitor.time_limit
+        return monitor.seconds_left >= _LAST_SHARE * monitor.time_limit
 
     # Step 3: choice
 

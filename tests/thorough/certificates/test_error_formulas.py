@@ -358,7 +358,7 @@ def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(found.error, whole.product_error[boundary])
     assert (found.value, found.value_error) == (whole.value, whole.value_error)
     size = np.abs(whole.product[inside]) + whole.product_error[inside]
-    assert found.quadratic >= ENOUGH * np.sum(size**2 / slack[:, None]) > 3.0 * found.left
+    assert found.quadratic >= ENOUGH * np.sum(size**2 / slack[:, None]) > 3.0 * found.estimated_loss
     away = np.linalg.norm((X - start)[n + 6 :].reshape(-1, 9), axis=1)
     assert found.squared_distances >= ENOUGH * np.sum((np.sqrt(8.0) + away) ** 2)
 
