@@ -162,8 +162,8 @@ class Driver:
         """Start the robots, unless `open_pool` returns a pool whose robots are at work already.
 
         `memory` is the largest number of bytes that the interface may take; a SettingError if it
-        would take more. The value 0 selects a run without a driver (`robots_alone`): no interface
-        is built or solved, and this object only carries the messages of the robots and adds up.
+        would take more. The value 0 selects a run without a driver (`place_without_driver`): no
+        interface is built or solved, and this object only carries messages and adds up.
         `backend` factors the interface.
         """
         self.num_poses = num_poses

@@ -1,9 +1,9 @@
 """A robot that loads its own file: what it knows, order by order, until it is one like any other.
 
 The orders stand below in the sequence in which they are given: `read_file`, `number_poses`,
-`join_neighbours`, those of `own_consistency` where edges are judged, `take_cost`, `place_cover`;
+`join_neighbours`, those of `consistency` where edges are judged, `take_cost`, `place_cover`;
 then, after the solve, `keep_answer`, `return_to_answer`, `move_answer` and `write_answer`. Where
-edges are judged again those of `own_revision` follow `keep_answer`, and go on with `take_cost`.
+edges are judged again those of `revision` follow `keep_answer`, and go on with `take_cost`.
 `solvers.robots.setup` gives them.
 """
 
