@@ -9,7 +9,8 @@ Where Newton is at a stationary point of a rank, the driver proves a bound
 S + eta blockdiag(0, I), and inverse iteration with it finds the direction down: one round for the
 first vector, and one for every further one (`follow_direction`). The robots then append a dimension
 to their poses (`go_upwards`) and try lengths along the direction (`try_climb`), a round each.
-`round_lifted` ends the staircase with two rounds more.
+`round_lifted` ends the staircase with three rounds more: the sum of R R^T, the rounded rotations,
+and their best translations.
 
 The driver's method stands first; the robot's orders (Rosen et al. 2019) are below it.
 """
@@ -239,7 +240,7 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
     """Find the eigenvector of the smallest eigenvalue of Q - Lambda, whose rotations have norm 1.
 
     The answer is that vector on the cover, (side, 1), what robots find theirs by, and the length at
-    which its largest block turns by 45 degrees. It is inverse iteration, two rounds each, with an
+    which its largest block turns by 45 degrees. It is inverse iteration, a round each, with an
     eta that hardly makes Q - Lambda + eta I definite: the eigenvalue of its inverse is far above
     all others. The translations are the best ones.
     """
