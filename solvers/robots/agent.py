@@ -17,10 +17,12 @@ from solvers.carry.messages import Snapshot
 from solvers.carry.moments import Recall
 from solvers.carry.serialization import deserialize, serialize
 from solvers.robots.interior import Interior, interior_of
+from solvers.robots.newton import DescentSession
 from solvers.robots.proof_of_robot import ProofSession, RobotProof
 from solvers.robots.records import Reweigh, RobotAscent
+from solvers.robots.soc import RecursionSession
 from solvers.robots.start import AveragingSession
-from solvers.robots.state import DescentSession, InteriorState, RecursionSession, Session
+from solvers.robots.state import InteriorState, Session
 from solvers.robots.system import System
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
 from solvers.soc.consensus_robot import ConsensusRobot
@@ -232,16 +234,6 @@ def _states(held: Held) -> HeldStates:
 
 
 # Orders are functions of an agent and a request, some of them once their first argument is given.
-
-
-def order_interior(
-    order: Callable[[Interior, Q], tuple[Interior, A]], agent: Agent, request: Q
-) -> A | None:
-    """Give the interior an order; None if the robot counts no edge."""
-    if agent.interior is None:
-        return None
-    agent.interior, answer = order(agent.interior, request)
-    return answer
 
 
 def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: Agent, request: Q) -> A:

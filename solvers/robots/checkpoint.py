@@ -55,7 +55,7 @@ from solvers.soc.soc import SOC
 S = TypeVar("S")
 JudgedPoses = tuple[Poses, Certificate]
 # First line of a file; the second is the SHA-256 of all that follows.
-_FORMAT = b"pgo-splitting checkpoint 7\n"
+_FORMAT = b"pgo-splitting checkpoint 8\n"
 _DIGEST_SIZE = 65  # 64 hexadecimal digits and the end of the line
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")

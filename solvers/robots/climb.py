@@ -34,6 +34,7 @@ from solvers.riemannian.staircase import Staircase
 from solvers.robots.driver import CoverPoses, Driver, collect
 from solvers.robots.interior import Interior
 from solvers.robots.newton import (
+    DescentSession,
     Move,
     SubstructuredNewton,
     SubstructuredNewtonState,
@@ -41,7 +42,6 @@ from solvers.robots.newton import (
 )
 from solvers.robots.proof import eliminate_S, prove_with_eta
 from solvers.robots.records import CostParts, ReducedTranslations, RightHandSide
-from solvers.robots.state import DescentSession
 from solvers.robots.translations import reduce_translations
 
 # Decrement at which an indefinite Hessian is left by a climb, not by descent, while the rank is

@@ -40,11 +40,13 @@ Rows on the cover have the same layout, with g in place of n. chi2 is not quadra
 matrix of its tangent, the quadratic cost that equals chi2 to first order at the current poses.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar, cast
+from typing import Protocol, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -69,7 +71,6 @@ from solvers.carry.moments import Moment
 from solvers.carry.process import DEFAULT_MEMORY, WorkerPool
 from solvers.result import Measurement
 from solvers.robots import current_poses, start, translations
-from solvers.robots.agent import order_interior
 from solvers.robots.interface import Interface, InterfaceFactor, Separators
 from solvers.robots.interior import Interior
 from solvers.robots.records import (
@@ -562,3 +563,19 @@ def collect(driver: Driver) -> tuple[Poses, Array]:
         t[answer.poses] = answer.t
         Lambda[answer.poses] = answer.Lambda
     return poses_from(R, t), Lambda
+
+
+class HoldsInterior(Protocol):
+    """A robot as the driver gives it orders: `solvers.robots.agent.Agent`."""
+
+    interior: Interior | None
+
+
+def order_interior(
+    order: Callable[[Interior, Q], tuple[Interior, A]], agent: HoldsInterior, request: Q
+) -> A | None:
+    """Give the interior an order; None if the robot counts no edge."""
+    if agent.interior is None:
+        return None
+    agent.interior, answer = order(agent.interior, request)
+    return answer

@@ -58,7 +58,7 @@ from solvers.robots.records import (
     ReducedTranslations,
     RightHandSide,
 )
-from solvers.robots.state import DescentSession
+from solvers.robots.state import Session
 from solvers.robots.translations import reduced_translations, translations
 
 
@@ -332,6 +332,16 @@ class TrialEvaluation:
 
     at: CostParts
     gradient: RightHandSide
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DescentSession(Session):
+    """Newton, or a climb of the staircase: a direction, and the trial that it led to.
+
+    A climb has no system: its direction comes from a proof's.
+    """
+
+    step: tuple[Array, Array] | None = None  # (p, .), (p, d): of rotations, of translations
 
 
 def reduce_model(robot: Interior, order: ModelOrder) -> tuple[Interior, Reduced | None]:

@@ -46,8 +46,9 @@ from pgo_models.problem.weighting import (
     convex_cost,
     is_isotropic,
 )
-from solvers.robots.agent import Agent, held_poses, order_interior
+from solvers.robots.agent import Agent, held_poses
 from solvers.robots.current_poses import set_poses
+from solvers.robots.driver import order_interior
 from solvers.robots.interior import Interior
 from solvers.soc.subgraph import PartProblem, Placement, RobotSummary, Subgraph
 

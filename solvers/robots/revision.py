@@ -36,7 +36,7 @@ from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
 from solvers.result import Stage
 from solvers.robots import current_poses
-from solvers.robots.agent import Agent, held_poses, order_interior
+from solvers.robots.agent import Agent, held_poses
 from solvers.robots.consistency import (
     ConsistentPart,
     edges_between,
@@ -47,7 +47,7 @@ from solvers.robots.consistency import (
     own_odometry,
     with_edges,
 )
-from solvers.robots.driver import Driver
+from solvers.robots.driver import Driver, order_interior
 from solvers.robots.own_file import Border, JoinedFile, PlacedFile, border_of
 from solvers.robots.reweigh import SharedGNC, stage_of, sum_truncated
 from solvers.robots.setup import OpenedFiles

@@ -42,7 +42,7 @@ from solvers.robots.records import (
     RescaleInterior,
     RightHandSide,
 )
-from solvers.robots.state import RecursionSession
+from solvers.robots.state import Session
 from solvers.robots.translations import reduce_translations
 from solvers.soc.copies import Norms, subsampled
 from solvers.soc.penalty import PenaltyOrder
@@ -263,6 +263,14 @@ def _factorize(
 
 
 # The robot's orders.
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecursionSession(Session):
+    """SOC: the system of step (a), and the rotations of the interior in the recursion."""
+
+    block: RecursionBlock
+    x: Array | None = None  # (side, d): of the last step (a); None before the first
 
 
 def report_norms(robot: Interior, step: int | None) -> tuple[Interior, Norms]:

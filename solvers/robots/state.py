@@ -11,7 +11,6 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.robots.records import Reweigh, RobotAscent
 from solvers.robots.system import System
-from solvers.soc.recursion_block import RecursionBlock
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,21 +38,3 @@ class InteriorState:
     has_sent_laplacian: bool = False  # whether the driver has the matrix of the translations
     terms: HandednessTerms | None = None  # of its edges, for proofs with them
     ascent: RobotAscent | None = None  # the search for such terms
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DescentSession(Session):
-    """Newton, or a climb of the staircase: a direction, and the trial that it led to.
-
-    A climb has no system: its direction comes from a proof's.
-    """
-
-    step: tuple[Array, Array] | None = None  # (p, .), (p, d): of rotations, of translations
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RecursionSession(Session):
-    """SOC: the system of step (a), and the rotations of the interior in the recursion."""
-
-    block: RecursionBlock
-    x: Array | None = None  # (side, d): of the last step (a); None before the first

@@ -17,7 +17,8 @@ from solvers import GNC, Checkpoint
 from solvers.carry.serialization import deserialize, serialize
 from solvers.result import Stage
 from solvers.robots import current_poses
-from solvers.robots.agent import CLASSES, Agent, order_interior
+from solvers.robots.agent import CLASSES, Agent
+from solvers.robots.driver import order_interior
 from solvers.robots.records import Reweigh
 from solvers.robots.reweigh import reweigh
 from solvers.robust.known import odometry
