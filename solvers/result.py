@@ -2,7 +2,7 @@
 
 import enum
 from dataclasses import dataclass, field, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -272,7 +272,7 @@ class Stage(Summarised):
         return self.status.name if self.was_taken else f"skipped: {self.reason}"
 
     @classmethod
-    def of(cls, run: Run[S]) -> "Stage":
+    def of(cls, run: Outcome[Any]) -> "Stage":
         """Return the stage of a finished run."""
         return cls(
             run.name,

@@ -1,6 +1,6 @@
 """The search for handedness terms: an ascent at given poses, and the relaxation with hulls."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from pgo_models.certificates.dual_variables import multipliers
@@ -72,13 +72,4 @@ class HandednessSearch:
 
 def stage_of_search(outcome: Outcome[S]) -> Stage:
     """Stage of a search for a bound, which a time limit or Ctrl-C may end, but no failure."""
-    return Stage(
-        outcome.name,
-        outcome.status,
-        outcome.iterations,
-        outcome.objective,
-        outcome.seconds,
-        outcome.history,
-        outcome.method,
-        finds_poses=False,
-    )
+    return replace(Stage.of(outcome), finds_poses=False)

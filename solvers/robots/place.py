@@ -66,7 +66,7 @@ from solvers.robots.revision import go_to_poses_found
 from solvers.robots.reweigh import SharedGNC, inliers_of
 from solvers.robots.soc import SubstructuredSOC
 from solvers.robots.translations import reduce_translations
-from solvers.robots.trees import tree_traffic
+from solvers.robots.trees import hand_out_along_tree
 from solvers.robust.gnc import GNC, Inliers
 from solvers.robust.known import KnownEdges
 from solvers.robust.weighted_edges import first_poses
@@ -291,15 +291,8 @@ class PlaceOfRobots(Place):
 
     def _add_stage(self, name: str, finished: Outcome[Any], method: object) -> None:
         """Write down a run that has ended at the current poses, with the settings of its method."""
-        stage = Stage(
-            name,
-            finished.status,
-            finished.iterations,
-            self.driver.current.objective,
-            finished.seconds,
-            finished.history,
-            method,
-        )
+        objective = self.driver.current.objective
+        stage = replace(Stage.of(finished), name=name, objective=objective, method=method)
         self.table.add(stage)
 
     def certify(self, attempt: Attempt) -> Attempt:
@@ -432,9 +425,7 @@ class PlaceOfRobots(Place):
         problem = self.known_here.problem
         if start is None:
             known = KnownEdges.of(problem.graph, gnc.known).edges
-            driver.hand_out(first_poses(problem.graph, known))
-            for traffic in tree_traffic(problem, self.owners):
-                driver.network.ledger = driver.network.ledger.after_round(traffic)
+            hand_out_along_tree(driver, problem, self.owners, first_poses(problem.graph, known))
         else:
             driver.hand_out(start)
         driver.choose_cost(final=True)

@@ -38,7 +38,7 @@ from solvers.robots.consensus import (
 )
 from solvers.robots.driver import Driver
 from solvers.robots.place import PlaceOfRobots
-from solvers.robots.trees import robot_tree, tree_traffic
+from solvers.robots.trees import hand_out_along_tree, robot_tree
 from solvers.soc.consensus import ConsensusState, ask_all
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.recursion_block import Rotations
@@ -111,9 +111,7 @@ class RobotsAlone(PlaceOfRobots):
         problem = self.known_here.problem
         driver = self.driver
         tree_poses = spanning_tree_start(problem.graph)
-        driver.hand_out(tree_poses)
-        for traffic in tree_traffic(problem, owners):
-            driver.network.ledger = driver.network.ledger.after_round(traffic)
+        hand_out_along_tree(driver, problem, owners, tree_poses)
         loose = replace(
             soc, local_passes=1, tolerance=_START_TOLERANCE, max_iterations=_START_ROUNDS
         )
@@ -150,9 +148,8 @@ class RobotsAlone(PlaceOfRobots):
         poses, status = cheaper_end(problem, attempt.known_poses, end, outcome, soc.tolerance)
         objective = problem.objective(poses)
         seconds = time.perf_counter() - began
-        self.table.add(
-            Stage("SOC", status, outcome.iterations, objective, seconds, outcome.history, soc)
-        )
+        stage = replace(Stage.of(outcome), name="SOC", status=status, objective=objective)
+        self.table.add(replace(stage, seconds=seconds, method=soc))
         self.monitor.poses_found.append(poses)
         return Attempt(poses, status)
 

@@ -203,15 +203,7 @@ def inliers_of(
 
 def stage_of(gnc: GNC, finished: Outcome[SharedGNCState]) -> Stage:
     """What a run did."""
-    return Stage(
-        "GNC",
-        finished.status,
-        finished.iterations,
-        finished.objective,
-        finished.seconds,
-        finished.history,
-        gnc,
-    )
+    return replace(Stage.of(finished), name="GNC", method=gnc)
 
 
 # Orders to a robot's interior.

@@ -4,11 +4,13 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
+from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import spanning_tree
 from pgo_models.problem.problem import PGOProblem
 from solvers.carry.ledger import BYTES_PER_NUMBER, Traffic
+from solvers.robots.driver import Driver
 
 
 def robot_tree(problem: PGOProblem, robots: Partition) -> tuple[IntArray, IntArray]:
@@ -24,6 +26,15 @@ def robot_tree(problem: PGOProblem, robots: Partition) -> tuple[IntArray, IntArr
     order, parents = breadth_first_order(adjacency, 0, directed=False)
     parents[0] = 0
     return order, parents
+
+
+def hand_out_along_tree(
+    driver: Driver, problem: PGOProblem, robots: Partition, poses: Poses
+) -> None:
+    """Bring the robots to poses that each learns along a spanning tree, whose rounds count."""
+    driver.hand_out(poses)
+    for traffic in tree_traffic(problem, robots):
+        driver.network.ledger = driver.network.ledger.after_round(traffic)
 
 
 def tree_traffic(problem: PGOProblem, robots: Partition) -> list[Traffic]:
