@@ -486,23 +486,8 @@ def certify_with(
         problem.weighting if isinstance(problem.weighting, Weighting) else Weighting.ISOTROPIC
     )
     judgement = judge_cost(repr(problem), objective, rounding, bound, gap)
-    return Certificate(
-        objective=judgement.objective,
-        bound=judgement.bound,
-        gap=judgement.gap,
-        rounding_level=rounding.level,
-        stationarity=stationarity,
-        source=source,
-        poses=poses,
-        poses_objective=objective,
-        Lambda=Lambda,
-        wanted_gap=gap,
-        verdict=judgement.verdict,
-        weighting=weighting,
-        objective_error=rounding.error,
-        has_translations=problem.has_translations,
-        fit=rounding.fit,
-        weights_error=rounding.weights_error,
+    return judgement.certificate(
+        gap, stationarity, source, poses, Lambda, weighting, problem.has_translations
     )
 
 
@@ -530,6 +515,36 @@ class Judgement:
     bound: LowerBound
     gap: float
     verdict: Verdict
+
+    def certificate(
+        self,
+        wanted_gap: float,
+        stationarity: float,
+        source: BoundSource,
+        poses: Poses,
+        Lambda: Array,
+        weighting: Weighting,
+        has_translations: bool = True,
+    ) -> Certificate:
+        """Certificate of the poses that were judged; the rest as in `Certificate`."""
+        return Certificate(
+            objective=self.objective,
+            bound=self.bound,
+            gap=self.gap,
+            rounding_level=self.rounding.level,
+            stationarity=stationarity,
+            source=source,
+            poses=poses,
+            poses_objective=self.objective,
+            Lambda=Lambda,
+            wanted_gap=wanted_gap,
+            verdict=self.verdict,
+            weighting=weighting,
+            objective_error=self.rounding.error,
+            has_translations=has_translations,
+            fit=self.rounding.fit,
+            weights_error=self.rounding.weights_error,
+        )
 
     def of(self, certificate: Certificate) -> Certificate:
         """The certificate with this judgement of its poses in place of its own."""

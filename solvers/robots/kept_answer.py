@@ -91,22 +91,8 @@ class AnswerAtRobots:
         kept = self.known
         no_poses = Poses.identity(0, kept.cover.R.shape[2])
         judgement = judge_cost(self.name, kept.objective, kept.rounding, bound, self.gap)
-        return Certificate(
-            objective=judgement.objective,
-            bound=judgement.bound,
-            gap=judgement.gap,
-            rounding_level=kept.rounding.level,
-            stationarity=kept.decrement,
-            source=source,
-            poses=no_poses,
-            poses_objective=kept.objective,
-            Lambda=no_poses.R,
-            wanted_gap=self.gap,
-            verdict=judgement.verdict,
-            weighting=self.weighting,
-            objective_error=kept.rounding.error,
-            fit=kept.rounding.fit,
-            weights_error=kept.rounding.weights_error,
+        return judgement.certificate(
+            self.gap, kept.decrement, source, no_poses, no_poses.R, self.weighting
         )
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
