@@ -126,7 +126,7 @@ def solve_folder(
     folder = locate(folder).absolute()
     _check_first_stage(pipeline.soc)
     _check_robots(robots)
-    check_robust(robust)
+    _check_robust(robust)
     if weighting is Weighting.ROTATIONS:
         raise SettingError(f"robots with files of their own solve for poses; {READ_HERE}")
     files = [OwnLines(robot, path) for robot, path in enumerate(g2o_files(folder))]
@@ -233,7 +233,7 @@ def _check_first_stage(soc: FirstStage) -> None:
         )
 
 
-def check_robust(robust: GNC | PCM | None) -> None:
+def _check_robust(robust: GNC | PCM | None) -> None:
     """Raise a SettingError for wrong edges that robots with own files cannot find."""
     if robust is not None and not takes_odometry(robust.known):
         raise SettingError(

@@ -27,7 +27,7 @@ from solvers.robots.setup import SOLVE_PARTS
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
-from solvers.solves.folder_solve import FilesOfRobots, check_robust
+from solvers.solves.folder_solve import FilesOfRobots
 from solvers.team.driving import Drive
 from solvers.team.measurements import Measurements
 from solvers.team.messages import Ended
@@ -82,7 +82,6 @@ class Member:
     def _solve_by_robots(self, drive: Drive) -> RobotsSolution:
         """The solution by robots with files of their own."""
         files = [OwnLines(place, _path_of(name)) for place, name in enumerate(drive.members)]
-        check_robust(self.robust)
         job = FilesOfRobots(
             "team", files, drive, DEFAULT_MEMORY, self.weighting, robust=self.robust
         )

@@ -222,12 +222,11 @@ class Robot:
     @property
     def poses(self) -> dict[int, tuple[Array, Array]]:
         """Rotation (d, d) and position (d,) of every pose of this robot, by id; none before."""
-        if self._member.known is None:
+        known = self._member.known
+        if known is None:
             return {}
-        poses = self._member.known.poses
-        return dict(
-            zip(self._member.known.ids.tolist(), zip(poses.R, poses.t, strict=True), strict=True)
-        )
+        poses = zip(known.poses.R, known.poses.t, strict=True)
+        return dict(zip(known.ids.tolist(), poses, strict=True))
 
     @property
     def solution(self) -> RobotsSolution | None:
@@ -240,18 +239,16 @@ class Robot:
 
         Where they are not known, there are none.
         """
-        if self._member.known is None or self._member.known.covariances is None:
+        known = self._member.known
+        if known is None or known.covariances is None:
             return {}
-        return dict(
-            zip(self._member.known.ids.tolist(), self._member.known.covariances, strict=True)
-        )
+        return dict(zip(known.ids.tolist(), known.covariances, strict=True))
 
     @property
     def rejected(self) -> list[tuple[int, int]]:
         """Ids of the ends of edges at this robot's poses that a robust solve has left out."""
-        if self._member.known is None:
-            return []
-        return [(i, j) for i, j in self._member.known.rejected.tolist()]
+        known = self._member.known
+        return [] if known is None else [(i, j) for i, j in known.rejected.tolist()]
 
     @property
     def covered(self) -> tuple[str, ...]:
@@ -369,9 +366,10 @@ class Robot:
         SettingError
             When there are no poses yet.
         """
-        if self._member.known is None:
+        known = self._member.known
+        if known is None:
             raise SettingError(f"{self.name} has no poses yet; a solve has to end before")
-        text = self._member.measurements.text_at(self._member.known.ids, self._member.known.poses)
+        text = self._member.measurements.text_at(known.ids, known.poses)
         with replace_when_done(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
 
