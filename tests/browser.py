@@ -146,6 +146,12 @@ class Browser:
         except Navigated:  # the page was left while it was asked; the next one will answer
             return False
 
+    def press(self, key: str, code: str, number: int) -> None:
+        """Press a key, of this name, place and number, and let it go."""
+        for kind in ("keyDown", "keyUp"):
+            event = {"type": kind, "key": key, "code": code, "windowsVirtualKeyCode": number}
+            self.call("Input.dispatchKeyEvent", event)
+
     def value(self, expression: str) -> object:
         """Value of a JavaScript expression."""
         answer = self.call(

@@ -216,16 +216,13 @@ def test_a_film_of_a_notebook_is_seen_and_moves_by_a_key(width, browser, site):
         browser.wait_for(f"{drawn} === {FILM}.clientWidth")
         first = browser.value(PICTURE)
         browser.value(f"{FILM}.focus()")
-        for kind in ("keyDown", "keyUp"):
-            key = {"type": kind, "key": "End", "code": "End", "windowsVirtualKeyCode": 35}
-            browser.call("Input.dispatchKeyEvent", key)
+        browser.press("End", "End", 35)
         browser.wait_for(f"{STATUS} !== ''")
         browser.wait_for(f"{PICTURE} !== {json.dumps(first)}")
         slider = f"{FILM}._fullLayout.sliders[0]"
         assert browser.value(f"{slider}.active === {slider}.steps.length - 1")
-        for kind in ("keyDown", "keyUp", "keyDown", "keyUp"):  # play and stop
-            key = {"type": kind, "key": " ", "code": "Space", "windowsVirtualKeyCode": 32}
-            browser.call("Input.dispatchKeyEvent", key)
+        browser.press(" ", "Space", 32)  # play
+        browser.press(" ", "Space", 32)  # stop
         browser.value("new Promise(done => setTimeout(done, 500))")
         opened_without_complaint(browser)
 

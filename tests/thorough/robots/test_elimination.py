@@ -35,6 +35,15 @@ from solvers.soc.subgraph import Part, split_graph
 SIZES = st.integers(2, 30)
 LIMITS = st.sampled_from([None, 0, 3, 1000])  # poses that a robot couples at most
 KINDS = st.sampled_from(["translations", "poses", "tangent"])
+any_split = given(
+    seed=SEEDS,
+    n=SIZES,
+    d=DIMENSIONS,
+    partitioner=PARTITIONERS,
+    kind=KINDS,
+    backend=BACKENDS,
+    most=LIMITS,
+)
 
 
 def widths_of(kind: str, d: int) -> tuple[int, ...]:
@@ -127,15 +136,7 @@ def side_of(problem: PGOProblem, kind: str) -> int:
 
 
 @settings(max_examples=examples(50))
-@given(
-    seed=SEEDS,
-    n=SIZES,
-    d=DIMENSIONS,
-    partitioner=PARTITIONERS,
-    kind=KINDS,
-    backend=BACKENDS,
-    most=LIMITS,
-)
+@any_split
 def test_elimination_and_back_substitution_solve_the_whole_system(
     seed: int,
     n: int,
@@ -179,15 +180,7 @@ def test_elimination_and_back_substitution_solve_the_whole_system(
 
 
 @settings(max_examples=examples(50))
-@given(
-    seed=SEEDS,
-    n=SIZES,
-    d=DIMENSIONS,
-    partitioner=PARTITIONERS,
-    kind=KINDS,
-    backend=BACKENDS,
-    most=LIMITS,
-)
+@any_split
 def test_robots_hold_the_matrix_between_them(
     seed: int,
     n: int,
@@ -223,15 +216,7 @@ def test_robots_hold_the_matrix_between_them(
 
 
 @settings(max_examples=examples(50))
-@given(
-    seed=SEEDS,
-    n=SIZES,
-    d=DIMENSIONS,
-    partitioner=PARTITIONERS,
-    kind=KINDS,
-    backend=BACKENDS,
-    most=LIMITS,
-)
+@any_split
 def test_the_whole_is_positive_definite_where_all_parts_of_it_are(
     seed: int,
     n: int,
