@@ -1,13 +1,14 @@
-"""Robots and their driver are set up: each is given its edges of a graph in memory, or has its own.
+"""The set-up of a driver and its robots: of a graph in memory, or of robots with own lines.
 
-`open_driver` cuts a graph that this process has. `open_files` has robots read their own lines, and
-the driver learns only the interface between them. It learns the ids of poses as runs of consecutive
-ids, so that it can number the poses, and of the edges between robots their ends, of which it
-computes a vertex cover. Measurements between two robots are messages between these robots, which
-the process of the driver delivers: they pass through its memory, and nothing of the driver reads
-them. A pose belongs to the first file with a VERTEX line of it, or else to the first file that
-names it. An edge that stands in several files counts once, as in `read_g2o`. What robots do is in
-`solvers.robots.own_file`.
+`open_driver` cuts a graph that this process has, and gives every robot its part. `open_files` has
+robots read their own lines. The driver then learns the ids of poses as runs of consecutive ids, so
+that it can number the poses; of the edges between robots their ends, of which it computes a vertex
+cover; counts of poses and edges, and which poses are connected; and in a robust solve how large the
+errors of each robot are and how many edges agree. Measurements between two robots are messages
+between these robots, which the process of the driver delivers: they pass through its memory, and
+nothing of the driver reads them. A pose belongs to the first file with a VERTEX line of it, or else
+to the first file that names it. An edge that stands in several files counts once, as in `read_g2o`.
+What robots do is in `solvers.robots.own_file`.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ class OpenedFiles:
     borders : sequence of Border
         What the robots have told of their edges to others.
     sizes : (2, num_robots) array
-        How many poses, and edges, every robot has.
+        Number of poses with an edge, and of edges, of every robot.
     folder : Path
         Where the files are.
     weighting : Weighting
@@ -111,7 +112,8 @@ class OpenedFiles:
     num_rejected : int
         Edges that robots have left out, as they do not agree with others.
     threshold_scale : float
-        Scale of the thresholds of a robust solve, for errors as they are among own poses.
+        Factor on the thresholds of GNC, below 1 where the closures within robots have clearly
+        smaller errors than their files claim.
     """
 
     driver: Driver
@@ -169,8 +171,9 @@ def open_files(
 ) -> OpenedFiles:
     """Have robots read these files, and agree on the cost that `weighting` stands for.
 
-    In a robust solve they leave out edges that do not agree pairwise. GNC, which takes all edges
-    back, begins with those of the `strongest_neighbours`, where they join all poses.
+    In a robust solve they leave out edges that do not agree pairwise. GNC judges these again later.
+    It begins with the edges of `strongest_neighbours` if they connect the graph, and otherwise with
+    those of all pairs of robots.
 
     Raises a FileFormatError for a file that cannot be read or has no pose of its own, and, unless
     the folder is trusted, for files that speak against being of one graph. Raises a GraphError if
@@ -229,7 +232,10 @@ def _placed(
     weighting: Weighting,
     folder: Path,
 ) -> tuple[Driver, IntArray]:
-    """Have robots with these borders take their places around a driver; and their sizes."""
+    """Driver of robots with these borders, and their sizes as in `OpenedFiles`.
+
+    Where the cost that is solved is not convex and quadratic for some robot, SOC runs on another.
+    """
     sizes = np.array([border.counts for border in borders]).T
     _check_connected(borders, num_poses - int(sizes[0].sum()), folder)
     pairs = np.concatenate([border.pairs for border in borders])
@@ -269,9 +275,9 @@ def _agreements(network: CountedPool, quantile: float, scale: float) -> list[Agr
 def strongest_neighbours(agreements: Sequence[AgreeingCounts]) -> list[IntArray]:
     """Neighbours of every robot with whom most edges agree.
 
-    A wrong edge agrees with itself, and so two robots that have no right ones keep some. The pairs
-    of robots here are those of a spanning tree with the largest numbers of edges that agree, and
-    those with as many as the weakest of the tree.
+    An edge agrees with itself, so that two robots keep some even if all between them are wrong. The
+    pairs of robots here are those of a spanning tree with the largest numbers of edges that agree,
+    and those with as many as the weakest of the tree.
     """
     num_robots = len(agreements)
     a = np.repeat(np.arange(num_robots), [len(each.neighbours) for each in agreements])

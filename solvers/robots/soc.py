@@ -1,20 +1,22 @@
 """SUBSTRUCTURED: the recursion of JOINT, with step (a) split by eliminating the robots' interiors.
 
-The iterates are those of JOINT up to rounding, whatever the number of robots: `solvers.soc.joint`
-is the recursion to read. Step (a) is K x = b with K = M + D/2 and b = D/2 (omega - B), where M has
-a robot's edges and D the penalties of its interior, zero on the rows of all other poses and of
-translations. The driver adds the penalties of the separators. An iteration goes as follows.
+The iterates are those of JOINT up to rounding, whatever the number of robots. `solvers.soc.joint`
+is the recursion to read: it has steps (a), (b) and (c), and what x, omega, B and rho are;
+`solvers.robots.driver` says what cover, boundary and interior are. Step (a) is K x = b with
+K = M + D/2 and b = D/2 (omega - B), where M has a robot's edges and D the penalties of its
+interior, zero on the rows of all other poses and of translations. The driver adds the penalties of
+the cover. An iteration goes as follows.
 
-1. The driver sums up the robots' right-hand sides, with their interiors eliminated, and solves for
-   x on the cover.
-2. Every robot is sent x on its boundary and solves for its interior (`solve`). It answers the sums
-   for the acceleration. Steps 1 and 2 are a round.
-3. Every robot is sent what the acceleration has chosen. It takes steps (b) and (c) in closed form
-   (`agree`), and answers sums of the residuals, which are an all-reduce, and its right-hand side of
-   the next step (a).
+1. The driver sums up the right-hand sides that the robots have reduced to the cover in step 3 of
+   the iteration before, and solves for x on the cover.
+2. It sends every robot x on its boundary. The robot solves for its interior (`solve`), and answers
+   sums for the acceleration. Steps 1 and 2 are a round.
+3. The driver sends every robot the choice of the acceleration. The robot takes steps (b) and (c) in
+   closed form (`agree`), and answers sums of the residuals and its next right-hand side. The ledger
+   counts the exchange as an all-reduce.
 
 Where rho changes the robots factor again (`rescale`), as at the start (`penalize`). The driver's
-method stands first; the robot's orders are below it.
+method stands first; below it are the functions that robots are ordered to call.
 """
 
 from __future__ import annotations

@@ -50,14 +50,14 @@ class RobotsAnswer:
 def answer_by_passes(
     opened: OpenedFiles, place: PlaceOfRobots, gnc: GNC, pipeline: Pipeline
 ) -> RobotsAnswer:
-    """The answer by a first attempt, and passes of GNC, each from the map of the one before.
+    """The answer by a first attempt, and passes of GNC, each from the poses of the one before.
 
-    The first attempt is of what agrees pairwise, and is gone on from whether it is certified or
-    not. From a certified map one last pass judges the edges near it, with the settings that have
-    found it. Without one there are passes with what agrees pairwise, with all edges, and with all
-    edges and tight thresholds; those that agree are all there are where the settings say so.
-    Thresholds follow the errors. The last map has the other steps of the pipeline, if it is not
-    certified.
+    The first attempt is of the edges that agree pairwise, and GNC continues from it in either case.
+    After a certified attempt one last pass judges the edges near its poses, with the settings of
+    the pass before. Otherwise passes judge the edges that agree pairwise, then all edges, then all
+    edges with tighter thresholds; with `gnc.consistent` every pass judges those that agree. The
+    `threshold_scale` of the robots multiplies the thresholds. If the last attempt is not certified,
+    the other steps of the pipeline follow.
     """
     newton_alone = pipeline.with_newton_alone(pipeline.newton)
     place = replace(place, is_on_the_way=True)
@@ -91,7 +91,10 @@ def answer_by_passes(
 
 
 def _after_pass(answer: RobotsAnswer, job: Pass, pipeline: Pipeline) -> RobotsAnswer:
-    """The answer after a pass, with the edges before where that finds nothing better."""
+    """The answer after one pass and another solve.
+
+    If the pass finds nothing better, that solve is of the edges before.
+    """
     revision = revised(answer.opened, job, answer.place.monitor)
     answer.place.table.add(revision.stage)
     start = "poses of GNC" if revision.is_better else answer.name_of_poses
