@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -174,7 +175,7 @@ def solution_for(request: SolveRequest) -> Solution:
     if request.robust is not None:
         from solvers.robust_solves.robust_solve import solve_robustly
 
-        return solve_robustly(request.robust, request)
+        return request.restarted(partial(solve_robustly, request.robust, request))
     return solution_by(solve_at, request)
 
 

@@ -10,6 +10,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from pgo_models.certificates.certificate import (
@@ -20,6 +23,7 @@ from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
+from solvers.carry.process import most_restarts, restarted
 from solvers.handedness.search import HandednessSearch
 from solvers.here import Here
 from solvers.loop import RunMonitor
@@ -30,7 +34,7 @@ from solvers.result import StageTable
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.riemannian.staircase import Staircase
-from solvers.robots.settings import Robots
+from solvers.robots.settings import Checkpoint, Robots
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC
 from solvers.solution import Solution
@@ -194,6 +198,24 @@ class SolveRequest:
         owners = robots_of_solve(self.pipeline.soc, self.robots.owners, self.problem.graph)
         return replace(self, robots=self.robots.with_owners(owners))
 
+    @contextmanager
+    def with_checkpoint(self) -> Iterator[SolveRequest]:
+        """The request with a checkpoint in a temporary file, where robots can be lost.
+
+        One that was asked for serves as well.
+        """
+        robots = self.robots
+        if robots is None or robots.checkpoint is not None or not most_restarts(robots.engine):
+            yield self
+            return
+        with TemporaryDirectory() as folder:
+            checkpoint = Checkpoint(Path(folder) / "checkpoint")
+            yield replace(self, robots=replace(robots, checkpoint=checkpoint))
+
+    def restarted(self, run: Callable[[], Solution]) -> Solution:
+        """Solution of a run, which begins again where it has lost robots."""
+        return restarted(None if self.robots is None else self.robots.engine, run)
+
     def open_place(self, gnc: GNC | None = None) -> AbstractContextManager[Place]:
         """Open the place of the request: robots if there are any, else this process.
 
@@ -294,8 +316,17 @@ class SolveRequest:
 
 
 def solution_by(page: Page, request: SolveRequest) -> Solution:
-    """Solution of a request by the steps of a page, at the place where it is to be solved."""
+    """Solution of a request by the steps of a page, at the place where it is to be solved.
+
+    Robots that are lost on the way start again, and all go on from the last checkpoint.
+    """
     request = request.with_partition()
+    with request.with_checkpoint() as request:
+        return request.restarted(partial(_solution_in_one_run, page, request))
+
+
+def _solution_in_one_run(page: Page, request: SolveRequest) -> Solution:
+    """Solution of a request by robots none of which is lost, or without robots."""
     with request.open_place() as place:
         best = page(place, request.pipeline, request.start)
         place.finish(best)

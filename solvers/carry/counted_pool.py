@@ -3,7 +3,7 @@
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from solvers.carry.ledger import DRIVER, Ledger, Traffic
 from solvers.carry.messages import count_bytes, restore, snapshot_bytes, take_snapshot
 from solvers.carry.moments import Moments, obey_after
 from solvers.carry.process import WorkerPool
-from solvers.carry.recovery import RecoveringPool
 
 Q = TypeVar("Q")
 A = TypeVar("A")
@@ -39,8 +38,6 @@ class CountedPool:
         self.ledger = Ledger(num_robots)
         # Every exchange that was counted, by its content: equal ones share one object.
         self._traffic: dict[bytes, Traffic] = {}
-        # Bytes, already on the ledger, of the snapshots that a recovering pool took unasked.
-        self._counted_snapshot_bytes = 0
         # Robots without a driver sum along a tree to its root: all of them, parents first, and the
         # parent of each.
         self.tree: tuple[IntArray, IntArray] | None = None
@@ -59,7 +56,8 @@ class CountedPool:
         other workers are counted when they are exchanged.
         """
         answers = self._obeyed(order, requests)
-        self._count_snapshots(answers if order is take_snapshot else [])
+        if order is take_snapshot:
+            self.ledger = self.ledger.after_snapshots(snapshot_bytes(cast(Any, answers)))
         if count is Count.OFF:
             return answers
         robots = np.arange(len(requests)) if robots is None else robots
@@ -108,15 +106,6 @@ class CountedPool:
         self.count(links[:, 0], links[:, 1], sizes, is_round=True)
         arrived = messages if channel is None else channel.carry(messages)
         return delivered(arrived, len(sent))
-
-    def _count_snapshots(self, asked_for: Sequence[Any]) -> None:
-        """Count snapshots asked for, and those that the pool took unasked since the last call."""
-        num_bytes = snapshot_bytes(asked_for)
-        if isinstance(self.workers, RecoveringPool):
-            num_bytes += self.workers.snapshot_bytes - self._counted_snapshot_bytes
-            self._counted_snapshot_bytes = self.workers.snapshot_bytes
-        if num_bytes:
-            self.ledger = self.ledger.after_snapshots(num_bytes)
 
     def count(
         self,

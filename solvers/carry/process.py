@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from pgo_models.errors import check_settings
+from pgo_models.errors import EngineError, check_settings
 from solvers.carry.messages import Worker, obey, raise_first_error
 
 # Bytes that the driver of a solve by robots may take with its matrix and factor, unless given.
@@ -13,6 +14,10 @@ DEFAULT_MEMORY = 4e9
 T = TypeVar("T")
 Q = TypeVar("Q")
 A = TypeVar("A")
+
+
+class RobotLostError(EngineError):
+    """A robot is lost, and with it all that it held."""
 
 
 class WorkerPool(Protocol):
@@ -32,6 +37,11 @@ class WorkerPool(Protocol):
         -------
         list
             Answer of every robot; None of one without an order.
+
+        Raises
+        ------
+        RobotLostError
+            If a robot does not exist any more.
         """
 
     def close(self) -> None:
@@ -39,7 +49,11 @@ class WorkerPool(Protocol):
 
 
 class Engine(Protocol):
-    """Settings of a place where robots can run."""
+    """Settings of a place where robots can run.
+
+    An engine whose robots can be lost also has `max_restarts`, the number of times that a run
+    begins again after a loss.
+    """
 
     def open(self, make: Callable[[T], Worker], parts: Sequence[T]) -> WorkerPool:
         """Start a worker for every part; each worker is sent its own part and no other.
@@ -119,3 +133,27 @@ class _LocalPool:
     def close(self) -> None:
         if self._executor is not None:
             self._executor.shutdown()
+
+
+def most_restarts(engine: Engine | None) -> int:
+    """How often a run on an engine begins again where it has lost robots."""
+    return getattr(engine, "max_restarts", 0)
+
+
+def restarted(engine: Engine | None, run: Callable[[], T]) -> T:
+    """Return the result of a run on an engine; the run begins again where it has lost robots.
+
+    All robots start again from their parts: what a run keeps for itself, say in a checkpoint, saves
+    it steps. Raises an EngineError when robots are lost once more than `most_restarts`.
+    """
+    num_restarts = most_restarts(engine)
+    for _ in range(num_restarts):
+        with suppress(RobotLostError):
+            return run()
+    try:
+        return run()
+    except RobotLostError as error:
+        raise EngineError(
+            f"robots were lost {num_restarts + 1} times, the last time as {error}; "
+            "look at the memory of their machines, or run in this process"
+        ) from error

@@ -7,7 +7,6 @@ engine the robots run in this process, too, each with its own data.
 """
 
 import math
-import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -22,7 +21,7 @@ from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
 from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
-from solvers.carry.process import Engine, InProcess
+from solvers.carry.process import Engine, InProcess, restarted
 from solvers.carry.ray_engine import RayEngine
 from solvers.loop import RunMonitor
 from solvers.place import AUTO, FirstStage
@@ -68,8 +67,8 @@ def solve_folder(
     A pose belongs to the first file with a VERTEX line of it, else to the first that names it. An
     edge between two robots may be in the file of either, or of both. Start, SOC, Newton,
     certificate and staircase are those of `solve(.., robots=..)`. Priors, landmarks,
-    checkpoints and an ascent of handedness terms need `solve`. A robot that is lost reads its file
-    again, and is sent again all that it had received. The frame is that of the first pose with a
+    checkpoints and an ascent of handedness terms need `solve`. Where a robot is lost, all robots
+    read their files again, and the solve begins again. The frame is that of the first pose with a
     FIX line, or else of the first pose of all, where its file has it.
 
     Parameters
@@ -136,7 +135,8 @@ def solve_folder(
     job = FilesOfRobots(
         folder.name, files, engine, robots.driver_memory, weighting, trust_folder, robust
     )
-    return job.solved(pipeline, monitor, None if out is None else Path(out).absolute())
+    target = None if out is None else Path(out).absolute()
+    return restarted(engine, partial(job.solved, pipeline, monitor, target))
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,13 +259,9 @@ def _check_robots(robots: Robots) -> None:
 
 
 def _engine_of_robots(engine: Engine | None, num_robots: int) -> Engine:
-    """Where robots with own files run: with Ray one process for every robot, and no snapshots.
-
-    The process of the driver would keep the snapshots, which hold all that the robots know.
-    """
+    """Where robots with own files run: with Ray one process for every robot."""
     if engine is None:
         return InProcess()
     if not isinstance(engine, RayEngine):
         return engine
-    recovery = replace(engine.recovery, orders_between_snapshots=sys.maxsize)
-    return replace(engine, recovery=recovery, actors=engine.actors or num_robots)
+    return replace(engine, actors=engine.actors or num_robots)

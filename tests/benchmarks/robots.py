@@ -14,8 +14,10 @@ import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,7 @@ from pgo_models.graphs.separators import vertex_cover
 from solvers import Faults, InProcess, RayEngine
 from solvers.carry.counted_pool import Count
 from solvers.carry.process import Engine
+from solvers.carry.ray_cluster import connect
 from solvers.loop import run
 from solvers.result import History, Record, Run
 from solvers.robots.consensus import AsynchronousSOC, AsynchronousState, RobotsOfDriver
@@ -131,8 +134,8 @@ def faults_job(name: str, fault: str) -> dict[str, object]:
 
 
 def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
-    """Iterations of SOC, no tolerance, in this process and in two actors that are kept: least of
-    five solves each.
+    """Iterations of SOC, no tolerance, in this process and in two actors: least of five solves
+    each.
     """
     graph = replace(pgo.load(name), information=None)  # the cost is F
     shared = pgo.partition(graph, int(robots), METIS)
@@ -164,9 +167,8 @@ def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
         )
 
     here = least(InProcess())
-    with RayEngine(num_cpus=2).kept() as engine:
-        there = least(engine)
-    return {"here": here, "there": there}
+    connect(num_cpus=2)
+    return {"here": here, "there": least(RayEngine())}
 
 
 def world_job() -> dict[str, object]:
@@ -203,9 +205,9 @@ def interleaved_job(poses: str) -> dict[str, object]:
         shape = ["--robots", "16", "--poses", poses, "-d", "2"]
         run_cli(["generate", "grid-world", *shape, "--out", str(world)])
         began = time.perf_counter()
-        with RayEngine(num_cpus=16, actors=16).kept() as engine:
+        engine = RayEngine(num_cpus=16, actors=16)
+        with watching("ray::") as actors:
             solution = solvers.solve_folder(world, robots=solvers.Robots(engine=engine))
-            actors = processes_of("ray::")
         seconds = time.perf_counter() - began
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return {
@@ -214,19 +216,41 @@ def interleaved_job(poses: str) -> dict[str, object]:
         "rounds": solution.ledger.rounds,
         "megabytes": solution.ledger.num_bytes / 1e6,
         "driver": usage.ru_utime + usage.ru_stime,
-        "busiest": max(cpu for cpu, _ in actors),
-        "robots": sum(cpu for cpu, _ in actors),
+        "busiest": max(cpu for cpu, _ in actors.values()),
+        "robots": sum(cpu for cpu, _ in actors.values()),
         "driver_memory": memory(),
-        "robot_memory": max(megabytes for _, megabytes in actors),
+        "robot_memory": max(megabytes for _, megabytes in actors.values()),
         "gap": solution.certificate.proven_gap,
         "verdict": solution.certificate.verdict.name,
         "seconds": seconds,
     }
 
 
-def processes_of(name: str) -> list[tuple[float, float]]:
-    """CPU seconds and largest memory, MB, of all processes whose command begins so (Linux)."""
-    found = []
+@contextmanager
+def watching(name: str) -> Iterator[dict[str, tuple[float, float]]]:
+    """CPU seconds and largest memory, MB, of all processes whose command begins so, by process.
+
+    They are read twice a second for as long as the block runs, as the processes end before it.
+    """
+    figures: dict[str, tuple[float, float]] = {}
+    has_ended = threading.Event()
+
+    def watch() -> None:
+        while not has_ended.wait(0.5):
+            figures.update(processes_of(name))
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield figures
+    finally:
+        has_ended.set()
+        thread.join()
+
+
+def processes_of(name: str) -> dict[str, tuple[float, float]]:
+    """CPU seconds and largest memory, MB, of the processes whose command begins so (Linux)."""
+    figures = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             command = (folder / "cmdline").read_text()
@@ -238,8 +262,8 @@ def processes_of(name: str) -> list[tuple[float, float]]:
         if command.startswith(name) and "IDLE" not in command:
             ticks = int(numbers[11]) + int(numbers[12])
             (peak,) = (line.split()[1] for line in status.splitlines() if "VmHWM" in line)
-            found.append((ticks / os.sysconf("SC_CLK_TCK"), int(peak) / 1024))
-    return found
+            figures[folder.name] = (ticks / os.sysconf("SC_CLK_TCK"), int(peak) / 1024)
+    return figures
 
 
 class TimedRobots:

@@ -286,9 +286,3 @@ REFUSED: list[tuple[Callable[[dict[str, Any]], object], str]] = [
 def test_what_is_not_clear_is_named_with_the_way_out(call, message, things) -> None:
     with pytest.raises(pgo.PGOError, match=message):
         call(things)
-
-
-def test_a_list_that_fits_stays_the_one_that_was_given() -> None:
-    """An engine whose actors are kept shares their list with the solves that it is given to."""
-    idle: list[object] = []
-    assert solvers.RayEngine(idle=idle).idle is idle
