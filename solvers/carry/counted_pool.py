@@ -10,7 +10,13 @@ import numpy as np
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.carry.faults import LossyChannel
 from solvers.carry.ledger import DRIVER, Ledger, Traffic
-from solvers.carry.messages import count_bytes, restore, snapshot_bytes, take_snapshot
+from solvers.carry.messages import (
+    Messages,
+    count_bytes,
+    restore,
+    snapshot_bytes,
+    take_snapshot,
+)
 from solvers.carry.moments import Moments, obey_after
 from solvers.carry.process import WorkerPool
 
@@ -93,8 +99,8 @@ class CountedPool:
         self.count(sender, receiver, sizes, is_round=count is Count.ROUND)
 
     def exchange(
-        self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None
-    ) -> list[Mapping[int, A]]:
+        self, sent: Sequence[Messages[A]], channel: LossyChannel[A] | None = None
+    ) -> list[Messages[A]]:
         """Carry out one round between robots: messages by receiver in, messages by sender out.
 
         Entry a of `sent` is what robot a sends, entry a of the answer what it receives. Messages
@@ -126,7 +132,7 @@ class CountedPool:
         self.ledger = self.ledger.after_exchange(traffic, is_round)
 
 
-def by_link(sent: Sequence[Mapping[int, A]]) -> dict[tuple[int, int], A]:
+def by_link(sent: Sequence[Messages[A]]) -> dict[tuple[int, int], A]:
     """Messages by (sender, receiver), of what every sender sends, by receiver."""
     messages = {}
     for sender, addressed in enumerate(sent):
@@ -135,9 +141,9 @@ def by_link(sent: Sequence[Mapping[int, A]]) -> dict[tuple[int, int], A]:
     return messages
 
 
-def delivered(messages: Mapping[tuple[int, int], A], num_robots: int) -> list[Mapping[int, A]]:
+def delivered(messages: Mapping[tuple[int, int], A], num_robots: int) -> list[Messages[A]]:
     """Messages by sender for every receiver, of messages by (sender, receiver)."""
-    received: list[dict[int, A]] = [{} for _ in range(num_robots)]
+    received: list[Messages[A]] = [Messages() for _ in range(num_robots)]
     for (sender, receiver), value in messages.items():
         received[receiver][sender] = value
-    return list(received)
+    return received

@@ -1,12 +1,12 @@
 """Orders to workers: functions of a worker and a request.
 
-Requests and answers are numbers, arrays and records.
+Requests and answers are numbers, arrays and records. What workers tell each other is `Messages`.
 """
 
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pgo_models.errors import PGOError
 from solvers.carry.ledger import BYTES_PER_NUMBER
 
+A = TypeVar("A")
 Snapshot = Mapping[str, NDArray[Any]]
 
 
@@ -39,11 +40,18 @@ class Worker(Protocol):
         """
 
 
+class Messages(dict[int, A]):
+    """Messages between robots: by receiver in an answer to an order, by sender in a request.
+
+    Nothing else in an answer goes to other robots.
+    """
+
+
 @dataclass(frozen=True)
 class Token:
-    """Stands for a message that a robot sends another itself: number `number` of its answer.
+    """Stands for a message that a robot sends another itself: in Messages number `number`.
 
-    The answer is that to order number `call`. The message has so many bytes.
+    These are counted in its answer to order number `call`. The message has so many bytes.
     """
 
     sender: int
@@ -108,15 +116,17 @@ def count_bytes(record: object) -> int:
 
     A number takes eight bytes, an array its `nbytes`, and a token those of its message.
 
-    A mapping holds messages for other workers, which are counted when they are exchanged. Fields
-    whose names begin with `measured` are off the ledger.
+    Messages to other workers are counted when they are exchanged. Fields whose names begin with
+    `measured` are off the ledger.
     """
     if isinstance(record, np.ndarray):
         return record.nbytes
-    if record is None or isinstance(record, Mapping):
+    if record is None or isinstance(record, Messages):
         return 0
     if isinstance(record, Token):
         return record.num_bytes
+    if isinstance(record, Mapping):
+        return sum(count_bytes(item) for item in record.values())
     if isinstance(record, tuple):
         return sum(count_bytes(item) for item in record)
     fields = getattr(type(record), "__dataclass_fields__", None)

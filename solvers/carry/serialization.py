@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from solvers.carry.messages import Messages
+
 _TREE = "tree"
 # Numbers and arrays by the identity of the arrays: one that a record has twice is stored once.
 _Arrays = dict[int, tuple[int, NDArray[Any]]]
@@ -24,7 +26,8 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
 
     The record is None, a number, a string, an array, a member of an enum, a dataclass or a named
     tuple, a sequence of such, or a mapping of strings or integers to such; a sequence comes back as
-    a tuple. Raises a TypeError if it contains anything else.
+    a tuple, and a mapping as a dict unless it is `Messages`. Raises a TypeError if it contains
+    anything else.
     """
     arrays: _Arrays = {}
     tree = json.dumps(_describe(value, arrays))
@@ -64,7 +67,8 @@ def _describe(value: object, arrays: _Arrays) -> object:
         if not all(isinstance(key, str | int) for key in value):
             raise TypeError(f"cannot serialize the keys {list(value)!r}")
         items = [_describe(item, arrays) for item in value.values()]
-        return {"keys": list(value), "values": items}
+        kind = {"is_messages": True} if isinstance(value, Messages) else {}
+        return {"keys": list(value), "values": items, **kind}
     if isinstance(value, Sequence):
         return {"items": [_describe(item, arrays) for item in value]}
     raise TypeError(f"cannot serialize {value!r}")
@@ -97,5 +101,6 @@ def _rebuild(
         return class_of_name[tree["class"]](**fields)
     if "keys" in tree:
         values = [_rebuild(item, arrays, class_of_name) for item in tree["values"]]
-        return dict(zip(tree["keys"], values, strict=True))
+        items = dict(zip(tree["keys"], values, strict=True))
+        return Messages(items) if "is_messages" in tree else items
     return tuple(_rebuild(item, arrays, class_of_name) for item in tree["items"])

@@ -6,7 +6,7 @@ same, over-relaxed, and damped where values are old (Peng et al. 2016, ARock).
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -17,6 +17,7 @@ from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from solvers.carry.counted_pool import Count
 from solvers.carry.faults import Faults, LossyChannel
+from solvers.carry.messages import Messages
 from solvers.carry.moments import Moment
 from solvers.result import Measurement, Status
 from solvers.robots.agent import C, begin_copies, finish_copies, order_copies
@@ -74,8 +75,8 @@ class RobotsOfDriver:
         return self.driver.network.ask(partial(order_copies, order), requests, count)
 
     def exchange(
-        self, sent: Sequence[Mapping[int, A]], channel: LossyChannel[A] | None = None
-    ) -> list[Mapping[int, A]]:
+        self, sent: Sequence[Messages[A]], channel: LossyChannel[A] | None = None
+    ) -> list[Messages[A]]:
         """Carry out one round: messages by receiver in, messages by sender out."""
         return self.driver.network.exchange(sent, channel)
 

@@ -10,7 +10,6 @@ the driver answers with the neighbours whose closures stay.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import edge_residuals
 from pgo_models.problem.weighting import Weighting
+from solvers.carry.messages import Messages
 from solvers.riemannian.polish import polish
 from solvers.robots.agent import Agent
 from solvers.robots.own_file import (
@@ -87,17 +87,17 @@ class ConsistentPart:
     num_rejected: int  # where an edge between two robots counts with one of them
 
 
-def tell_trajectories(agent: Agent, _: None) -> Mapping[int, Trajectory]:
+def tell_trajectories(agent: Agent, _: None) -> Messages[Trajectory]:
     """Order: tell every neighbour of the own poses that edges between the two touch."""
     return _trajectories(agent.robot, agent.known(JoinedFile))
 
 
-def _trajectories(robot: int, joined: JoinedFile) -> Mapping[int, Trajectory]:
+def _trajectories(robot: int, joined: JoinedFile) -> Messages[Trajectory]:
     graph = joined.graph
     is_own = joined.owners == robot
     chains = Chains.of(graph, own_odometry(graph, is_own))
     R, t = chains.motion
-    trajectories = {}
+    trajectories: Messages[Trajectory] = Messages()
     for other in neighbours_of(joined, robot):
         between = edges_between(joined, robot, other)
         ends = np.concatenate([graph.i[between], graph.j[between]])
@@ -142,7 +142,7 @@ def tell_error_scale(agent: Agent, request: tuple[Weighting, float]) -> float:
 
 
 def judge_closures(
-    agent: Agent, request: tuple[Mapping[int, Trajectory], float, float]
+    agent: Agent, request: tuple[Messages[Trajectory], float, float]
 ) -> AgreeingCounts:
     """Order: find what agrees, with the neighbours' trajectories, a quantile and an error scale."""
     received, quantile, scale = request

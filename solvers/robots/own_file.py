@@ -9,7 +9,7 @@ edges are judged again those of `revision` follow `keep_answer`, and go on with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -46,6 +46,7 @@ from pgo_models.problem.weighting import (
     convex_cost,
     is_isotropic,
 )
+from solvers.carry.messages import Messages
 from solvers.robots.agent import Agent, held_poses
 from solvers.robots.current_poses import set_poses
 from solvers.robots.driver import order_interior
@@ -256,7 +257,7 @@ def read_file(agent: Agent, _: None) -> Claim:
     return lines.d, runs_of_vertices, _runs(ids_of_edges_alone), lines.digits
 
 
-def number_poses(agent: Agent, runs: OwnedRuns) -> Mapping[int, Told]:
+def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[Told]:
     """Take numbers and owners for the ids; return what others are to be told of their poses.
 
     They are messages, by the number of the other robot.
@@ -269,7 +270,7 @@ def number_poses(agent: Agent, runs: OwnedRuns) -> Mapping[int, Told]:
     edges = Edges(rows, numbers, owners)
     places = placed_poses(lines)
     owners_of_places = runs.owner[runs.of(places.ids)]
-    messages = {}
+    messages: Messages[Told] = Messages()
     for robot in np.unique(np.append(owners, owners_of_places)).tolist():
         touches = (owners == robot).any(axis=1)
         messages[robot] = Told(edges.some(touches), places.some(owners_of_places == robot))
@@ -279,7 +280,7 @@ def number_poses(agent: Agent, runs: OwnedRuns) -> Mapping[int, Told]:
     return messages
 
 
-def join_neighbours(agent: Agent, request: tuple[Mapping[int, Told], bool]) -> Border:
+def join_neighbours(agent: Agent, request: tuple[Messages[Told], bool]) -> Border:
     """Make the graph of the robot: its own edges, and those that others have of its poses.
 
     FIX lines of its own poses count. The request is what others told the robot, and whether the

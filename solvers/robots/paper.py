@@ -11,7 +11,7 @@ iteration.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from solvers.result import Measurement, Status
 from solvers.robots.agent import begin_paper
 from solvers.robots.consensus import RobotsOfDriver
 from solvers.robots.driver import Driver
+from solvers.soc.copies import Rows
 from solvers.soc.paper import CommonPenalty, PaperSOC
 from solvers.soc.paper_robot import PaperPenalty, PaperReply, PaperRobot
 from solvers.soc.penalty import PenaltyOrder
@@ -64,7 +65,7 @@ class PaperRobotsState:
     root: float
     scale: float
     squares: Array
-    rows: Sequence[Mapping[int, Array]]
+    rows: Sequence[Rows]
     objective: float
     primal_residual: float = math.inf
     dual_residual: float = math.inf

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,7 @@ from pgo_models.graphs.pose_graph import IntArray, least_tree
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
+from solvers.carry.messages import Messages
 from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
 from solvers.result import Stage
@@ -141,7 +142,7 @@ def _taken_back(opened: OpenedFiles, job: Pass) -> list[TakenBack]:
     """What every robot takes back; neighbours agree on what is near the map."""
     network = opened.driver.network
     num_robots = network.ledger.num_robots
-    near: Sequence[Mapping[int, BoolArray]] = [{}] * num_robots
+    near: Sequence[Messages[BoolArray]] = [Messages()] * num_robots
     if job.comes_back is ComesBack.NEAR:
         solved_poses = network.ask(tell_solved, [None] * num_robots, Count.PIGGYBACKED)
         requests = [
@@ -206,7 +207,7 @@ class TakenBack:
     weighting: Weighting
     quantile: float
     is_first: bool
-    near: Mapping[int, BoolArray]
+    near: Messages[BoolArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,13 +226,13 @@ class Links:
     ratio: Array
 
 
-def tell_solved(agent: Agent, _: None) -> Mapping[int, NumberedPoses]:
+def tell_solved(agent: Agent, _: None) -> Messages[NumberedPoses]:
     """Order: tell every neighbour of the own poses found that edges between the two touch."""
     placed = agent.known(PlacedFile)
     everything = everything_of(placed.joined)
     solved = _own_poses_of(agent)
     own_poses = np.flatnonzero(everything.owners == agent.robot)
-    messages = {}
+    messages: Messages[NumberedPoses] = Messages()
     for other in neighbours_of(everything, agent.robot):
         between = edges_between(everything, agent.robot, other)
         ends = np.concatenate([everything.graph.i[between], everything.graph.j[between]])
@@ -241,8 +242,8 @@ def tell_solved(agent: Agent, _: None) -> Mapping[int, NumberedPoses]:
 
 
 def judge_near(
-    agent: Agent, request: tuple[Mapping[int, NumberedPoses], Weighting, float]
-) -> Mapping[int, BoolArray]:
+    agent: Agent, request: tuple[Messages[NumberedPoses], Weighting, float]
+) -> Messages[BoolArray]:
     """Order: find the edges near the map, with the poses of neighbours; those kept stay.
 
     Of an edge between two robots the one of the lower number decides, and tells the other, so that
@@ -264,11 +265,11 @@ def judge_near(
     near = problem.edge_costs(Poses(R, t)) <= _NEAR * chi2_thresholds(problem, quantile)
     near[placed.joined.edges] = True
     agent.record = replace(placed, near=near)
-    return {
-        other: near[edges_between(everything, agent.robot, other)]
-        for other in neighbours_of(everything, agent.robot)
-        if other > agent.robot
-    }
+    messages: Messages[BoolArray] = Messages()
+    for other in neighbours_of(everything, agent.robot):
+        if other > agent.robot:
+            messages[other] = near[edges_between(everything, agent.robot, other)]
+    return messages
 
 
 def take_back(agent: Agent, request: TakenBack) -> Border:
@@ -354,7 +355,7 @@ def tell_links(agent: Agent, request: tuple[float, Poses]) -> Links:
     return Links(owners, ratio[links])
 
 
-def tell_kept(agent: Agent, is_held: BoolArray) -> Mapping[int, BoolArray]:
+def tell_kept(agent: Agent, is_held: BoolArray) -> Messages[BoolArray]:
     """Order: keep the links that hold robots together, too, (k,); tell neighbours what is kept.
 
     Each is told of the edges that both have, (2, k), whether this robot counts and keeps it.
@@ -366,7 +367,7 @@ def tell_kept(agent: Agent, is_held: BoolArray) -> Mapping[int, BoolArray]:
     kept = placed.within.copy()
     kept[_counted_links(agent)[is_held]] = True
     agent.record = replace(placed, within=kept)
-    messages = {}
+    messages: Messages[BoolArray] = Messages()
     for other in neighbours_of(joined, agent.robot):
         between = edges_between(joined, agent.robot, other)
         messages[other] = np.stack([subgraph.is_counted[between], kept[between]])
@@ -382,7 +383,7 @@ def _counted_links(agent: Agent) -> IntArray:
     return np.flatnonzero(is_link & agent.subgraph.is_counted)
 
 
-def keep(agent: Agent, received: Mapping[int, BoolArray]) -> ConsistentPart:
+def keep(agent: Agent, received: Messages[BoolArray]) -> ConsistentPart:
     """Order: leave out the edges that are not kept by the robot that counts them."""
     placed = agent.known(PlacedFile)
     joined = placed.joined

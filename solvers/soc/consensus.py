@@ -16,7 +16,7 @@ be in one process (`LocalRobots`) or on a network (`solvers.robots.consensus`).
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
@@ -27,6 +27,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import relative_length
 from solvers.carry.counted_pool import Count, by_link, delivered
+from solvers.carry.messages import Messages
 from solvers.carry.moments import Moment
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
@@ -36,8 +37,8 @@ from solvers.soc.copies import (
     CopiesState,
     CopyLayout,
     InitReply,
-    Messages,
     RescaleCopies,
+    RowMessages,
     Rows,
     SeparatorPenalty,
     SolveReply,
@@ -70,7 +71,7 @@ class AskedRobots(Protocol):
     def ask(self, order: Order[Q, A], requests: Sequence[Q], count: Count) -> list[A]:
         """Return the answers of all robots to an order, each with its request."""
 
-    def exchange(self, sent: Sequence[Mapping[int, A]]) -> list[Mapping[int, A]]:
+    def exchange(self, sent: Sequence[Messages[A]]) -> list[Messages[A]]:
         """Deliver what every robot sent, by receiver; return what every robot gets, by sender."""
 
 
@@ -97,7 +98,7 @@ class ConsensusState(SharedSteps):
         Sum of `rotation_squares`, to which the gradient is relative.
     ahead : array or None
         Sums of the next step (a), unless the penalties change before.
-    rows : sequence of Messages
+    rows : sequence of RowMessages
         Messages with the rows of the next step (a), by receiver.
     robots : tuple of ConsensusRobot
         The robots with their rows, in one process.
@@ -110,7 +111,7 @@ class ConsensusState(SharedSteps):
     gradient: float
     rotation_square: float
     ahead: Array | None = None
-    rows: Sequence[Messages] = ()
+    rows: Sequence[RowMessages] = ()
     robots: tuple[ConsensusRobot, ...] = ()
     moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
 
@@ -344,7 +345,7 @@ class LocalRobots:
         self.robots = tuple(robot for robot, _ in pairs)
         return [answer for _, answer in pairs]
 
-    def exchange(self, sent: Sequence[Mapping[int, A]]) -> list[Mapping[int, A]]:
+    def exchange(self, sent: Sequence[Messages[A]]) -> list[Messages[A]]:
         """Deliver what every robot sent, by receiver; return what every robot gets, by sender."""
         return delivered(by_link(sent), self.num_robots)
 

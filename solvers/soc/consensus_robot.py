@@ -26,6 +26,7 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.stationarity import gradient_squares, rotation_squares
+from solvers.carry.messages import Messages
 from solvers.soc import copies
 from solvers.soc.anderson import AndersonSums
 from solvers.soc.penalty import PenaltyOrder
@@ -72,7 +73,7 @@ class ConsensusRobot:
 
     def penalize(
         self, order: PenaltyOrder
-    ) -> tuple[ConsensusRobot, Mapping[int, copies.NeighbourMessage]]:
+    ) -> tuple[ConsensusRobot, Messages[copies.NeighbourMessage]]:
         """Set rho of own poses; tell their holders about them, and the forces on common poses."""
         layout = self.layout
         state = self.state
@@ -88,14 +89,14 @@ class ConsensusRobot:
         force, sent = self._as_sent(force, no_force, order.settings.bytes_per_number)
         of_poses = np.concatenate([rho[:, None], state.diagonal, pull], axis=1)
         no_poses = np.zeros(0, dtype=np.int64)
-        messages = {}
+        messages: Messages[copies.NeighbourMessage] = Messages()
         for robot, rows in sent.items():
             common = layout.sent.get(robot, no_poses)
             messages[robot] = copies.NeighbourMessage(of_poses[common], rows)
         return self._with(rho=rho, pull=pull, force=force, settings=order.settings), messages
 
     def stiffness(
-        self, messages: Mapping[int, copies.NeighbourMessage]
+        self, messages: Messages[copies.NeighbourMessage]
     ) -> tuple[ConsensusRobot, float]:
         """Take the neighbours' messages; return the stiffness of the robot's separators."""
         layout = self.layout
@@ -189,13 +190,13 @@ class ConsensusRobot:
                 gamma, own_sums = own_sums.coefficients(alone, sums)
             block = block.extrapolated(Agreement(gamma, is_best=False))
             sums = sums[:1]
-            sent = self._common_rows(block.s)
+            sent = Messages({**self._common_rows(block.s)})
         part = PartOfSums.of(sums, block.settings.bytes_per_number)
         return self._with(ahead=(X, block, own_sums)), copies.SolveReply(part, sent)
 
     def _as_sent(
         self, X: Array, known: Array, bytes_per_number: int
-    ) -> tuple[Array, copies.Messages]:
+    ) -> tuple[Array, copies.RowMessages]:
         """X, (rows, d), as the neighbours will have it, and the messages that tell them.
 
         What is sent is the change from `known`, which they have. X is sent whole where it is not
@@ -206,18 +207,18 @@ class ConsensusRobot:
         if bytes_per_number < WHOLE:
             change = RowChange.of(X[shared] - known[shared], bytes_per_number)
         if change is None:
-            return X, self._common_rows(X)
+            return X, Messages({**self._common_rows(X)})
         X = X.copy()
         X[shared] = change.added_to(known[shared])
         places = self.layout.common_among_shared
-        return X, {robot: change.some(rows) for robot, rows in places.items()}
+        return X, Messages({robot: change.some(rows) for robot, rows in places.items()})
 
     def _common_rows(self, X: Array) -> copies.Rows:
         """Rows of X for every neighbour, of the poses that both hold."""
-        return {robot: X[rows] for robot, rows in self.layout.common.items()}
+        return Messages({robot: X[rows] for robot, rows in self.layout.common.items()})
 
     def step(
-        self, order: tuple[Agreement, copies.Messages]
+        self, order: tuple[Agreement, copies.RowMessages]
     ) -> tuple[ConsensusRobot, copies.StepReply]:
         """One iteration: (b) and (c) with the neighbours' rows, and (a) of the next one."""
         agreement, messages = order
@@ -230,8 +231,8 @@ class ConsensusRobot:
         return following, copies.StepReply(squares, stationarity, reply_of_solve)
 
     def _accelerated(
-        self, agreement: Agreement, messages: copies.Messages
-    ) -> tuple[ConsensusRobot, copies.Rows]:
+        self, agreement: Agreement, messages: copies.RowMessages
+    ) -> tuple[ConsensusRobot, Mapping[int, Array]]:
         """Take the step (a) that was done ahead; extrapolate its s, and the neighbours' rows of s.
 
         A neighbour extrapolates its rows with the same coefficients, so that nobody waits for them
@@ -411,7 +412,7 @@ class ConsensusRobot:
         local = self.block.after_local_passes(self.step_a.solve, self.layout.private)
         return self.step_a.solve(local.shift), local
 
-    def _agreed_omega(self, received: copies.Rows) -> Array:
+    def _agreed_omega(self, received: Mapping[int, Array]) -> Array:
         """Step (b): omega and the mean translations, from s and the neighbours' rows.
 
         The rows are summed in the order of the robots, so that all get the same bits.

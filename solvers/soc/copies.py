@@ -13,14 +13,15 @@ from pgo_models.geometry.rotations import Array, BoolArray, unstack_transposes
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
+from solvers.carry.messages import Messages
 from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
 from solvers.soc.recursion_block import RecursionBlock, StepSettings
 from solvers.soc.rounding import PartOfSums, RowChange
 from solvers.soc.subgraph import PartProblem, Subgraph
 
-Rows = Mapping[int, Array]  # to or from every neighbour
-Messages = Mapping[int, Array | RowChange]  # of rows, or of their change since the last message
+Rows = Messages[Array]  # to or from every neighbour
+RowMessages = Messages[Array | RowChange]  # of rows, or of their change since the last message
 # An asynchronous run makes progress when a merit falls to this share of the smallest so far; it
 # stagnates when that has not happened for so many turns.
 _PROGRESS = 0.9
@@ -93,7 +94,7 @@ class SolveReply:
     """Answer to an order to solve step (a)."""
 
     part: PartOfSums  # of this robot, for the acceleration
-    rows: Messages  # of s for every neighbour, before the extrapolation that all do together
+    rows: RowMessages  # of s for every neighbour, before the extrapolation that all do together
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +248,7 @@ class CopyLayout:
 
     def rows_of_own_poses(self, X: Array) -> Rows:
         """Rows of X, (rows, d), of own poses, for every neighbour that holds copies of them."""
-        return {robot: X[self.rows(mine)] for robot, mine in self.sent.items()}
+        return Messages({robot: X[self.rows(mine)] for robot, mine in self.sent.items()})
 
     def with_rows_of_others(self, X: Array, rows: Rows) -> Array:
         """Write the rows that the owners of other poses sent into X, (rows, d), and return it."""
@@ -269,7 +270,7 @@ class Waiting:
     """What a robot of an asynchronous run has received, and how far it relaxes."""
 
     settings: TurnSettings
-    newest: Rows  # the newest rows from every neighbour
+    newest: Mapping[int, Array]  # the newest rows from every neighbour
     waited: Mapping[int, int]  # how many turns ago they arrived
     excess: float = 1.0  # share of the over-relaxation that is left
     least: float = math.inf  # the smallest merit since that share changed

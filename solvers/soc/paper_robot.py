@@ -8,7 +8,6 @@ precision. They repeat (b) and (c) for these poses, and so know omega, too, whic
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.problem.matrices import inner, norm
+from solvers.carry.messages import Messages
 from solvers.soc.copies import CopyLayout, Rows
 from solvers.soc.paper import Blocks, PaperIterate
 from solvers.soc.penalty import PenaltyOrder
@@ -216,10 +216,11 @@ class PaperRobot:
     def _R_of_start(self) -> Array:
         return unstack_transposes(self.state.X[self.layout.problem.num_poses :])
 
-    def _sent(self, R: Array) -> Mapping[int, Array]:
+    def _sent(self, R: Array) -> Rows:
         """R^T of the poses that a neighbour holds, from R of own poses, for every neighbour."""
         place = np.cumsum(self.layout.subgraph.is_own) - 1
-        return {robot: stack_transposes(R[place[mine]]) for robot, mine in self.layout.sent.items()}
+        sent = self.layout.sent.items()
+        return Messages({robot: stack_transposes(R[place[mine]]) for robot, mine in sent})
 
     def _prepared(self) -> PaperRobot:
         """The robot with step (a) for its penalty."""

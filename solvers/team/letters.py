@@ -1,8 +1,8 @@
 """Letters: what robots of a team tell each other in a solve that a third one drives.
 
-An answer of a robot may have messages for other robots, in mappings by receiver. The robot sends
+An answer of a robot may have messages for other robots, by receiver. The robot sends
 them itself, and its answer carries tokens in their place. The page of the solve passes the tokens
-on, in mappings by sender, and the receiver puts what the letters say in their place. A letter that
+on, by sender, and the receiver puts what the letters say in their place. A letter that
 is lost is asked for again. What is for the robot that drives, or from it, needs no letter.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import count
 from typing import Any, NamedTuple
 
-from solvers.carry.messages import Token, count_bytes
+from solvers.carry.messages import Messages, Token, count_bytes
 
 DRIVER_PLACE = 0  # the first robot of a solve drives it; its messages need no letters
 
@@ -43,8 +43,8 @@ class Letters:
         """The answer to an order with tokens in place of messages, and the letters to be sent."""
         contents: dict[int, dict[int, Any]] = {}
 
-        def take(messages: Mapping[int, Any], number: int) -> Mapping[int, Any]:
-            kept = {}
+        def take(messages: Messages[Any], number: int) -> Messages[Any]:
+            kept: Messages[Any] = Messages()
             for receiver, message in messages.items():
                 if receiver in (DRIVER_PLACE, self.place):
                     kept[receiver] = message
@@ -53,7 +53,7 @@ class Letters:
                 kept[receiver] = Token(self.place, call, number, count_bytes(message))
             return kept
 
-        with_tokens = _with_mappings(answer, _numbered(take))
+        with_tokens = _with_messages(answer, _numbered(take))
         names = [LetterName(receiver, call) for receiver in contents]
         for name in names:
             self.sent[name] = contents[name.other]
@@ -63,8 +63,8 @@ class Letters:
         """The request of an order with messages in place of tokens, and the letters missing."""
         missing = set()
 
-        def put(messages: Mapping[int, Any], _: int) -> Mapping[int, Any]:
-            completed = {}
+        def put(messages: Messages[Any], _: int) -> Messages[Any]:
+            completed: Messages[Any] = Messages()
             for sender, message in messages.items():
                 completed[sender] = message
                 if isinstance(message, Token):
@@ -75,31 +75,31 @@ class Letters:
                         missing.add(name)
             return completed
 
-        return _with_mappings(request, _numbered(put)), missing
+        return _with_messages(request, _numbered(put)), missing
 
 
-Change = Callable[[Mapping[int, Any]], Mapping[int, Any]]
+Change = Callable[[Messages[Any]], Messages[Any]]
 
 
-def _numbered(change: Callable[[Mapping[int, Any], int], Mapping[int, Any]]) -> Change:
-    """Tell a change, too, how many mappings came before."""
+def _numbered(change: Callable[[Messages[Any], int], Messages[Any]]) -> Change:
+    """Tell a change, too, how many messages came before."""
     numbers = count()
     return lambda messages: change(messages, next(numbers))
 
 
-def _with_mappings(record: Any, change: Change) -> Any:  # noqa: ANN401 - a request or an answer
-    """A record with its mappings changed, one after the other."""
-    if isinstance(record, Mapping):
+def _with_messages(record: Any, change: Change) -> Any:  # noqa: ANN401 - a request or an answer
+    """A record with its messages changed, one after the other."""
+    if isinstance(record, Messages):
         return change(record)
     if isinstance(record, tuple):
-        items = [_with_mappings(item, change) for item in record]
+        items = [_with_messages(item, change) for item in record]
         return type(record)(*items) if hasattr(record, "_fields") else tuple(items)
     if not is_dataclass(record) or isinstance(record, type):
         return record
     changed = {}
     for each in fields(record):
         before = getattr(record, each.name)
-        after = _with_mappings(before, change)
+        after = _with_messages(before, change)
         if after is not before:
             changed[each.name] = after
     return replace(record, **changed) if changed else record

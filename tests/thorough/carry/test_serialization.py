@@ -9,6 +9,7 @@ from hypothesis import given
 from pgo_models import Poses
 from pgo_models.geometry.rotations import stack_transposes
 from solvers import Status
+from solvers.carry.messages import Messages, count_bytes
 from solvers.carry.serialization import deserialize, serialize
 from solvers.soc.anderson import AndersonShare
 from solvers.soc.recursion_block import Rotations, StepSettings, block_at
@@ -33,6 +34,17 @@ def test_arrays_and_classes_come_back_bit_by_bit_and_apart_from_the_original(see
 def test_only_arrays_of_plain_numbers_and_one_text_are_made():
     arrays = serialize({"poses": random_poses(2, 2, 0), "status": Status.CONVERGED})
     assert {array.dtype.kind for array in arrays.values()} <= set("fiUb")
+
+
+def test_messages_stay_messages_and_other_mappings_stay_as_they_are():
+    """A mapping that happens to be in an answer is not taken for messages to other robots."""
+    answer = {"sent": Messages({3: 1.5}), "counts": {3: 2}}
+    restored = deserialize(serialize(answer), ())
+    assert type(restored["sent"]) is Messages
+    assert type(restored["counts"]) is dict
+    assert restored == answer
+    assert count_bytes(restored["sent"]) == 0
+    assert count_bytes(restored["counts"]) == 8
 
 
 def test_a_class_that_is_not_expected_is_not_made():
