@@ -144,7 +144,7 @@ def closed_form_terms(problem: PGOProblem, poses: Poses) -> HandednessTerms | No
     """
     graph = problem.graph
     turns = ~np.isin(graph.j, graph.landmarks)
-    W = problem.weights.W(3)
+    W = problem.weights.W_matrices
     E = np.swapaxes(graph.R_ij, 1, 2) @ np.swapaxes(poses.R[graph.i], 1, 2) @ poses.R[graph.j]
     product = W @ E
     values, axes = np.linalg.eigh(0.5 * (product + np.swapaxes(product, 1, 2)))

@@ -20,8 +20,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information, middle_pose
 from pgo_models.graphs.precisions import edge_precisions
+from pgo_models.problem.costs import ExcessCost
 from pgo_models.problem.excess import CoupledExcess
-from pgo_models.problem.information_costs import ExcessCost
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 

@@ -90,16 +90,18 @@ def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     terms = weights.evaluate_edges(delta, errors, P_i)
     # M X = A^T G: an entry is a sum over the edges of a pose of products of an entry of A and G,
     # which is itself a sum of at most d + 1 terms.
-    A = problem.plain_residual_matrix
+    A = problem.A
     most_entries = int(np.bincount(A.indices, minlength=1).max())
     count = most_entries + d + 2
     G_error = terms.G_error + gamma(count) * terms.G_size
-    product, product_error = terms.complete_half_gradient(
-        problem.incidence,
-        gamma(count),
-        A.T @ rows_of_blocks(terms.G),
-        abs(A).T @ rows_of_blocks(G_error),
-    )
+    product = A.T @ rows_of_blocks(terms.G)
+    product_error = abs(A).T @ rows_of_blocks(G_error)
+    if terms.in_P_i is not None and terms.in_P_i_error is not None:
+        # The half gradient in R_i^T itself: one more sum over the edges of a pose, and an addition.
+        at_beginning = problem.incidence.at_beginning
+        product[n:] += at_beginning(terms.in_P_i)
+        product_error[n:] += at_beginning(terms.in_P_i_error + gamma(count) * np.abs(terms.in_P_i))
+        product_error += UNIT_ROUNDOFF * np.abs(product)
     value = exact_sum(terms.value)
     value_error = OUTWARD * terms.value_error
     return Evaluation(value, value_error, product, OUTWARD * product_error)
@@ -200,9 +202,7 @@ def matrix_errors(problem: PGOProblem, diagonal: Array) -> Array:
     of_rotations = float(orthogonality_error(graph.R_ij).max())
     relative_error = of_terms + of_rotations + d * gamma(d + 2)
     # v^T E v <= sum_a v_a^2 (E u)_a / u_a for any positive u; here 1 / u_a = u_a diagonal_a.
-    E_u = problem.weights.entry_errors(
-        problem.plain_residual_matrix, problem.incidence, u, relative_error
-    )
+    E_u = problem.weights.entry_errors(problem.A, problem.incidence, u, relative_error)
     of_blocks = 4 * d * UNIT_ROUNDOFF
     return np.asarray(OUTWARD * (E_u * u + of_blocks))
 
@@ -247,25 +247,22 @@ def rounding_of(at: EvaluatedPoses) -> ObjectiveRounding:
     poses = problem.seen_poses(at.poses)
     graph = problem.graph
     d = problem.d
-    m = problem.graph.num_edges
     offsets = poses.t.take(graph.j, axis=0) - poses.t.take(graph.i, axis=0)
     errors = residual_errors(problem, block_norms(offsets), poses.orthogonality_error)
     e_t = errors.translation
     e_R = float(errors.rotation[0])  # the same of every edge
-    residuals = at.residuals
-    _, w = problem.residual_matrix
-    # sum ||D r|| e, the terms that are linear in the errors. Along the axes of W, which turn no
-    # norm, kappa weighs row by row.
-    weighted = w[:, None] * residuals
-    squared_rows = inner_products(weighted, weighted)
-    norms_t = np.sqrt(squared_rows[:m])
-    norms_R = np.sqrt(np.einsum("mk->m", squared_rows[m:].reshape(m, d)))
+    delta = at.point.delta
+    weighted = problem.weights.apply_weights(delta)
+    sizes = problem.weights.apply_absolute_weights(np.abs(delta))
+    # sum ||D r|| e, the terms that are linear in the errors; a row of W r is a sum of d products.
+    norms_t = block_norms(weighted[:, 0])
+    norms_R = block_norms(weighted[:, 1:]) + gamma(d) * block_norms(sizes[:, 1:])
     cross = float(np.sum(norms_t * e_t))
     cross += e_R * float(np.sum(norms_R))
     # The terms that are quadratic in the errors, and the rounding of the sum F.
     quadratic = errors.cost(problem)
-    F = float(np.sum(np.abs(w) * inner_products(residuals, residuals)))
-    error = quadratic + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * F
+    sum_of_sizes = float(np.sum(sizes * np.abs(delta)))
+    error = quadratic + 2.0 * cross + PAIRWISE_SUM * UNIT_ROUNDOFF * sum_of_sizes
     for of_cost in problem.weights.value_errors(at.point, poses.orthogonality_error, e_t, e_R):
         error += of_cost
     roundings = edge_roundings(problem, poses)

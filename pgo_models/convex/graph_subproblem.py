@@ -21,7 +21,7 @@ from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.problem.matrices import residual_matrix, rotation_columns
+from pgo_models.problem.matrices import isotropic_weights, residual_matrix, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
@@ -415,7 +415,8 @@ def _posed(
         columns = np.concatenate([poses, columns])
         penalty = np.concatenate([penalty_t, penalty])
 
-    A_whole, weights = residual_matrix(graph)
+    A_whole = residual_matrix(graph)
+    weights = isotropic_weights(graph).row_weights
     variables = _variables(graph, unknowns, poses, columns, A_whole)
     change = _checked_change(changer, variables)
     shares = shares.copy()

@@ -30,13 +30,13 @@ from typing import Self
 import numpy as np
 
 from pgo_models.geometry.arrays import block_norms, inner_products
-from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
-from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.geometry.rotations import Array, hat, tangent_dimension, vee
 from pgo_models.problem.floating_point import OUTWARD, gamma
+from pgo_models.problem.incidence import EdgeArrays
 
 
 @dataclass(frozen=True, eq=False)
-class Excess:
+class Excess(EdgeArrays):
     """Excess u^T J u with u = r: that of edges whose translations and rotations are not coupled."""
 
     R_ij: Array  # (m, d, d)
@@ -47,16 +47,6 @@ class Excess:
     # (m, 2): lower bounds on the eigenvalues of the translation and the rotation blocks. J is at
     # least the diagonal matrix of both, J_ss at least the second.
     least: Array
-
-    def of_edges(self, chosen: IntArray | BoolArray) -> Self:
-        """The excess of the chosen edges."""
-        return replace(
-            self,
-            R_ij=self.R_ij[chosen],
-            J=self.J[chosen],
-            size=self.size[chosen],
-            least=self.least[chosen],
-        )
 
     def with_silent_edges(self, R_ij: Array) -> Self:
         """The excess with further edges, on which it is zero; R_ij, (k, d, d), is theirs."""
@@ -118,11 +108,6 @@ class CoupledExcess(Excess):
     """Excess u^T J u + tr(H J_ss H) with u = (r, s), where edges have coupling blocks."""
 
     J_ss: Array  # (m, p, p), p = 1 in the plane, 3 in space
-
-    def of_edges(self, chosen: IntArray | BoolArray) -> Self:
-        """The excess of the chosen edges."""
-        excess = super().of_edges(chosen)
-        return replace(excess, J_ss=self.J_ss[chosen])
 
     def with_silent_edges(self, R_ij: Array) -> Self:
         """The excess with further edges, on which it is zero; R_ij, (k, d, d), is theirs."""
@@ -196,7 +181,7 @@ class CoupledExcess(Excess):
 
 
 @dataclass(frozen=True, eq=False)
-class Tangent:
+class Tangent(EdgeArrays):
     """A quadratic minorant of the excess: sum_e value + 2 <C, Z - Z*> - loss.
 
     C is half the gradient of the excess at Z*, where the minorant is equal to the excess but for
@@ -208,11 +193,6 @@ class Tangent:
     Z: Array  # Z*, (m, d + 1, d)
     value: Array  # the excess at Z*, (m,)
     excess: Excess
-
-    def of_edges(self, chosen: IntArray | BoolArray) -> "Tangent":
-        """The tangent of the chosen edges."""
-        excess = self.excess.of_edges(chosen)
-        return Tangent(self.C[chosen], self.Z[chosen], self.value[chosen], excess)
 
     def with_silent_edges(self, R_ij: Array) -> "Tangent":
         """The tangent with further edges, which have no excess; R_ij, (k, d, d), is theirs."""

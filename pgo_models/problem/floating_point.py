@@ -29,8 +29,8 @@ UNIT_ROUNDOFF = 2.0**-53
 # A bound is a sum of fewer than 2^22 non-negative terms, each of a few operations: this makes up
 # for their rounding.
 OUTWARD = 1.0 + 2.0**-30
-# Roundings of a weighted square and of numpy's sum in pairs: blocks of 128, then halves of 2^60
-# numbers at most.
+# Roundings of a term of F, which has at most d + 1 of them, and of numpy's sum in pairs: at most 24
+# in a block of up to 128 numbers, then one each time that the number of blocks, 2^52, is halved.
 PAIRWISE_SUM = 80
 
 

@@ -1,11 +1,12 @@
-"""Incidence of edges and poses: sums over the edges of a pose, and blocks of residual rows."""
+"""Incidence of edges and poses: sums over the edges of a pose; arrays with a block an edge."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 
 
@@ -52,11 +53,27 @@ class Incidence:
         return np.asarray(sums.reshape(-1, *block_shape))
 
 
-def blocks_of_rows(rows: Array, m: int) -> Array:
+@dataclass(frozen=True, eq=False)
+class EdgeArrays:
+    """Base of what is made of arrays (m, ..) with an entry an edge, and of such things."""
+
+    def of_edges(self, chosen: IntArray | BoolArray) -> Self:
+        """The same of the chosen edges: these entries of every array."""
+        of_chosen: dict[str, Array | EdgeArrays] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                of_chosen[field.name] = value[chosen]
+            elif isinstance(value, EdgeArrays):
+                of_chosen[field.name] = value.of_edges(chosen)
+        return replace(self, **of_chosen)
+
+
+def blocks_of_rows(rows: Array, d: int) -> Array:
     """Rows of A, ((d + 1) m, k), as blocks of edges, (m, d + 1, k): translation, then rotation."""
-    num_columns = rows.shape[1]
+    m = len(rows) // (d + 1)
     translation_rows = rows[:m, None]
-    rotation_rows = rows[m:].reshape(m, -1, num_columns)
+    rotation_rows = rows[m:].reshape(m, d, rows.shape[1])
     return np.concatenate([translation_rows, rotation_rows], axis=1)
 
 

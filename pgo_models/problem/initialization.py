@@ -16,7 +16,7 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
 from pgo_models.problem.cholesky import analyze, factorize_damped
-from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.costs import EdgeCost
 from pgo_models.problem.matrices import assemble, rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
@@ -156,11 +156,11 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
     graph = problem.graph
     if graph.world is not None and graph.is_world_loose:
         return _start_with_loose_world(problem, graph.world, averaged)
-    if problem.d == 2 and not problem.weights.rotation.has_own_axes:
+    if problem.d == 2 and problem.weights.is_isotropic:
         R = _chordal_rotations_in_the_plane(problem)
     else:
         R = _chordal_rotations(problem)
-    stiffness = largest_stiffness(problem.weights, problem.d) if averaged else None
+    stiffness = largest_stiffness(problem.weights) if averaged else None
     if stiffness is not None:
         pull = averaging_pull(problem, R, stiffness)
         R = R @ exp_map(problem.solve_translations(pull))
@@ -227,12 +227,12 @@ def _start_with_loose_world(problem: PGOProblem, world: int, averaged: bool) -> 
     return problem.with_best_translations(fitted.R)
 
 
-def largest_stiffness(weights: EdgeCost, d: int) -> float | None:
+def largest_stiffness(weights: EdgeCost) -> float | None:
     """Largest kappa / tau of edges, 0 if there are none.
 
     None if their rotations cannot be averaged by `averaging_pull`.
     """
-    if d != 2 or weights.rotation.has_own_axes or not (weights.tau > 0.0).all():
+    if weights.d != 2 or not (weights.is_isotropic and (weights.tau > 0.0).all()):
         return None
     return float((weights.kappa / weights.tau).max(initial=0.0))
 

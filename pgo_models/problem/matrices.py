@@ -19,35 +19,42 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.cholesky import factorize
-from pgo_models.problem.edge_cost import EdgeCost, isotropic_cost
+from pgo_models.problem.costs import EdgeCost, isotropic_cost
 from pgo_models.problem.incidence import Incidence
 
 MAX_DENSE_SIDE = 6000  # a dense Q of this side takes 288 MB
 
 
-def residual_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> tuple[csr_array, Array]:
-    """A, ((d+1) m, N), and weights w, ((d+1) m,), with F = sum_rows w ||A X||^2.
+def residual_matrix(
+    graph: PoseGraph, has_translations: bool = True, U: Array | None = None
+) -> csr_array:
+    """A, ((d+1) m, N): the residuals of all edges are A X.
 
-    Its first m rows give t_j^T - t_i^T - t_ij^T R_i^T with weight tau. Then d rows of every edge
-    give R_j^T - R_ij^T R_i^T with weight kappa (equations `translation` and `rotation` of the
-    paper). Where the weights are W = U diag(kappa) U^T, the latter are multiplied by U^T, and their
-    weights are the d eigenvalues kappa of the edge. The weights are those of F unless given.
+    Its first m rows give t_j^T - t_i^T - t_ij^T R_i^T, with zeros for t_ij of rotations alone. Then
+    d rows of every edge give R_j^T - R_ij^T R_i^T (equations `translation` and `rotation` of the
+    paper), multiplied by the U^T of the edge if U, (m, d, d), is given.
     """
     n = graph.num_poses
     m = graph.num_edges
     d = graph.d
-    weights = weights if weights is not None else isotropic_weights(graph)
     block_i = rotation_columns(graph.i, n, d)
     block_j = rotation_columns(graph.j, n, d)
     # Entries of the translation rows, (m, 2 + d): in the columns of t_i, t_j and R_i.
     columns_t = np.concatenate([graph.i[:, None], graph.j[:, None], block_i], axis=1)
     minus_ones = np.full((m, 1), -1.0)
     ones = np.ones((m, 1))
-    minus_offsets = -weights.seen_offsets(graph.t_ij)
+    minus_offsets = -graph.t_ij if has_translations else np.zeros_like(graph.t_ij)
     values_t = np.concatenate([minus_ones, ones, minus_offsets], axis=1)
     # Entries of the rotation rows, (m, d, d + 1) or (m, d, 2 d): in the columns of R_i and R_j.
-    values_i, values_j, columns_j = weights.rotation.row_entries(graph.R_ij, block_j)
     columns_i = np.repeat(block_i[:, None], d, axis=1)
+    if U is None:
+        columns_j = block_j[:, :, None]
+        values_i = -np.swapaxes(graph.R_ij, 1, 2)
+        values_j = np.ones((m, d, 1))
+    else:
+        columns_j = np.repeat(block_j[:, None], d, axis=1)
+        values_i = -np.swapaxes(graph.R_ij @ U, 1, 2)
+        values_j = np.swapaxes(U, 1, 2)
     columns_R = np.concatenate([columns_i, columns_j], axis=2)
     values_R = np.concatenate([values_i, values_j], axis=2)
     # All entries, row by row.
@@ -61,12 +68,12 @@ def residual_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> tuple[
     A = csr_array((values, columns, row_starts), shape=shape)
     # No entry is stored twice; the call sorts the rows.
     A.sum_duplicates()
-    return A, weights.row_weights(d)
+    return A
 
 
 def isotropic_weights(graph: PoseGraph) -> EdgeCost:
     """The weights of F."""
-    return isotropic_cost(graph.tau, graph.kappa)
+    return isotropic_cost(graph.tau, graph.kappa, graph.d)
 
 
 def joint_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> csc_array:

@@ -23,11 +23,10 @@ from pgo_models.problem.cholesky import (
     analyze,
     factorize_damped,
 )
-from pgo_models.problem.edge_cost import EdgeCost, EdgePoint
+from pgo_models.problem.costs import EdgeCost, EdgePoint, rotation_cost
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.right_costs import RightCosts
-from pgo_models.problem.rotation_averaging import RotationAveraging
 from pgo_models.problem.weighting import (
     Weighting,
     convex_cost,
@@ -131,7 +130,8 @@ class PGOProblem(ReadOnly):
         if self.weighting is Weighting.ISOTROPIC:
             return matrices.isotropic_weights(self.graph)
         if self.weighting is Weighting.ROTATIONS:
-            return RotationAveraging.of(self.graph)
+            kappa = self.graph.kappa
+            return rotation_cost(kappa, np.zeros_like(kappa), self.d)
         return information_cost(self.graph, self.information)
 
     @cached_property
@@ -294,18 +294,23 @@ class PGOProblem(ReadOnly):
         return read_only(matrices.marginalized_matrix(self.graph, self.weights))
 
     @cached_property
-    def residual_matrix(self) -> tuple[csr_array, Array]:
-        """Residual matrix A, ((d+1) m, N), and weights w: F = sum_rows w ||A X||^2."""
-        A, w = matrices.residual_matrix(self.graph, self.weights)
-        return read_only(A), read_only(w)
+    def A(self) -> csr_array:
+        """Matrix A, ((d+1) m, N), of the residuals of all edges, A X."""
+        return read_only(matrices.residual_matrix(self.graph, self.has_translations))
 
     @cached_property
-    def plain_residual_matrix(self) -> csr_array:
-        """A with the rotation residuals as they are, not along the axes of W."""
-        if self.weights.rotation.has_own_axes:
-            A, _ = matrices.residual_matrix(self.graph, self.weights.with_unit_weights())
-            return read_only(A)
-        return self.residual_matrix[0]
+    def residual_matrix(self) -> tuple[csr_array, Array]:
+        """Rows, ((d+1) m, N), and their weights w: F = sum_rows w ||rows X||^2.
+
+        The rows are those of A where W = kappa I. Else W = U diag(kappa) U^T: the rotation rows of
+        an edge are multiplied by U^T, and their weights are its d eigenvalues.
+        """
+        weights = self.weights
+        rows = self.A
+        if not weights.is_isotropic:
+            _, U = weights.eigenbasis
+            rows = matrices.residual_matrix(self.graph, self.has_translations, U)
+        return read_only(rows), read_only(weights.row_weights)
 
     @cached_property
     def analysis(self) -> SymbolicCholesky:
@@ -380,9 +385,9 @@ class PGOProblem(ReadOnly):
         Returns
         -------
         ((d+1) m, d) array
-            The residuals, those of rotations along the axes of W.
+            The residuals.
         """
-        return np.asarray(self.residual_matrix[0] @ X)
+        return np.asarray(self.A @ X)
 
     def point(self, X: Array) -> EdgePoint:
         """Return X as the edges see it: what their cost is evaluated at.
@@ -395,12 +400,11 @@ class PGOProblem(ReadOnly):
         Returns
         -------
         EdgePoint
-            Residuals, their weights, and rotations.
+            Residuals and rotations.
         """
-        _, w = self.residual_matrix
-        d = self.d
-        P = X[self.num_poses :].reshape(self.num_poses, d, -1)
-        return EdgePoint(self.weights, w, self.residuals(X), P, self.graph.i)
+        P = X[self.num_poses :].reshape(self.num_poses, self.d, -1)
+        residuals = self.residuals(X)
+        return EdgePoint(residuals, self.weights.weigh_rows(residuals), P, self.graph.i)
 
     def objective_stacked(self, X: Array) -> float:
         """Return the cost at any X, as a weighted sum of squares of residuals.
@@ -461,7 +465,7 @@ class PGOProblem(ReadOnly):
         return self.weights.edge_values(self.at(poses).point)
 
     def apply_M(self, X: Array) -> Array:
-        """Return M X = A^T (w A X) by way of the residuals.
+        """Return M X = A^T (D A X) by way of the residuals.
 
         That is accurate where the edges fit, however large the translations are.
 
@@ -690,7 +694,9 @@ class PGOProblem(ReadOnly):
         Poses
             The given ones; in a problem of rotations alone with zeros for translations.
         """
-        return self.weights.seen_poses(poses)
+        if self.has_translations or not poses.t.any():
+            return poses
+        return poses.with_translations(np.zeros_like(poses.t))
 
     def stacked(self, poses: Poses) -> Array:
         """Return X of poses: the rows t_i, then the rows of every R_i^T.
@@ -756,7 +762,7 @@ class PGOProblem(ReadOnly):
     @cached_property
     def residual_adjoint(self) -> csc_array:
         """A^T, (N, (d+1) m)."""
-        return self.residual_matrix[0].T
+        return self.A.T
 
     @cached_property
     def incidence(self) -> Incidence:
@@ -912,19 +918,14 @@ class _TangentProblem(_SharingProblem):
     """A tangent of chi2."""
 
     @cached_property
-    def residual_matrix(self) -> tuple[csr_array, Array]:
-        """A and w, those of the quadratic part that both have."""
-        return self.original.residual_matrix[0], read_only(self.weights.row_weights(self.d))
+    def A(self) -> csr_array:
+        """A, which both have."""
+        return self.original.A
 
     @cached_property
     def convex_part(self) -> PGOProblem:
         """The tangent itself if it is convex in (R, t), else the problem near chi2 that is."""
         return self if self.weights.is_convex else self.original.convex_part
-
-    @cached_property
-    def plain_residual_matrix(self) -> csr_array:
-        """A with the rotation residuals as they are."""
-        return self.original.plain_residual_matrix
 
     @cached_property
     def residual_adjoint(self) -> csc_array:

@@ -14,7 +14,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import LEAST_SCALED, gaussian_information, scaled_blocks
-from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.costs import EdgeCost
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def _chi2_weights(graph: PoseGraph, cost: EdgeCost, is_chi2: bool) -> Array:
     root_t = root[:, :d]
     root_r = root[:, d:]
     # The matrix root^T blockdiag(tau I, V) root.
-    W = cost.W(d)
+    W = cost.W_matrices
     trace = np.einsum("mkk->m", W)[:, None, None]
     V = trace if d == 2 else trace * np.eye(3) - W
     is_seen_t, _ = cost.is_seen()

@@ -15,7 +15,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import edge_errors
-from pgo_models.problem.edge_cost import isotropic_cost
+from pgo_models.problem.costs import isotropic_cost
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.right_costs import RightCosts
 from pgo_models.summaries import Summarised
@@ -151,7 +151,7 @@ def _right_costs_of(problem: PGOProblem | PoseGraph) -> RightCosts:
     """Distribution of the costs of right edges; for a graph the cost is F."""
     if isinstance(problem, PGOProblem):
         return problem.right_costs
-    return RightCosts.of(problem, isotropic_cost(problem.tau, problem.kappa))
+    return RightCosts.of(problem, isotropic_cost(problem.tau, problem.kappa, problem.d))
 
 
 def _median_ratio(cost: Array, right_costs: RightCosts) -> float:

@@ -1,6 +1,6 @@
 """The costs of a graph's measurements: F, with two precisions an edge, or chi2; or rotations alone.
 
-**F**: tau ||delta_t||^2 + kappa ||delta_R||_F^2 (`pgo_models.problem.edge_cost`).
+**F**: tau ||delta_t||^2 + kappa ||delta_R||_F^2 (`pgo_models.problem.costs`).
 
 **chi2** (`pgo_models.graphs.residuals.chi2`, CHORDAL): for a rotation E by theta about a, 2 (1 -
 cos theta) a^T I_rr a = tr(W (2 I - E - E^T)) with W = tr(I_rr) / 2 I - I_rr in space and I_theta /
@@ -10,7 +10,7 @@ the smallest eigenvalue of I_tt, is a convex function of Z, and so is the coupli
 with rotations: see `pgo_models.problem.excess`.
 
 **Rotations alone**: the rotation part of F, or of chi2 where no edge measures a translation
-(`pgo_models.problem.rotation_averaging`).
+(`pgo_models.problem.costs.rotation_cost`).
 """
 
 import enum
@@ -30,16 +30,9 @@ from pgo_models.graphs.precisions import (
     smallest_eigenvalues,
     uncoupled_share,
 )
-from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.costs import EdgeCost, ExcessCost, rotation_cost
 from pgo_models.problem.excess import CoupledExcess, Excess
 from pgo_models.problem.floating_point import OUTWARD, gamma
-from pgo_models.problem.information_costs import ExcessCost
-from pgo_models.problem.rotation_averaging import RotationAveraging
-from pgo_models.problem.rotation_weights import (
-    RotationWeights,
-    RoundedIdentities,
-    SymmetricMatrices,
-)
 
 # Distance of tau from the smallest eigenvalue, as a share of it: with it the excess is strictly
 # convex.
@@ -172,7 +165,7 @@ def information_cost(graph: PoseGraph, information: Array) -> EdgeCost:
     is_coupled = bool(blocks.is_coupled.any())
     if is_isotropic and not is_coupled:
         tau = blocks.I_tt[:, 0, 0].copy()
-        return _quadratic_cost(tau, _uncoupled_rotation_weights(blocks.I_rr))
+        return _quadratic_cost(tau, *_uncoupled_rotation_weights(blocks.I_rr), d)
     _check_positions(graph, blocks)
     if is_coupled:
         return _coupled_cost(graph, information, blocks)
@@ -191,7 +184,7 @@ def _uncoupled_cost(graph: PoseGraph, blocks: _Information) -> ExcessCost:
     size = _block_sizes(d, trace_of_sizes, np.zeros_like(tau))
     least = 0.5 * margin[:, [0, -1]]
     excess = Excess(graph.R_ij, J, size, least)
-    return ExcessCost(tau, _uncoupled_rotation_weights(blocks.I_rr), excess)
+    return ExcessCost(tau, *_uncoupled_rotation_weights(blocks.I_rr), d, excess)
 
 
 def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) -> ExcessCost:
@@ -230,7 +223,7 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     trace_of_sizes = blocks.trace + d * tau
     size = _block_sizes(d, trace_of_sizes, np.einsum("mkk->m", J_ss))
     excess = CoupledExcess(graph.R_ij, J, size, 0.5 * margin[:, [0, -1]], J[:, d:, d:])
-    return ExcessCost(tau, _rotation_weights(blocks.I_rr, J_ss), excess)
+    return ExcessCost(tau, *_rotation_weights(blocks.I_rr, J_ss), d, excess)
 
 
 def _coupled_tau(information: Array, blocks: _Information) -> Array:
@@ -281,38 +274,42 @@ def _check_positions(graph: PoseGraph, blocks: _Information) -> None:
 def convex_cost(information: Array, d: int) -> EdgeCost:
     """A strictly convex quadratic cost near chi2.
 
-    It has the tau of F, and W with its eigenvalues raised to a share of the kappa of F.
+    It has the tau of F, and W with its eigenvalues raised to a share of the kappa of F; W = kappa
+    I is convex as it is. The stored numbers define these weights, so that they have no error.
     """
     kappa_F, tau_F = edge_precisions(information)
-    rotation = _uncoupled_rotation_weights(information[:, d:, d:])
-    return _quadratic_cost(tau_F, rotation.raised_to(_LEAST_CONVEX * kappa_F))
+    W, _ = _uncoupled_rotation_weights(information[:, d:, d:])
+    if W.ndim > 1:
+        kappa, axes = np.linalg.eigh(W)
+        raised = np.maximum(kappa, _LEAST_CONVEX * kappa_F[:, None])
+        W = (axes * raised[:, None, :]) @ np.swapaxes(axes, 1, 2)
+    return _quadratic_cost(tau_F, W, np.zeros(len(W)), d)
 
 
-def _quadratic_cost(tau: Array, rotation: RotationWeights) -> EdgeCost:
+def _quadratic_cost(tau: Array, W: Array, W_error: Array, d: int) -> EdgeCost:
     """The quadratic cost with tau and W; of rotations alone where every tau is zero."""
-    if tau.any():
-        return EdgeCost(tau, rotation)
-    return RotationAveraging.with_weights(rotation)
+    return EdgeCost(tau, W, W_error, d) if tau.any() else rotation_cost(W, W_error, d)
 
 
-def _uncoupled_rotation_weights(I_rr: Array) -> RotationWeights:
-    """The W that belongs to I_rr, (m, p, p)."""
+def _uncoupled_rotation_weights(I_rr: Array) -> tuple[Array, Array]:
+    """The W that belongs to I_rr, (m, p, p), and its error."""
     return _rotation_weights(I_rr, np.zeros_like(I_rr))
 
 
-def _rotation_weights(I_rr: Array, J_ss: Array) -> RotationWeights:
-    """The W that belongs to I_rr - J_ss, (m, p, p), with a bound on its rounding error."""
+def _rotation_weights(I_rr: Array, J_ss: Array) -> tuple[Array, Array]:
+    """The W that belongs to I_rr - J_ss, (m, p, p), with a bound on its rounding error, (m,).
+
+    W is (m,) where it is kappa I on every edge, else (m, d, d).
+    """
     p = I_rr.shape[1]
     difference = I_rr - J_ss
     sizes = np.linalg.norm(I_rr, axis=(1, 2)) + np.linalg.norm(J_ss, axis=(1, 2))
     error = OUTWARD * gamma(4.0 * p) * p * sizes
     multiples_of_identity = difference[:, :1, :1] * np.eye(p)
     if p == 1 or (difference == multiples_of_identity).all():
-        return RoundedIdentities(0.5 * difference[:, 0, 0], error)
+        return 0.5 * difference[:, 0, 0], error
     traces = np.einsum("mkk->m", difference)[:, None, None]
-    W = 0.5 * traces * np.eye(p) - difference
-    kappa, axes = np.linalg.eigh(W)
-    return SymmetricMatrices(kappa, error, axes, W)
+    return 0.5 * traces * np.eye(p) - difference, error
 
 
 def _check(graph: PoseGraph, is_definite: BoolArray) -> None:

@@ -276,7 +276,7 @@ def run_fingerprint(
 ) -> dict[str, str]:
     """What a checkpoint must have in common with the run that goes on from it."""
     graph = problem.graph
-    edges = [graph.i, graph.j, graph.R_ij, graph.t_ij, *problem.weights.arrays(graph.d)]
+    edges = [graph.i, graph.j, graph.R_ij, graph.t_ij, *problem.weights.arrays()]
     poses = () if start is None else (start.R, start.t)
     text = np.frombuffer(repr(settings).encode(), dtype=np.uint8)
     digests = (digest(*edges), digest(robots.robot), digest(text, *poses))

@@ -18,7 +18,7 @@ from pgo_models.graphs.pose_graph import (
     written_error_of,
 )
 from pgo_models.graphs.separators import cover_of_edges
-from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.costs import EdgeCost
 from pgo_models.problem.initialization import largest_stiffness
 from pgo_models.problem.problem import PGOProblem, as_problem
 from solvers.soc.subdomains import MOST_COUPLED, Subdomains, find_subdomains, poses_to_leave
@@ -161,7 +161,7 @@ class Subgraph:
             has_translations=self.weights.has_translations,
             part=self.poses[poses_of_part],
             coupled=self._coupled,
-            stiffness=largest_stiffness(self.weights.of_edges(self.is_counted), self.graph.d),
+            stiffness=largest_stiffness(self.weights.of_edges(self.is_counted)),
         )
 
     @property

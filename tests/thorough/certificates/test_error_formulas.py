@@ -56,8 +56,7 @@ def written_out(
     degree = np.bincount(np.concatenate([graph.i, np.repeat(graph.i, d), graph.j]), minlength=n)
     # Non-zeros in the longest column of A: one for a translation's edge, and of a rotation row one
     # a t_ij and d or one.
-    A, _ = problem.residual_matrix
-    most = int(np.diff(A.tocsc().indptr).max())
+    most = int(np.diff(problem.A.tocsc().indptr).max())
     assert degree.max() > 0
     for e in range(graph.num_edges):
         i, j, tau, kappa, R, s = (

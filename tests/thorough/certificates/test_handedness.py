@@ -162,7 +162,7 @@ def test_terms_in_closed_form_make_no_other_direction_negative(
         return
     i, j = graph.i, graph.j
     E = np.swapaxes(graph.R_ij, 1, 2) @ np.swapaxes(poses.R[i], 1, 2) @ poses.R[j]
-    weights = tangent.weights.W(3) @ E
+    weights = tangent.weights.W_matrices @ E
     weights = 0.5 * (weights + np.swapaxes(weights, 1, 2))
     lowest = np.linalg.eigvalsh(weights)
     of_terms = np.flatnonzero((lowest[:, 0] < 0.0) & (lowest[:, 1] > 0.0))

@@ -30,7 +30,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.precisions import are_definite, proper_information, uncoupled_share
 from pgo_models.graphs.residuals import chi2
-from pgo_models.problem.information_costs import ExcessCost, TangentCost
+from pgo_models.problem.costs import ExcessCost, TangentCost
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import rotation_columns
 from solvers.riemannian.polish import polish
@@ -53,7 +53,7 @@ def exact_tangent_matrix(problem: PGOProblem) -> Exact:
     n = problem.num_poses
     d = problem.d
     M = exact(np.zeros((problem.side, problem.side)))
-    W = exact(problem.weights.W(d))
+    W = exact(problem.weights.W_matrices)
     C = exact(problem.weights.tangent.C)
     tau = exact(problem.weights.tau)
     R_ij = exact(graph.R_ij)

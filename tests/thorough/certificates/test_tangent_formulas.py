@@ -23,10 +23,9 @@ from pgo_models.certificates.rounding_errors import (
 )
 from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.graphs.precisions import are_definite, proper_information
-from pgo_models.problem.edge_cost import EdgeCost
+from pgo_models.problem.costs import EdgeCost, ExcessCost, TangentCost
 from pgo_models.problem.excess import CoupledExcess, Tangent
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u, gamma
-from pgo_models.problem.information_costs import ExcessCost, TangentCost
 from pgo_models.problem.matrices import rotation_columns
 from solvers.robots.proof_of_robot import verify_interior
 
@@ -46,8 +45,7 @@ def touching(problem: PGOProblem, seed: int = 0) -> tuple[PGOProblem, Tangent]:
 
 def with_error_of_W(cost: EdgeCost, factor: float | Array) -> EdgeCost:
     """The cost with the error of W times a factor, one or one an edge."""
-    rotation = replace(cost.rotation, error=factor * cost.rotation.norm_of_error())
-    return replace(cost, rotation=rotation)
+    return replace(cost, W_error=factor * cost.W_error)
 
 
 def changed(tangent: Tangent, **numbers: Array) -> Tangent:
@@ -109,7 +107,7 @@ def test_error_of_W(d: int, coupled: bool) -> None:
     # in the frame of i, which turns no norm
     K = excess.J_ss if isinstance(excess, CoupledExcess) else np.zeros_like(I_rr)
     sizes = np.linalg.norm(I_rr, axis=(1, 2)) + np.linalg.norm(K, axis=(1, 2))
-    assert (weights.rotation.norm_of_error() >= (1.0 - 1e-9) * gamma(4.0 * p) * p * sizes).all()
+    assert (weights.W_error >= (1.0 - 1e-9) * gamma(4.0 * p) * p * sizes).all()
 
 
 @CASES
@@ -175,12 +173,12 @@ def written_out(problem: PGOProblem, t: Array, low: Array, P: Array) -> tuple[fl
     d = problem.d
     weights = problem.weights
     assert isinstance(weights, TangentCost)
-    W_error = weights.rotation.norm_of_error()
+    W_error = weights.W_error
     T = weights.tangent
     product = np.zeros((n * (d + 1), d))
     error = np.zeros((n * (d + 1), d))
     value_error = 0.0
-    most = int(np.diff(problem.plain_residual_matrix.tocsc().indptr).max()) + d + 2
+    most = int(np.diff(problem.A.tocsc().indptr).max()) + d + 2
     for e in range(graph.num_edges):
         i = graph.i[e]
         j = graph.j[e]
@@ -188,7 +186,7 @@ def written_out(problem: PGOProblem, t: Array, low: Array, P: Array) -> tuple[fl
         s = graph.t_ij[e]
         C = T.C[e]
         W = np.zeros((d + 1, d + 1))
-        W[0, 0], W[1:, 1:] = weights.tau[e], weights.W(d)[e]
+        W[0, 0], W[1:, 1:] = weights.tau[e], weights.W_matrices[e]
         rho, errors = residual_of(problem, e, t, low, P)
         sizes = abs(W) @ abs(rho)
         off = abs(W) @ errors
@@ -262,8 +260,8 @@ def test_residuals_that_are_rounding_are_counted_beside_an_uncertain_W(d: int) -
     j = problem.graph.j[0]
     R[j] = problem.graph.R_ij[0].T @ R[i]
     count = problem.graph.num_edges
-    rotation = replace(problem.weights.rotation, error=1e30 * (np.arange(count) == 0))
-    uncertain = replace(problem, weighting=replace(problem.weights, rotation=rotation))
+    W_error = 1e30 * (np.arange(count) == 0)
+    uncertain = replace(problem, weighting=replace(problem.weights, W_error=W_error))
     found = evaluate_edges(
         uncertain, np.concatenate([np.zeros((2, d)), R.reshape(-1, d)]), np.zeros((2, d))
     )
@@ -279,7 +277,7 @@ def test_errors_of_the_matrix_of_a_tangent(d: int, coupled: bool, of_W: float) -
     graph = problem.graph
     n = 6
     weights = problem.weights
-    W_error = weights.rotation.norm_of_error()
+    W_error = weights.W_error
     most = np.bincount(np.concatenate([graph.i, graph.j])).max()
     count = gamma(most + 3.0 * d + 6.0) + orthogonality_error(graph.R_ij).max() + d * gamma(d + 2)
     rng = np.random.default_rng(0)
@@ -301,7 +299,7 @@ def test_errors_of_the_matrix_of_a_tangent(d: int, coupled: bool, of_W: float) -
             dW = np.zeros((d + 1, d + 1))
             W[0, 0], W[1:, 1:], dW[1:, 1:] = (
                 weights.tau[e],
-                abs(weights.W(d)[e]),
+                abs(weights.W_matrices[e]),
                 of_W * W_error[e],
             )
             C = np.zeros((d + 1, 2 + 2 * d))
@@ -319,7 +317,7 @@ def test_errors_of_chi2(d: int, coupled: bool) -> None:
     weights = problem.weights
     assert isinstance(weights, ExcessCost)
     excess = weights.excess
-    W_error = weights.rotation.norm_of_error()
+    W_error = weights.W_error
     for spread, of_W in ((1.0, 1.0), (1e6, 1.0), (1e-6, 1.0), (1.0, 1e9)):
         one = replace(problem, weighting=with_error_of_W(weights, of_W))
         poses = random_poses(6, d, 1, spread)
@@ -330,7 +328,6 @@ def test_errors_of_chi2(d: int, coupled: bool) -> None:
         level = 0.0
         error = 0.0
         touched = excess.tangent(problem.at(poses).point.Z)
-        kappa = weights.rotation.row_weights(d).reshape(m, d)
         e_R = 2 * np.sqrt(d) * share + 2 * omega
         for e in range(m):
             i = graph.i[e]
@@ -342,7 +339,8 @@ def test_errors_of_chi2(d: int, coupled: bool) -> None:
             s_t, s_R = excess.size[e]
             r_t = residuals[e]
             r_R = residuals[m + d * e : m + d * e + d]
-            most = abs(kappa[e]).max()
+            W = weights.W_matrices[e]
+            most = abs(np.linalg.eigvalsh(W)).max()
             level += (
                 weights.tau[e] * at_level**2 + most * e_R**2 + (s_t * at_level + s_R * e_R) ** 2
             )
@@ -350,18 +348,17 @@ def test_errors_of_chi2(d: int, coupled: bool) -> None:
                 weights.tau[e] * (2 * np.linalg.norm(r_t) * e_t + e_t**2)
                 + (s_t * e_t + s_R * e_R) ** 2
             )
-            error += 2 * e_R * np.linalg.norm(kappa[e][:, None] * r_R) + most * e_R**2
+            error += 2 * e_R * np.linalg.norm(W @ r_R) + most * e_R**2
             error += (
                 80
                 * u
                 * (
                     weights.tau[e] * r_t @ r_t
-                    + np.sum(abs(kappa[e]) @ r_R**2)
+                    + np.sum(abs(r_R) * (abs(W) @ abs(r_R)))
                     + abs(touched.value[e])
                 )
             )
-            of_axes = gamma(4.0 * d) * most if weights.rotation.has_own_axes else 0.0
-            error += (of_W * W_error[e] + of_axes) * np.sum(r_R**2)
+            error += of_W * W_error[e] * np.sum(r_R**2)
             moved = np.linalg.norm(touched.Z[e], axis=1)
             error += 2 * np.linalg.norm(touched.C[e, 0]) * (e_t + omega * moved[0])
             error += 2 * np.linalg.norm(touched.C[e, 1:]) * (e_R + omega * moved[1:].sum())

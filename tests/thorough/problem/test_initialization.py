@@ -31,7 +31,7 @@ from pgo_models import (
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import unstack_transposes
 from pgo_models.graphs.scenes import MILD_NOISE, observe
-from pgo_models.problem.matrices import residual_matrix
+from pgo_models.problem.matrices import isotropic_weights
 from solvers import polish
 
 
@@ -59,7 +59,7 @@ def assert_costs_nothing(graph: PoseGraph, poses: Poses) -> None:
     Every residual is below about n eps times the size of the world.
     """
     size = 1.0 + np.abs(poses.t).max()
-    w = residual_matrix(graph)[1]
+    w = isotropic_weights(graph).row_weights
     assert PGOProblem(graph).objective(poses) <= w.sum() * (1e3 * graph.num_poses * EPS * size) ** 2
 
 

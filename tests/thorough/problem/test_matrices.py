@@ -10,6 +10,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import stack_transposes
 from pgo_models.problem.matrices import (
     connection_laplacian,
+    isotropic_weights,
     joint_matrix,
     marginalized_matrix,
     residual_matrix,
@@ -37,7 +38,8 @@ def translation_cost(graph: PoseGraph, R: np.ndarray, t: np.ndarray) -> float:
 def test_M_is_A_transposed_w_A(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
     M = joint_matrix(graph).toarray()
-    A, w = residual_matrix(graph)
+    A = residual_matrix(graph)
+    w = isotropic_weights(graph).row_weights
     assert A.shape == ((d + 1) * graph.num_edges, (d + 1) * n)
     A = A.toarray()
     # M has kappa I where A has kappa R_ij R_ij^T, whose entries beside the diagonal are off by its
@@ -52,7 +54,7 @@ def test_M_is_A_transposed_w_A(seed: int, n: int, d: int) -> None:
 def test_rows_of_A_are_the_residuals(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
     poses = random_poses(n, d, seed)
-    residuals = residual_matrix(graph)[0] @ poses.stacked()
+    residuals = residual_matrix(graph) @ poses.stacked()
     m = graph.num_edges
     R_i = poses.R[graph.i]
     R_j = poses.R[graph.j]
@@ -81,7 +83,8 @@ def test_Q_is_the_minimum_over_translations(seed: int, n: int, d: int) -> None:
     Y = stack_transposes(R)
     Q = marginalized_matrix(graph)
     # By least squares over the translation rows of A.
-    A, w = residual_matrix(graph)
+    A = residual_matrix(graph)
+    w = isotropic_weights(graph).row_weights
     root = np.sqrt(w[:, None])
     t = np.linalg.lstsq(root * A[:, :n].toarray(), -root * (A[:, n:] @ Y), rcond=None)[0]
     least = rotation_cost(graph, R) + translation_cost(graph, R, t)

@@ -13,8 +13,8 @@ from pgo_models import PGOProblem, Poses, Weighting, chi2, chordal_start, multip
 from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.precisions import are_definite, isotropic_information
+from pgo_models.problem.costs import TangentCost
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
-from pgo_models.problem.information_costs import TangentCost
 from solvers import polish
 
 COUPLED = st.booleans()

@@ -40,8 +40,8 @@ from pgo_models import (
 from pgo_models.certificates.lower_bound import pose_rows
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
 from pgo_models.problem.cholesky import CholeskyBackend
+from pgo_models.problem.costs import TangentCost
 from pgo_models.problem.floating_point import gamma
-from pgo_models.problem.information_costs import TangentCost
 from pgo_models.problem.matrices import columns_of
 from solvers import polish
 from solvers.robots import proof as distributed_bound
