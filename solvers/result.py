@@ -10,10 +10,12 @@ from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.summaries import Summarised
+from solvers.carry.registry import record
 
 S = TypeVar("S")
 
 
+@record("Status")
 class Status(enum.Enum):
     """Why a run ended."""
 
@@ -43,6 +45,7 @@ class Status(enum.Enum):
 OUT_OF_TIME = (Status.INTERRUPTED, Status.TIME_LIMIT)
 
 
+@record("Measurement")
 @dataclass(frozen=True)
 class Measurement(Summarised):
     """Figures of one iterate.
@@ -77,6 +80,7 @@ class Measurement(Summarised):
     all_reduces: int | None = None
 
 
+@record("Record")
 @dataclass(frozen=True)
 class Record(Summarised):
     """One row of a history: an iterate and its figures.
@@ -96,6 +100,7 @@ class Record(Summarised):
     measurement: Measurement
 
 
+@record("History")
 @dataclass(frozen=True)
 class History(Summarised):
     """Records of all measured iterates, in order.
@@ -221,6 +226,7 @@ class Run(Outcome[S]):
     poses: Poses
 
 
+@record("Stage")
 @dataclass(frozen=True)
 class Stage(Summarised):
     """What one stage of a solve did.

@@ -17,6 +17,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
 from solvers.carry.ledger import Ledger
+from solvers.carry.registry import record
 from solvers.reporting.notes import verdict_suffix
 from solvers.reporting.two_costs import both_costs
 from solvers.result import History, Stage, Status
@@ -24,6 +25,7 @@ from solvers.robust.rejection import Support
 from solvers.solution import Solution
 
 
+@record("RobotsSolution")
 @dataclass(frozen=True, eq=False)
 class RobotsSolution(Summarised):
     """The answer to a pose graph that no process has: all but the poses, which the robots have.

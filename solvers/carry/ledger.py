@@ -9,11 +9,13 @@ import numpy as np
 from pgo_models.errors import SettingError
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.summaries import Summarised
+from solvers.carry.registry import record
 
 DRIVER = -1  # the driver's number as a sender or receiver; robots are 0, 1, ..
 BYTES_PER_NUMBER = 8  # of a double
 
 
+@record("Traffic")
 @dataclass(frozen=True, eq=False)
 class Traffic(Summarised):
     """Messages of one exchange; pass the same object each time the exchange is repeated.
@@ -41,6 +43,7 @@ class Traffic(Summarised):
             )
 
 
+@record("Ledger")
 @dataclass(frozen=True, eq=False)
 class Ledger(Summarised):
     """Communication of a distributed run; a solve by robots returns it as `Solution.ledger`.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError
 from solvers.carry.ledger import BYTES_PER_NUMBER
+from solvers.carry.registry import order, record
 
 A = TypeVar("A")
 Snapshot = Mapping[str, NDArray[Any]]
@@ -47,6 +48,7 @@ class Messages(dict[int, A]):
     """
 
 
+@record("Token")
 @dataclass(frozen=True)
 class Token:
     """Stands for a message that a robot sends another itself: in Messages number `number`.
@@ -66,11 +68,13 @@ class Idle(enum.Enum):
     IDLE = "no order"
 
 
+@order("worker.take_snapshot")
 def take_snapshot(worker: Worker, _: None) -> Snapshot:
     """Order: return the state that earlier orders left in the worker."""
     return worker.snapshot()
 
 
+@order("worker.restore")
 def restore(worker: Worker, snapshot: Snapshot) -> None:
     """Order: continue from a snapshot."""
     worker.restore(snapshot)

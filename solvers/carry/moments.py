@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 from weakref import WeakSet
 
+from solvers.carry.registry import order, record
+
 Q = TypeVar("Q")
 A = TypeVar("A")
 
@@ -22,6 +24,7 @@ class Moment:
     number: int
 
 
+@record("Recall")
 @dataclass(frozen=True)
 class Recall:
     """What a worker does about moments before it obeys an order, in the order of the fields.
@@ -41,6 +44,7 @@ class Remembering(Protocol):
         """Forget, keep, and return to moments."""
 
 
+@order("worker.obey_after")
 def obey_after(recall: Recall, order: Callable[[Any, Q], A], worker: Remembering, request: Q) -> A:
     """Order: obey another one after a recall."""
     worker.recall(recall)

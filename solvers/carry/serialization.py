@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solvers.carry.messages import Messages
+from solvers.carry.registry import name_of_record, record_named
 
 _TREE = "tree"
 # Numbers and arrays by the identity of the arrays: one that a record has twice is stored once.
@@ -24,10 +25,9 @@ COMPUTED_AGAIN = {"is_computed_again": True}
 def serialize(value: object) -> dict[str, NDArray[Any]]:
     """Arrays of which `deserialize` makes an equal record.
 
-    The record is None, a number, a string, an array, a member of an enum, a dataclass or a named
-    tuple, a sequence of such, or a mapping of strings or integers to such; a sequence comes back as
-    a tuple, and a mapping as a dict unless it is `Messages`. Raises a TypeError if it contains
-    anything else.
+    The value is None, a number, a string, an array, a record that has a name, a sequence of such,
+    or a mapping of strings or integers to such. A sequence comes back as a tuple, and a mapping as
+    a dict unless it is `Messages`. Raises a TypeError if it contains anything else.
     """
     arrays: _Arrays = {}
     tree = json.dumps(_describe(value, arrays))
@@ -35,15 +35,14 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
     return {_TREE: np.array(tree), **numbered}
 
 
-def deserialize(arrays: Mapping[str, NDArray[Any]], classes: Sequence[type]) -> Any:  # noqa: ANN401 - whatever was serialized
+def deserialize(arrays: Mapping[str, NDArray[Any]]) -> Any:  # noqa: ANN401 - whatever was serialized
     """Record of which `serialize` made the arrays.
 
-    Only dataclasses and enums in `classes` are ever constructed. Raises a ValueError if the arrays
-    are not those of `serialize`, or contain a class that is not among `classes`.
+    Only records that have a name (`solvers.carry.registry`) are ever constructed. Raises a
+    ValueError if the arrays are not those of `serialize`, or name no record.
     """
-    class_of_name = {known.__name__: known for known in classes}
     try:
-        return _rebuild(json.loads(str(arrays[_TREE])), arrays, class_of_name)
+        return _rebuild(json.loads(str(arrays[_TREE])), arrays)
     except (KeyError, TypeError, IndexError) as error:
         raise ValueError(f"arrays that were not serialized here: {error!r}") from error
 
@@ -58,11 +57,11 @@ def _describe(value: object, arrays: _Arrays) -> object:
         number, _ = arrays.setdefault(id(value), (len(arrays), value))
         return {"array": number}
     if isinstance(value, enum.Enum):
-        return {"enum": type(value).__name__, "member": value.name}
+        return {"enum": name_of_record(type(value)), "member": value.name}
     names = _names_of_fields(value)
     if names is not None:
         fields = {name: _describe(getattr(value, name), arrays) for name in names}
-        return {"class": type(value).__name__, "fields": fields}
+        return {"record": name_of_record(type(value)), "fields": fields}
     if isinstance(value, Mapping):
         if not all(isinstance(key, str | int) for key in value):
             raise TypeError(f"cannot serialize the keys {list(value)!r}")
@@ -82,25 +81,19 @@ def _names_of_fields(value: object) -> list[str] | None:
     return list(getattr(value, "_fields", ())) or None
 
 
-def _rebuild(
-    tree: Any,  # noqa: ANN401 - JSON
-    arrays: Mapping[str, NDArray[Any]],
-    class_of_name: Mapping[str, type],
-) -> Any:  # noqa: ANN401 - whatever was serialized
+def _rebuild(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:  # noqa: ANN401 - JSON
     """Rebuild the value that `_describe` has described."""
     if not isinstance(tree, dict):
         return tree
     if "array" in tree:
         return np.array(arrays[str(tree["array"])])  # a copy, which may be written to
     if "enum" in tree:
-        return class_of_name[tree["enum"]][tree["member"]]  # type: ignore[index] # an enum's class
-    if "class" in tree:
-        fields = {}
-        for name, item in tree["fields"].items():
-            fields[name] = _rebuild(item, arrays, class_of_name)
-        return class_of_name[tree["class"]](**fields)
+        return record_named(tree["enum"])[tree["member"]]  # type: ignore[index] # an enum's class
+    if "record" in tree:
+        fields = {name: _rebuild(item, arrays) for name, item in tree["fields"].items()}
+        return record_named(tree["record"])(**fields)
     if "keys" in tree:
-        values = [_rebuild(item, arrays, class_of_name) for item in tree["values"]]
+        values = [_rebuild(item, arrays) for item in tree["values"]]
         items = dict(zip(tree["keys"], values, strict=True))
         return Messages(items) if "is_messages" in tree else items
-    return tuple(_rebuild(item, arrays, class_of_name) for item in tree["items"])
+    return tuple(_rebuild(item, arrays) for item in tree["items"])

@@ -11,6 +11,7 @@ from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.summaries import Summarised
+from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton_step import NewtonFigures
 from solvers.riemannian.polish import (
@@ -28,6 +29,7 @@ class NewtonState(Summarised):
     polish: PolishState
 
 
+@record("Newton")
 @dataclass(frozen=True)
 class Newton:
     """Riemannian Newton on SE(d)^n, one factorisation a step.

@@ -15,6 +15,7 @@ import numpy as np
 
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
+from solvers.carry.registry import record
 
 # Decrement of a stationary point of chi2. What is left weighs more in its bound than in that of F,
 # because the tangent is softer than chi2 itself.
@@ -35,6 +36,7 @@ SECANT_STEPS = 8  # and with the secants of the moves before
 PROGRESS = 0.1  # share of the decrement that a move leaves, at most, before another is worth it
 
 
+@record("ModelOrder")
 @dataclass(frozen=True)
 class ModelOrder:
     """Which matrix a model of F has.

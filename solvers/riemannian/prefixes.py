@@ -24,6 +24,7 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.initialization import compose_along_tree, with_world_fitted
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
+from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.riemannian.polish import polish_step, start_polish
 
@@ -161,6 +162,7 @@ class PrefixState:
     is_at_minimum: bool = True
 
 
+@record("GrowingStart")
 @dataclass(frozen=True)
 class GrowingStart:
     """Poses to start from, by solving prefixes of a graph that grow.

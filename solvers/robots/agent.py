@@ -7,30 +7,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.g2o_parser import G2OLines, parse_lines, read_lines
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.relaxations.low_rank import LiftedPoses
 from solvers.carry.messages import Snapshot
 from solvers.carry.moments import Recall
+from solvers.carry.registry import order, record
 from solvers.carry.serialization import deserialize, serialize
 from solvers.robots.interior import Interior, interior_of
-from solvers.robots.newton import DescentSession
-from solvers.robots.proof_of_robot import ProofSession, RobotProof
-from solvers.robots.records import Reweigh, RobotAscent
-from solvers.robots.soc import RecursionSession
-from solvers.robots.start import AveragingSession
-from solvers.robots.state import InteriorState, Session
-from solvers.robots.system import System
-from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
+from solvers.robots.state import InteriorState
 from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import CopiesState, CopyLayout, ReceivedRows, Rows, TurnSettings, Waiting
-from solvers.soc.paper import PaperIterate
-from solvers.soc.paper_robot import PaperCopies, PaperPenalty, PaperRobot
-from solvers.soc.r_step import RStep
-from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
+from solvers.soc.copies import CopiesState, CopyLayout, Rows
+from solvers.soc.paper_robot import PaperCopies, PaperRobot
 from solvers.soc.subgraph import Subgraph
 
 Q = TypeVar("Q")
@@ -49,6 +38,7 @@ class Held:
     copies: Copies | None  # None before SOC with copies of neighbours' poses begins
 
 
+@record("HeldStates")
 @dataclass(frozen=True, eq=False)
 class HeldStates:
     """The states of what a robot holds, without what follows from its subgraph."""
@@ -57,6 +47,7 @@ class HeldStates:
     copies: CopiesState | PaperCopies | None
 
 
+@record("AgentRecord")
 @dataclass(frozen=True, eq=False)
 class AgentRecord:
     """State that orders leave with an agent; a checkpoint contains it."""
@@ -65,46 +56,13 @@ class AgentRecord:
     moments: Mapping[int, HeldStates]
 
 
+@record("CoverRotations")
 @dataclass(frozen=True, eq=False)
 class CoverRotations:
     """Omega of the own poses that are in the cover, and their numbers in the whole graph."""
 
     numbers: IntArray
     R: np.ndarray
-
-
-# Classes of the records in a snapshot.
-CLASSES = (
-    AgentRecord,
-    HeldStates,
-    InteriorState,
-    CopiesState,
-    Waiting,
-    TurnSettings,
-    Poses,
-    LiftedPoses,
-    RecursionBlock,
-    StepSettings,
-    Rotations,
-    Anderson,
-    AndersonShare,
-    AndersonSums,
-    ReceivedRows,
-    PaperCopies,
-    PaperIterate,
-    PaperPenalty,
-    RStep,
-    RobotProof,
-    HandednessTerms,
-    Reweigh,
-    RobotAscent,
-    System,
-    Session,
-    AveragingSession,
-    RecursionSession,
-    DescentSession,
-    ProofSession,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +159,7 @@ class Agent:
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this robot."""
-        record: AgentRecord = deserialize(snapshot, CLASSES)
+        record: AgentRecord = deserialize(snapshot)
         held = self._restored(record.held)
         self.interior = held.interior
         self.copies = held.copies
@@ -236,6 +194,7 @@ def _states(held: Held) -> HeldStates:
 # Orders are functions of an agent and a request, some of them once their first argument is given.
 
 
+@order("robot.order_copies")
 def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: Agent, request: Q) -> A:
     """Give the copies an order, which is of their kind: a method began with these."""
     copies: Any = agent.copies
@@ -244,6 +203,7 @@ def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: Agent, request: Q)
     return answer
 
 
+@order("robot.begin_copies")
 def begin_copies(agent: Agent, cover: Poses) -> Rows:
     """Start the copies at the current poses, of which the driver sends those of the cover."""
     if not isinstance(agent.copies, ConsensusRobot):
@@ -251,6 +211,7 @@ def begin_copies(agent: Agent, cover: Poses) -> Rows:
     return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
 
 
+@order("robot.begin_paper")
 def begin_paper(agent: Agent, cover: Poses) -> Rows:
     """Start Algorithm 1 at the current poses, of which the driver sends those of the cover."""
     agent.copies = PaperRobot(agent._layout, PaperCopies())
@@ -278,6 +239,7 @@ def held_poses(agent: Agent, cover: Poses) -> Poses:
     return Poses(R, t)
 
 
+@order("robot.finish_copies")
 def finish_copies(agent: Agent, _: None) -> CoverRotations:
     """Take omega for the rotations of the interior; return those of the own poses in the cover."""
     assert agent.copies is not None

@@ -20,47 +20,29 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
-from pgo_models.certificates.fit import Fit
-from pgo_models.certificates.lower_bound import LowerBound
+from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import FileFormatError, PGOError, SettingError
 from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
-from pgo_models.graphs.partitioning import Partition, PartitionMethod
+from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.weighting import Weighting
-from solvers.carry.ledger import Ledger, Traffic
+from solvers.carry.registry import VERSION, record
 from solvers.carry.serialization import deserialize, serialize
 from solvers.loop import Method, RunMonitor
-from solvers.result import History, Measurement, Outcome, Record, Stage, StageTable, Status
-from solvers.riemannian.newton import Newton
-from solvers.riemannian.prefixes import GrowingStart
-from solvers.robots.driver import CoverPoses, Driver, DriverState
-from solvers.robots.newton import SubstructuredNewtonState
-from solvers.robots.paper import PaperRobotsState
-from solvers.robots.records import RightHandSide
+from solvers.result import Outcome, Record, Stage, StageTable
+from solvers.robots.driver import Driver, DriverState
 from solvers.robots.settings import Checkpoint
-from solvers.robots.soc import SubstructuredState
-from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
-from solvers.soc.consensus import ConsensusState
-from solvers.soc.copies import SeparatorPenalty
-from solvers.soc.paper import CommonPenalty, PaperSOC, PaperStop
-from solvers.soc.penalty import BalancedPenalty, BoydPenalty, FixedPenalty, MultiplierPenalty
-from solvers.soc.r_step import RStep
-from solvers.soc.recursion_block import RecursionBlock, Rotations, StepSettings
-from solvers.soc.rounding import RowChange
-from solvers.soc.settings import Coupling
-from solvers.soc.soc import SOC
 
 S = TypeVar("S")
 JudgedPoses = tuple[Poses, Certificate]
 # First line of a file; the second is the SHA-256 of all that follows.
-_FORMAT = b"pgo-splitting checkpoint 8\n"
+_FORMAT = f"pgo-splitting checkpoint {VERSION}\n".encode()
 _DIGEST_SIZE = 65  # 64 hexadecimal digits and the end of the line
 _LOG = logging.getLogger(__name__)
 _PARTS = ("graph", "partition", "settings")
 
 
+@record("Checkpoint")
 @dataclass(frozen=True, eq=False)
 class Saved:
     """What a checkpoint holds beside the robots' snapshots.
@@ -76,60 +58,6 @@ class Saved:
     state: object
     records: tuple[Record, ...]
     driver: DriverState
-
-
-# Types that a checkpoint may hold.
-_CLASSES = (
-    Saved,
-    # Poses and their certificate.
-    Poses,
-    Certificate,
-    LowerBound,
-    BoundSource,
-    Verdict,
-    Fit,
-    Weighting,
-    # The driver and the account of its network.
-    DriverState,
-    CoverPoses,
-    Ledger,
-    Traffic,
-    # What was done so far.
-    Stage,
-    Status,
-    History,
-    Record,
-    Measurement,
-    # States of methods.
-    SubstructuredState,
-    ConsensusState,
-    PaperRobotsState,
-    CommonPenalty,
-    SubstructuredNewtonState,
-    RecursionBlock,
-    RightHandSide,
-    StepSettings,
-    AndersonShare,
-    AndersonSums,
-    RowChange,
-    SeparatorPenalty,
-    Rotations,
-    # Settings of methods.
-    SOC,
-    PaperSOC,
-    PaperStop,
-    Newton,
-    GrowingStart,
-    Anderson,
-    Coupling,
-    RStep,
-    MultiplierPenalty,
-    FixedPenalty,
-    BalancedPenalty,
-    BoydPenalty,
-    Partition,
-    PartitionMethod,
-)
 
 
 class Journal:
@@ -331,7 +259,7 @@ def _read(path: Path, mark: Mapping[str, str]) -> tuple[Saved, list[dict[str, ND
         header = [str(text) for text in parts["header"][""]]
         others = [part for part, text in zip(_PARTS, header, strict=True) if text != mark[part]]
         if not others:
-            saved: Saved = deserialize(parts["run"], _CLASSES)
+            saved: Saved = deserialize(parts["run"])
             num_robots = saved.driver.ledger.num_robots
             return saved, [parts[f"robot {robot}"] for robot in range(num_robots)]
     except OSError as error:

@@ -27,6 +27,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
 from pgo_models.relaxations.low_rank import append_dimension, gram_matrix, poses_from
 from solvers.carry.moments import Moment
+from solvers.carry.registry import order, record
 from solvers.result import Measurement, Status
 from solvers.riemannian.climb import ClimbEnding, DualBound, climb, staircase_status
 from solvers.riemannian.newton import Newton, newton_status
@@ -278,6 +279,7 @@ def _direction(driver: Driver, eta: float) -> tuple[Array, list[Move], float]:
 # The robot's orders.
 
 
+@record("PowerStep")
 @dataclass(frozen=True, eq=False)
 class PowerStep:
     """Right-hand side of the next inverse iteration, and figures of the interior part of v."""
@@ -287,6 +289,7 @@ class PowerStep:
     largest: float  # largest squared norm of a block
 
 
+@order("climb.begin_direction")
 def begin_direction(robot: Interior, _: None) -> tuple[Interior, PowerStep]:
     """Begin inverse iteration at a random direction of the interior's rotations."""
     rng = np.random.default_rng(robot.part.poses[0])
@@ -295,6 +298,7 @@ def begin_direction(robot: Interior, _: None) -> tuple[Interior, PowerStep]:
     return _power_step(robot, v)
 
 
+@order("climb.follow_direction")
 def follow_direction(robot: Interior, order: Move) -> tuple[Interior, PowerStep]:
     """Take one inverse iteration, from its solution on the boundary, times a length."""
     x = robot.system.back_substitute(order.x)
@@ -302,6 +306,7 @@ def follow_direction(robot: Interior, order: Move) -> tuple[Interior, PowerStep]
     return _power_step(robot, v)
 
 
+@order("climb.go_upwards")
 def go_upwards(robot: Interior, order: Move) -> tuple[Interior, float]:
     """Go to one dimension more, with a direction x in it; answer the robot's part of x^T S x.
 
@@ -324,6 +329,7 @@ def pulled(Lambda: Array, x: Array) -> float:
     return float(np.einsum("na,nab,nb->", blocks, Lambda, blocks))
 
 
+@order("climb.try_climb")
 def try_climb(robot: Interior, length: float) -> tuple[Interior, CostParts]:
     """Move a length along the direction: a trial, and the parts of F there."""
     trial = moved(robot, length)
@@ -331,12 +337,14 @@ def try_climb(robot: Interior, length: float) -> tuple[Interior, CostParts]:
     return following, following.evaluation(trial)
 
 
+@order("climb.sum_gram")
 def sum_gram(robot: Interior, _: None) -> tuple[Interior, Array]:
     """Compute the sum of R_i R_i^T over the interior, (r, r)."""
     interior = robot.part.interior
     return robot, gram_matrix(robot.poses.R[interior])
 
 
+@order("climb.round_to")
 def round_to(robot: Interior, V: Array) -> tuple[Interior, ReducedTranslations]:
     """Project the poses V^T R_i to rotations; then as `reduce_translations`."""
     poses = robot.poses

@@ -22,6 +22,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import edge_residuals
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.messages import Messages
+from solvers.carry.registry import order, record
 from solvers.riemannian.polish import polish
 from solvers.robots.agent import Agent
 from solvers.robots.own_file import (
@@ -48,6 +49,7 @@ _FEWEST_CLOSURES = 5
 _QUARTILE = 0.25
 
 
+@record("Trajectory")
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses of a robot along its chains of odometry, each seen from the first one of its chain.
@@ -71,6 +73,7 @@ class Trajectory:
     covariance: Array
 
 
+@record("AgreeingCounts")
 @dataclass(frozen=True, eq=False)
 class AgreeingCounts:
     """Neighbours of a robot, (k,), and how many edges between it and each agree, (k,)."""
@@ -79,6 +82,7 @@ class AgreeingCounts:
     num_agreeing: IntArray
 
 
+@record("ConsistentPart")
 @dataclass(frozen=True, eq=False)
 class ConsistentPart:
     """What a robot reports of its edges that are left, and how many are not."""
@@ -87,6 +91,7 @@ class ConsistentPart:
     num_rejected: int  # where an edge between two robots counts with one of them
 
 
+@order("consistency.tell_trajectories")
 def tell_trajectories(agent: Agent, _: None) -> Messages[Trajectory]:
     """Order: tell every neighbour of the own poses that edges between the two touch."""
     return _trajectories(agent.robot, agent.known(JoinedFile))
@@ -113,6 +118,7 @@ def _trajectories(robot: int, joined: JoinedFile) -> Messages[Trajectory]:
     return trajectories
 
 
+@order("consistency.tell_error_scale")
 def tell_error_scale(agent: Agent, request: tuple[Weighting, float]) -> float:
     """Order: return the scale of the errors among own poses; nan where too few edges tell it.
 
@@ -141,6 +147,7 @@ def tell_error_scale(agent: Agent, request: tuple[Weighting, float]) -> float:
     return error_scale(edge_residuals(problem, polish(problem, chordal_start(problem))))
 
 
+@order("consistency.judge_closures")
 def judge_closures(
     agent: Agent, request: tuple[Messages[Trajectory], float, float]
 ) -> AgreeingCounts:
@@ -184,6 +191,7 @@ def _own_part(joined: JoinedFile, robot: int) -> tuple[PoseGraph | None, BoolArr
     return graph.edge_subgraph(among_own) if len(among_own) else None, odometry, among_own
 
 
+@order("consistency.keep_agreeing")
 def keep_agreeing(agent: Agent, neighbours: IntArray) -> ConsistentPart:
     """Order: leave out what does not agree, and all edges to other robots than these neighbours.
 

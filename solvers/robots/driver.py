@@ -69,6 +69,7 @@ from solvers.carry.ledger import Ledger
 from solvers.carry.messages import Snapshot, restore, take_snapshot
 from solvers.carry.moments import Moment
 from solvers.carry.process import DEFAULT_MEMORY, WorkerPool
+from solvers.carry.registry import order, record
 from solvers.result import Measurement
 from solvers.robots import current_poses, start, translations
 from solvers.robots.interface import Interface, InterfaceFactor, Separators
@@ -87,6 +88,7 @@ A = TypeVar("A")
 InteriorOrder = Callable[[Interior, Q], tuple[Interior, A]]
 
 
+@record("CoverPoses")
 @dataclass(frozen=True, eq=False)
 class CoverPoses:
     """What the driver knows of the g poses of the cover, and the cost of all poses."""
@@ -118,6 +120,7 @@ class HeldByDriver:
     laplacian: InterfaceFactor | None
 
 
+@record("DriverState")
 @dataclass(frozen=True, eq=False)
 class DriverState:
     """State of a driver between two steps: its attributes, and the ledger of its network."""
@@ -571,6 +574,7 @@ class HoldsInterior(Protocol):
     interior: Interior | None
 
 
+@order("robot.order_interior")
 def order_interior(
     order: Callable[[Interior, Q], tuple[Interior, A]], agent: HoldsInterior, request: Q
 ) -> A | None:

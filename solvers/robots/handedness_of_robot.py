@@ -14,6 +14,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.matrices import inner
+from solvers.carry.registry import order
 from solvers.handedness.ascent import derivative_of_minimum, nearest_semidefinite
 from solvers.robots.interior import Interior
 from solvers.robots.records import (
@@ -24,6 +25,7 @@ from solvers.robots.records import (
 )
 
 
+@order("handedness.take_closed_form")
 def take_closed_form(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
     """Take the terms of the robot's edges that are known in closed form."""
     terms = None
@@ -32,11 +34,13 @@ def take_closed_form(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
     return _with_terms(robot, terms)
 
 
+@order("handedness.report_pairs")
 def report_pairs(robot: Interior, _: None) -> tuple[Interior, IntArray]:
     """Return the pairs of poses that the robot's edges join, (k, 2), numbered as the graph is."""
     return robot, robot.part.poses[_pairs(robot)]
 
 
+@order("handedness.report_terms")
 def report_terms(robot: Interior, _: None) -> tuple[Interior, HandednessTerms | None]:
     """Return the terms of the robot's edges, with the numbers of the whole graph."""
     terms = robot.state.terms
@@ -46,6 +50,7 @@ def report_terms(robot: Interior, _: None) -> tuple[Interior, HandednessTerms | 
     return robot, replace(terms, i=numbers[terms.i], j=numbers[terms.j])
 
 
+@order("handedness.begin_ascent")
 def begin_ascent(robot: Interior, P: Array | None) -> tuple[Interior, TermsAnswer]:
     """Begin an ascent with the P of all pairs of the robot, (k, 3, 3), or with zero."""
     if P is None:
@@ -53,18 +58,21 @@ def begin_ascent(robot: Interior, P: Array | None) -> tuple[Interior, TermsAnswe
     return _at(robot, RobotAscent(P=P, best=P))
 
 
+@order("handedness.keep_best")
 def keep_best(robot: Interior, _: None) -> tuple[Interior, None]:
     """Remember the P as the best so far."""
     ascent = _ascent(robot)
     return _with_ascent(robot, replace(ascent, best=ascent.P)), None
 
 
+@order("handedness.return_to_best")
 def return_to_best(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
     """Go back to the best P."""
     ascent = _ascent(robot)
     return _at(robot, replace(ascent, P=ascent.best))
 
 
+@order("handedness.begin_vectors")
 def begin_vectors(robot: Interior, count: int) -> tuple[Interior, VectorsAnswer]:
     """Begin inverse iteration at the last vectors, or at so many random ones."""
     X = _ascent(robot).X
@@ -76,6 +84,7 @@ def begin_vectors(robot: Interior, count: int) -> tuple[Interior, VectorsAnswer]
     return _with_vectors(robot, X, np.zeros_like(X))
 
 
+@order("handedness.follow_vectors")
 def follow_vectors(robot: Interior, order: VectorsOrder) -> tuple[Interior, VectorsAnswer]:
     """Take one inverse iteration of X C, from its solution on the boundary."""
     system = robot.system
@@ -84,6 +93,7 @@ def follow_vectors(robot: Interior, order: VectorsOrder) -> tuple[Interior, Vect
     return _with_vectors(robot, X, b)
 
 
+@order("handedness.find_derivative")
 def find_derivative(robot: Interior, order: Array) -> tuple[Interior, float]:
     """Find the derivative for every P of eigenvectors X C, C (q, q) with roots of their weights.
 
@@ -99,6 +109,7 @@ def find_derivative(robot: Interior, order: Array) -> tuple[Interior, float]:
     return following, inner(derivative, derivative)
 
 
+@order("handedness.ascend")
 def ascend(robot: Interior, length: float) -> tuple[Interior, TermsAnswer]:
     """Go a length along the derivative, and back to P >= 0."""
     ascent = _ascent(robot)

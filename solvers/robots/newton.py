@@ -37,6 +37,7 @@ from pgo_models.relaxations.low_rank import (
 )
 from solvers.carry.counted_pool import Count
 from solvers.carry.moments import Moment
+from solvers.carry.registry import order, record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton import Newton, newton_status
@@ -62,6 +63,7 @@ from solvers.robots.state import Session
 from solvers.robots.translations import reduced_translations, translations
 
 
+@record("SubstructuredNewtonState")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SubstructuredNewtonState(NewtonFigures):
     """Figures of iterate k; the poses are with driver and robots, which hold them at a moment."""
@@ -318,6 +320,7 @@ def _solved(
 # The robot's orders.
 
 
+@record("Move")
 @dataclass(frozen=True, eq=False)
 class Move:
     """H^-1 g on the boundary, (w g, 1), and how far to go along minus it."""
@@ -326,6 +329,7 @@ class Move:
     length: float
 
 
+@record("TrialEvaluation")
 @dataclass(frozen=True, eq=False)
 class TrialEvaluation:
     """`CostParts` at a trial, and the reduced gradient there."""
@@ -334,6 +338,7 @@ class TrialEvaluation:
     gradient: RightHandSide
 
 
+@record("DescentSession")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DescentSession(Session):
     """Newton, or a climb of the staircase: a direction, and the trial that it led to.
@@ -344,6 +349,7 @@ class DescentSession(Session):
     step: tuple[Array, Array] | None = None  # (p, .), (p, d): of rotations, of translations
 
 
+@order("newton.reduce_model")
 def reduce_model(robot: Interior, order: ModelOrder) -> tuple[Interior, Reduced | None]:
     """Eliminate the matrix of the order, and the gradient; None where K_II is not definite.
 
@@ -378,27 +384,32 @@ def reduce_model(robot: Interior, order: ModelOrder) -> tuple[Interior, Reduced 
     return eliminated.in_session(DescentSession(system=system)), system.reduced(system.right)
 
 
+@order("newton.move")
 def move(robot: Interior, order: Move) -> tuple[Interior, ReducedTranslations]:
     """Direction -H^-1 g from H^-1 g on the boundary; then `turn`."""
     return turn(_directed(robot, order), order.length)
 
 
+@order("newton.move_straight")
 def move_straight(robot: Interior, order: Move) -> tuple[Interior, TrialEvaluation]:
     """Direction -H^-1 g from H^-1 g on the boundary; then `go_straight`."""
     return go_straight(_directed(robot, order), order.length)
 
 
+@order("newton.turn")
 def turn(robot: Interior, length: float) -> tuple[Interior, ReducedTranslations]:
     """Turn a length along the direction: the right-hand side of the best translations there."""
     trial = moved(robot, length).with_translations(robot.poses.t)
     return reduced_translations(robot.at_trial(trial), trial.R)
 
 
+@order("newton.go_straight")
 def go_straight(robot: Interior, length: float) -> tuple[Interior, TrialEvaluation]:
     """Move a length along the direction, translations too: F, force and gradient there."""
     return _evaluated(robot, moved(robot, length))
 
 
+@order("newton.evaluate_trial")
 def evaluate_trial(robot: Interior, t: Array) -> tuple[Interior, TrialEvaluation]:
     """Take the trial's best translations, t on the boundary: F, force and gradient there."""
     trial = robot.trial

@@ -47,6 +47,7 @@ from pgo_models.problem.weighting import (
     is_isotropic,
 )
 from solvers.carry.messages import Messages
+from solvers.carry.registry import order, record
 from solvers.robots.agent import Agent, held_poses
 from solvers.robots.current_poses import set_poses
 from solvers.robots.driver import order_interior
@@ -63,6 +64,7 @@ READ_HERE = (
 Claim = tuple[int, IntArray, IntArray, WrittenDigits]
 
 
+@record("OwnedRuns")
 @dataclass(frozen=True, eq=False)
 class OwnedRuns:
     """Runs of consecutive ids, (k,): first id, number of that pose in the whole graph, owner.
@@ -80,6 +82,7 @@ class OwnedRuns:
         return np.searchsorted(self.first, ids, side="right") - 1
 
 
+@record("Edges")
 @dataclass(frozen=True, eq=False)
 class Edges:
     """Edges of a file, and the numbers and owners of their ends, (m, 2)."""
@@ -102,6 +105,7 @@ class _JoinedEdges(NamedTuple):
     owners: IntArray
 
 
+@record("Told")
 @dataclass(frozen=True, eq=False)
 class Told:
     """What a robot tells another: edges that touch its poses, and VERTEX lines of these."""
@@ -110,6 +114,7 @@ class Told:
     places: Rows
 
 
+@record("Border")
 @dataclass(frozen=True, eq=False)
 class Border:
     """What a robot reports of its edges to other robots."""
@@ -131,6 +136,7 @@ class Border:
 NO_ROUNDING = ObjectiveRounding(0.0, 0.0, FITS_WITHOUT_EDGES)  # of no edges
 
 
+@record("Answer")
 @dataclass(frozen=True, eq=False)
 class Answer:
     """Rounding of a robot's part of the cost, and a pose that can hold the frame.
@@ -144,6 +150,7 @@ class Answer:
     given: Array  # (d + 1, d): the same in the file, nan if it is not there
 
 
+@record("MovedAnswer")
 @dataclass(frozen=True, eq=False)
 class MovedAnswer:
     """A robot's part of the cost where its answer was moved to, and of F there."""
@@ -241,6 +248,7 @@ class PlacedFile:
         return self.answer
 
 
+@order("files.read_file")
 def read_file(agent: Agent, _: None) -> Claim:
     """Read the file, and return the ids in it.
 
@@ -257,6 +265,7 @@ def read_file(agent: Agent, _: None) -> Claim:
     return lines.d, runs_of_vertices, _runs(ids_of_edges_alone), lines.digits
 
 
+@order("files.number_poses")
 def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[Told]:
     """Take numbers and owners for the ids; return what others are to be told of their poses.
 
@@ -280,6 +289,7 @@ def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[Told]:
     return messages
 
 
+@order("files.join_neighbours")
 def join_neighbours(agent: Agent, request: tuple[Messages[Told], bool]) -> Border:
     """Make the graph of the robot: its own edges, and those that others have of its poses.
 
@@ -379,6 +389,7 @@ def border_of(robot: int, joined: JoinedFile) -> Border:
     )
 
 
+@order("files.take_cost")
 def take_cost(agent: Agent, weighting: Weighting) -> bool:
     """Learn which cost is solved: F or chi2. Return whether SOC can run on the robot's part of it.
 
@@ -396,6 +407,7 @@ def take_cost(agent: Agent, weighting: Weighting) -> bool:
     return cost.is_quadratic and cost.is_convex
 
 
+@order("files.place_cover")
 def place_cover(agent: Agent, place: tuple[Placement, bool]) -> RobotSummary:
     """Learn which poses the driver solves for, and which robots hold which of them.
 
@@ -423,6 +435,7 @@ def place_cover(agent: Agent, place: tuple[Placement, bool]) -> RobotSummary:
     return replace(subgraph.summary, part=None)
 
 
+@order("files.keep_answer")
 def keep_answer(agent: Agent, cover: Poses) -> Answer:
     """Keep the current poses for the answer; the driver sends those of the cover."""
     placed = agent.known(PlacedFile)
@@ -441,6 +454,7 @@ def keep_answer(agent: Agent, cover: Poses) -> Answer:
     return Answer(rounding, (len(fixed) > 0, number, pose_id), solved, joined.given)
 
 
+@order("files.return_to_answer")
 def return_to_answer(agent: Agent, _: None) -> None:
     """Return to the poses that were kept; the driver does likewise."""
     if agent.interior is not None:
@@ -448,6 +462,7 @@ def return_to_answer(agent: Agent, _: None) -> None:
         order_interior(set_poses, agent, answer)
 
 
+@order("files.move_answer")
 def move_answer(agent: Agent, motion: tuple[Array, Array]) -> MovedAnswer:
     """Move the poses that were kept by (R, t); return the part of the cost there."""
     placed = agent.known(PlacedFile)
@@ -468,6 +483,7 @@ def _interior_answer(agent: Agent, interior: Interior) -> Poses:
     return kept[np.searchsorted(agent.subgraph.poses, interior.part.poses)]
 
 
+@order("files.write_answer")
 def write_answer(folder: Path, agent: Agent, _: None) -> None:
     """Write the poses that were kept, and the robot's edges."""
     make_folder(folder)

@@ -20,6 +20,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from solvers.carry.counted_pool import Count
 from solvers.carry.moments import Moment
+from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.robots.agent import begin_paper
@@ -32,6 +33,7 @@ from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RStep
 
 
+@record("PaperRobotsState")
 @dataclass(frozen=True, eq=False)
 class PaperRobotsState:
     """Iterate k, whose rows the robots hold at a moment, and what is known of the next one.

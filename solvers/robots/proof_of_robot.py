@@ -34,6 +34,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import OUTWARD
 from pgo_models.problem.problem import PGOProblem
+from solvers.carry.registry import order, record
 from solvers.robots.elimination import Cut, Elimination, eliminate
 from solvers.robots.interior import Interior
 from solvers.robots.records import RightHandSide
@@ -42,6 +43,7 @@ from solvers.robots.system import System
 from solvers.soc.subgraph import Part
 
 
+@record("ProofSums")
 @dataclass(frozen=True, eq=False)
 class ProofSums:
     """Parts of the bound at one X."""
@@ -58,6 +60,7 @@ class ProofSums:
     error: Array
 
 
+@record("ProofOrder")
 @dataclass(frozen=True, eq=False)
 class ProofOrder:
     """How S is eliminated for a proof."""
@@ -71,6 +74,7 @@ class ProofOrder:
     with_terms: bool  # whether S is that of the cost less the robots' handedness terms
 
 
+@record("ProofStep")
 @dataclass(frozen=True, eq=False)
 class ProofStep:
     """Parts of the bound, and the right-hand side of the next move."""
@@ -79,6 +83,7 @@ class ProofStep:
     right: RightHandSide
 
 
+@record("ProofAnswer")
 @dataclass(frozen=True, eq=False)
 class ProofAnswer:
     """S with the interior eliminated for a proof."""
@@ -89,6 +94,7 @@ class ProofAnswer:
     step: ProofStep | None  # the first one, where the proof begins at a point
 
 
+@record("ProofSession")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProofSession(Session):
     """A bound, or inverse iteration: S eliminated, and the proof where one was begun."""
@@ -96,6 +102,7 @@ class ProofSession(Session):
     proof: RobotProof | None = None
 
 
+@order("proof.prove_interior")
 def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofAnswer]:
     """Eliminate S for a proof, and at a point begin one."""
     problem = robot.tangent_problem
@@ -144,11 +151,13 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     return following, ProofAnswer(elimination.schur, sizes, trace, step)
 
 
+@order("proof.fits_part")
 def fits_part(robot: Interior, _: None) -> tuple[Interior, bool]:
     """Whether every edge of the robot fits to its rounding at the poses."""
     return robot, fits_to_rounding(robot.problem, robot.poses)
 
 
+@order("proof.move_proof")
 def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
     """Move X by -S_r^-1 G, from its rows on the boundary: parts of the bound there."""
     session = robot.session(ProofSession)
@@ -180,6 +189,7 @@ def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:
 # The algebra of these orders.
 
 
+@record("RobotProof")
 @dataclass(frozen=True, eq=False)
 class RobotProof:
     """Where a robot evaluates the certificate."""

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pgo_models.geometry.rotations import Array
+from solvers.carry.registry import record
 from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.copies import OwnPoses
 from solvers.soc.recursion_block import Agreement
 
 
+@record("RightHandSide")
 @dataclass(frozen=True, eq=False)
 class RightHandSide:
     """b on the boundary with the interior eliminated, (w g, k), and b_I . K_II^-1 b_I."""
@@ -22,6 +24,7 @@ class RightHandSide:
     energy: float
 
 
+@record("Reduced")
 @dataclass(frozen=True, eq=False)
 class Reduced:
     """A robot's matrix and right-hand side with the interior eliminated."""
@@ -31,6 +34,7 @@ class Reduced:
     right: RightHandSide
 
 
+@record("ReducedTranslations")
 @dataclass(frozen=True, eq=False)
 class ReducedTranslations:
     """Right-hand side of the best translations, (g, d), and the first time their matrix."""
@@ -39,6 +43,7 @@ class ReducedTranslations:
     schur: Array | None
 
 
+@record("CostParts")
 @dataclass(frozen=True, eq=False)
 class CostParts:
     """Part of F and of its rounding level, and the rows of M X on the boundary, ((d+1) g, d).
@@ -52,6 +57,7 @@ class CostParts:
     ratios: RatioSums | None = None
 
 
+@record("Reweigh")
 @dataclass(frozen=True)
 class Reweigh:
     """How edges are weighed by their residuals in a robust solve."""
@@ -68,6 +74,7 @@ class Reweigh:
         return RobustLoss.TRUNCATED if self.is_truncated else RobustLoss.GEMAN_MCCLURE
 
 
+@record("Reweighed")
 @dataclass(frozen=True, eq=False)
 class Reweighed:
     """The cost with new weights, and the diagonal of its M on the boundary."""
@@ -76,6 +83,7 @@ class Reweighed:
     at: CostParts
 
 
+@record("RescaleInterior")
 @dataclass(frozen=True)
 class RescaleInterior:
     """Change of the penalty in SOC."""
@@ -84,6 +92,7 @@ class RescaleInterior:
     from_best: bool  # whether all go back to their best iterate
 
 
+@record("Agree")
 @dataclass(frozen=True, eq=False)
 class Agree:
     """What all parties learn from step (a)."""
@@ -92,6 +101,7 @@ class Agree:
     measured_at: Array  # (dg, d): rows of the next omega on the boundary
 
 
+@record("Agreed")
 @dataclass(frozen=True, eq=False)
 class Agreed:
     """What a robot answers to `Agree`."""
@@ -101,6 +111,7 @@ class Agreed:
     measured: float  # part of F at omega
 
 
+@record("RobotAscent")
 @dataclass(frozen=True, eq=False)
 class RobotAscent:
     """Where a robot is in an ascent of handedness terms, with the k pairs that its edges join."""
@@ -111,6 +122,7 @@ class RobotAscent:
     X: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (side, q): inverse iteration's
 
 
+@record("VectorsOrder")
 @dataclass(frozen=True, eq=False)
 class VectorsOrder:
     """A step of inverse iteration: the right-hand sides become X C, with the solution x."""
@@ -119,6 +131,7 @@ class VectorsOrder:
     C: Array  # (q, q)
 
 
+@record("VectorsAnswer")
 @dataclass(frozen=True, eq=False)
 class VectorsAnswer:
     """Vectors X of inverse iteration, of right-hand sides b.
@@ -131,6 +144,7 @@ class VectorsAnswer:
     products: Array  # (q, q): X^T X
 
 
+@record("TermsAnswer")
 @dataclass(frozen=True, eq=False)
 class TermsAnswer:
     """Handedness terms of a robot's edges, before a proof with them."""
@@ -139,6 +153,7 @@ class TermsAnswer:
     diagonal: Array  # ((d+1) g,): of M less the terms, on the boundary
 
 
+@record("InteriorPoses")
 @dataclass(frozen=True, eq=False)
 class InteriorPoses(OwnPoses):
     """Interior poses, and their multipliers."""

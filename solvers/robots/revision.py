@@ -33,6 +33,7 @@ from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
 from solvers.carry.messages import Messages
+from solvers.carry.registry import order, record
 from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
 from solvers.result import Stage
@@ -61,6 +62,7 @@ from solvers.soc.subgraph import PartProblem
 _NEAR = 100.0
 
 
+@record("ComesBack")
 class ComesBack(enum.Enum):
     """Which edges a pass judges anew."""
 
@@ -194,6 +196,7 @@ def _truncated_cost(driver: Driver, scale: float) -> float:
 # Orders to robots, and what they say.
 
 
+@record("TakenBack")
 @dataclass(frozen=True, eq=False)
 class TakenBack:
     """Which edges come back, the cost that is solved, and the quantile of the thresholds.
@@ -210,6 +213,7 @@ class TakenBack:
     near: Messages[BoolArray]
 
 
+@record("NumberedPoses")
 @dataclass(frozen=True, eq=False)
 class NumberedPoses:
     """Poses that were found, and their numbers in the whole graph, (k,)."""
@@ -218,6 +222,7 @@ class NumberedPoses:
     poses: Poses
 
 
+@record("Links")
 @dataclass(frozen=True, eq=False)
 class Links:
     """Edges between robots: the owners of their ends, (k, 2), and costs over thresholds, (k,)."""
@@ -226,6 +231,7 @@ class Links:
     ratio: Array
 
 
+@order("revision.tell_solved")
 def tell_solved(agent: Agent, _: None) -> Messages[NumberedPoses]:
     """Order: tell every neighbour of the own poses found that edges between the two touch."""
     placed = agent.known(PlacedFile)
@@ -241,6 +247,7 @@ def tell_solved(agent: Agent, _: None) -> Messages[NumberedPoses]:
     return messages
 
 
+@order("revision.judge_near")
 def judge_near(
     agent: Agent, request: tuple[Messages[NumberedPoses], Weighting, float]
 ) -> Messages[BoolArray]:
@@ -272,6 +279,7 @@ def judge_near(
     return messages
 
 
+@order("revision.take_back")
 def take_back(agent: Agent, request: TakenBack) -> Border:
     """Order: hold the edges that come back, with thresholds, and remember what to go back to.
 
@@ -308,6 +316,7 @@ def take_back(agent: Agent, request: TakenBack) -> Border:
     return border_of(robot, joined)
 
 
+@order("revision.tell_cover")
 def tell_cover(agent: Agent, _: None) -> NumberedPoses:
     """Order: return the own poses that were found, of those in the cover."""
     placed = agent.known(PlacedFile)
@@ -317,6 +326,7 @@ def tell_cover(agent: Agent, _: None) -> NumberedPoses:
     return NumberedPoses(subgraph.poses[own_separators[in_cover]], _solved(placed.joined)[in_cover])
 
 
+@order("revision.go_to_solved")
 def go_to_solved(agent: Agent, cover: Poses) -> None:
     """Order: go to the poses that were found; the driver sends those of the cover."""
     placed = agent.known(PlacedFile)
@@ -333,6 +343,7 @@ def go_to_solved(agent: Agent, cover: Poses) -> None:
     order_interior(current_poses.set_poses, agent, Poses(R[places], t[places]))
 
 
+@order("revision.tell_links")
 def tell_links(agent: Agent, request: tuple[float, Poses]) -> Links:
     """Order: judge the edges that the robot counts; return those of them that join two robots.
 
@@ -355,6 +366,7 @@ def tell_links(agent: Agent, request: tuple[float, Poses]) -> Links:
     return Links(owners, ratio[links])
 
 
+@order("revision.tell_kept")
 def tell_kept(agent: Agent, is_held: BoolArray) -> Messages[BoolArray]:
     """Order: keep the links that hold robots together, too, (k,); tell neighbours what is kept.
 
@@ -383,6 +395,7 @@ def _counted_links(agent: Agent) -> IntArray:
     return np.flatnonzero(is_link & agent.subgraph.is_counted)
 
 
+@order("revision.keep")
 def keep(agent: Agent, received: Messages[BoolArray]) -> ConsistentPart:
     """Order: leave out the edges that are not kept by the robot that counts them."""
     placed = agent.known(PlacedFile)
@@ -399,6 +412,7 @@ def keep(agent: Agent, received: Messages[BoolArray]) -> ConsistentPart:
     return go_on_with(agent, replace(remaining, solved=joined.solved, before=joined.before))
 
 
+@order("revision.go_back")
 def go_back(agent: Agent, _: None) -> ConsistentPart:
     """Order: go back to the edges before, or to what agrees pairwise, at the poses found before."""
     before = joined_of(agent).before

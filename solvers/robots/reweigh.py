@@ -18,6 +18,7 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph, connecting_edges
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from solvers.carry.counted_pool import Count
+from solvers.carry.registry import order
 from solvers.result import Measurement, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.robots.current_poses import describe
@@ -209,6 +210,7 @@ def stage_of(gnc: GNC, finished: Outcome[SharedGNCState]) -> Stage:
 # Orders to a robot's interior.
 
 
+@order("reweigh.reweigh")
 def reweigh(interior: Interior, order: Reweigh) -> tuple[Interior, Reweighed]:
     """Weights for the residuals at the current poses, and the cost with them."""
     ratio = interior.whole.ratios(interior.poses, order.scale)
@@ -227,22 +229,26 @@ def reweigh(interior: Interior, order: Reweigh) -> tuple[Interior, Reweighed]:
     return following, Reweighed(diagonal, following.evaluation(interior.poses))
 
 
+@order("reweigh.sum_ratios")
 def sum_ratios(interior: Interior, order: Reweigh) -> tuple[Interior, RatioSums]:
     """Sums over the edges at the current poses."""
     return interior, interior.ratio_sums(interior.poses, order)
 
 
+@order("reweigh.count_doubted")
 def count_doubted(interior: Interior, _: None) -> tuple[Interior, float]:
     """Number of edges that are not known to be right."""
     return interior, float(np.sum(~interior.is_known))
 
 
+@order("reweigh.sum_truncated")
 def sum_truncated(interior: Interior, scale: float) -> tuple[Interior, float]:
     """Sum of the costs, of which each counts its scaled threshold at most."""
     costs = interior.whole.costs(interior.poses)
     return interior, float(np.minimum(costs, scale * interior.thresholds).sum())
 
 
+@order("reweigh.count_below")
 def count_below(interior: Interior, request: tuple[float, Array]) -> tuple[Interior, IntArray]:
     """Numbers of edges, without the known ones, whose r^2 / c^2 is at most each of some bounds.
 
@@ -254,6 +260,7 @@ def count_below(interior: Interior, request: tuple[float, Array]) -> tuple[Inter
     return interior, np.searchsorted(ratios, bounds, side="right")
 
 
+@order("reweigh.edges_within")
 def edges_within(interior: Interior, scale: float) -> tuple[Interior, IntArray]:
     """Numbers of the edges within their scaled thresholds, for the result."""
     assert interior.whole.edges is not None

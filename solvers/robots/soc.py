@@ -31,6 +31,7 @@ from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from solvers.carry.counted_pool import Count
 from solvers.carry.moments import Moment
+from solvers.carry.registry import order, record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.robots.driver import Driver
@@ -56,6 +57,7 @@ from solvers.soc.soc import SOC
 ENOUGH_NORMS = 2**12
 
 
+@record("SubstructuredState")
 @dataclass(frozen=True, eq=False)
 class SubstructuredState(SharedSteps):
     """Iterate k: the driver's rows; those of the interiors are with the robots.
@@ -267,6 +269,7 @@ def _factorize(
 # The robot's orders.
 
 
+@record("RecursionSession")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecursionSession(Session):
     """SOC: the system of step (a), and the rotations of the interior in the recursion."""
@@ -275,6 +278,7 @@ class RecursionSession(Session):
     x: Array | None = None  # (side, d): of the last step (a); None before the first
 
 
+@order("soc.report_norms")
 def report_norms(robot: Interior, step: int | None) -> tuple[Interior, Norms]:
     """||Lambda_i||_2 and m_i of the interior poses, of every step-th one."""
     Lambda = robot.multipliers()[robot.part.interior]
@@ -285,6 +289,7 @@ def report_norms(robot: Interior, step: int | None) -> tuple[Interior, Norms]:
     return robot, subsampled(norms, step)
 
 
+@order("soc.penalize")
 def penalize(robot: Interior, order: PenaltyOrder) -> tuple[Interior, Reduced]:
     """Set rho_i, factor M + D/2; omega is at the poses, B zero or stationary."""
     interior = robot.part.interior
@@ -295,6 +300,7 @@ def penalize(robot: Interior, order: PenaltyOrder) -> tuple[Interior, Reduced]:
     return _factorized(robot, block)
 
 
+@order("soc.rescale")
 def rescale(robot: Interior, order: RescaleInterior) -> tuple[Interior, Reduced]:
     """Multiply rho, from the best iterate on if asked to, and factor again."""
     session = robot.session(RecursionSession)
@@ -302,6 +308,7 @@ def rescale(robot: Interior, order: RescaleInterior) -> tuple[Interior, Reduced]
     return _factorized(robot, block.rescaled(order.factor * block.rho), session.x)
 
 
+@order("soc.solve")
 def solve(robot: Interior, x: Array) -> tuple[Interior, Array]:
     """Step (a) in the interior, from x on the boundary; the sums for the acceleration."""
     session = robot.session(RecursionSession)
@@ -310,6 +317,7 @@ def solve(robot: Interior, x: Array) -> tuple[Interior, Array]:
     return robot.in_session(replace(session, block=block, x=X)), sums
 
 
+@order("soc.agree")
 def agree(robot: Interior, order: Agree) -> tuple[Interior, Agreed]:
     """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a).
 
@@ -324,6 +332,7 @@ def agree(robot: Interior, order: Agree) -> tuple[Interior, Agreed]:
     return following, Agreed(sums, right, measured)
 
 
+@order("soc.cost")
 def cost(robot: Interior, omega: Array) -> tuple[Interior, float]:
     """Part of F at omega, here its rows of the boundary, and the translations of step (a)."""
     problem = robot.part.problem
@@ -333,11 +342,13 @@ def cost(robot: Interior, omega: Array) -> tuple[Interior, float]:
     return robot, problem.objective_stacked(X)
 
 
+@order("soc.finish")
 def finish(robot: Interior, omega: Array) -> tuple[Interior, ReducedTranslations]:
     """Take omega for the rotations; then `reduce_translations`."""
     return reduce_translations(robot.at_rotations(_rotations(robot, omega)), None)
 
 
+@order("soc.reduce_again")
 def reduce_again(robot: Interior, _: None) -> tuple[Interior, Reduced]:
     """Send the matrix and the right-hand side again, to a driver that was started again."""
     return robot, robot.system.reduced(robot.system.right)

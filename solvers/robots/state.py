@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
+from solvers.carry.registry import record
 from solvers.robots.records import Reweigh, RobotAscent
 from solvers.robots.system import System
 
 
+@record("Session")
 @dataclass(frozen=True, eq=False)
 class Session:
     """What an algorithm leaves for its next order; each has what it needs beside it in a subclass.
@@ -24,6 +26,7 @@ class Session:
     trial: Poses | None = None
 
 
+@record("InteriorState")
 @dataclass(frozen=True, eq=False)
 class InteriorState:
     """What orders leave with a robot; the p poses are those of its part."""

@@ -11,6 +11,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
+from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.robots.elimination import Cut, Elimination, eliminate
 from solvers.robots.records import Reduced, RightHandSide
@@ -18,6 +19,7 @@ from solvers.robots.subdomain_blocks import SubdomainBlocks, Widths
 from solvers.soc.subgraph import Part
 
 
+@record("System")
 @dataclass(frozen=True, eq=False)
 class System:
     """A robot's system K x = b, with the interior eliminated to the boundary.

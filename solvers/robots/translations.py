@@ -8,16 +8,19 @@ from dataclasses import replace
 import numpy as np
 
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
+from solvers.carry.registry import order
 from solvers.robots.current_poses import evaluate
 from solvers.robots.interior import Interior
 from solvers.robots.records import CostParts, ReducedTranslations
 
 
+@order("translations.reduce_translations")
 def reduce_translations(robot: Interior, _: None) -> tuple[Interior, ReducedTranslations]:
     """Right-hand side of the best translations, and once their matrix."""
     return reduced_translations(robot, robot.poses.R)
 
 
+@order("translations.set_translations")
 def set_translations(robot: Interior, t: Array) -> tuple[Interior, CostParts]:
     """Take the best translations, from those of the boundary, (g, d); then `evaluate`."""
     poses = robot.poses
@@ -25,6 +28,7 @@ def set_translations(robot: Interior, t: Array) -> tuple[Interior, CostParts]:
     return evaluate(robot.at_poses(moved), None)
 
 
+@order("translations.adopt")
 def adopt(robot: Interior, rows: Array) -> tuple[Interior, ReducedTranslations]:
     """Take rotations of the cover's poses, rows (dg, d); then `reduce_translations`."""
     R = robot.poses.R.copy()
@@ -32,6 +36,7 @@ def adopt(robot: Interior, rows: Array) -> tuple[Interior, ReducedTranslations]:
     return reduce_translations(robot.at_rotations(R), None)
 
 
+@order("translations.send_matrix_again")
 def send_matrix_again(robot: Interior, _: None) -> tuple[Interior, ReducedTranslations]:
     """Send the matrix again, if it was sent, to a driver that was started again."""
     no_right = np.zeros((0, robot.part.problem.d))

@@ -15,6 +15,7 @@ from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import chi2_thresholds
 from pgo_models.problem.weighting import Weighting
+from solvers.carry.registry import record
 from solvers.riemannian.polish import PolishState, polish_step, start_polish
 from solvers.robust.losses import RobustLoss
 
@@ -23,6 +24,7 @@ from solvers.robust.losses import RobustLoss
 _NEGLIGIBLE_WEIGHT = 1e-2
 
 
+@record("RatioSums")
 @dataclass(frozen=True)
 class RatioSums:
     """Sums over the edges that graduated non-convexity needs: no figure is of a single edge.

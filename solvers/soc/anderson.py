@@ -18,6 +18,7 @@ import numpy as np
 from pgo_models.errors import check_settings
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.matrices import inner
+from solvers.carry.registry import record
 
 # Shares of at most so many numbers take the products with all differences in one call of numpy,
 # from a copy; above it the copy costs more than the calls.
@@ -29,6 +30,7 @@ def over_relax(new: Array, old: Array, alpha: float) -> Array:
     return new if alpha == 1.0 else alpha * new + (1.0 - alpha) * old
 
 
+@record("Anderson")
 @dataclass(frozen=True)
 class Anderson:
     """Settings of the Anderson acceleration.
@@ -80,6 +82,7 @@ class Anderson:
         )
 
 
+@record("AndersonShare")
 @dataclass(frozen=True, eq=False)
 class AndersonShare:
     """One party's rows of the past differences of residuals and of images."""
@@ -144,6 +147,7 @@ class AndersonShare:
         return self.image - total, self
 
 
+@record("AndersonSums")
 @dataclass(frozen=True, eq=False)
 class AndersonSums:
     """What all parties know of the steps since the last restart."""

@@ -29,6 +29,7 @@ from pgo_models.problem.stationarity import relative_length
 from solvers.carry.counted_pool import Count, by_link, delivered
 from solvers.carry.messages import Messages
 from solvers.carry.moments import Moment
+from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson
@@ -80,6 +81,7 @@ def ask_all(robots: AskedRobots, order: Order[Q, A], request: Q, count: Count) -
     return robots.ask(order, [request] * robots.num_robots, count)
 
 
+@record("ConsensusState")
 @dataclass(frozen=True, eq=False)
 class ConsensusState(SharedSteps):
     """Iterate k: the sums that all robots know, and the robots, who have x, omega, B and rho.

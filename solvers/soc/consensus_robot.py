@@ -27,6 +27,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.stationarity import gradient_squares, rotation_squares
 from solvers.carry.messages import Messages
+from solvers.carry.registry import order
 from solvers.soc import copies
 from solvers.soc.anderson import AndersonSums
 from solvers.soc.penalty import PenaltyOrder
@@ -58,10 +59,12 @@ class ConsensusRobot:
         X = poses.stacked()
         return self._with(X=X), self.layout.rows_of_own_poses(X)
 
+    @order("consensus.begin_here")
     def begin_here(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Start at omega with the robot's translations."""
         return self.begin(self.poses)
 
+    @order("consensus.multiplier_ratios")
     def multiplier_ratios(self, rows: copies.Rows) -> tuple[ConsensusRobot, Array]:
         """Take the owners' poses; return ||Lambda_i||_2 / m_i of the robot's own."""
         layout = self.layout
@@ -71,6 +74,7 @@ class ConsensusRobot:
         norms = multiplier_norms(Lambda[layout.own_poses])
         return following, norms / following._scale[layout.own_poses]
 
+    @order("consensus.penalize")
     def penalize(
         self, order: PenaltyOrder
     ) -> tuple[ConsensusRobot, Messages[copies.NeighbourMessage]]:
@@ -95,6 +99,7 @@ class ConsensusRobot:
             messages[robot] = copies.NeighbourMessage(of_poses[common], rows)
         return self._with(rho=rho, pull=pull, force=force, settings=order.settings), messages
 
+    @order("consensus.stiffness")
     def stiffness(
         self, messages: Messages[copies.NeighbourMessage]
     ) -> tuple[ConsensusRobot, float]:
@@ -126,6 +131,7 @@ class ConsensusRobot:
         following = self._with(rho=rho, diagonal=diagonal, pull=pull, total_force=total_force)
         return following, stiffness
 
+    @order("consensus.start")
     def start(self, separators: copies.SeparatorPenalty) -> tuple[ConsensusRobot, copies.InitReply]:
         """Set omega to the poses and B in balance, and prepare step (a)."""
         layout = self.layout
@@ -166,6 +172,7 @@ class ConsensusRobot:
 
     # The recursion.
 
+    @order("consensus.solve")
     def solve(self, _: None) -> tuple[ConsensusRobot, copies.SolveReply]:
         """Step (a); return rows of s after it, and sums for the acceleration.
 
@@ -217,6 +224,7 @@ class ConsensusRobot:
         """Rows of X for every neighbour, of the poses that both hold."""
         return Messages({robot: X[rows] for robot, rows in self.layout.common.items()})
 
+    @order("consensus.step")
     def step(
         self, order: tuple[Agreement, copies.RowMessages]
     ) -> tuple[ConsensusRobot, copies.StepReply]:
@@ -258,11 +266,13 @@ class ConsensusRobot:
             received[robot] = copies.ReceivedRows(rows[robot], share)
         return self._with(X=X, block=block, sums=own_sums, received=received), rows
 
+    @order("consensus.announce")
     def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
         """Send the robot's rows to every neighbour, before the first turn."""
         waiting = copies.Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
         return self._with(waiting=waiting)._sending(self.block)
 
+    @order("consensus.turn")
     def turn(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.TurnAnswer]:
         """Make one turn, (b), (c) and (a), with the newest rows that have arrived, damped.
 
@@ -292,6 +302,7 @@ class ConsensusRobot:
         age = max(waiting.waited.values(), default=0)
         return robot, copies.TurnAnswer(sent, sums, stationarity, age)
 
+    @order("consensus.travel")
     def travel(self, _: None) -> tuple[ConsensusRobot, Array]:
         """How far separator translations and their multipliers have gone.
 
@@ -306,10 +317,12 @@ class ConsensusRobot:
         pulled = block.rho[separators, None] * change_of_B
         return self, travel(moved, pulled, block.diagonal[separators])
 
+    @order("consensus.back_at_best")
     def back_at_best(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Return to the s of the smallest merit, and send its rows to every neighbour."""
         return self._sending(replace(self.block, s=self.block.best))
 
+    @order("consensus.rescale")
     def rescale(self, order: copies.RescaleCopies) -> tuple[ConsensusRobot, None]:
         """Multiply rho and keep rho B; agree first on what was sent, if all are at their best."""
         block = self.block
@@ -350,16 +363,19 @@ class ConsensusRobot:
         X = np.where(self.layout.held, self.block.omega, self.state.X)
         return Poses(self.omega, X[: self.layout.problem.num_poses])
 
+    @order("consensus.own_poses")
     def own_poses(self, _: None) -> tuple[ConsensusRobot, copies.OwnPoses]:
         """Poses that the robot owns, with their numbers in the whole graph."""
         positions = self.layout.own_poses
         poses = self.poses[positions]
         return self, copies.OwnPoses(self.layout.subgraph.poses[positions], poses.R, poses.t)
 
+    @order("consensus.held_rows")
     def held_rows(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Rows of the own poses, for every neighbour that holds copies of them."""
         return self, self.layout.rows_of_own_poses(self.poses.stacked())
 
+    @order("consensus.stationarity_beside")
     def stationarity_beside(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.Stationarity]:
         """As `stationarity`, with the owners' rows in place of the robot's copies."""
         X = self.layout.with_rows_of_others(self.poses.stacked(), rows)

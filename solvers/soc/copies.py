@@ -14,6 +14,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
 from solvers.carry.messages import Messages
+from solvers.carry.registry import record
 from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
 from solvers.soc.recursion_block import RecursionBlock, StepSettings
@@ -28,6 +29,7 @@ _PROGRESS = 0.9
 _PATIENCE = 20
 
 
+@record("Norms")
 @dataclass(frozen=True, eq=False)
 class Norms:
     """||Lambda_i||_2 and m_i of a party's poses, in no order."""
@@ -45,6 +47,7 @@ def subsampled(norms: Norms, step: int | None) -> Norms:
     return Norms(norms.norms[chosen], norms.scale[chosen])
 
 
+@record("NeighbourMessage")
 @dataclass(frozen=True, eq=False)
 class NeighbourMessage:
     """What one robot sends another about the poses that both hold."""
@@ -55,6 +58,7 @@ class NeighbourMessage:
     force: Array | RowChange  # ((d + 1) q, d): -2 M_a X on the rows of all
 
 
+@record("SeparatorPenalty")
 @dataclass(frozen=True)
 class SeparatorPenalty:
     """Penalties of separators."""
@@ -63,6 +67,7 @@ class SeparatorPenalty:
     rotation: float  # least rho_i / m_i of their rotations
 
 
+@record("Stationarity")
 @dataclass(frozen=True, eq=False)
 class Stationarity:
     """One robot's part of F and of its relative gradient: sums over its own edges and poses."""
@@ -72,6 +77,7 @@ class Stationarity:
     rotations: float | None = None  # of `rotation_squares`: they never change and are sent once
 
 
+@record("InitReply")
 @dataclass(frozen=True, eq=False)
 class InitReply:
     """What a robot reports of its own poses when it is ready for the first step."""
@@ -80,6 +86,7 @@ class InitReply:
     stationarity: Stationarity
 
 
+@record("RescaleCopies")
 @dataclass(frozen=True)
 class RescaleCopies:
     """Order to multiply rho."""
@@ -89,6 +96,7 @@ class RescaleCopies:
     rows: Rows | None  # rows to agree on, where all robots have gone back to their best iterate
 
 
+@record("SolveReply")
 @dataclass(frozen=True, eq=False)
 class SolveReply:
     """Answer to an order to solve step (a)."""
@@ -97,6 +105,7 @@ class SolveReply:
     rows: RowMessages  # of s for every neighbour, before the extrapolation that all do together
 
 
+@record("StepReply")
 @dataclass(frozen=True, eq=False)
 class StepReply:
     """What an iteration gives, which ends with step (a) of the next one."""
@@ -106,6 +115,7 @@ class StepReply:
     solved: SolveReply
 
 
+@record("TurnSettings")
 @dataclass(frozen=True)
 class TurnSettings:
     """Over-relaxation and damping of an asynchronous run."""
@@ -114,6 +124,7 @@ class TurnSettings:
     damping: float
 
 
+@record("TurnAnswer")
 @dataclass(frozen=True, eq=False)
 class TurnAnswer:
     """What one turn of an asynchronous run gives."""
@@ -124,6 +135,7 @@ class TurnAnswer:
     waited: int  # age in turns of the oldest rows in use
 
 
+@record("OwnPoses")
 @dataclass(frozen=True, eq=False)
 class OwnPoses:
     """Poses that a robot owns, and their numbers in the whole graph."""
@@ -265,6 +277,7 @@ class CopyLayout:
         )
 
 
+@record("Waiting")
 @dataclass(frozen=True, eq=False)
 class Waiting:
     """What a robot of an asynchronous run has received, and how far it relaxes."""
@@ -293,6 +306,7 @@ class Waiting:
         return replace(self, excess=0.5 * self.excess, least=math.inf, turns_since=0)
 
 
+@record("ReceivedRows")
 @dataclass(frozen=True, eq=False)
 class ReceivedRows:
     """Rows of a neighbour's s that the robot shares, and what the acceleration remembers of them.
@@ -304,6 +318,7 @@ class ReceivedRows:
     share: AndersonShare = field(default_factory=AndersonShare)
 
 
+@record("CopiesState")
 @dataclass(frozen=True, eq=False)
 class CopiesState:
     """What orders leave with a robot; rows are those of `CopyLayout`.

@@ -43,6 +43,7 @@ from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.matrices import assemble, block_entries, norm, rotation_columns
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.summaries import Summarised
+from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import (
     BalancedPenalty,
@@ -56,6 +57,7 @@ from solvers.soc.r_step import BackEnd, RotationStep, RStep, RSubproblem, prepar
 _PATIENCE = 20  # steps without a new smallest merit, after which rho goes up
 
 
+@record("PaperIterate")
 @dataclass(frozen=True, eq=False)
 class PaperIterate:
     """R_i, omega_i and B_i of Algorithm 1, (q, d, d) each, of the poses that a party owns."""
@@ -194,6 +196,7 @@ class Blocks:
         return 2.0 * self.pull(iterate.R, known) + rho * stack_transposes(iterate.B)
 
 
+@record("CommonPenalty")
 @dataclass(frozen=True)
 class CommonPenalty:
     """One rho for all poses, and what its rule remembers.
@@ -289,6 +292,7 @@ class PaperState(Summarised):
         return self.penalty.rho
 
 
+@record("PaperStop")
 class PaperStop(enum.Enum):
     """When the recursion has converged."""
 
@@ -298,6 +302,7 @@ class PaperStop(enum.Enum):
     )
 
 
+@record("PaperSOC")
 @dataclass(frozen=True)
 class PaperSOC:
     """Algorithm 1 of the paper: rotations only, each robot with its neighbours frozen.

@@ -17,12 +17,14 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.problem.matrices import inner, norm
 from solvers.carry.messages import Messages
+from solvers.carry.registry import order, record
 from solvers.soc.copies import CopyLayout, Rows
 from solvers.soc.paper import Blocks, PaperIterate
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, RStep
 
 
+@record("PaperUnits")
 @dataclass(frozen=True, eq=False)
 class PaperUnits:
     """A robot's part of what rho and the residuals are measured in: sums over its own poses.
@@ -45,6 +47,7 @@ class PaperUnits:
     num_poses: int
 
 
+@record("PaperPenalty")
 @dataclass(frozen=True)
 class PaperPenalty:
     """Order to do steps (a) to (c) with this rho from now on; `r_step` solves (a)."""
@@ -53,6 +56,7 @@ class PaperPenalty:
     r_step: RStep
 
 
+@record("PaperReply")
 @dataclass(frozen=True, eq=False)
 class PaperReply:
     """What a robot tells after the steps (a) to (c).
@@ -69,6 +73,7 @@ class PaperReply:
     rows: Rows
 
 
+@record("PaperLast")
 @dataclass(frozen=True, eq=False)
 class PaperLast:
     """A robot's part of the iterate whose R the neighbours have just sent: sums of its own.
@@ -85,6 +90,7 @@ class PaperLast:
     cost: float
 
 
+@record("PaperCopies")
 @dataclass(frozen=True, eq=False)
 class PaperCopies:
     """What orders leave with a robot.
@@ -121,12 +127,14 @@ class PaperRobot:
         X = poses.stacked()
         return self._with(X=X), self.layout.rows_of_own_poses(X)
 
+    @order("paper.ratios")
     def ratios(self, rows: Rows) -> tuple[PaperRobot, Array]:
         """Take the owners' poses; return ||Lambda_i||_2 / m_i of the robot's own."""
         following = self._with(X=self.layout.with_rows_of_others(self.state.X.copy(), rows))
         norms, scale = following._norms_and_scale
         return following, norms / scale
 
+    @order("paper.units")
     def units(self, order: PenaltyOrder) -> tuple[PaperRobot, PaperUnits]:
         """Return the sums that rho and the residuals are measured in."""
         norms, scale = self._norms_and_scale
@@ -136,11 +144,13 @@ class PaperRobot:
         units = PaperUnits(rho, float(blocks.own.diagonal().sum()), cost, len(norms))
         return replace(self, blocks=blocks), units
 
+    @order("paper.start")
     def start(self, penalty: PaperPenalty) -> tuple[PaperRobot, PaperReply]:
         """Set R = omega to the poses and B = 0, and do the first steps (a) to (c)."""
         last = PaperIterate.first(self._R_of_start)
         return self._with(last=last, penalty=penalty)._prepared()._with_next()
 
+    @order("paper.step")
     def step(
         self, order: tuple[PaperPenalty, Rows]
     ) -> tuple[PaperRobot, tuple[PaperLast, PaperReply]]:

@@ -11,11 +11,13 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
+from solvers.carry.registry import record
 from solvers.soc.recursion_block import RecursionBlock, StepSettings, block_at, stationary_B
 
 _SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
 
 
+@record("PenaltyOrder")
 @dataclass(frozen=True)
 class PenaltyOrder:
     """What a party must know to set its penalties.
@@ -102,6 +104,7 @@ def first_penalties(rule: PenaltyRule, problem: PGOProblem, poses: Poses) -> Arr
     return PenaltyOrder(*rule.bounds(norms / scale)).rho(norms, scale)
 
 
+@record("MultiplierPenalty")
 @dataclass(frozen=True)
 class MultiplierPenalty(_FirstPenalty):
     """A penalty of every pose from its multiplier: rho_i = factor max(||Lambda_i||_2, q m_i).
@@ -170,6 +173,7 @@ class MultiplierPenalty(_FirstPenalty):
         return self.factor, self.factor * q, 0.0
 
 
+@record("FixedPenalty")
 @dataclass(frozen=True)
 class FixedPenalty(_FirstPenalty):
     """The same penalty for all poses, rho_i = rho, unless the safeguard raises it.
@@ -221,6 +225,7 @@ class _ScaledRule:
         return 0.0, self.scale, 0.0
 
 
+@record("BalancedPenalty")
 @dataclass(frozen=True)
 class BalancedPenalty(_ScaledRule):
     """A penalty that balances the relative residuals, after OSQP (Stellato et al. 2020).
@@ -282,6 +287,7 @@ class BalancedPenalty(_ScaledRule):
         return 1.0
 
 
+@record("BoydPenalty")
 @dataclass(frozen=True)
 class BoydPenalty(_ScaledRule):
     """One penalty for all poses that balances residuals as Boyd et al. 2011, (3.13); for PaperSOC.

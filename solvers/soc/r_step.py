@@ -19,6 +19,7 @@ from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, Symboli
 from pgo_models.problem.matrices import entry_positions
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.summaries import Summarised
+from solvers.carry.registry import record
 from solvers.soc.accelerated_gradients import minimize_with_fista, minimize_with_nesterov
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 _BOUND_SWEEPS = 10
 
 
+@record("RStep")
 class RStep(enum.Enum):
     """Which back end solves the R-subproblem."""
 

@@ -22,10 +22,12 @@ from pgo_models.geometry.rotations import (
     unstack_transposes,
 )
 from pgo_models.problem.matrices import inner
+from solvers.carry.registry import record
 from solvers.soc.anderson import Anderson, AndersonShare, over_relax
 from solvers.soc.rounding import WHOLE, ShortNumbers
 
 
+@record("Rotations")
 class Rotations(enum.Enum):
     """What step (b) does with the rotations.
 
@@ -37,6 +39,7 @@ class Rotations(enum.Enum):
     FIXED = "all held as they are"
 
 
+@record("StepSettings")
 @dataclass(frozen=True)
 class StepSettings:
     """The settings of SOC that a robot needs; they are sent once."""
@@ -49,6 +52,7 @@ class StepSettings:
     rotations: Rotations = Rotations.PROJECTED
 
 
+@record("Agreement")
 @dataclass(frozen=True)
 class Agreement:
     """What all parties learn from the sums of step (a)."""
@@ -63,6 +67,7 @@ class Agreement:
         return given.numbers if isinstance(given, ShortNumbers) else given
 
 
+@record("RecursionBlock")
 @dataclass(frozen=True, eq=False)
 class RecursionBlock:
     """Rows of x, omega, B and rho: the rows of every R_i^T, and of separator translations.

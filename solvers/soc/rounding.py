@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
+from solvers.carry.registry import record
 
 WHOLE = 8  # bytes of a number that is not rounded
 _LARGEST = {1: 127, 2: 32767}  # by the number of bytes
 
 
+@record("RowChange")
 @dataclass(frozen=True, eq=False)
 class RowChange:
     """Change of rows that sender and receiver have: `multiples` of the unit of each kind.
@@ -66,6 +68,7 @@ def _of_rows(units: Array, rows: Array) -> Array:
     return np.repeat(units, [q, d * q])[:, None]
 
 
+@record("ShortNumbers")
 @dataclass(frozen=True, eq=False)
 class ShortNumbers:
     """Numbers in two bytes each, m 2^e with a mantissa m of one byte: two digits.
@@ -90,6 +93,7 @@ class ShortNumbers:
         return np.ldexp(self.mantissas / 128.0, self.exponents)
 
 
+@record("PartOfSums")
 @dataclass(frozen=True, eq=False)
 class PartOfSums:
     """One party's part of the sums of the acceleration; those after the first are in float32.

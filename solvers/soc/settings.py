@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
+from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson
 from solvers.soc.penalty import BoydPenalty, MultiplierPenalty, PenaltyOrder, PenaltyRule
@@ -25,6 +26,7 @@ _SEPARATOR_PENALTY = 0.7
 _MAX_SEPARATOR_PENALTY = 0.3
 
 
+@record("Coupling")
 class Coupling(enum.Enum):
     """How the R-subproblem is shared."""
 

@@ -13,6 +13,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
+from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.soc.joint import Joint, SOCState
 from solvers.soc.settings import Coupling, SOCSettings
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     SOCIterate = SOCState | ConsensusState
 
 
+@record("SOC")
 @dataclass(frozen=True)
 class SOC(SOCSettings):
     """Splitting of orthogonality constraints, after Ebrahimi & Deghat and Lai & Osher 2014.

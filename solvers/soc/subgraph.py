@@ -21,6 +21,7 @@ from pgo_models.graphs.separators import cover_of_edges
 from pgo_models.problem.costs import EdgeCost
 from pgo_models.problem.initialization import largest_stiffness
 from pgo_models.problem.problem import PGOProblem, as_problem
+from solvers.carry.registry import record
 from solvers.soc.subdomains import MOST_COUPLED, Subdomains, find_subdomains, poses_to_leave
 
 
@@ -172,6 +173,7 @@ class Subgraph:
         return np.stack(self.part.subdomains.coupled.nonzero(), axis=1)
 
 
+@record("RobotSummary")
 @dataclass(frozen=True, eq=False)
 class RobotSummary:
     """What a driver knows of a robot, whose poses in the cover are those the driver solves for.
@@ -211,6 +213,7 @@ class RobotSummary:
     stiffness: float | None = None
 
 
+@record("Placement")
 @dataclass(frozen=True, eq=False)
 class Placement:
     """The poses that a robot shares with others, with the fields that `Subgraph` has of them."""

@@ -16,6 +16,7 @@ from pgo_models.graphs.g2o_parser import parse_lines
 from pgo_models.graphs.g2o_rows import lines_of, numbers_of
 from pgo_models.graphs.g2o_tags import SKIPPED_TAGS
 from pgo_models.graphs.pose_graph import IntArray, isotropic_information
+from solvers.carry.registry import record
 
 _EDGE_TAGS = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 _VERTEX_TAGS = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
@@ -25,6 +26,7 @@ _ORIGIN = {2: "0 0 0", 3: "0 0 0 0 0 0 1"}
 _WITHOUT_ESTIMATE = "POSE"
 
 
+@record("Measurements")
 @dataclass(eq=False)
 class Measurements:
     """Lines of a g2o file, in the order in which they have come, each with its end.

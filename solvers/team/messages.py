@@ -9,7 +9,7 @@ from typing import Any
 
 from pgo_models import errors
 from pgo_models.errors import PGOError
-from solvers.result import History, Stage, Status
+from solvers.carry.registry import record
 from solvers.robots_solution import RobotsSolution
 from solvers.team.wire import Order
 
@@ -26,6 +26,7 @@ class Priority(IntEnum):
     NORMAL = 1
 
 
+@record("Term")
 @dataclass(frozen=True, order=True)
 class Term:
     """Names a solve: a number that only grows, and the robot that drives."""
@@ -34,6 +35,7 @@ class Term:
     driver: str
 
 
+@record("Hello")
 @dataclass(frozen=True)
 class Hello:
     """A robot is there, with measurements of this revision; `term` is the latest that it knows."""
@@ -42,6 +44,7 @@ class Hello:
     term: Term
 
 
+@record("Ask")
 @dataclass(frozen=True, eq=False)
 class Ask:
     """Order number `call` to a robot in a solve, with its request; `place` is the robot's number.
@@ -57,6 +60,7 @@ class Ask:
     members: tuple[str, ...] = ()
 
 
+@record("Reply")
 @dataclass(frozen=True, eq=False)
 class Reply:
     """The answer to order number `call`, or what went wrong.
@@ -71,6 +75,7 @@ class Reply:
     error: tuple[str, str] | None = None  # name and text of a PGOError
 
 
+@record("Letter")
 @dataclass(frozen=True, eq=False)
 class Letter:
     """What a robot tells another one in its answer to order number `call`."""
@@ -81,6 +86,7 @@ class Letter:
     content: Mapping[int, Any]
 
 
+@record("LetterLost")
 @dataclass(frozen=True)
 class LetterLost:
     """The letter of order number `call` has not arrived at the robot with this place."""
@@ -90,6 +96,7 @@ class LetterLost:
     place: int
 
 
+@record("Ended")
 @dataclass(frozen=True, eq=False)
 class Ended:
     """A solve of the team has ended.
@@ -131,15 +138,12 @@ class Ended:
         return f"{said}, for {names}: gap {gap}, {solution.ledger.rounds} rounds"
 
 
+@record("Heard")
 @dataclass(frozen=True)
 class Heard:
     """The outcome of this solve has arrived."""
 
     term: Term
-
-
-_OF_SOLUTION = (RobotsSolution, Stage, Status, History)
-MESSAGES = (Hello, Ask, Reply, Letter, LetterLost, Ended, Heard, Term, *_OF_SOLUTION)
 
 
 def error_as_message(error: PGOError) -> tuple[str, str]:

@@ -18,6 +18,7 @@ from pgo_models.errors import SettingError, door, extra_module
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
+from solvers.carry.registry import record
 from solvers.carry.serialization import deserialize, serialize
 from solvers.request import Pipeline
 from solvers.robots_solution import RobotsSolution
@@ -26,14 +27,15 @@ from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
 from solvers.team.measurements import Measurements
 from solvers.team.member import Member
-from solvers.team.messages import MESSAGES, Ended, Term
+from solvers.team.messages import Ended, Term
 from solvers.team.session import PATIENCE, RETRY, Message, Session, TeamLedger
 from solvers.team.sharing import OwnAnswer, Sharing
-from solvers.team.wire import packed, records_of_rooms, unpacked
+from solvers.team.wire import packed, unpacked
 
 _FEWEST_KEY_BYTES = 16  # 128 bits, which nobody can guess
 
 
+@record("SavedRobot")
 @dataclass(frozen=True, eq=False)
 class Saved:
     """What `Robot.save` keeps."""
@@ -488,9 +490,11 @@ class Robot:
             For other bytes.
         """
         try:
-            saved = deserialize(unpacked(data), (*records_of_rooms(), *MESSAGES, *_SAVED))
+            saved = deserialize(unpacked(data))
         except ValueError as error:
             raise SettingError(f"these bytes are no saved robot: {error}") from error
+        if not isinstance(saved, Saved):
+            raise SettingError(f"these bytes are a {type(saved).__name__}, and no saved robot")
         robot = cls(
             saved.name,
             saved.team,
@@ -510,9 +514,6 @@ class Robot:
         robot._session.term = saved.term
         robot._session.last = saved.outcome
         return robot
-
-
-_SAVED = (Measurements, OwnAnswer, Saved, Sharing, Weighting)
 
 
 def _names_of_stages(solution: RobotsSolution) -> list[str]:

@@ -15,11 +15,13 @@ from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
+from solvers.carry.registry import order, record
 from solvers.robots.agent import Agent
 from solvers.robots.own_file import PlacedFile
 from solvers.solution import Solution
 
 
+@record("Sharing")
 class Sharing(enum.Enum):
     """What the robots of a team tell each other."""
 
@@ -27,6 +29,7 @@ class Sharing(enum.Enum):
     MEASUREMENTS = "all that each has measured, to the robot that drives"
 
 
+@record("OwnAnswer")
 @dataclass(frozen=True, eq=False)
 class OwnAnswer:
     """What a solve in one place has found of a robot's poses.
@@ -80,6 +83,7 @@ def answer_of(agent: Agent) -> OwnAnswer | None:
     return OwnAnswer(ids, agent.record.answer[own_poses], None, joined.rejected)
 
 
+@order("team.give_measurements")
 def give_measurements(agent: Agent, _: None) -> IntArray:
     """Return the lines of the robot in UTF-8; a SettingError if it does not share them."""
     own_lines = agent.own_lines
@@ -91,6 +95,7 @@ def give_measurements(agent: Agent, _: None) -> IntArray:
     return np.frombuffer(own_lines.text.encode("utf-8"), dtype=np.uint8)
 
 
+@order("team.take_answer")
 def take_answer(agent: Agent, answer: OwnAnswer) -> None:
     """Learn what was found of the robot's poses."""
     agent.record = answer

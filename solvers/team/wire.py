@@ -1,7 +1,7 @@
 """Messages as bytes: versioned arrays without pickle, sealed with the key of a team.
 
 A message is a record (`solvers.carry.serialization`): a tree in JSON, and the arrays in it. Its
-bytes are a mark and version, the HMAC-SHA256 of what follows (RFC 2104), and the record,
+bytes are a mark, a version, the HMAC-SHA256 of what follows (RFC 2104), and the record,
 compressed. Who does not have the key can neither make a message nor change one. Messages are not
 encrypted: a transport may do that.
 """
@@ -9,58 +9,39 @@ encrypted: a transport may do that.
 from __future__ import annotations
 
 import dataclasses
-import enum
 import hashlib
 import hmac
-import importlib
-import inspect
 import json
-import pkgutil
 import zlib
 from collections.abc import Callable, Mapping
-from functools import cache, partial
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError
+from solvers.carry.registry import VERSION, name_of_order, order_named, record
 from solvers.carry.serialization import deserialize, serialize
 
-_MARK = b"PGO2"  # the last character is the version
+_MARK = b"PGO"
+_VERSION = VERSION.to_bytes(1, "big")
 _SEAL_BYTES = 32  # of HMAC-SHA256
 _LENGTH_BYTES = 4  # of the length of the description, which precedes it
 _LEVEL = 1  # of the compression: numbers hardly shrink, trees do
 # A message may not unpack to more: whoever has the key could else fill the memory of the others.
 MOST_BYTES = 1 << 30
-# Rooms and modules whose records are sent, and modules whose functions robots are ordered to call.
-_ROOMS = (
-    "pgo_models.certificates",
-    "pgo_models.geometry",
-    "pgo_models.graphs",
-    "pgo_models.problem",
-    "pgo_models.relaxations",
-    "solvers.robots",
-    "solvers.carry",
-    "solvers.riemannian",
-    "solvers.robust.weighted_edges",
-    "solvers.soc",
-)
-_MODULES_OF_ORDERS = (
-    "solvers.robots.",
-    "solvers.carry.moments",
-    "solvers.soc.",
-    "solvers.team.sharing",
-)
+K = TypeVar("K")
 
 
 class WireError(PGOError):
     """Bytes that are no message of this team and version."""
 
 
+@record("Order")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Order:
-    """An order by its name, `module:function`, with the arguments that it has already."""
+    """An order by its name, with the arguments that it has already."""
 
     name: str
     arguments: tuple[Any, ...] = ()
@@ -72,71 +53,50 @@ class Order:
             function = cls.of(order.func)
             given = tuple(cls.of(value) if callable(value) else value for value in order.args)
             return cls(function.name, (*function.arguments, *given))
-        return cls(f"{order.__module__}:{order.__qualname__}")
+        return cls(name_of_order(order))
 
     def function(self) -> Callable[..., Any]:
         """Return the order; a WireError unless it is one that robots have."""
-        module, _, path = self.name.partition(":")
-        if not module.startswith(_MODULES_OF_ORDERS):
-            raise WireError(f"{self.name!r:.80} is no order")
-        function: Any = importlib.import_module(module)
-        for part in path.split("."):
-            if part.startswith("_"):
-                raise WireError(f"{self.name!r:.80} is no order")
-            function = getattr(function, part, None)
-        if not inspect.isfunction(function) or function.__module__ != module:
-            raise WireError(f"{self.name!r:.80} is no order")
+        try:
+            function = order_named(self.name)
+        except ValueError as error:
+            raise WireError(str(error)) from error
         given = [
             value.function() if isinstance(value, Order) else value for value in self.arguments
         ]
         return partial(function, *given) if given else function
 
 
-@cache
-def records_of_rooms() -> tuple[type, ...]:
-    """Dataclasses, named tuples and enums of the rooms whose records are sent."""
-    records: dict[str, type] = {}
-    for room in _ROOMS:
-        package = importlib.import_module(room)
-        within = pkgutil.iter_modules(getattr(package, "__path__", []), f"{room}.")
-        for module in [room, *(inside.name for inside in within)]:
-            for name, value in vars(importlib.import_module(module)).items():
-                if inspect.isclass(value) and value.__module__ == module and _is_record(value):
-                    assert name not in records, f"two records are called {name}"
-                    records[name] = value
-    return tuple(records.values())
-
-
-def _is_record(value: type) -> bool:
-    is_tuple = issubclass(value, tuple) and hasattr(value, "_fields")
-    return dataclasses.is_dataclass(value) or is_tuple or issubclass(value, enum.Enum)
-
-
 def sealed(key: bytes, message: object) -> bytes:
     """Bytes of a message, which only holders of the key can make."""
     body = zlib.compress(packed(serialize(message)), _LEVEL)
-    return _MARK + hmac.digest(key, _MARK + body, hashlib.sha256) + body
+    return _MARK + _VERSION + hmac.digest(key, _MARK + _VERSION + body, hashlib.sha256) + body
 
 
-def opened(key: bytes, data: bytes, kinds: tuple[type, ...]) -> Any:  # noqa: ANN401 - one of kinds
+def opened(key: bytes, data: bytes, kind: type[K]) -> K:
     """The message that the bytes are, one of the given kinds.
 
     A WireError for bytes of another version, key or kind, and for those that were changed.
     """
-    mark, seal, body = _cut(data, len(_MARK), _SEAL_BYTES)
+    mark, version, seal, body = _cut(data, len(_MARK), len(_VERSION), _SEAL_BYTES)
     if mark != _MARK:
-        raise WireError("bytes of another program or version")
-    if not hmac.compare_digest(seal, hmac.digest(key, _MARK + body, hashlib.sha256)):
+        raise WireError("bytes of another program")
+    if version != _VERSION:
+        raise WireError(
+            f"a message of version {int.from_bytes(version, 'big')}, and this robot has version "
+            f"{VERSION}; install one version on all robots"
+        )
+    if not hmac.compare_digest(seal, hmac.digest(key, mark + version + body, hashlib.sha256)):
         raise WireError("a message that was not sealed with the key of the team")
     try:
         unpacker = zlib.decompressobj()
         plain = unpacker.decompress(body, MOST_BYTES)
         if not unpacker.eof:
             raise WireError("a message that is too long")
-        message = deserialize(unpacked(plain), (*records_of_rooms(), Order, *kinds))
+        message = deserialize(unpacked(plain))
     except (zlib.error, ValueError) as error:
         raise WireError(f"a message that cannot be read: {error}") from error
-    if not isinstance(message, kinds):
+    if not isinstance(message, kind):
         raise WireError(f"a {type(message).__name__} is no message")
     return message
 

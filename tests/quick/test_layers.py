@@ -33,9 +33,9 @@ ORDER = {
         "plots",
     ),
     "solvers": (
+        "carry",
         "result",
         "progress",
-        "carry",
         "soc",
         "riemannian",
         "robust",

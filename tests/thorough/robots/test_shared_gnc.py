@@ -17,7 +17,7 @@ from solvers import GNC, Checkpoint
 from solvers.carry.serialization import deserialize, serialize
 from solvers.result import Stage
 from solvers.robots import current_poses
-from solvers.robots.agent import CLASSES, Agent
+from solvers.robots.agent import Agent
 from solvers.robots.driver import order_interior
 from solvers.robots.records import Reweigh
 from solvers.robots.reweigh import reweigh
@@ -88,9 +88,7 @@ def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
     np.testing.assert_array_equal(before.force, after.force)
     weights = agent.interior.state.weights
     assert ((weights > 0) & (weights < 1)).any()
-    np.testing.assert_array_equal(
-        deserialize(serialize(agent.interior.state), CLASSES).weights, weights
-    )
+    np.testing.assert_array_equal(deserialize(serialize(agent.interior.state)).weights, weights)
 
 
 def subgraph_known(problem: pgo.PGOProblem) -> np.ndarray:
