@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 from pgo_models.errors import PGOError, extra_module
 from solvers.carry.messages import Idle, Worker, obey, raise_first_error
+from solvers.carry.wire import Order
 from solvers.robots.agent import Agent
 from solvers.robots_solution import RobotsSolution
 from solvers.team.messages import Ask, Ended, Reply, Term, error_of_message
-from solvers.team.wire import Order
 
 T = TypeVar("T")
 Q = TypeVar("Q")

@@ -10,8 +10,8 @@ from typing import Any
 from pgo_models import errors
 from pgo_models.errors import PGOError
 from solvers.carry.registry import record
+from solvers.carry.wire import Order
 from solvers.robots_solution import RobotsSolution
-from solvers.team.wire import Order
 
 _PLAIN_ERRORS = {
     kind.__name__: kind

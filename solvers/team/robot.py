@@ -20,6 +20,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.registry import record
 from solvers.carry.serialization import deserialize, serialize
+from solvers.carry.wire import packed, unpacked
 from solvers.request import Pipeline
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
@@ -30,7 +31,6 @@ from solvers.team.member import Member
 from solvers.team.messages import Ended, Term
 from solvers.team.session import PATIENCE, RETRY, Message, Session, TeamLedger
 from solvers.team.sharing import OwnAnswer, Sharing
-from solvers.team.wire import packed, unpacked
 
 _FEWEST_KEY_BYTES = 16  # 128 bits, which nobody can guess
 

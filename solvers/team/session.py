@@ -15,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pgo_models.errors import EngineError, PGOError
+from solvers.carry.letters import LetterName, Letters
 from solvers.carry.registry import record
+from solvers.carry.wire import WireError, opened, sealed
 from solvers.robots.agent import Agent
 from solvers.team.driving import Drive
-from solvers.team.letters import LetterName, Letters
 from solvers.team.member import Member
 from solvers.team.messages import (
     Ask,
@@ -32,7 +33,6 @@ from solvers.team.messages import (
     Term,
     error_as_message,
 )
-from solvers.team.wire import WireError, opened, sealed
 
 PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
 RETRY = 1.0  # seconds after which a message without an answer is sent again

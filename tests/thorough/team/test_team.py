@@ -22,12 +22,12 @@ from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import Sharing
 from solvers.carry.messages import Token
+from solvers.carry.wire import opened, sealed
 from solvers.robots.own_file import Told
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.messages import Ask, Ended, Heard, Letter, Reply
 from solvers.team.session import Envelope, TeamLedger
-from solvers.team.wire import opened, sealed
 
 pytest.importorskip("greenlet")
 

@@ -26,8 +26,8 @@ from solvers import (
 )
 from solvers.carry.process import WorkerPool
 from solvers.carry.registry import VERSION, names_and_fields
+from solvers.carry.wire import Order, WireError, opened, sealed
 from solvers.studies.tightness import noisy_scene
-from solvers.team.wire import Order, WireError, opened, sealed
 
 KEY = b"sixteen or more bytes"
 
