@@ -186,7 +186,7 @@ class SolveRequest:
         if self.robots is not None:
             self._check_robots(self.robots)
         if self.start is not None and self.problem.graph.has_far_priors:
-            self.problem.stacked(self.start)  # raises unless the poses fit
+            self.problem.check_poses(self.start)
             object.__setattr__(self, "start", self.problem.graph.near_zero(self.start))
 
     def with_partition(self) -> SolveRequest:

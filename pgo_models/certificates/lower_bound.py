@@ -416,7 +416,7 @@ def _grounded_at(problem: PGOProblem, poses: Poses, is_complex: bool = False) ->
     n = problem.num_poses
     d = problem.d
     r = middle_pose(problem.graph)
-    X = problem.stacked(poses)
+    X = problem.at(poses).X.copy()
     X[:n] -= X[r]
     X = X @ poses.R[r]
     rows = pose_rows(r, n, d)
@@ -580,7 +580,7 @@ def _first_point(problem: PGOProblem, Lambda: Array, X: Array) -> _Point:
     """The point before any move; its S X' is computed without a bound on its error."""
     n = problem.num_poses
     d = problem.d
-    product = problem.apply_M(X)
+    product = problem.at_point(X).half_gradient.copy()
     of_multipliers = Lambda @ X[n:].reshape(n, d, d)
     product[n:] -= of_multipliers.reshape(-1, d)
     no_move = np.zeros((n, d))

@@ -50,7 +50,7 @@ def negative_curvature(
     direction = vectors[:, 0]
     v = direction / np.linalg.norm(direction)
     blocks = v.reshape(n, d)
-    Qv = problem.apply_Q(v[:, None])[:, 0]
+    Qv = problem.translations.apply_Q(v[:, None])[:, 0]
     curvature = inner(v, Qv)
     curvature -= float(np.einsum("na,nab,nb->", blocks, Lambda, blocks))
     return NegativeCurvature(curvature, blocks, shift, factor)

@@ -163,7 +163,7 @@ def chordal_start(problem: PGOProblem, averaged: bool = False) -> Poses:
     stiffness = largest_stiffness(problem.weights) if averaged else None
     if stiffness is not None:
         pull = averaging_pull(problem, R, stiffness)
-        R = R @ exp_map(problem.solve_translations(pull))
+        R = R @ exp_map(problem.translations.solve(pull))
     return problem.with_best_translations(R)
 
 

@@ -146,14 +146,15 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> Ar
 
     Q = M_RR - M_Rt (M_tt)^+ M_tR, the Schur complement of the translations (SE-Sync: Rosen et al.
     2019, equation 22). A SettingError when its side would exceed `MAX_DENSE_SIDE`;
-    `PGOProblem.apply_Q` multiplies with it at any size.
+    `PGOProblem.translations` multiplies with it at any size.
     """
     n = graph.num_poses
     side = graph.d * graph.num_poses
     if side > MAX_DENSE_SIDE:
         gigabytes = 8e-9 * side**2
         raise SettingError(
-            f"Q has side {side}, {gigabytes:.1f} GB; use PGOProblem.apply_Q, which forms no Q"
+            f"Q has side {side}, {gigabytes:.1f} GB; "
+            "use PGOProblem.translations.apply_Q, which forms no Q"
         )
     M = joint_matrix(graph, weights)
     M_RR = M[n:, n:].toarray()
@@ -164,34 +165,6 @@ def marginalized_matrix(graph: PoseGraph, weights: EdgeCost | None = None) -> Ar
     M_tR = M_Rt.toarray().T
     product = M_Rt @ factor.solve(M_tR)
     return np.asarray(M_RR - product)
-
-
-@dataclass(frozen=True, eq=False)
-class BlockLaplacian:
-    """Laplacians of a graph whose edges have weights of d x d numbers, with one pattern for all.
-
-    They are the matrices of translations whose edges have such information matrices.
-    """
-
-    incidence: Incidence
-    pattern: SummedPattern
-
-    @classmethod
-    def of(cls, incidence: Incidence, d: int) -> BlockLaplacian:
-        """The Laplacians of a graph."""
-        n = incidence.begins.shape[0]
-        every_pose = np.arange(n)
-        pairs = [(every_pose, every_pose), (incidence.i, incidence.j), (incidence.j, incidence.i)]
-        return cls(incidence, SummedPattern.of(pairs, n).of_blocks(d))
-
-    def matrix(self, of_edges: Array) -> csc_array:
-        """Laplacian with symmetric weights, (m, d, d), the diagonal block of pose 0 doubled.
-
-        Doubling a block makes it positive definite.
-        """
-        diagonal = self.incidence.at_both(of_edges, of_edges)
-        diagonal[0] *= 2.0
-        return self.pattern.matrix([diagonal, -of_edges, -of_edges])
 
 
 def rotation_columns(pose: IntArray, first: int, d: int) -> IntArray:

@@ -21,12 +21,12 @@ from pgo_models.problem.cholesky import (
     CholeskyFactor,
     SymbolicCholesky,
     analyze,
-    factorize_damped,
 )
 from pgo_models.problem.costs import EdgeCost, EdgePoint, rotation_cost
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.right_costs import RightCosts
+from pgo_models.problem.translations import TranslationLaplacian, TranslationSystem
 from pgo_models.problem.weighting import (
     Weighting,
     convex_cost,
@@ -34,8 +34,6 @@ from pgo_models.problem.weighting import (
     name_of_cost,
     own_weighting,
 )
-
-MOST_REFINEMENTS = 60  # of translations: each but the last halves F at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +172,7 @@ class PGOProblem(ReadOnly):
     @cached_property
     def _convex_neighbour(self) -> "PGOProblem":
         cost = convex_cost(self.information, self.d)
-        return _SharingProblem(self.graph, self.backend, cost, original=self)
+        return _SameGraph(self.graph, self.backend, cost, original=self)
 
     def check_quadratic(self, method: str, convex: bool = False) -> None:
         """Raise an error where a method needs a cost that is quadratic, or convex, and it is not.
@@ -268,7 +266,7 @@ class PGOProblem(ReadOnly):
             written_error=None,
         )
         cost = self.weights.with_rotation_terms(R_ij, W)
-        return _ExtendedProblem(extended, self.backend, cost, original=self)
+        return _SamePattern(extended, self.backend, cost, original=self)
 
     # Matrices, each built when first asked for, read-only: what follows from them is kept, too.
 
@@ -299,6 +297,11 @@ class PGOProblem(ReadOnly):
         return read_only(matrices.residual_matrix(self.graph, self.has_translations))
 
     @cached_property
+    def A_transposed(self) -> csc_array:
+        """A^T, (N, (d+1) m)."""
+        return self.A.T
+
+    @cached_property
     def residual_matrix(self) -> tuple[csr_array, Array]:
         """Rows, ((d+1) m, N), and their weights w: F = sum_rows w ||rows X||^2.
 
@@ -317,8 +320,11 @@ class PGOProblem(ReadOnly):
         """Symbolic factorisation of the pattern of M, shared by every matrix that has it."""
         if self.convex_part is not self:
             return self.convex_part.analysis
+        return self._analyze()
+
+    def _analyze(self) -> SymbolicCholesky:
         order = row_order(self.pose_order, 1, self.d)
-        counts = partial(most_counts, self._pose_analysis, 1, self.d)
+        counts = partial(most_counts, self.translations.analysis, 1, self.d)
         return analyze(self.M, self.backend, order, counts)
 
     @cached_property
@@ -374,53 +380,6 @@ class PGOProblem(ReadOnly):
 
     # The cost and its derivatives.
 
-    def residuals(self, X: Array) -> Array:
-        """Return A X: the translation residuals of the edges, then their rotation residuals.
-
-        Parameters
-        ----------
-        X : (N, d) array
-            Poses, stacked, or any other point.
-
-        Returns
-        -------
-        ((d+1) m, d) array
-            The residuals.
-        """
-        return np.asarray(self.A @ X)
-
-    def point(self, X: Array) -> EdgePoint:
-        """Return X as the edges see it: what their cost is evaluated at.
-
-        Parameters
-        ----------
-        X : (N, d) array
-            Poses, stacked, or any other point.
-
-        Returns
-        -------
-        EdgePoint
-            Residuals and rotations.
-        """
-        P = X[self.num_poses :].reshape(self.num_poses, self.d, -1)
-        residuals = self.residuals(X)
-        return EdgePoint(residuals, self.weights.weigh_rows(residuals), P, self.graph.i)
-
-    def objective_stacked(self, X: Array) -> float:
-        """Return the cost at any X, as a weighted sum of squares of residuals.
-
-        Parameters
-        ----------
-        X : (N, d) array
-            The point.
-
-        Returns
-        -------
-        float
-            F = tr(X^T M X), or chi2.
-        """
-        return self.weights.value(self.point(X))
-
     def objective(self, poses: Poses) -> float:
         """Return the cost of poses: F (equation (16) of the paper, weighted), or chi2.
 
@@ -462,59 +421,7 @@ class PGOProblem(ReadOnly):
         (m,) array
             Their sum is the objective.
         """
-        return self.weights.edge_values(self.at(poses).point)
-
-    def apply_M(self, X: Array) -> Array:
-        """Return M X = A^T (D A X) by way of the residuals.
-
-        That is accurate where the edges fit, however large the translations are.
-
-        Parameters
-        ----------
-        X : (N, d) array
-            The point.
-
-        Returns
-        -------
-        (N, d) array
-            In the rows of X.
-        """
-        return self.sum_gradients(*self.weights.edge_gradients(self.point(X)))
-
-    def sum_gradients(self, in_residuals: Array, in_P_i: Array | None) -> Array:
-        """Return the half gradient in X of edges with these (`EdgeCost.edge_gradients`).
-
-        Parameters
-        ----------
-        in_residuals : ((d + 1) m, d) array
-            Half gradients in the rows of A X.
-        in_P_i : (m, d, d) array or None
-            Half gradients in the rows of R_i^T beside them; None for zeros.
-
-        Returns
-        -------
-        (N, d) array
-            In the rows of X.
-        """
-        half_gradient = self.residual_adjoint @ in_residuals
-        if in_P_i is not None:
-            half_gradient[self.num_poses :] += self.incidence.at_beginning(in_P_i)
-        return np.asarray(half_gradient)
-
-    def apply_Q(self, Y: Array) -> Array:
-        """Return Q Y without forming Q: M applied to Y and its best translations.
-
-        Parameters
-        ----------
-        Y : (dn, k) array
-            Rows of rotations, or any others.
-
-        Returns
-        -------
-        (dn, k) array
-            In the rows of Y.
-        """
-        return np.asarray(self._M_rotation_rows @ np.concatenate([self.translations_for(Y), Y]))
+        return self.at(poses).edge_costs
 
     def riemannian_gradient(self, poses: Poses) -> tuple[Array, Array]:
         """Return the gradient of F(R_i Exp(hat(w_i)), t_i + v_i) in (w, v) at zero.
@@ -537,57 +444,13 @@ class PGOProblem(ReadOnly):
 
     # Exact translations for given rotations.
 
-    def recover_translations(self, R: Array) -> Array:
-        """Return the translations that minimise F for given rotations, with t_0 = 0.
-
-        They solve M_tt t = -M_tR Y, Y the rows R_i^T: one sparse solve.
-
-        Parameters
-        ----------
-        R : (n, d, d) array
-            Rotations.
-
-        Returns
-        -------
-        (n, d) array
-            Translations, in metres.
-        """
-        return self.translations_for(stack_transposes(R))
-
-    def translations_for(self, Y: Array) -> Array:
-        """Return the rows t that minimise tr(X^T M X) for X = (t, Y), with t_0 = 0.
-
-        Parameters
-        ----------
-        Y : (dn, k) array
-            Rows R_i^T of rotations, or any others.
-
-        Returns
-        -------
-        (n, k) array
-            The rows t.
-        """
-        return self.solve_translations(-(self._M_tR @ Y))
-
-    def solve_translations(self, b: Array) -> Array:
-        """Return t with M_tt t = b but for the row of pose 0, and t_0 = 0.
-
-        Parameters
-        ----------
-        b : (n, k) array
-            Right-hand sides.
-
-        Returns
-        -------
-        (n, k) array
-            Solutions.
-        """
-        without_pose_0 = b.copy()
-        without_pose_0[0] = 0.0
-        return self._translation_factor.solve(without_pose_0)
+    @cached_property
+    def translations(self) -> TranslationSystem:
+        """The rows of M for translations, which give the best ones for given rotations."""
+        return TranslationSystem(self.M, self.pose_order, self.backend)
 
     def with_best_translations(self, R: Array) -> Poses:
-        """Return poses with given rotations and the translations of `recover_translations`.
+        """Return poses with given rotations and the translations that minimise F, with t_0 = 0.
 
         Parameters
         ----------
@@ -599,7 +462,7 @@ class PGOProblem(ReadOnly):
         Poses
             (R, t).
         """
-        return Poses(R, self.recover_translations(R))
+        return Poses(R, self.translations.best_for(stack_transposes(R)))
 
     def translation_factor(self, poses: Poses) -> CholeskyFactor | None:
         """Factor the matrix of the translations where it depends on the rotations.
@@ -617,8 +480,11 @@ class PGOProblem(ReadOnly):
         of_edges = self.weights.translation_matrices(poses.R[self.graph.i])
         if of_edges is None:
             return None
-        laplacian = self._translation_laplacian.matrix(of_edges)
-        return factorize_damped(self._translation_analysis, laplacian)
+        return self._translation_laplacian.factorize(of_edges)
+
+    @cached_property
+    def _translation_laplacian(self) -> TranslationLaplacian:
+        return TranslationLaplacian(self.incidence, self.d, self.pose_order, self.backend)
 
     def at_best_translations(self, poses: Poses, factor: CholeskyFactor | None = None) -> Poses:
         """Return the poses with the translations of least cost for their rotations.
@@ -646,40 +512,9 @@ class PGOProblem(ReadOnly):
         if factor is None:
             factor = self.translation_factor(poses)
         assert factor is not None  # the cost is not quadratic
-        of_edges = self.weights.translation_gradients(self.point(poses.stacked()))
-        half_gradient = self.incidence.ends @ of_edges - self.incidence.begins @ of_edges
+        half_gradient = self.at(poses).half_gradient[: self.num_poses]
         step = factor.solve(half_gradient.ravel()).reshape(-1, self.d)
         return poses.with_translations(poses.t - (step - step[0]))
-
-    def with_refined_translations(self, poses: Poses) -> Poses:
-        """Return the poses after steps of iterative refinement of the translations.
-
-        A solve leaves errors in proportion to its condition; a step with residuals edge by edge
-        takes most of it away. At most `MOST_REFINEMENTS` steps are taken, as many as lower the
-        cost. Another one follows only where the last one halved F and left it positive: chi2 may
-        come out below zero by rounding, and then every number is less than half of itself.
-
-        Parameters
-        ----------
-        poses : Poses
-            One pose for every pose of the graph.
-
-        Returns
-        -------
-        Poses
-            With the same rotations, and t_0 where it is.
-        """
-        here = self.at(poses)
-        for _ in range(MOST_REFINEMENTS):
-            step = self.solve_translations(here.half_gradient[: self.num_poses])
-            refined = self.at(here.poses.with_translations(here.poses.t - step))
-            if not refined.value < here.value:
-                break
-            was_halved = 0.0 < refined.value < 0.5 * here.value
-            here = refined
-            if not was_halved:
-                break
-        return here.poses
 
     def seen_poses(self, poses: Poses) -> Poses:
         """Return the poses that the cost is evaluated at.
@@ -698,28 +533,19 @@ class PGOProblem(ReadOnly):
             return poses
         return poses.with_translations(np.zeros_like(poses.t))
 
-    def stacked(self, poses: Poses) -> Array:
-        """Return X of poses: the rows t_i, then the rows of every R_i^T.
+    def check_poses(self, poses: Poses) -> None:
+        """Raise an error unless there is one pose for every pose of the graph.
 
         Parameters
         ----------
         poses : Poses
-            One pose for every pose of the graph.
-
-        Returns
-        -------
-        (N, d) array
-            X.
+            Poses, or what somebody gave for them.
 
         Raises
         ------
         GraphError
             When they are no poses, or their number or dimension is not the graph's.
         """
-        self._check_poses(poses)
-        return self.seen_poses(poses).stacked()
-
-    def _check_poses(self, poses: Poses) -> None:
         if not isinstance(poses, Poses):
             raise GraphError(
                 f"poses are a {type(poses).__name__}; "
@@ -756,69 +582,99 @@ class PGOProblem(ReadOnly):
         >>> bool(np.isclose(here.value, np.sum(here.X * here.half_gradient)))
         True
         """
-        self._check_poses(poses)
-        return EvaluatedPoses(self, poses)
+        self.check_poses(poses)
+        return EvaluatedPoses(self, read_only(self.seen_poses(poses).stacked()), poses)
 
-    @cached_property
-    def residual_adjoint(self) -> csc_array:
-        """A^T, (N, (d+1) m)."""
-        return self.A.T
+    def at_point(self, X: Array) -> "EvaluatedPoint":
+        """Return the cost at any X, as `at` does at poses.
+
+        Parameters
+        ----------
+        X : (N, k) array
+            The rows t_i and then the rows of every R_i^T, or any others.
+
+        Returns
+        -------
+        EvaluatedPoint
+            Its value and gradient go by way of the residuals, which is accurate where the edges
+            fit, however large the translations are.
+        """
+        return EvaluatedPoint(self, X)
 
     @cached_property
     def incidence(self) -> Incidence:
         """Which edges begin and end at a pose."""
         return Incidence.of(self.graph)
 
-    @cached_property
-    def _M_tt(self) -> csc_array:
-        return self.M[: self.num_poses, : self.num_poses].tocsc()
-
-    @cached_property
-    def _pose_analysis(self) -> SymbolicCholesky:
-        """Symbolic factorisation of the pattern of M_tt, with one entry for a block of poses."""
-        return analyze(self._M_tt, self.backend, self.pose_order)
-
-    @cached_property
-    def _translation_factor(self) -> CholeskyFactor:
-        """Factor of M_tt, in which pose 0 has its diagonal entry alone."""
-        grounded = self._M_tt.copy()
-        of_pose_0 = matrices.meets(grounded, np.zeros(1, dtype=np.int64))
-        of_pose_0[matrices.diagonal_positions(grounded)] = False
-        grounded.data[of_pose_0] = 0.0
-        return factorize_damped(self._pose_analysis, grounded)
-
-    @cached_property
-    def _translation_laplacian(self) -> matrices.BlockLaplacian:
-        """Laplacian of the translations, with the block of pose 0 doubled: so it is definite."""
-        return matrices.BlockLaplacian.of(self.incidence, self.d)
-
-    @cached_property
-    def _translation_analysis(self) -> SymbolicCholesky:
-        """Symbolic factorisation of that Laplacian, whose pattern the graph alone gives."""
-        ones = np.broadcast_to(np.eye(self.d), self.graph.R_ij.shape)
-        order = row_order(self.pose_order, self.d)
-        return analyze(self._translation_laplacian.matrix(ones), self.backend, order)
-
-    @cached_property
-    def _M_tR(self) -> csr_array:
-        return self.M[: self.num_poses, self.num_poses :].tocsr()
-
-    @cached_property
-    def _M_rotation_rows(self) -> csr_array:
-        return self.M[self.num_poses :].tocsr()
-
 
 @dataclass(frozen=True, eq=False)
-class EvaluatedPoses(ReadOnly):
-    """Poses with their cost in a problem, residuals and gradient, each computed when asked for.
+class EvaluatedPoint(ReadOnly):
+    """A point X with the cost of a problem, residuals and gradient, each computed when asked for.
 
-    What was computed is kept here: who asks several things of the same poses holds on to this.
-    Arrays are read-only.
+    Nothing else evaluates a cost. What was computed is kept here: who asks several things of the
+    same point holds on to this.
 
     Parameters
     ----------
     problem : PGOProblem
         The problem.
+    X : (N, k) array
+        The rows t_i and then the rows of every R_i^T, or any others.
+    """
+
+    problem: PGOProblem
+    X: Array
+
+    @cached_property
+    def point(self) -> EdgePoint:
+        """X as the edges see it."""
+        problem = self.problem
+        residuals = np.asarray(problem.A @ self.X)
+        weighted = problem.weights.weigh_rows(residuals)
+        P = self.X[problem.num_poses :].reshape(problem.num_poses, problem.d, -1)
+        return EdgePoint(residuals, weighted, P, problem.graph.i)
+
+    @cached_property
+    def minorant(self) -> EdgeCost:
+        """The quadratic cost of the edges that touches theirs from below at the point.
+
+        A quadratic cost is its own minorant.
+        """
+        return self.problem.weights.minorant(self.point)
+
+    @cached_property
+    def value(self) -> float:
+        """F, or chi2, of which the minorant has computed most."""
+        if self.problem.is_quadratic:
+            return self.problem.weights.value(self.point)
+        return self.minorant.value_at_contact(self.point)
+
+    @property
+    def edge_costs(self) -> Array:
+        """The share of every edge in the cost, (m,)."""
+        return self.problem.weights.edge_values(self.point)
+
+    @cached_property
+    def half_gradient(self) -> Array:
+        """M X, (N, k), half the gradient in X; for chi2 M is that of the tangent."""
+        problem = self.problem
+        in_residuals, in_P_i = self.minorant.edge_gradients(self.point)
+        half_gradient = np.asarray(problem.A_transposed @ in_residuals)
+        if in_P_i is not None:
+            half_gradient[problem.num_poses :] += problem.incidence.at_beginning(in_P_i)
+        return read_only(half_gradient)
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedPoses(EvaluatedPoint):
+    """Poses with their cost in a problem, residuals and gradient, each computed when asked for.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem.
+    X : (N, d) array
+        The poses as the cost sees them (`PGOProblem.seen_poses`), stacked.
     poses : Poses
         One pose for every pose of its graph (`PGOProblem.at` checks that).
 
@@ -831,34 +687,7 @@ class EvaluatedPoses(ReadOnly):
     True
     """
 
-    problem: PGOProblem
     poses: Poses
-
-    @cached_property
-    def X(self) -> Array:
-        """The poses as the cost sees them: the rows t_i, then the rows of every R_i^T, (N, d)."""
-        return read_only(self.problem.seen_poses(self.poses).stacked())
-
-    @cached_property
-    def point(self) -> EdgePoint:
-        """X as the edges see it."""
-        return self.problem.point(self.X)
-
-    @property
-    def residuals(self) -> Array:
-        """A X, ((d+1) m, d)."""
-        return read_only(self.point.residuals)
-
-    @cached_property
-    def minorant(self) -> EdgeCost:
-        """The quadratic cost of the edges that touches theirs from below at the poses.
-
-        A quadratic cost is its own minorant.
-        """
-        problem = self.problem
-        if problem.is_quadratic:
-            return problem.weights
-        return problem.weights.minorant(self.point)
 
     @cached_property
     def tangent(self) -> PGOProblem:
@@ -866,20 +695,7 @@ class EvaluatedPoses(ReadOnly):
         problem = self.problem
         if problem.is_quadratic:
             return problem
-        return _TangentProblem(problem.graph, problem.backend, self.minorant, original=problem)
-
-    @cached_property
-    def value(self) -> float:
-        """F, or chi2, of which the minorant has computed most."""
-        if self.problem.is_quadratic:
-            return self.problem.weights.value(self.point)
-        return self.minorant.value_at_contact(self.point)
-
-    @cached_property
-    def half_gradient(self) -> Array:
-        """M X, (N, d), half the gradient in X; for chi2 M is that of the tangent."""
-        of_edges = self.minorant.edge_gradients(self.point)
-        return read_only(self.problem.sum_gradients(*of_edges))
+        return _SameGraph(problem.graph, problem.backend, self.minorant, original=problem)
 
     @property
     def riemannian_gradient(self) -> tuple[Array, Array]:
@@ -894,13 +710,38 @@ class EvaluatedPoses(ReadOnly):
 
 
 @dataclass(frozen=True, eq=False)
-class _SharingProblem(PGOProblem):
-    """Another cost of the graph of an `original`, which has what follows from the graph alone."""
+class _SamePattern(PGOProblem):
+    """A problem whose M has the pattern of that of an `original`, and so has every factor."""
 
     original: PGOProblem = field(kw_only=True)
 
     def __post_init__(self) -> None:
         """Accept what the original was accepted with."""
+
+    @cached_property
+    def pose_order(self) -> IntArray:
+        """Order of elimination of the poses."""
+        return self.original.pose_order
+
+    @cached_property
+    def analysis(self) -> SymbolicCholesky:
+        """Symbolic factorisation of the pattern of M, which both have."""
+        return self.original.analysis
+
+
+@dataclass(frozen=True, eq=False)
+class _SameGraph(_SamePattern):
+    """Another cost of the graph of an `original`: a tangent of chi2, or its convex neighbour."""
+
+    @cached_property
+    def A(self) -> csr_array:
+        """Matrix of the residuals."""
+        return self.original.A
+
+    @cached_property
+    def A_transposed(self) -> csc_array:
+        """A^T."""
+        return self.original.A_transposed
 
     @cached_property
     def incidence(self) -> Incidence:
@@ -908,57 +749,14 @@ class _SharingProblem(PGOProblem):
         return self.original.incidence
 
     @cached_property
-    def pose_order(self) -> IntArray:
-        """Order of elimination of the poses."""
-        return self.original.pose_order
-
-
-@dataclass(frozen=True, eq=False)
-class _TangentProblem(_SharingProblem):
-    """A tangent of chi2."""
-
-    @cached_property
-    def A(self) -> csr_array:
-        """A, which both have."""
-        return self.original.A
-
-    @cached_property
-    def convex_part(self) -> PGOProblem:
-        """The tangent itself if it is convex in (R, t), else the problem near chi2 that is."""
-        return self if self.weights.is_convex else self.original.convex_part
-
-    @cached_property
-    def residual_adjoint(self) -> csc_array:
-        """A^T."""
-        return self.original.residual_adjoint
-
-    @cached_property
     def analysis(self) -> SymbolicCholesky:
-        """Symbolic factorisation of the pattern of M, which both have."""
-        return self.original.analysis
+        """Symbolic factorisation of the pattern of M, which all costs of the graph have."""
+        analysed = self.original.convex_part
+        return self._analyze() if analysed is self else analysed.analysis
 
-
-@dataclass(frozen=True, eq=False)
-class _ExtendedProblem(PGOProblem):
-    """A problem with further terms between poses that share an edge in the `original`.
-
-    Its M has the pattern of the original's, and so has every factor.
-    """
-
-    original: PGOProblem = field(kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Accept what the original was accepted with."""
-
-    @cached_property
-    def pose_order(self) -> IntArray:
-        """Order of elimination of the poses."""
-        return self.original.pose_order
-
-    @cached_property
-    def analysis(self) -> SymbolicCholesky:
-        """Symbolic factorisation of the pattern of M, which both have."""
-        return self.original.analysis
+    @property
+    def _convex_neighbour(self) -> PGOProblem:
+        return self.original.convex_part
 
 
 def as_problem(given: PGOProblem | PoseGraph) -> PGOProblem:

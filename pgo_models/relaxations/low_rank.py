@@ -204,7 +204,7 @@ def lifted_point(problem: PGOProblem, Y: Array) -> LiftedPoint:
     Y = real_array(Y, "Y")
     n, d, r = Y.shape
     stacked = Y.reshape(n * d, r)
-    translations = problem.translations_for(stacked)
+    translations = problem.translations.best_for(stacked)
     poses = LiftedPoses(np.swapaxes(Y, 1, 2), translations)
     # The translations are the best ones for Y, so that the rotation rows of M X are Q Y.
     here = problem.at(poses)
@@ -221,6 +221,6 @@ def hessian_product(problem: PGOProblem, point: LiftedPoint, V: Array) -> Array:
     """
     n, d, r = V.shape
     stacked = V.reshape(n * d, r)
-    QV = problem.apply_Q(stacked).reshape(n, d, r)
+    QV = problem.translations.apply_Q(stacked).reshape(n, d, r)
     product = QV - point.Lambda @ V
     return 2.0 * project_to_tangent(point.Y, product)

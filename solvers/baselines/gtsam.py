@@ -87,7 +87,7 @@ def run_gtsam(
     gtsam = extra_module("gtsam", "peers")
     settings = settings if settings is not None else Gtsam()
     if start is not None:
-        problem.stacked(start)  # raises unless the poses fit
+        problem.check_poses(start)
     began = time.perf_counter()
     graph = factor_graph(problem, start)
     with _singular_named():

@@ -108,7 +108,7 @@ class ComplexCost:
         rows = Y.reshape(2 * n, -1)
         b = -(self.M_tr @ rows)
         # Both coordinates of a translation, in every column, have the same matrix.
-        t = self.problem.solve_translations(b.reshape(n, -1)).reshape(2 * n, -1)
+        t = self.problem.translations.solve(b.reshape(n, -1)).reshape(2 * n, -1)
         return np.asarray(self.M_rr @ rows + self.M_tr.T @ t).reshape(Y.shape)
 
     def evaluate(self, Y: Array) -> ComplexPoint:

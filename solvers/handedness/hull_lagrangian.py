@@ -140,7 +140,7 @@ class AugmentedLagrangian:
         """Apply the Riemannian Hessian of L (a generalised one, as [.]_+ has kinks)."""
         n, d, r = V.shape
         Y = point.Y
-        QV = self.problem.apply_Q(V.reshape(n * d, r)).reshape(n, d, r)
+        QV = self.problem.translations.apply_Q(V.reshape(n * d, r)).reshape(n, d, r)
         changes = hull_changes(self._products(V, Y) + self._products(Y, V))
         multiplier_changes = -self.rho * _projection_derivative(point, changes)
         coupling = self._spread(hull_gradients(point.Pi), V)

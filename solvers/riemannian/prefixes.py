@@ -230,7 +230,7 @@ class GrowingStart:
             )
         poses = tree.poses
         if start is not None:
-            problem.stacked(start)  # raises unless the poses fit
+            problem.check_poses(start)
             poses = start
         size = min(self.first_size, tree.num_ranks)
         return PrefixState(0, tree, poses, size, self.growth)

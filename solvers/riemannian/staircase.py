@@ -118,7 +118,7 @@ class Staircase:
         """State 0: rank d, at the rotations of `start`, or of the chordal relaxation."""
         problem.check_quadratic("the staircase")
         poses = start if start is not None else chordal_start(problem)
-        problem.stacked(poses)  # a GraphError when they do not fit
+        problem.check_poses(poses)
         rotation_diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
         shift = _SHIFT * float(rotation_diagonal.mean())
         no_multipliers = np.zeros((problem.num_poses, problem.d, problem.d))

@@ -316,7 +316,7 @@ def go_upwards(robot: Interior, order: Move) -> tuple[Interior, float]:
     poses = append_dimension(robot.poses)
     Lambda = robot.multipliers()[robot.part.interior]
     own_rows = x[robot.interior_rows]
-    objective = robot.problem.objective_stacked(x)
+    objective = robot.problem.at_point(x).value
     value = objective - pulled(Lambda, own_rows)
     descent = DescentSession(step=poses.upwards(x[:, 0]))
     return robot.in_session(descent).at_poses(poses), value

@@ -256,7 +256,7 @@ def begin_proof(
     first = part.boundary[0]
     R = poses.R[first] @ point[g : g + d]
     t = (poses.t - poses.t[first]) @ R + point[0]
-    X = part.problem.stacked(Poses(R.T @ poses.R, t))
+    X = part.problem.at(Poses(R.T @ poses.R, t)).X.copy()
     X[cut.boundary] = point
     no_move = np.zeros((poses.num_poses, d))
     return RobotProof(

@@ -337,9 +337,9 @@ def cost(robot: Interior, omega: Array) -> tuple[Interior, float]:
     """Part of F at omega, here its rows of the boundary, and the translations of step (a)."""
     problem = robot.part.problem
     x = robot.session(RecursionSession).x
-    X = problem.stacked(robot.poses) if x is None else x.copy()
+    X = problem.at(robot.poses).X.copy() if x is None else x.copy()
     X[problem.num_poses :] = stack_transposes(_rotations(robot, omega))
-    return robot, problem.objective_stacked(X)
+    return robot, problem.at_point(X).value
 
 
 @order("soc.finish")

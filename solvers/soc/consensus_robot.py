@@ -88,7 +88,7 @@ class ConsensusRobot:
         if order.is_stationary:
             B = stationary_B(unstack_transposes(state.X[n:]), state.Lambda, np.ones(n))
             pull = stack_transposes(B).reshape(n, d * d)
-        force = -2.0 * layout.problem.apply_M(state.X)
+        force = -2.0 * layout.problem.at_point(state.X).half_gradient
         no_force = np.zeros_like(force)
         force, sent = self._as_sent(force, no_force, order.settings.bytes_per_number)
         of_poses = np.concatenate([rho[:, None], state.diagonal, pull], axis=1)

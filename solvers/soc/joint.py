@@ -35,7 +35,7 @@ import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms, multipliers
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, project_to_rotations, stack_transposes
+from pgo_models.geometry.rotations import Array, project_to_rotations
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
 from solvers.result import Measurement, Status
@@ -90,7 +90,7 @@ class Joint:
 
     def init(self, problem: PGOProblem, start: Poses) -> SOCState:
         """State 0: omega = the rotations of `start`, B = 0."""
-        problem.stacked(start)  # raises unless the poses fit
+        problem.check_poses(start)
         return self._state_at(problem, start, treat_as_stationary=False)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
@@ -111,9 +111,7 @@ class Joint:
         """F at omega with the best translations for it, and the residuals."""
         if math.isnan(state.primal_residual):
             return Measurement(np.nan, np.nan, np.nan)
-        t = problem.recover_translations(state.omega)
-        X = np.concatenate([t, stack_transposes(state.omega)])
-        return state.measurement(problem.objective_stacked(X))
+        return state.measurement(problem.objective(self.poses(problem, state)))
 
     def poses(self, problem: PGOProblem, state: SOCState) -> Poses:
         """Omega with the best translations for it."""

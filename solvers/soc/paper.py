@@ -404,7 +404,7 @@ class PaperSOC:
         """State 0: R = omega = start, a spanning tree unless given; B = 0."""
         problem.check_quadratic("SOC", convex=True)
         start = start if start is not None else spanning_tree_start(problem.graph)
-        problem.stacked(start)  # raises unless the poses fit
+        problem.check_poses(start)
         robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
         all_poses = np.arange(problem.num_poses)
         blocks = Blocks.of(problem, robots.cut_edges(problem.graph), all_poses)
@@ -450,8 +450,8 @@ class PaperSOC:
             return Measurement(np.nan, np.nan, np.nan)
         omega = state.omega
         p_res = math.sqrt(state.iterate.p_res_square / len(omega))
-        X = np.concatenate([problem.recover_translations(omega), stack_transposes(omega)])
-        return Measurement(problem.objective_stacked(X), p_res, state.dual_residual)
+        poses = problem.with_best_translations(omega)
+        return Measurement(problem.objective(poses), p_res, state.dual_residual)
 
     def poses(self, problem: PGOProblem, state: PaperState) -> Poses:
         """Return the poses that a state stands for.

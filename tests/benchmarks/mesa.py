@@ -186,7 +186,7 @@ class Mesa:
     def init(self, problem: PGOProblem, start: Poses | None) -> MesaState:
         """State 0: all copies at `start`, or at the chordal relaxation, and zero multipliers."""
         poses = start if start is not None else chordal_start(problem)
-        problem.stacked(poses)  # raises unless the poses fit
+        problem.check_poses(poses)
         held = held_poses(problem, self.robots)
         x = poses[held.pose]
         num_pairs = len(held.copy)

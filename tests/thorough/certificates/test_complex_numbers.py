@@ -140,7 +140,7 @@ def test_errors_of_a_gradient_add_up(seed: int, n: int) -> None:
 def test_the_starting_point_is_that_of_the_poses_with_exact_blocks(seed: int, n: int) -> None:
     problem = PGOProblem(varied_graph(seed, n, 2))
     poses = random_poses(n, 2, seed)
-    X = problem.stacked(poses)
+    X = problem.at(poses).X
     start = unknowns_at(problem).starting_point(X)
     np.testing.assert_allclose(start, X, rtol=0, atol=1e-14)
     blocks = start[n:].reshape(n, 2, 2)
@@ -202,7 +202,7 @@ def test_what_is_barely_said_to_be_definite_is(
     largest = problem.M.diagonal().max()
     Lambda = scalar_multipliers(largest * rng.uniform(0.1, 1.0, (n, 1, 1)) * np.eye(2))
     unknowns = unknowns_at(problem)
-    X = unknowns.starting_point(problem.stacked(random_poses(n, 2, seed)))
+    X = unknowns.starting_point(problem.at(random_poses(n, 2, seed)).X)
 
     def attempt(share: float) -> DefiniteProof | None:
         return unknowns.prove_definite(share * Lambda, eta, X)

@@ -252,7 +252,7 @@ def test_entries_and_products_of_S_less_terms_are_within_their_errors(
     share = float(matrix_errors(less, diagonal).max())
     for difference in (S - exact(stored), exact(stored) - S):
         assert largest_share(difference, diagonal) <= share
-    X = less.stacked(poses)
+    X = less.at(poses).X
     evaluated = evaluate_certificate(less, Lambda, X, np.zeros((n, 3)))
     exact_X = exact(X)
     product = S @ exact_X

@@ -83,7 +83,7 @@ def points(problem: PGOProblem, kind: str, rng: np.random.Generator) -> tuple[Ar
         X[n:] = 0.0
     elif kind == "poses":
         poses = polish(problem, chordal_start(problem))
-        X = problem.stacked(poses)
+        X = problem.at(poses).X
     return X, low
 
 

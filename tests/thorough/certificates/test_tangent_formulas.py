@@ -323,7 +323,7 @@ def test_errors_of_chi2(d: int, coupled: bool) -> None:
         poses = random_poses(6, d, 1, spread)
         omega = orthogonality_error(poses.R).max() + d * gamma(d + 2)
         share = (2 * d + 3) * u
-        residuals = problem.residuals(poses.stacked())
+        residuals = problem.A @ poses.stacked()
         m = graph.num_edges
         level = 0.0
         error = 0.0

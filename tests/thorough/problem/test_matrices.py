@@ -98,5 +98,5 @@ def test_Q_is_the_minimum_over_translations(seed: int, n: int, d: int) -> None:
 
 def test_a_dense_Q_has_a_largest_side() -> None:
     graph = random_geometric(2001, np.random.default_rng(0))
-    with pytest.raises(SettingError, match=r"side 6003, 0\.3 GB; use PGOProblem\.apply_Q"):
+    with pytest.raises(SettingError, match=r"side 6003, 0\.3 GB; use PGOProblem\.translations"):
         marginalized_matrix(graph)

@@ -27,17 +27,17 @@ from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.rotations import stack_transposes
 from pgo_models.problem.cholesky import factorize
 from pgo_models.problem.initialization import relaxed_rotations
+from solvers.riemannian.polish import refine_translations
 
 
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_the_objective_of_any_matrix_is_the_quadratic_form(seed: int, n: int, d: int) -> None:
     problem = varied_problem(seed, n, d)
     X = np.random.default_rng(seed).standard_normal((problem.side, d))
-    assert problem.objective_stacked(X) == pytest.approx(
-        float(np.sum(X * (problem.M @ X))), rel=1e-11
-    )
+    here = problem.at_point(X)
+    assert here.value == pytest.approx(float(np.sum(X * (problem.M @ X))), rel=1e-11)
     np.testing.assert_allclose(
-        problem.apply_M(X),
+        here.half_gradient,
         problem.M @ X,
         rtol=0,
         atol=1e-13 * float(abs(problem.M).sum(axis=0).max()),
@@ -50,7 +50,6 @@ def test_recovered_translations_are_the_best(seed: int, n: int, d: int) -> None:
     R = random_poses(n, d, seed).R
     best = problem.with_best_translations(R)
     np.testing.assert_array_equal(best.R, R)
-    np.testing.assert_array_equal(best.t, problem.recover_translations(R))
     assert (best.t[0] == 0.0).all()
     scale = float(abs(problem.M).sum(axis=0).max()) * (1.0 + np.abs(best.t).max())
     assert np.abs(problem.riemannian_gradient(best)[1]).max() <= 1e-12 * scale
@@ -63,12 +62,15 @@ def test_apply_Q_multiplies_with_Q(seed: int, n: int, d: int, columns: int) -> N
     problem = varied_problem(seed, n, d)
     Y = np.random.default_rng(seed).standard_normal((d * n, columns))
     np.testing.assert_allclose(
-        problem.apply_Q(Y), problem.Q @ Y, rtol=0, atol=1e-9 * np.abs(problem.M.data).max()
+        problem.translations.apply_Q(Y),
+        problem.Q @ Y,
+        rtol=0,
+        atol=1e-9 * np.abs(problem.M.data).max(),
     )
     R = random_poses(n, d, seed).R
     rows = stack_transposes(R)
     least = problem.objective(problem.with_best_translations(R))
-    assert np.sum(rows * problem.apply_Q(rows)) == pytest.approx(least, rel=1e-10)
+    assert np.sum(rows * problem.translations.apply_Q(rows)) == pytest.approx(least, rel=1e-10)
 
 
 def test_unit_weights_are_the_paper_s_equation() -> None:
@@ -100,14 +102,15 @@ def test_evaluated_poses_say_what_the_problem_says(seed: int, d: int, weighting:
     poses = random_poses(6, d, seed)
     here = problem.at(poses)
     assert here.poses is poses
-    np.testing.assert_array_equal(here.X, problem.stacked(poses))
-    np.testing.assert_array_equal(here.residuals, problem.residuals(here.X))
-    assert here.value == problem.objective(poses) == problem.objective_stacked(here.X)
+    np.testing.assert_array_equal(here.X, problem.seen_poses(poses).stacked())
+    np.testing.assert_array_equal(here.point.residuals, problem.A @ here.X)
+    assert here.value == problem.objective(poses) == problem.at_point(here.X).value
     tangent = problem.tangent_at(poses)
-    np.testing.assert_array_equal(here.half_gradient, tangent.apply_M(here.X))
+    np.testing.assert_array_equal(here.half_gradient, tangent.at(poses).half_gradient)
     # The cost of the tangent is that of its own problem everywhere, not where it touches alone.
     elsewhere = random_poses(6, d, seed + 1)
-    assert tangent.objective(elsewhere) == tangent.objective_stacked(tangent.stacked(elsewhere))
+    X = problem.seen_poses(elsewhere).stacked()
+    assert tangent.objective(elsewhere) == tangent.at_point(X).value
     assert here.tangent.tangent_at(elsewhere) is here.tangent
 
 
@@ -119,7 +122,7 @@ def test_poses_must_fit_the_graph(poses: Poses) -> None:
         problem.objective,
         problem.edge_costs,
         problem.riemannian_gradient,
-        problem.stacked,
+        problem.check_poses,
     ):
         with pytest.raises(GraphError, match="give one pose for every pose of the graph"):
             function(poses)
@@ -145,8 +148,8 @@ def refined_cost_of_exact_poses(seed: int) -> float:
     graph = PoseGraph(n, i, j, back @ truth.R[j], t_ij, ones, ones, information=information)
     problem = PGOProblem(graph, weighting=Weighting.INFORMATION)
     assert not problem.weights.is_convex
-    refined = problem.with_refined_translations(truth)
-    assert problem.objective(refined) <= problem.objective(truth)
+    refined = refine_translations(problem.at(truth))
+    assert refined.value <= problem.objective(truth)
     return problem.objective(truth)
 
 

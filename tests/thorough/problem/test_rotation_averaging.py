@@ -81,12 +81,15 @@ def test_the_cost_is_the_rotation_part_of_f_at_any_poses(seed: int, n: int, d: i
     assert problem.edge_costs(poses).sum() == pytest.approx(expected, rel=1e-12)
     Y = poses.stacked()[n:]
     assert np.sum(Y * (PGOProblem(graph).L @ Y)) == pytest.approx(expected, rel=1e-11)
-    X = problem.stacked(poses)
+    X = problem.at(poses).X
     np.testing.assert_array_equal(X[:n], 0.0)
     L = PGOProblem(graph).L.toarray()
     np.testing.assert_allclose(problem.L.toarray(), L, rtol=0, atol=1e-14 * abs(L).max())
     np.testing.assert_allclose(
-        problem.apply_M(X), problem.M @ X, rtol=0, atol=1e-12 * abs(problem.M).max() * abs(X).max()
+        problem.at_point(X).half_gradient,
+        problem.M @ X,
+        rtol=0,
+        atol=1e-12 * abs(problem.M).max() * abs(X).max(),
     )
     _, of_translations = problem.riemannian_gradient(poses)
     np.testing.assert_array_equal(of_translations, 0.0)

@@ -49,7 +49,7 @@ def test_the_value_is_that_of_the_dense_marginalised_matrix(
     atol = 1e-11 * n * np.abs(problem.Q).max()
     assert point.value == pytest.approx(np.sum(rows * product), abs=atol)
     assert np.einsum("naa->", point.Lambda) == pytest.approx(point.value, abs=atol)
-    np.testing.assert_allclose(problem.apply_Q(rows), product, rtol=0, atol=atol)
+    np.testing.assert_allclose(problem.translations.apply_Q(rows), product, rtol=0, atol=atol)
     assert point.rank == d + extra
 
 

@@ -93,7 +93,7 @@ def test_the_model_keeps_the_squares_of_other_edges() -> None:
     poses = run(IRLS(), problem).poses
     expected = problem.edge_costs(poses)
     expected[edges] = huber(expected[edges], thresholds[edges])
-    assert model.cost(problem.stacked(poses)) == pytest.approx(expected.sum(), rel=1e-9)
+    assert model.cost(problem.at(poses).X) == pytest.approx(expected.sum(), rel=1e-9)
     assert model.qp.problem.is_dcp(dpp=True)
 
 
