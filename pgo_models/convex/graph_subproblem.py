@@ -50,7 +50,7 @@ class Stack:
 
     Parameters
     ----------
-    whole : (count side, (d + 1) n) sparse array
+    rows : (count side, (d + 1) n) sparse array
         Their rows in terms of the t_i and R_i^T of the whole graph.
     columns : array of int
         Which of these t and R the program has.
@@ -60,7 +60,7 @@ class Stack:
         1 for vectors, d for matrices, which are transposed in X.
     """
 
-    whole: csr_array
+    rows: csr_array
     columns: IntArray
     X: cp.Variable
     side: int
@@ -69,18 +69,18 @@ class Stack:
         self, which: int | slice | IntArray | BoolArray | Sequence[int]
     ) -> cp.Expression:
         """Expression of shape (d,) or (d, d) for a number, (k, d) or (k, d, d) for k numbers."""
-        count = self.whole.shape[0] // self.side
+        count = self.rows.shape[0] // self.side
         numbers: Any = np.arange(count)[which]
         row_numbers = rotation_columns(np.atleast_1d(numbers), 0, self.side)
-        rows = self.whole[row_numbers.ravel()]
-        rows_of_program = rows[:, self.columns]
-        if rows_of_program.nnz < rows.nnz:
+        chosen = self.rows[row_numbers.ravel()]
+        chosen_in_program = chosen[:, self.columns]
+        if chosen_in_program.nnz < chosen.nnz:
             raise SettingError(
                 f"[{which!r:.60}] needs rows of t or R that are not unknown in this program, which "
-                f"has {len(self.columns)} of {rows.shape[1]}; ask for its own poses, or "
+                f"has {len(self.columns)} of {chosen.shape[1]}; ask for its own poses, or "
                 "Unknowns.POSES for t"
             )
-        stacked = rows_of_program @ self.X
+        stacked = chosen_in_program @ self.X
         if np.ndim(numbers) == 0:
             return stacked[0] if self.side == 1 else stacked.T
         if self.side == 1:
@@ -186,7 +186,7 @@ class GraphQP(Summarised):
     w : (rows,) array
         Weights of the residuals.
     between : (N_a, N) sparse array
-        A^T diag(w) A_whole on the frozen neighbours' rows of the whole graph; empty unless FROZEN.
+        A^T diag(w) A_of_graph on the rows of frozen neighbours; empty unless FROZEN.
     """
 
     variables: PoseVariables
@@ -415,9 +415,9 @@ def _posed(
         columns = np.concatenate([poses, columns])
         penalty = np.concatenate([penalty_t, penalty])
 
-    A_whole = residual_matrix(graph)
+    A_of_graph = residual_matrix(graph)
     weights = isotropic_weights(graph).row_weights
-    variables = _variables(graph, unknowns, poses, columns, A_whole)
+    variables = _variables(graph, unknowns, poses, columns, A_of_graph)
     change = _checked_change(changer, variables)
     shares = shares.copy()
     shares[np.array(change.replaced_edges, dtype=int)] = 0.0
@@ -426,7 +426,7 @@ def _posed(
     weights = weights * np.concatenate([shares_of_translations, shares_of_rotations])
     is_counted = weights > 0
     w = weights[is_counted]
-    A_counted = A_whole[is_counted]
+    A_counted = A_of_graph[is_counted]
     A = A_counted[:, columns].tocsr()
 
     is_frozen = np.ones((d + 1) * n)
@@ -444,14 +444,14 @@ def _posed(
 
 
 def _variables(
-    graph: PoseGraph, unknowns: Unknowns, poses: IntArray, columns: IntArray, A_whole: csr_array
+    graph: PoseGraph, unknowns: Unknowns, poses: IntArray, columns: IntArray, A_of_graph: csr_array
 ) -> PoseVariables:
-    """The unknowns, in the `columns` of the whole graph; `A_whole` gives the residuals."""
+    """The unknowns, in the `columns` of the whole graph; `A_of_graph` gives the residuals."""
     n = graph.num_poses
     m = graph.num_edges
     d = graph.d
     X = cp.Variable((len(columns), d), name="X")
-    identity = csr_array(eye_array(A_whole.shape[1]))
+    identity = csr_array(eye_array(A_of_graph.shape[1]))
     return PoseVariables(
         graph,
         unknowns,
@@ -459,8 +459,8 @@ def _variables(
         X,
         t=Stack(identity[:n], columns, X, 1),
         R=Stack(identity[n:], columns, X, d),
-        translation_residual=Stack(A_whole[:m], columns, X, 1),
-        rotation_residual=Stack(A_whole[m:], columns, X, d),
+        translation_residual=Stack(A_of_graph[:m], columns, X, 1),
+        rotation_residual=Stack(A_of_graph[m:], columns, X, d),
     )
 
 

@@ -21,6 +21,7 @@ from pgo_models.graphs.precisions import gaussian_information
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.robust.chains import (
+    QUANTILE,
     Motions,
     carried,
     inverse,
@@ -30,8 +31,6 @@ from solvers.robust.chains import (
     squared_distances,
 )
 
-# Probability with which a cycle of right edges agrees.
-_QUANTILE = 0.99
 # Votes of a cycle, by its length: one of four edges has a wrong one more often than one of three.
 _VOTES = {3: 1.0, 4: 0.5}
 # What an edge has before any vote, agreeing and in all: without cycles its share is a half.
@@ -223,7 +222,7 @@ class _Walks:
         motion, covariance = self._along(cycles)
         d = motion[1].shape[1]
         dof = tangent_dimension(d) + d * self.has_translations
-        allowed = scale * float(scipy.special.chdtri(dof, 1.0 - _QUANTILE))
+        allowed = scale * float(scipy.special.chdtri(dof, 1.0 - QUANTILE))
         return Cycles(cycles % self.num_edges, squared_distances(motion, covariance) <= allowed)
 
     def _along(self, cycles: IntArray) -> tuple[Motions, Array]:

@@ -11,8 +11,9 @@ import scipy  # and scipy.special when it is used
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray
+from solvers.robust.chains import QUANTILE
 from solvers.robust.distances import FirstOrder
-from solvers.robust.edge_sets import QUANTILE, EdgeSets
+from solvers.robust.edge_sets import EdgeSets
 from solvers.robust.revision import Fit
 
 # Distances that are found together. With more, the fill of wrong closures makes each one slower.

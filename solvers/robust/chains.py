@@ -18,6 +18,8 @@ from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import LEAST_SCALED, are_definite, gaussian_information
 from pgo_models.graphs.residuals import logarithm_translation
 
+# Probability with which right measurements pass a test: an edge, a cluster, or two that agree.
+QUANTILE = 0.99
 # R, (m, d, d), and t, (m, d).
 Motions = tuple[Array, Array]
 

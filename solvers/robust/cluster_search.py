@@ -29,7 +29,8 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.thresholds import FALSE_ALARM
 from solvers.robust.candidates import Candidates
-from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
+from solvers.robust.chains import QUANTILE
+from solvers.robust.edge_sets import EdgeSets, with_edges
 from solvers.robust.fixes import agreeing_fixes, is_fix
 from solvers.robust.linear_search import LinearSearch
 from solvers.robust.revision import Fit, inlier_problem, is_held

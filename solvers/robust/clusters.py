@@ -17,6 +17,7 @@ from pgo_models.geometry.rotations import Array, BoolArray, tangent_dimension
 from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from solvers.robust.chains import (
+    QUANTILE,
     Chains,
     Closures,
     Motions,
@@ -33,8 +34,6 @@ _REACHES = (12, 6, 3, 1)
 # Links by chance, at most: one, or one for so many closures. With three times as many, clusters of
 # intel and smallGrid3D are mixed, among nine wrong closures of ten.
 _CLOSURES_PER_CHANCE_LINK = 1000
-# Probability with which two right closures agree.
-_QUANTILE = 0.99
 _SEED = 0  # fixed, so that every solve is the same
 
 
@@ -72,7 +71,7 @@ class ClosurePairs:
         if len(tested) == 0:
             return EdgeGroups.singles(partial)
         dof = graph.d + tangent_dimension(graph.d)
-        links = self._links(scale * float(scipy.special.chdtri(dof, 1.0 - _QUANTILE)))
+        links = self._links(scale * float(scipy.special.chdtri(dof, 1.0 - QUANTILE)))
         size = len(tested)
         adjacency = scipy.sparse.csr_array((np.ones(len(links[0])), links), shape=(size, size))
         _, label = scipy.sparse.csgraph.connected_components(adjacency, directed=False)

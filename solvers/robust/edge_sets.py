@@ -15,8 +15,6 @@ from solvers.robust.chains import Chains
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
-# Probability with which a right cluster, or edge, passes a test.
-QUANTILE = 0.99
 # Newton steps in which poses follow a change of the edges kept, at most.
 _MOST_STEPS = 20
 # Relative decrease of a cost that is more than rounding.

@@ -19,14 +19,12 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import gaussian_information
-from solvers.robust.chains import Chains, adjoint, definite
+from solvers.robust.chains import QUANTILE, Chains, adjoint, definite
 from solvers.robust.cliques import greedy_clique
 
 # Fixes all pairs of which are compared. Of more every second is, or every third, and so on: a map
 # that those of a group align lets the others of their kind come in one at a time.
 _MOST_COMPARED = 200
-# Probability with which two right fixes agree.
-_QUANTILE = 0.99
 
 
 def is_fix(graph: PoseGraph) -> BoolArray:
@@ -60,7 +58,7 @@ def _agreement(chains: Chains, fixes: IntArray, scale: float) -> BoolArray:
     half of that across it over the distance. Fixes on two chains agree, as odometry says nothing
     of their distance.
     """
-    threshold = scale * float(scipy.special.chdtri(1, 1.0 - _QUANTILE))
+    threshold = scale * float(scipy.special.chdtri(1, 1.0 - QUANTILE))
     a, b = np.triu_indices(len(fixes), 1)
     pose = chains.graph.j[fixes]
     of_one_chain = chains.chain[pose[a]] == chains.chain[pose[b]]

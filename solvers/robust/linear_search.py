@@ -14,8 +14,8 @@ import scipy  # and scipy.special when it is used
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from solvers.robust.chains import is_whole
-from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
+from solvers.robust.chains import QUANTILE, is_whole
+from solvers.robust.edge_sets import EdgeSets, with_edges
 from solvers.robust.linear_choice import LinearChoice
 from solvers.robust.revision import Fit, inlier_problem, is_held
 

@@ -21,8 +21,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
-from solvers.robust.chains import Chains, Closures, cycle_distances, is_whole
-from solvers.robust.edge_sets import QUANTILE, EdgeSets, with_edges
+from solvers.robust.chains import QUANTILE, Chains, Closures, cycle_distances, is_whole
+from solvers.robust.edge_sets import EdgeSets, with_edges
 from solvers.robust.revision import Fit, is_held, truncated_cost
 from solvers.robust.weighted_edges import held_together
 
