@@ -15,8 +15,7 @@ from solvers.carry.messages import Snapshot
 from solvers.carry.moments import Recall
 from solvers.carry.registry import order, record
 from solvers.carry.serialization import deserialize, serialize
-from solvers.robots.interior import Interior, interior_of
-from solvers.robots.state import InteriorState
+from solvers.robots.part import Interior, InteriorState, interior_of
 from solvers.soc.consensus_robot import ConsensusRobot
 from solvers.soc.copies import CopiesState, CopyLayout, Rows
 from solvers.soc.paper_robot import PaperCopies, PaperRobot

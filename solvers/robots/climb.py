@@ -33,7 +33,7 @@ from solvers.riemannian.climb import ClimbEnding, DualBound, climb, staircase_st
 from solvers.riemannian.newton import Newton, newton_status
 from solvers.riemannian.staircase import Staircase
 from solvers.robots.driver import CoverPoses, Driver, collect
-from solvers.robots.interior import Interior
+from solvers.robots.elimination import RightHandSide
 from solvers.robots.newton import (
     DescentSession,
     Move,
@@ -41,9 +41,9 @@ from solvers.robots.newton import (
     SubstructuredNewtonState,
     moved,
 )
+from solvers.robots.part import CostParts, Interior, ReducedTranslations
+from solvers.robots.poses import reduce_translations
 from solvers.robots.proof import eliminate_S, prove_with_eta
-from solvers.robots.records import CostParts, ReducedTranslations, RightHandSide
-from solvers.robots.translations import reduce_translations
 
 # Decrement at which an indefinite Hessian is left by a climb, not by descent, while the rank is
 # below d + _LOW: a ring wound up has plateaus that take 50 steps, and every further rank costs.

@@ -71,14 +71,9 @@ from solvers.carry.moments import Moment
 from solvers.carry.process import DEFAULT_MEMORY, WorkerPool
 from solvers.carry.registry import order, record
 from solvers.result import Measurement
-from solvers.robots import current_poses, start, translations
+from solvers.robots import poses as pose_orders
 from solvers.robots.interface import Interface, InterfaceFactor, Separators
-from solvers.robots.interior import Interior
-from solvers.robots.records import (
-    CostParts,
-    ReducedTranslations,
-    Reweighed,
-)
+from solvers.robots.part import CostParts, Interior, ReducedTranslations, Reweighed
 from solvers.robots.subdomain_blocks import Widths
 from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.subgraph import RobotSummary
@@ -276,7 +271,7 @@ class Driver:
 
     def describe(self, count: Count) -> None:
         """Ask for the diagonal of M at the current poses."""
-        self.diagonal = self.gather_diagonal(self.ask(current_poses.describe, None, count))
+        self.diagonal = self.gather_diagonal(self.ask(pose_orders.describe, None, count))
 
     def choose_cost(self, final: bool) -> None:
         """Make one of two costs the current one, see `is_final`.
@@ -285,7 +280,7 @@ class Driver:
         """
         if self.has_two_costs and final != self.is_final:
             self.is_final = final
-            answers = self.ask(current_poses.choose_cost, final, Count.PIGGYBACKED)
+            answers = self.ask(pose_orders.choose_cost, final, Count.PIGGYBACKED)
             self.current = self.with_cost(self.current, answers)
 
     def take_weights(self, answers: Sequence[Reweighed]) -> None:
@@ -413,7 +408,7 @@ class Driver:
         self.saved = state.saved
         self.network.ledger = state.ledger
         self.is_final = state.is_final
-        answers = self.ask(translations.send_matrix_again, None, Count.PIGGYBACKED)
+        answers = self.ask(pose_orders.send_matrix_again, None, Count.PIGGYBACKED)
         matrices = [answer.schur for answer in answers if answer.schur is not None]
         # Robots that had not sent their part yet have none. Without all parts the matrix is
         # factored when it is needed (`best_translations`).
@@ -429,20 +424,20 @@ class Driver:
         gathers those of the translations and scatters the best ones. An `averaged` start, where
         `can_average`, takes a round more, for a step of rotation averaging (`chordal_start`).
         """
-        answers = self.ask(start.chordal, None, Count.PIGGYBACKED)
+        answers = self.ask(pose_orders.chordal, None, Count.PIGGYBACKED)
         # Unknowns of these widths are solved for at the start alone: the factor is not kept.
         interface = Interface(self._separators, (self.d,))
         factor = interface.factorize([answer.schur for answer in answers])
         Y, parts, _ = factor.solve([answer.right.b for answer in answers])
         self.current = replace(self.current, R=project_to_rotations(unstack_transposes(Y)))
-        self.ask_each(start.project, parts)
+        self.ask_each(pose_orders.project, parts)
         if averaged:
             assert self._stiffness is not None
-            pulls = self.ask(start.average, self._stiffness, Count.PIGGYBACKED)
+            pulls = self.ask(pose_orders.average, self._stiffness, Count.PIGGYBACKED)
             angles, parts = self.best_translations(pulls)  # the same matrix
             self.current = replace(self.current, R=self.current.R @ exp_map(angles))
-            self.ask_each(start.turn_by, parts)
-        self.set_translations(self.ask(translations.reduce_translations, None, Count.PIGGYBACKED))
+            self.ask_each(pose_orders.turn_by, parts)
+        self.set_translations(self.ask(pose_orders.reduce_translations, None, Count.PIGGYBACKED))
 
     def set_poses(self, poses: Poses) -> None:
         """Take all poses as they are, with F and M X on the cover, gathered with the next round.
@@ -451,7 +446,7 @@ class Driver:
         """
         self.hand_out(poses)
         self.current = self.with_cost(
-            self.current, self.ask(current_poses.evaluate, None, Count.PIGGYBACKED)
+            self.current, self.ask(pose_orders.evaluate, None, Count.PIGGYBACKED)
         )
 
     def hand_out(self, poses: Poses) -> None:
@@ -464,7 +459,7 @@ class Driver:
             raise GraphError(f"{poses} for {expected}; give one pose for every pose of the graph")
         self.current = replace(self.current, R=poses.R[self.cover], t=poses.t[self.cover])
         poses_of_parts = [poses[part] for part in self._parts if part is not None]
-        self.ask_each(current_poses.set_poses, poses_of_parts, Count.OFF)
+        self.ask_each(pose_orders.set_poses, poses_of_parts, Count.OFF)
 
     def poses_of_cover(self) -> list[Poses]:
         """Poses of the cover for every robot that holds some of them."""
@@ -473,12 +468,12 @@ class Driver:
     def save_poses(self) -> None:
         """Save the current poses, here and on the robots."""
         self.saved = self.current
-        self.ask(current_poses.save_poses, None, Count.PIGGYBACKED)
+        self.ask(pose_orders.save_poses, None, Count.PIGGYBACKED)
 
     def restore_poses(self) -> None:
         """Return to the saved poses, here and on the robots."""
         self.current = self.saved
-        self.ask(current_poses.restore_poses, None, Count.PIGGYBACKED)
+        self.ask(pose_orders.restore_poses, None, Count.PIGGYBACKED)
 
     def accept(self, trial: CoverPoses) -> None:
         """Go to the trial, here and on all robots, even if Ctrl-C arrives meanwhile.
@@ -487,9 +482,9 @@ class Driver:
         twice is at the trial, as after once.
         """
         try:
-            self.ask(current_poses.accept, None, Count.PIGGYBACKED)
+            self.ask(pose_orders.accept, None, Count.PIGGYBACKED)
         except KeyboardInterrupt:
-            self.ask(current_poses.accept, None, Count.OFF)
+            self.ask(pose_orders.accept, None, Count.OFF)
             self.current = trial
             raise
         self.current = trial
@@ -501,7 +496,7 @@ class Driver:
         """
         self.current = replace(self.current, R=R)
         parts = self.scattered_rotations(stack_transposes(R))
-        self.set_translations(self.ask_each(translations.adopt, parts))
+        self.set_translations(self.ask_each(pose_orders.adopt, parts))
 
     def set_translations(self, answers: Sequence[ReducedTranslations]) -> None:
         """Go to the best translations for the current rotations: one round.
@@ -509,7 +504,7 @@ class Driver:
         `answers` are the robots' reduced right-hand sides, which were gathered by the ask before.
         """
         t, parts = self.best_translations(answers)
-        costs = self.ask_each(translations.set_translations, parts)
+        costs = self.ask_each(pose_orders.set_translations, parts)
         self.current = self.with_cost(replace(self.current, t=t), costs)
 
     def best_translations(
@@ -521,7 +516,7 @@ class Driver:
             # that were sent has failed, and they are needed again.
             eliminated: Sequence[ReducedTranslations] = answers
             if any(answer.schur is None for answer in answers):
-                eliminated = self.ask(translations.send_matrix_again, None, Count.PIGGYBACKED)
+                eliminated = self.ask(pose_orders.send_matrix_again, None, Count.PIGGYBACKED)
             matrices = [answer.schur for answer in eliminated if answer.schur is not None]
             self._factorize_laplacian(matrices)
         assert self._laplacian is not None
@@ -561,7 +556,7 @@ def collect(driver: Driver) -> tuple[Poses, Array]:
     R[driver.cover] = driver.current.R
     t[driver.cover] = driver.current.t
     Lambda[driver.cover] = driver.current.multipliers
-    for answer in driver.ask(current_poses.result, None, Count.OFF):
+    for answer in driver.ask(pose_orders.result, None, Count.OFF):
         R[answer.poses] = answer.R
         t[answer.poses] = answer.t
         Lambda[answer.poses] = answer.Lambda

@@ -51,16 +51,10 @@ from solvers.riemannian.newton_step import (
 )
 from solvers.riemannian.polish import MOST_FITTING_STEPS, NEARLY_EXACT
 from solvers.robots.driver import CoverPoses, Driver
+from solvers.robots.elimination import Reduced, RightHandSide
 from solvers.robots.interface import InterfaceFactor
-from solvers.robots.interior import Interior
-from solvers.robots.records import (
-    CostParts,
-    Reduced,
-    ReducedTranslations,
-    RightHandSide,
-)
-from solvers.robots.state import Session
-from solvers.robots.translations import reduced_translations, translations
+from solvers.robots.part import CostParts, Interior, ReducedTranslations, Session
+from solvers.robots.poses import reduced_translations, translations
 
 
 @record("SubstructuredNewtonState")

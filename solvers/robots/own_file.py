@@ -49,9 +49,9 @@ from pgo_models.problem.weighting import (
 from solvers.carry.messages import Messages
 from solvers.carry.registry import order, record
 from solvers.robots.agent import Agent, held_poses
-from solvers.robots.current_poses import set_poses
 from solvers.robots.driver import order_interior
-from solvers.robots.interior import Interior
+from solvers.robots.part import Interior
+from solvers.robots.poses import set_poses
 from solvers.soc.subgraph import PartProblem, Placement, RobotSummary, Subgraph
 
 READ_HERE = (

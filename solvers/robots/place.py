@@ -61,11 +61,11 @@ from solvers.robots.own_file import (
     READ_HERE,
 )
 from solvers.robots.paper import PaperByRobots
+from solvers.robots.poses import reduce_translations
 from solvers.robots.proof import best_bound_distributed, best_bound_with_terms
 from solvers.robots.revision import go_to_poses_found
 from solvers.robots.reweigh import SharedGNC, inliers_of
 from solvers.robots.soc import SubstructuredSOC
-from solvers.robots.translations import reduce_translations
 from solvers.robots.trees import hand_out_along_tree
 from solvers.robust.gnc import GNC, Inliers
 from solvers.robust.known import KnownEdges

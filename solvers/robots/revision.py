@@ -37,7 +37,7 @@ from solvers.carry.registry import order, record
 from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
 from solvers.result import Stage
-from solvers.robots import current_poses
+from solvers.robots import poses as pose_orders
 from solvers.robots.agent import Agent, held_poses
 from solvers.robots.consistency import (
     ConsistentPart,
@@ -183,7 +183,7 @@ def go_to_poses_found(driver: Driver) -> None:
         t[positions] = on_cover.poses.t
     driver.current = replace(driver.current, R=R, t=t)
     network.ask(go_to_solved, driver.poses_of_cover(), Count.PIGGYBACKED)
-    answers = driver.ask(current_poses.evaluate, None, Count.PIGGYBACKED)
+    answers = driver.ask(pose_orders.evaluate, None, Count.PIGGYBACKED)
     driver.current = driver.with_cost(driver.current, answers)
     driver.choose_cost(final=True)
 
@@ -340,7 +340,7 @@ def go_to_solved(agent: Agent, cover: Poses) -> None:
     R[subgraph.is_own] = solved.R
     t[subgraph.is_own] = solved.t
     places = np.searchsorted(subgraph.poses, agent.interior.part.poses)
-    order_interior(current_poses.set_poses, agent, Poses(R[places], t[places]))
+    order_interior(pose_orders.set_poses, agent, Poses(R[places], t[places]))
 
 
 @order("revision.tell_links")

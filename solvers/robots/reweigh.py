@@ -21,11 +21,10 @@ from solvers.carry.counted_pool import Count
 from solvers.carry.registry import order
 from solvers.result import Measurement, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
-from solvers.robots.current_poses import describe
 from solvers.robots.driver import Driver, collect
-from solvers.robots.interior import Interior
 from solvers.robots.newton import SubstructuredNewton, SubstructuredNewtonState
-from solvers.robots.records import Reweigh, Reweighed
+from solvers.robots.part import Interior, Reweigh, Reweighed
+from solvers.robots.poses import describe
 from solvers.robust.chains import is_whole
 from solvers.robust.gnc import (
     GNC,

@@ -35,18 +35,10 @@ from solvers.carry.registry import order, record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.robots.driver import Driver
+from solvers.robots.elimination import Reduced, RightHandSide
 from solvers.robots.interface import InterfaceFactor
-from solvers.robots.interior import Interior
-from solvers.robots.records import (
-    Agree,
-    Agreed,
-    Reduced,
-    ReducedTranslations,
-    RescaleInterior,
-    RightHandSide,
-)
-from solvers.robots.state import Session
-from solvers.robots.translations import reduce_translations
+from solvers.robots.part import Interior, ReducedTranslations, Session
+from solvers.robots.poses import reduce_translations
 from solvers.soc.copies import Norms, subsampled
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import Agreement, RecursionBlock
@@ -267,6 +259,34 @@ def _factorize(
 
 
 # The robot's orders.
+
+
+@record("RescaleInterior")
+@dataclass(frozen=True)
+class RescaleInterior:
+    """Change of the penalty in SOC."""
+
+    factor: float  # on rho
+    from_best: bool  # whether all go back to their best iterate
+
+
+@record("Agree")
+@dataclass(frozen=True, eq=False)
+class Agree:
+    """What all parties learn from step (a)."""
+
+    agreement: Agreement
+    measured_at: Array  # (dg, d): rows of the next omega on the boundary
+
+
+@record("Agreed")
+@dataclass(frozen=True, eq=False)
+class Agreed:
+    """What a robot answers to `Agree`."""
+
+    sums: Array  # (2,): squared residuals
+    right: RightHandSide  # of the next step (a)
+    measured: float  # part of F at omega
 
 
 @record("RecursionSession")

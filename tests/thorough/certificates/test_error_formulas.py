@@ -36,7 +36,7 @@ from pgo_models.problem.floating_point import (
 )
 from pgo_models.problem.initialization import chordal_start
 from solvers.riemannian.polish import polish
-from solvers.robots import elimination as substructure, proof_of_robot as robot_proof
+from solvers.robots import elimination as substructure, proof as proof_by_robots
 from solvers.robots.elimination import eliminate, row_sums
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
@@ -350,8 +350,8 @@ def test_errors_of_a_robot_s_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = evaluate_certificate(problem, Lambda, X, low)
     # large enough to be seen
     whole = replace(whole, product_error=whole.product_error + np.abs(whole.product))
-    monkeypatch.setattr(robot_proof, "evaluate_certificate", lambda *_: whole)
-    proof = robot_proof.RobotProof(Lambda, start, X, low, slack, inside, np.zeros(0))
+    monkeypatch.setattr(proof_by_robots, "evaluate_certificate", lambda *_: whole)
+    proof = proof_by_robots.RobotProof(Lambda, start, X, low, slack, inside, np.zeros(0))
     found, product = proof.evaluated(problem, boundary)
     np.testing.assert_array_equal(product, whole.product)
     np.testing.assert_array_equal(found.error, whole.product_error[boundary])
@@ -367,7 +367,9 @@ def test_a_robot_moves_rotations_and_adds_to_translations() -> None:
     X, step = rng.standard_normal((2, 4 * 5, 3))
     low = rng.standard_normal((5, 3))
     rows = np.arange(0)
-    proof = robot_proof.RobotProof(np.zeros((5, 3, 3)), X, X, low, np.zeros(0), rows, np.zeros(0))
+    proof = proof_by_robots.RobotProof(
+        np.zeros((5, 3, 3)), X, X, low, np.zeros(0), rows, np.zeros(0)
+    )
     moved = proof.moved(step)
     np.testing.assert_array_equal(moved.X[:5], X[:5])
     np.testing.assert_array_equal(moved.X[5:], X[5:] - step[5:])
@@ -387,9 +389,9 @@ def test_a_robot_counts_the_rounding_of_its_separators_entries(
     S, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
     S_before = S.diagonal()
     monkeypatch.setattr(
-        robot_proof, "matrix_errors", lambda problem, diagonal: np.full(problem.side, share)
+        proof_by_robots, "matrix_errors", lambda problem, diagonal: np.full(problem.side, share)
     )
-    found = robot_proof.verify_interior(
+    found = proof_by_robots.verify_interior(
         problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None
     )
     assert found is not None
@@ -398,9 +400,9 @@ def test_a_robot_counts_the_rounding_of_its_separators_entries(
     assert (lost[cut.interior] >= (2.0 - 1e-9) * share * diagonal[cut.interior]).all()
     assert (found[2] <= lost[cut.interior] - (1.0 - 1e-9) * share * diagonal[cut.interior]).all()
     monkeypatch.setattr(
-        robot_proof, "matrix_errors", lambda problem, diagonal: np.zeros(problem.side)
+        proof_by_robots, "matrix_errors", lambda problem, diagonal: np.zeros(problem.side)
     )
-    found = robot_proof.verify_interior(
+    found = proof_by_robots.verify_interior(
         problem, Lambda, 0.0, cut, np.zeros(0, dtype=np.int64), 1e-12, None
     )
     assert found is not None

@@ -27,7 +27,7 @@ from pgo_models.problem.costs import EdgeCost, ExcessCost, TangentCost
 from pgo_models.problem.excess import CoupledExcess, Tangent
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF as u, gamma
 from pgo_models.problem.matrices import rotation_columns
-from solvers.robots.proof_of_robot import verify_interior
+from solvers.robots.proof import verify_interior
 
 ENOUGH = 1.0 - 1e-12  # the formulas here are rounded, too; the bounds are rounded up by 2^-30
 CASES = pytest.mark.parametrize(("d", "coupled"), [(2, False), (2, True), (3, False), (3, True)])

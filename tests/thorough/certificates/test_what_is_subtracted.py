@@ -22,7 +22,7 @@ from pgo_models.errors import ProofError
 from pgo_models.geometry.rotations import Array, random_rotations
 from pgo_models.problem.initialization import chordal_start
 from solvers.riemannian.polish import polish
-from solvers.robots import proof as distributed_bound, proof_of_robot as robot_proof
+from solvers.robots import proof as proof_by_robots
 from solvers.robots.elimination import Cut, Elimination, eliminate
 from solvers.robots.interface import Interface
 
@@ -145,7 +145,7 @@ def test_weights_near_the_ends_of_the_doubles_prove_nothing_to_a_robot(exponent:
     inside = np.arange(problem.side) % 8 >= 2
     cut = cut_in_one_piece(np.flatnonzero(inside), np.flatnonzero(~inside))
     nothing_fixed = np.zeros(0, dtype=np.int64)
-    found = robot_proof.verify_interior(
+    found = proof_by_robots.verify_interior(
         problem, np.zeros((8, 3, 3)), 0.0, cut, nothing_fixed, 1e-12, None
     )
     assert found is None
@@ -165,7 +165,8 @@ def test_multipliers_out_of_range_prove_nothing_to_a_robot(size: float) -> None:
     Lambda[4] = size * np.eye(3)
     nothing_fixed = np.zeros(0, dtype=np.int64)
     assert (
-        robot_proof.verify_interior(problem, Lambda, 0.0, cut, nothing_fixed, 1e-12, None) is None
+        proof_by_robots.verify_interior(problem, Lambda, 0.0, cut, nothing_fixed, 1e-12, None)
+        is None
     )
 
 
@@ -185,10 +186,10 @@ def test_a_robot_has_slack_only_where_its_margin_is_twice_the_rounding(
         errors.append(error)
         return replace(found, interior_error=error)
 
-    monkeypatch.setattr(robot_proof, "eliminate", inexact)
+    monkeypatch.setattr(proof_by_robots, "eliminate", inexact)
     S, diagonal = shifted_certificate(problem, np.zeros((8, d, d)), np.zeros(problem.side))
     nothing_fixed = np.zeros(0, dtype=np.int64)
-    found = robot_proof.verify_interior(
+    found = proof_by_robots.verify_interior(
         problem, np.zeros((8, d, d)), 0.0, cut, nothing_fixed, share, None
     )
     if growth > 0.0:
@@ -210,7 +211,7 @@ def test_a_diagonal_that_terms_make_negative_is_rounded_all_the_same() -> None:
     _, diagonal = shifted_certificate(less, np.zeros((8, 3, 3)), np.zeros(less.side))
     of_M = less.M.data[less.diagonal_positions]
     assert (of_M[cut.boundary] < 0.0).any()
-    _, errors = robot_proof._entry_errors(less, diagonal, cut)
+    _, errors = proof_by_robots._entry_errors(less, diagonal, cut)
     assert (errors >= 4 * 3 * 2.0**-53 * np.abs(of_M[cut.boundary])).all()
 
 
@@ -231,7 +232,7 @@ def test_a_driver_counts_the_rounding_of_the_separators_entries(
         no_rounding = np.zeros(4 * len(driver.cover))
         monkeypatch.setattr(Interface, "rounding", lambda *_: no_rounding)
         fixed = driver.columns_of_pose_0(1).ravel()
-        proof = distributed_bound.eliminate_S(driver, None, 1.0, 0.0)
+        proof = proof_by_robots.eliminate_S(driver, None, 1.0, 0.0)
         assert proof is not None
         # With nothing else to subtract, the shift is a multiple of these eight roundings, and slack
         # is left over.

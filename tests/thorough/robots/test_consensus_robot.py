@@ -22,10 +22,10 @@ from pgo_models import NoiseModel, PoseGraph, exp_map, grid, partition
 from pgo_models.geometry.rotations import Array, tangent_dimension
 from solvers import SOC, Coupling, Pipeline, Robots, Solution, solve
 from solvers.carry.ledger import DRIVER
-from solvers.robots import handedness_of_robot as handedness, newton, start, translations
+from solvers.robots import handedness, newton, poses as pose_orders
 from solvers.robots.agent import begin_copies
 from solvers.robots.interface import Separators
-from solvers.robots.proof_of_robot import fits_part, move_proof, prove_interior
+from solvers.robots.proof import fits_part, move_proof, prove_interior
 from solvers.soc.consensus_robot import ConsensusRobot
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
@@ -33,8 +33,8 @@ NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 Copies = ConsensusRobot
 ROUNDS = (  # orders that are, or end, a round
     *(
-        start.project,
-        translations.set_translations,
+        pose_orders.project,
+        pose_orders.set_translations,
         newton.move,
         newton.evaluate_trial,
         newton.move_straight,
@@ -46,7 +46,7 @@ ROUNDS = (  # orders that are, or end, a round
         handedness.follow_vectors,
         handedness.find_derivative,
         handedness.ascend,
-        translations.adopt,
+        pose_orders.adopt,
         begin_copies,
         Copies.penalize,
         Copies.solve,

@@ -37,9 +37,9 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.cholesky import CholeskyBackend
 from solvers import InProcess, Pipeline, Robots, Solution, solve
 from solvers.place import AUTO, FirstStage
-from solvers.robots import newton, soc as substructured, start, translations
+from solvers.robots import newton, poses as pose_orders, soc as substructured
 from solvers.robots.driver import collect
-from solvers.robots.proof_of_robot import fits_part, move_proof, prove_interior
+from solvers.robots.proof import fits_part, move_proof, prove_interior
 from solvers.robots.setup import open_driver
 
 SIZES = st.integers(2, 24)
@@ -155,9 +155,9 @@ def test_the_ledger_counts_what_was_sent(
     # round each, and so does a move at rounding level, whose translations move straight on.
     counted = (
         *(
-            start.project,
-            start.turn_by,
-            translations.set_translations,
+            pose_orders.project,
+            pose_orders.turn_by,
+            pose_orders.set_translations,
             substructured.penalize,
             substructured.rescale,
             substructured.solve,

@@ -26,10 +26,10 @@ from pgo_models.problem.matrices import columns_of
 from solvers.robots.elimination import (
     Cut,
     Elimination,
+    FactoredPart,
     eliminate,
 )
 from solvers.robots.interface import Interface, InterfaceFactor, Separators
-from solvers.robots.system import FactoredPart
 from solvers.soc.subgraph import Part, split_graph
 
 SIZES = st.integers(2, 30)

@@ -46,14 +46,15 @@ from pgo_models.problem.matrices import columns_of
 from solvers import polish
 from solvers.robots import proof as distributed_bound
 from solvers.robots.driver import collect
+from solvers.robots.elimination import RightHandSide
 from solvers.robots.proof import (
     InterfaceProof,
+    ProofStep,
+    ProofSums,
     best_bound_distributed,
     prove_grounded,
     prove_with_eta,
 )
-from solvers.robots.proof_of_robot import ProofStep, ProofSums
-from solvers.robots.records import RightHandSide
 
 
 @settings(max_examples=examples(12))

@@ -37,10 +37,9 @@ from pgo_models.problem.cholesky import (
 )
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.ordering import row_order
-from solvers.robots.elimination import Cut, eliminate, row_sums
-from solvers.robots.proof_of_robot import verify_interior
+from solvers.robots.elimination import Cut, FactoredPart, eliminate, row_sums
+from solvers.robots.proof import verify_interior
 from solvers.robots.subdomain_blocks import SubdomainBlocks
-from solvers.robots.system import FactoredPart
 from solvers.soc.subdomains import Subdomains
 from solvers.soc.subgraph import Part, split_graph
 

@@ -16,10 +16,10 @@ from pgo_models.errors import SettingError
 from solvers import GNC, Checkpoint
 from solvers.carry.serialization import deserialize, serialize
 from solvers.result import Stage
-from solvers.robots import current_poses
+from solvers.robots import poses as pose_orders
 from solvers.robots.agent import Agent
 from solvers.robots.driver import order_interior
-from solvers.robots.records import Reweigh
+from solvers.robots.part import Reweigh
 from solvers.robots.reweigh import reweigh
 from solvers.robust.known import odometry
 from solvers.robust.weighted_edges import first_poses
@@ -76,14 +76,14 @@ def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
     agent = Agent(subgraph, None)
     again = Agent(subgraph, None)
     order_interior(
-        current_poses.set_poses,
+        pose_orders.set_poses,
         agent,
         first_poses(problem.graph, subgraph_known(problem))[subgraph.part.poses],
     )
     order_interior(reweigh, agent, Reweigh(True, 0.01, 1.0, 1e-9, 1e-13))
-    before = order_interior(current_poses.evaluate, agent, None)
+    before = order_interior(pose_orders.evaluate, agent, None)
     again.restore(agent.snapshot())
-    after = order_interior(current_poses.evaluate, again, None)
+    after = order_interior(pose_orders.evaluate, again, None)
     assert before.objective == after.objective
     np.testing.assert_array_equal(before.force, after.force)
     weights = agent.interior.state.weights

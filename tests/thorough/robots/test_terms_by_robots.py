@@ -21,11 +21,12 @@ from solvers.carry.messages import restore, take_snapshot
 from solvers.handedness.ascent import AscentState, HandednessAscent
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
 from solvers.loop import Outcome
-from solvers.robots import handedness, handedness_of_robot as robot_orders
+from solvers.robots import handedness
 from solvers.robots.driver import Driver
 from solvers.robots.proof import (
     best_bound_with_terms as best_bound_by_robots,
     prove_with_eta,
+    report_terms,
 )
 from solvers.studies.tightness import noisy_scene
 
@@ -60,7 +61,7 @@ def driver_with_terms(problem: PGOProblem, parts: Partition, poses: Poses, Pi: A
 
 
 def collected_terms(driver: Driver) -> HandednessTerms:
-    found = [terms for terms in driver.ask(robot_orders.report_terms, None, Count.OFF) if terms]
+    found = [terms for terms in driver.ask(report_terms, None, Count.OFF) if terms]
     fields = [np.concatenate([getattr(terms, name) for terms in found]) for name in "ijTP"]
     return HandednessTerms(*fields)
 

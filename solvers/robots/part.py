@@ -9,25 +9,116 @@ and edges leave the robot when the result is collected, and not before.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 from scipy.sparse import csc_array
 
 from pgo_models.certificates.dual_variables import multipliers_at
+from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
-from solvers.robots.records import CostParts, Reweigh, RightHandSide
-from solvers.robots.state import InteriorState, Session
+from solvers.carry.registry import record
+from solvers.robots.elimination import FactoredPart, RightHandSide, System
 from solvers.robots.subdomain_blocks import Widths
-from solvers.robots.system import FactoredPart, System
+from solvers.robust.losses import RobustLoss
 from solvers.robust.weighted_edges import RatioSums
 from solvers.soc.subgraph import Part, Subgraph
+
+
+@record("CostParts")
+@dataclass(frozen=True, eq=False)
+class CostParts:
+    """Part of F and of its rounding level, and the rows of M X on the boundary, ((d+1) g, d).
+
+    In a robust solve, `ratios` are the sums that belong to the last `Reweigh`.
+    """
+
+    objective: float
+    level: float
+    force: Array
+    ratios: RatioSums | None = None
+
+
+@record("Reweigh")
+@dataclass(frozen=True)
+class Reweigh:
+    """How edges are weighed by their residuals in a robust solve."""
+
+    is_truncated: bool
+    mu: float  # control of the robust loss's surrogate
+    scale: float  # of the thresholds
+    least: float  # weight under which an edge hardly counts
+    left_out: float  # weight of such an edge, which keeps its place in the matrices
+
+    @property
+    def loss(self) -> RobustLoss:
+        """The robust loss."""
+        return RobustLoss.TRUNCATED if self.is_truncated else RobustLoss.GEMAN_MCCLURE
+
+
+@record("Reweighed")
+@dataclass(frozen=True, eq=False)
+class Reweighed:
+    """The cost with new weights, and the diagonal of its M on the boundary."""
+
+    diagonal: Array
+    at: CostParts
+
+
+@record("ReducedTranslations")
+@dataclass(frozen=True, eq=False)
+class ReducedTranslations:
+    """Right-hand side of the best translations, (g, d), and the first time their matrix."""
+
+    b: Array
+    schur: Array | None
+
+
+@record("RobotAscent")
+@dataclass(frozen=True, eq=False)
+class RobotAscent:
+    """Where a robot is in an ascent of handedness terms, with the k pairs that its edges join."""
+
+    P: Array  # (k, 3, 3)
+    best: Array  # (k, 3, 3): the P that had the largest smallest eigenvalue
+    derivative: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    X: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (side, q): inverse iteration's
+
+
+@record("Session")
+@dataclass(frozen=True, eq=False)
+class Session:
+    """What an algorithm leaves for its next order; each has what it needs beside it in a subclass.
+
+    The session of an algorithm that tries poses has them as `trial`, which `accept` goes to.
+    """
+
+    system: System | None = None
+    trial: Poses | None = None
+
+
+@record("InteriorState")
+@dataclass(frozen=True, eq=False)
+class InteriorState:
+    """What orders leave with a robot; the p poses are those of its part."""
+
+    poses: Poses
+    saved: Poses  # those that `restore_poses` returns to
+    session: Session | None = None
+    # whether the current cost is the one that is solved, not the one that SOC is run on
+    is_final: bool = False
+    weights: Array | None = None  # (k,): of its edges, in a robust solve
+    reweighing: Reweigh | None = None  # how these weights came about
+    has_sent_laplacian: bool = False  # whether the driver has the matrix of the translations
+    terms: HandednessTerms | None = None  # of its edges, for proofs with them
+    ascent: RobotAscent | None = None  # the search for such terms
+
 
 S = TypeVar("S", bound=Session)
 
