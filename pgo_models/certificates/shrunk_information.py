@@ -21,6 +21,7 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import (
     LEAST_SCALED,
     are_definite,
+    are_singular,
     proper_information,
     uncoupled_share,
 )
@@ -40,15 +41,17 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
     Coupling blocks are removed first. With C = I_tt^-1/2 I_tr I_rr^-1/2 the rest keeps the share
     1 - ||C||, since I >= (1 - ||C||) blockdiag(I_tt, I_rr). Rounding may ask for a smaller share.
     An edge whose coupled matrix is only semidefinite has a share of zero. It is left out, since it
-    costs zero or more. A GraphError if rounding hides the inequality for every share.
+    costs zero or more, and so is a singular block. A GraphError if rounding hides the inequality
+    for every share, or what is left does not connect the graph.
     """
-    information = proper_information(graph)
+    information = without_singular_blocks(proper_information(graph), graph.d)
     d = graph.d
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
     is_coupled = I_tr.any(axis=(1, 2))
     is_singular = is_coupled & ~are_definite(information, LEAST_SCALED)
+    is_singular |= ~information.any(axis=(1, 2))
     # Weights of the two smallest eigenvalues of I_rr in the limit of the largest: W is convex if
     # the largest is at most the second and half the smallest.
     limit_weights = np.array([0.5, 1.0]) if d == 3 else np.ones(1)
@@ -74,6 +77,23 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
         # Rounding hides that the others are below; half of them is tried.
         share = np.where(is_below, share, 0.5 * share)
     raise GraphError("rounding hides that smaller information matrices are below the graph's own")
+
+
+def without_singular_blocks(information: Array, d: int) -> Array:
+    """Matrices, (m, k, k), with zeros for blocks that do not measure every direction.
+
+    A coupling block goes with either.
+    """
+    singular_t = are_singular(information[:, :d, :d])
+    singular_R = are_singular(information[:, d:, d:])
+    if not (singular_t | singular_R).any():
+        return information
+    kept = information.copy()
+    kept[singular_t, :d] = 0.0
+    kept[singular_t, :, :d] = 0.0
+    kept[singular_R, d:] = 0.0
+    kept[singular_R, :, d:] = 0.0
+    return kept
 
 
 def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:

@@ -38,7 +38,11 @@ from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.missing_poses import with_missing_poses
 from pgo_models.graphs.origin import far_middle, shifted_exactly
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
-from pgo_models.graphs.precisions import RotationWeight, edge_precisions
+from pgo_models.graphs.precisions import (
+    RotationWeight,
+    edge_precisions,
+    without_negative_rounding,
+)
 from pgo_models.graphs.written_digits import most_digits, written_errors
 
 MOST_SYMBOLS = len(LETTERS)  # robots whose poses can be named by GTSAM symbols
@@ -210,7 +214,16 @@ def graph_of_files(
     edges = np.searchsorted(ids, edge_ids)
     robot = _robots(file_ids, files, letters)
     estimate, is_known = _estimate(file_ids, robot, files)
-    information = information_of(d, rows)
+    information, is_changed = without_negative_rounding(information_of(d, rows), d)
+    if is_changed.any():
+        first = edge_places_of(files)[int(np.argmax(is_changed))]
+        warnings.warn(
+            f"{printable(first)}: information matrices of {is_changed.sum()} edges, of which this "
+            "is the first, are indefinite by the rounding of their digits; their negative "
+            "eigenvalues are taken for zero",
+            GraphWarning,
+            stacklevel=3,
+        )
     kappa, tau = edge_precisions(information, weights)
     R_ij, t_ij = poses_of(d, rows)
     is_prior = edge_ids[:, 0] == WORLD_ID
@@ -290,7 +303,11 @@ def edge_places(path: Path | str) -> list[str]:
     files = [
         read_lines(file, skip_unknown=True, needs_matrices=False) for file in g2o_files(Path(path))
     ]
-    files = _files_of_robots(files)
+    return edge_places_of(_files_of_robots(files))
+
+
+def edge_places_of(files: list[G2OLines]) -> list[str]:
+    """`file:line` of every edge of the graph of files that have been read."""
     kept_rows = _rows_to_keep(files)
     places = []
     for file, kept in zip(files, kept_rows, strict=True):

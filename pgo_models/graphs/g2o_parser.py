@@ -48,7 +48,7 @@ from pgo_models.graphs.g2o_tags import (
     supported_tags,
 )
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
-from pgo_models.graphs.precisions import are_definite
+from pgo_models.graphs.precisions import ROUNDED_EIGENVALUE, are_definite, lowest_scaled
 from pgo_models.graphs.weight_errors import MOST, SINGULAR
 from pgo_models.graphs.written_digits import ALL_DIGITS, WrittenDigits, digits_of
 
@@ -115,9 +115,9 @@ def read_lines(
     or thousands of them; a word, nan or inf where a number belongs; an id that is no integer of 64
     bits; an edge without a matrix, if it needs one, or with one that is not symmetric; a zero
     quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
-    rotation block is neither positive definite nor zero, or both of whose blocks are zero; a
-    covariance matrix that is not positive definite; an edge to itself; a VERTEX line of an id that
-    another one has elsewhere; an offset without a PARAMS_ line, or of a position prior; lines in 2D
+    rotation block has a negative eigenvalue, or both of whose blocks are zero; a covariance matrix
+    that is not positive definite; an edge to itself; a VERTEX line of an id that another one has
+    elsewhere; an offset without a PARAMS_ line, or of a position prior; lines in 2D
     beside lines in 3D.
     """
     path = Path(path)
@@ -684,17 +684,24 @@ def _problems_of_ids(file: G2OLines) -> list[Problem]:
 
 
 def _problems_of_blocks(file: G2OLines, name: str, blocks: Array) -> list[Problem]:
-    """Lines with a block, (m, k, k), that is neither zero nor positive definite."""
-    is_nonzero = blocks.any(axis=(1, 2))
-    is_wrong = is_nonzero & ~_is_positive_definite(blocks)
-    if not is_wrong.any():
+    """Lines with a block, (m, k, k), that has a negative eigenvalue, or is too small for doubles.
+
+    Directions without information are no fault.
+    """
+    doubtful = np.flatnonzero(_may_be_indefinite(blocks))
+    if not len(doubtful):
         return []
-    smallest = np.linalg.eigvalsh(blocks[is_wrong])[:, 0].tolist()
-    lines = file.edge_lines[is_wrong].tolist()
+    lowest = lowest_scaled(blocks[doubtful])
+    largest = np.abs(blocks[doubtful]).max(axis=(1, 2))
+    is_tiny = largest <= 1.0 / LARGEST
+    is_wrong = (lowest < -ROUNDED_EIGENVALUE) | is_tiny
+    wrong = doubtful[is_wrong]
+    smallest = np.linalg.eigvalsh(blocks[wrong])[:, 0].tolist()
+    lines = file.edge_lines[wrong].tolist()
     problems = []
     for line, eigenvalue in zip(lines, smallest, strict=True):
         problem = (
-            f"{name} block of the information matrix is not positive definite "
+            f"{name} block of the information matrix is indefinite "
             f"(smallest eigenvalue {eigenvalue:.3g}); "
             "give the upper triangle row by row, or remove the line"
         )
@@ -702,9 +709,9 @@ def _problems_of_blocks(file: G2OLines, name: str, blocks: Array) -> list[Proble
     return problems
 
 
-def _is_positive_definite(A: Array) -> BoolArray:
-    """Whether matrices (m, k, k) are positive definite, (m,), beyond rounding and underflow."""
+def _may_be_indefinite(A: Array) -> BoolArray:
+    """Whether matrices (m, k, k) are neither zero nor positive definite, (m,), beyond rounding."""
     diagonals = np.einsum("mkk->mk", A)
     is_positive = (diagonals > 1.0 / LARGEST).all(axis=1)
     is_positive[is_positive] = are_definite(A[is_positive], SINGULAR)
-    return np.asarray(is_positive)
+    return np.asarray(~is_positive & A.any(axis=(1, 2)))

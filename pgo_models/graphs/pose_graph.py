@@ -133,6 +133,9 @@ class PoseGraph(ReadOnly):
         zero, as in UTM coordinates, else zero. The t_ij of priors are measured from it, and poses
         in the frame of the file have the world pose there. Unless given it is found, and the t_ij
         given are seen from it if that takes no rounding.
+    free : str
+        Which directions of the map no edge measures, and how they are held: a sentence, "" for none
+        (`pgo_models.graphs.free_directions`).
 
     Raises
     ------
@@ -174,6 +177,7 @@ class PoseGraph(ReadOnly):
     written_error: Array | None = None
     weights_error: float = 0.0
     origin: Array | None = None
+    free: str = ""
 
     _way_out = "pgo_models.load(..) reads a graph, and `.graph` of a problem is one"
 

@@ -5,6 +5,7 @@ The formulas are those of the code of SE-Sync (Rosen et al. 2019).
 
 import enum
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -17,6 +18,13 @@ from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges, isotropic_
 # eigenvalue itself.
 LEAST_SCALED = 1e-12
 _SURELY_NEGATIVE = -1e-10
+# A matrix whose smallest eigenvalue is below this has directions that it does not measure.
+LEAST_DEFINITE = 1e-13
+# Negative eigenvalues down to here are what six digits make of a zero.
+ROUNDED_EIGENVALUE = 1e-5
+# Information of directions without any, in F, as a share of the largest of the block.
+UNMEASURED_SHARE = 1e-6
+_REMEMBERED = 2**16  # matrices of which exact arithmetic has said whether they are semidefinite
 # Share of the diagonal that the rounding of the entries can hide. This share is added to the
 # diagonal of a matrix that is semidefinite but for rounding.
 _ROUNDED_ENTRIES = 2.0**-45
@@ -48,8 +56,10 @@ def edge_precisions(
 
     In space, k = 6: tau = 3 / tr(I_tt^-1) and kappa = 3 / (2 tr(I_rr^-1)). In the plane, k = 3: tau
     = 2 / tr(I_tt^-1), and kappa as `weights` says. The blocks themselves are inverted, not the
-    marginal information; blocks of zeros give 0. The units are those of the matrices, per radian^2
-    and per metre^2. A SettingError when `weights` is no RotationWeight.
+    marginal information; blocks of zeros give 0. Of a singular block a direction without
+    information counts as if it had `UNMEASURED_SHARE` of the largest entry of its diagonal: F has
+    one precision for all directions. The units are those of the matrices, per radian^2 and per
+    metre^2. A SettingError when `weights` is no RotationWeight.
     """
     if not isinstance(weights, RotationWeight):
         raise SettingError(
@@ -58,11 +68,99 @@ def edge_precisions(
     if information.shape[-1] == 3:
         factor = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
         kappa = factor * information[:, 2, 2]
-        tau = 2.0 / trace_of_inverse(information[:, :2, :2])
+        tau = 2.0 / trace_of_inverse(_without_null_directions(information[:, :2, :2]))
         return kappa, tau
-    kappa = 1.5 / trace_of_inverse(information[:, 3:, 3:])
-    tau = 3.0 / trace_of_inverse(information[:, :3, :3])
+    kappa = 1.5 / trace_of_inverse(_without_null_directions(information[:, 3:, 3:]))
+    tau = 3.0 / trace_of_inverse(_without_null_directions(information[:, :3, :3]))
     return kappa, tau
+
+
+def are_singular(blocks: Array) -> BoolArray:
+    """Whether blocks (m, k, k) measure something, but not in every direction, (m,)."""
+    is_nonzero = blocks.any(axis=(1, 2))
+    is_singular = np.zeros(len(blocks), dtype=bool)
+    is_singular[is_nonzero] = ~are_definite(blocks[is_nonzero], LEAST_DEFINITE)
+    return is_singular
+
+
+def partial_edges(graph: PoseGraph) -> BoolArray:
+    """Return which edges measure rotations or positions in some directions alone.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Any graph; one without information matrices has no such edges.
+
+    Returns
+    -------
+    BoolArray
+        (m,), true where a block of the information matrix is singular and not zero.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import circle
+    >>> bool(partial_edges(circle(np.random.default_rng(0))).any())
+    False
+    """
+    if graph.information is None:
+        return np.zeros(graph.num_edges, dtype=bool)
+    d = graph.d
+    of_translations = are_singular(graph.information[:, :d, :d])
+    of_rotations = are_singular(graph.information[:, d:, d:])
+    return of_translations | of_rotations
+
+
+def without_negative_rounding(information: Array, d: int) -> tuple[Array, BoolArray]:
+    """Matrices, (m, k, k), whose blocks are semidefinite, and which of them had to be changed.
+
+    A file with few digits can have a semidefinite block with a negative eigenvalue: that is taken
+    for zero. Blocks with a larger one (`lowest_scaled`) are left alone.
+    """
+    is_changed = np.zeros(len(information), dtype=bool)
+    settled = information
+    for block in (slice(0, d), slice(d, None)):
+        blocks = information[:, block, block]
+        doubtful = np.flatnonzero(are_singular(blocks))
+        lowest = lowest_scaled(blocks[doubtful])
+        is_rounded = (lowest < _SURELY_NEGATIVE) & (lowest >= -ROUNDED_EIGENVALUE)
+        rounded = doubtful[is_rounded]
+        if not len(rounded):
+            continue
+        if settled is information:
+            settled = information.copy()
+        scaled, scale = scaled_blocks(blocks[rounded])
+        values, vectors = np.linalg.eigh(scaled)
+        raised = (vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+        raised = 0.5 * (raised + np.swapaxes(raised, 1, 2))
+        settled[rounded, block, block] = raised / (scale[:, :, None] * scale[:, None, :])
+        is_changed[rounded] = True
+    return settled, is_changed
+
+
+def lowest_scaled(blocks: Array) -> Array:
+    """Smallest eigenvalue, (m,), of blocks (m, k, k) that are scaled to ones on the diagonal.
+
+    A row whose diagonal entry is zero is semidefinite only with zeros: else -inf is returned.
+    """
+    scaled, _ = scaled_blocks(blocks)
+    diagonal = np.einsum("mkk->mk", blocks)
+    is_empty = diagonal == 0.0
+    is_crossed = (is_empty[:, :, None] & (blocks != 0.0)).any(axis=(1, 2))
+    lowest = np.linalg.eigvalsh(scaled)[:, 0] if len(blocks) else np.zeros(0)
+    return np.asarray(np.where(is_crossed, -np.inf, lowest))
+
+
+def _without_null_directions(blocks: Array) -> Array:
+    """Blocks, (m, k, k), with `UNMEASURED_SHARE` of information where singular ones have none."""
+    singular = np.flatnonzero(are_singular(blocks))
+    if not len(singular):
+        return blocks
+    filled_blocks = blocks.copy()
+    largest = np.einsum("mkk->mk", blocks[singular]).max(axis=1)
+    values, vectors = np.linalg.eigh(blocks[singular])
+    raised = np.maximum(values, UNMEASURED_SHARE * largest[:, None])
+    filled_blocks[singular] = (vectors * raised[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return filled_blocks
 
 
 def proper_information(graph: PoseGraph) -> Array:
@@ -238,13 +336,18 @@ def uncoupled_share(information: Array, d: int) -> Array:
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
+    singular = are_singular(I_tt)[:, None, None] | are_singular(I_rr)[:, None, None]
+    # A coupling of singular blocks leaves no share.
+    I_tt = np.where(singular, np.eye(d), I_tt)
+    I_rr = np.where(singular, np.eye(I_rr.shape[1]), I_rr)
+    I_tr = np.where(singular, 0.0, I_tr)
     product = eliminated_products(filled(I_tt), I_tr)
     if product.shape[1] == 1:
         squared_norm = np.abs(product / filled(I_rr))[:, 0, 0]
     else:
         eigenvalues = np.linalg.eigvals(np.linalg.solve(filled(I_rr), product))
         squared_norm = np.abs(eigenvalues).max(axis=1)
-    return np.asarray(1.0 - np.sqrt(squared_norm))
+    return np.asarray(np.where(singular[:, 0, 0], 0.0, 1.0 - np.sqrt(squared_norm)))
 
 
 def eliminated_products(A: Array, B: Array) -> Array:
@@ -371,13 +474,18 @@ def _without_coupling(information: Array, chosen: BoolArray, d: int) -> Array:
 def _semidefinite(information: Array, d: int) -> tuple[Array, BoolArray]:
     """Matrices, raised where rounding alone makes them indefinite; which are indefinite, (m,).
 
-    Matrices without coupling blocks are left alone.
+    Of matrices without a coupling block the two blocks are judged, of which one may be zero.
     """
     is_indefinite = np.zeros(len(information), dtype=bool)
-    coupling_blocks = information[:, :d, d:]
-    coupled = np.flatnonzero(coupling_blocks.any(axis=(1, 2)))
+    is_coupled = information[:, :d, d:].any(axis=(1, 2))
+    coupled = np.flatnonzero(is_coupled)
     is_definite = are_definite(information[coupled], LEAST_SCALED)
-    doubtful = coupled[~is_definite]
+    is_doubtful = are_singular(information[:, :d, :d]) | are_singular(information[:, d:, d:])
+    is_doubtful[coupled] = ~is_definite
+    # Directions along axes without any entry: what is left of most such matrices is definite.
+    filled_axes = with_empty_axes_filled(information[is_doubtful])
+    is_doubtful[is_doubtful] = ~are_definite(filled_axes, LEAST_SCALED)
+    doubtful = np.flatnonzero(is_doubtful)
     if not len(doubtful):
         return information, is_indefinite
     information = information.copy()
@@ -398,12 +506,31 @@ def _semidefinite(information: Array, d: int) -> tuple[Array, BoolArray]:
     return information, is_indefinite
 
 
+def with_empty_axes_filled(information: Array) -> Array:
+    """Matrices, (m, k, l), with a one on the diagonal of rows without any entry."""
+    filled_axes = information.copy()
+    is_empty = ~information.any(axis=2)
+    size = information.shape[1]
+    diagonal = np.einsum("mkk->mk", filled_axes[:, :, :size])  # a view
+    diagonal[is_empty] = 1.0
+    return filled_axes
+
+
 def is_semidefinite_exactly(matrix: Array) -> bool:
     """Whether a symmetric matrix of doubles, (k, k), has no negative eigenvalue, exactly.
 
     The matrix is scaled to whole numbers and eliminated. Pivots must not be negative, and in the
     row of a pivot of zero all entries must be zero.
     """
+    size = len(matrix)
+    entries = np.ascontiguousarray(matrix, dtype=float).tobytes()
+    return _has_no_negative_pivot(entries, size)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _has_no_negative_pivot(entries: bytes, size: int) -> bool:
+    """Like `is_semidefinite_exactly`; matrices of a graph are asked for several times."""
+    matrix = np.frombuffer(entries).reshape(size, size)
     rows = _as_whole_numbers(matrix)
     while rows:
         pivot, *pivot_row = rows[0]

@@ -676,16 +676,20 @@ class TangentCost(EdgeCost):
         product_errors = errors + gamma(d + 1) * delta_size
         difference_error = product_errors @ P_size
         difference_error += gamma(d * d + d + 4) * np.abs(difference)
-        linear_error = float(np.sum(2.0 * C_size * difference_error))
+        # What C is off by itself weighs with the difference, and in both half gradients.
+        C_error = tangent.C_error
+        of_C = 2.0 * C_error * (np.abs(difference) + difference_error)
+        linear_error = float(np.sum(2.0 * C_size * difference_error + of_C))
         constant_size = np.abs(constant) + np.abs(tangent.loss)
         constant_errors = tangent.value_error + 4.0 * UNIT_ROUNDOFF * constant_size
         value_error = linear_error + float(np.sum(constant_errors))
         # The half gradient in delta, C P_i.
         G = C @ P_i
-        G_error = gamma(d) * C_size @ np.swapaxes(P_size, 1, 2)
+        G_error = (gamma(d) * C_size + C_error) @ np.swapaxes(P_size, 1, 2)
         # The half gradient in P_i, C^T delta.
         in_P_i = np.swapaxes(C, 1, 2) @ delta
-        in_P_i_error = np.swapaxes(C_size, 1, 2) @ product_errors
+        in_P_i_error = np.swapaxes(C_size + C_error, 1, 2) @ product_errors
+        in_P_i_error = in_P_i_error + np.swapaxes(C_error, 1, 2) @ delta_size
         return EdgeTerms(
             value=terms.value + (linear_part + constant),
             value_error=terms.value_error + value_error,
@@ -701,19 +705,19 @@ class TangentCost(EdgeCost):
     ) -> Array:
         """E u, (N,), with the terms |A|^T |C| and its transpose beside those of W.
 
-        Every term is off by at most `relative_error` of itself.
+        Every term is off by at most `relative_error` of itself, and C by `Tangent.C_error`.
         """
         n = incidence.begins.shape[0]
         d = self.d
         A = abs(A)
-        C_size = np.abs(self.tangent.C)
+        errors = relative_error * np.abs(self.tangent.C) + self.tangent.C_error
         E_u = super().entry_errors(A, incidence, u, relative_error)
         # |A|^T |C|: C couples the residuals with the rows of R_i^T.
         u_R = u[n:].reshape(n, d, 1)
-        C_u = C_size @ u_R[incidence.i]
-        E_u += relative_error * (A.T @ rows_of_blocks(C_u))[:, 0]
+        C_u = errors @ u_R[incidence.i]
+        E_u += (A.T @ rows_of_blocks(C_u))[:, 0]
         # Its transpose, |C|^T |A|.
         A_u = blocks_of_rows((A @ u)[:, None], self.d)
-        Ct_A_u = np.swapaxes(C_size, 1, 2) @ A_u
-        E_u[n:] += relative_error * incidence.at_beginning(Ct_A_u)[:, 0]
+        Ct_A_u = np.swapaxes(errors, 1, 2) @ A_u
+        E_u[n:] += incidence.at_beginning(Ct_A_u)[:, 0]
         return E_u

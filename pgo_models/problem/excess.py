@@ -30,7 +30,7 @@ from typing import Self
 import numpy as np
 
 from pgo_models.geometry.arrays import block_norms, inner_products
-from pgo_models.geometry.rotations import Array, hat, tangent_dimension, vee
+from pgo_models.geometry.rotations import Array, BoolArray, hat, tangent_dimension, vee
 from pgo_models.problem.floating_point import OUTWARD, gamma
 from pgo_models.problem.incidence import EdgeArrays
 
@@ -45,7 +45,8 @@ class Excess(EdgeArrays):
     # (a, b) of J or J_ss is computed from have norms of at most size_a size_b.
     size: Array
     # (m, 2): lower bounds on the eigenvalues of the translation and the rotation blocks. J is at
-    # least the diagonal matrix of both, J_ss at least the second.
+    # least the diagonal matrix of both, J_ss at least the second. Both are zero of an edge whose J
+    # is semidefinite alone, in exact arithmetic: it does not measure every direction.
     least: Array
 
     def with_silent_edges(self, R_ij: Array) -> Self:
@@ -225,12 +226,30 @@ class Tangent(EdgeArrays):
         the maximum over D of 2 <e, D> - q(D). As q(D) is at least least_t ||D_t||^2 + least_R
         ||D_R||^2 / 4, the maximum is at most ||e_t||^2 / least_t + 4 ||e_R||^2 / least_R. In the
         plane the bound on q holds for D_R in the span of R_ij^T and its rotation by 90 degrees,
-        where D_R is but for rounding.
+        where D_R is but for rounding. Where J is semidefinite alone, nothing bounds that maximum:
+        nothing is subtracted, and `C_error` is counted as an error of the entries of M.
         """
         share, length = self._rounding
-        ratios = self.excess.size**2 / self.excess.least
-        sizes = ratios[:, 0] + ratios[:, 1]
+        least = np.where(self.is_semidefinite[:, None], 1.0, self.excess.least)
+        ratios = self.excess.size**2 / least
+        sizes = np.where(self.is_semidefinite, 0.0, ratios[:, 0] + ratios[:, 1])
         return np.asarray(OUTWARD * 32.0 * (share * length) ** 2 * sizes)
+
+    @property
+    def is_semidefinite(self) -> BoolArray:
+        """Whether J of an edge is semidefinite alone, (m,)."""
+        return np.asarray(self.excess.least[:, 0] == 0.0)
+
+    @cached_property
+    def C_error(self) -> Array:
+        """Bound on what the entries of C are off by, (m, d + 1, 1), beyond what `loss` makes up.
+
+        It is zero but where J is semidefinite alone.
+        """
+        share, length = self._rounding
+        rows = np.repeat(self.excess.size, [1, self.Z.shape[2]], axis=1)
+        errors = 4.0 * OUTWARD * share * length[:, None] * rows
+        return np.asarray(np.where(self.is_semidefinite[:, None], errors, 0.0))[:, :, None]
 
     @cached_property
     def _rounding(self) -> tuple[float, Array]:
@@ -261,7 +280,8 @@ class Tangent(EdgeArrays):
             np.abs(self.value) + self.loss + 2.0 * inner_products(np.abs(self.C), np.abs(self.Z))
         )
         num_products = self.C[0].size
-        errors = self.value_error + gamma(num_products + 8.0) * sizes
+        of_C = 2.0 * np.sum(self.C_error * np.abs(self.Z), axis=(1, 2))
+        errors = self.value_error + gamma(num_products + 8.0) * sizes + of_C
         return total, OUTWARD * float(np.sum(errors))
 
 

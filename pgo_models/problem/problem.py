@@ -13,6 +13,7 @@ from pgo_models.errors import GraphError, SettingError, check_settings
 from pgo_models.geometry.arrays import ReadOnly, read_only
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, vee
+from pgo_models.graphs.free_directions import with_free_directions_held
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem import matrices
@@ -94,6 +95,7 @@ class PGOProblem(ReadOnly):
         if self.weighting is Weighting.ROTATIONS:
             self.graph.check_rotations_connected()
         else:
+            object.__setattr__(self, "graph", with_free_directions_held(self.graph))
             self.graph.check_connected()
         if self.weighting is Weighting.ISOTROPIC and not self.graph.has_translations:
             object.__setattr__(self, "weighting", Weighting.ROTATIONS)

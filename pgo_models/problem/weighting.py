@@ -27,8 +27,10 @@ from pgo_models.graphs.precisions import (
     edge_precisions,
     eliminated_products,
     indefinite_edges,
+    is_semidefinite_exactly,
     smallest_eigenvalues,
     uncoupled_share,
+    with_empty_axes_filled,
 )
 from pgo_models.problem.costs import EdgeCost, ExcessCost, rotation_cost
 from pgo_models.problem.excess import CoupledExcess, Excess
@@ -128,16 +130,10 @@ class _Information:
         """Whether an edge has a coupling block that is not zero, (m,)."""
         return np.asarray(self.I_tr.any(axis=(1, 2)))
 
-    def check_definite(self, graph: PoseGraph) -> None:
-        """Raise a GraphError where a block is neither definite nor zero.
-
-        Edges to landmarks and priors on a position or a rotation alone have a zero block.
-        """
-        is_zero = self.trace == 0.0
-        is_zero_R = self.trace_R == 0.0
-        is_definite = self.smallest > _ROUNDED * self.trace
-        is_definite_R = self.smallest_R > _ROUNDED * self.trace_R
-        _check(graph, (is_zero | is_definite) & (is_zero_R | is_definite_R))
+    @property
+    def is_singular(self) -> BoolArray:
+        """Whether I_tt does not measure every direction, (m,): then tau is zero."""
+        return np.asarray(self.smallest <= _ROUNDED * self.trace)
 
     @property
     def margin(self) -> Array:
@@ -147,26 +143,23 @@ class _Information:
     @property
     def uncoupled_tau(self) -> Array:
         """The tau of edges without coupling, (m,): just below the smallest eigenvalue of I_tt."""
-        return self.smallest - 2.0 * self.margin
+        return np.where(self.is_singular, 0.0, self.smallest - 2.0 * self.margin)
 
 
 def information_cost(graph: PoseGraph, information: Array) -> EdgeCost:
     """chi2 of the information matrices, (m, k, k), of a graph's edges (`proper_information`).
 
-    The blocks I_tt and I_rr are definite or zero. A GraphError names an edge with a block that is
-    neither or whose eigenvalues span more orders of magnitude than doubles carry. It also names an
-    edge with I_tt = 0 if the cost is not quadratic because of the others.
+    The matrices are semidefinite. A GraphError names an edge whose eigenvalues span more orders of
+    magnitude than doubles carry.
     """
     d = graph.d
     blocks = _Information.of(information, d)
-    blocks.check_definite(graph)
     multiples_of_identity = blocks.I_tt[:, :1, :1] * np.eye(d)
     is_isotropic = bool((blocks.I_tt == multiples_of_identity).all())
     is_coupled = bool(blocks.is_coupled.any())
     if is_isotropic and not is_coupled:
         tau = blocks.I_tt[:, 0, 0].copy()
         return _quadratic_cost(tau, *_uncoupled_rotation_weights(blocks.I_rr), d)
-    _check_positions(graph, blocks)
     if is_coupled:
         return _coupled_cost(graph, information, blocks)
     return _uncoupled_cost(graph, blocks)
@@ -179,10 +172,12 @@ def _uncoupled_cost(graph: PoseGraph, blocks: _Information) -> ExcessCost:
     tau = blocks.uncoupled_tau
     in_frame_j = blocks.I_tt - tau[:, None, None] * np.eye(d)
     J = graph.R_ij @ in_frame_j @ np.swapaxes(graph.R_ij, 1, 2)
-    _check_excess(graph, tau, J, margin)
+    is_singular = blocks.is_singular
+    _check_excess(graph, tau, J, margin, is_singular)
     trace_of_sizes = blocks.trace + d * tau
     size = _block_sizes(d, trace_of_sizes, np.zeros_like(tau))
     least = 0.5 * margin[:, [0, -1]]
+    least[is_singular] = 0.0
     excess = Excess(graph.R_ij, J, size, least)
     return ExcessCost(tau, *_uncoupled_rotation_weights(blocks.I_rr), d, excess)
 
@@ -191,6 +186,7 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     """chi2 with the excess u^T J u + tr(H J_ss H), u = (r, s).
 
     An edge without coupling has J_ss = 0 and the excess r^T (I_tt - tau I) r of `_uncoupled_cost`.
+    Where I_tt is singular tau is zero, and J = I is semidefinite, exactly.
     """
     d = graph.d
     p = tangent_dimension(d)
@@ -203,10 +199,14 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     margin_R = _MARGIN * blocks.smallest_R + _ROUNDED * blocks.trace_R
     margin_R[~is_coupled] = 1.0
     # J_ss is above the Schur complement I_tr^T J_tt^-1 I_tr, so that J is positive definite.
-    schur = eliminated_products(J_tt, blocks.I_tr)
-    share = 0.5 + 4.0 * margin_t[:, 0] / blocks.smallest + _MARGIN
+    is_singular = blocks.is_singular
+    definite_J_tt = np.where(is_singular[:, None, None], np.eye(d), J_tt)
+    schur = eliminated_products(definite_J_tt, blocks.I_tr)
+    smallest = np.where(is_singular, 1.0, blocks.smallest)
+    share = 0.5 + 4.0 * margin_t[:, 0] / smallest + _MARGIN
     J_ss = share[:, None, None] * (schur + np.swapaxes(schur, 1, 2))
     J_ss = J_ss + 2.0 * margin_R[:, None, None] * np.eye(p)
+    J_ss[is_singular] = _rotation_part_of_excess(information[is_singular], d)
     J_ss[~is_coupled] = 0.0
     upper = np.concatenate([J_tt, blocks.I_tr], axis=2)
     lower = np.concatenate([np.swapaxes(blocks.I_tr, 1, 2), J_ss], axis=2)
@@ -217,12 +217,15 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     to_frame_i[:, d:, d:] = graph.R_ij if d == 3 else 1.0
     J = to_frame_i @ in_frame_j @ np.swapaxes(to_frame_i, 1, 2)
     margin = np.concatenate([margin_t, np.repeat(margin_R[:, None], p, axis=1)], axis=1)
-    _check_excess(graph, tau, J[:, :d, :d], margin_t)
-    least = margin[:, :, None] * np.eye(d + p)
-    _check(graph, ~is_coupled | are_definite(J - least, 0.0))
+    _check_excess(graph, tau, J[:, :d, :d], margin_t, is_singular)
+    least_J = margin[:, :, None] * np.eye(d + p)
+    is_exact = ~is_coupled | is_singular
+    _check(graph, is_exact | are_definite(J - least_J, 0.0))
     trace_of_sizes = blocks.trace + d * tau
     size = _block_sizes(d, trace_of_sizes, np.einsum("mkk->m", J_ss))
-    excess = CoupledExcess(graph.R_ij, J, size, 0.5 * margin[:, [0, -1]], J[:, d:, d:])
+    least = 0.5 * margin[:, [0, -1]]
+    least[is_singular] = 0.0
+    excess = CoupledExcess(graph.R_ij, J, size, least, J[:, d:, d:])
     return ExcessCost(tau, *_rotation_weights(blocks.I_rr, J_ss), d, excess)
 
 
@@ -238,7 +241,28 @@ def _coupled_tau(information: Array, blocks: _Information) -> Array:
     definite_share = _COUPLED_SHARE * uncoupled_share(information, d)
     share = np.where(is_definite, definite_share, _SINGULAR_SHARE)
     coupled_tau = share * blocks.smallest
+    coupled_tau[blocks.is_singular] = 0.0
     return np.where(is_coupled, coupled_tau, blocks.uncoupled_tau)
+
+
+def _rotation_part_of_excess(information: Array, d: int) -> Array:
+    """J_ss, (k, p, p), with (I_tt, I_tr; I_tr^T, J_ss) semidefinite, of matrices with singular I_tt.
+
+    It is just above the Schur complement where exact arithmetic agrees, and I_rr itself elsewhere:
+    then all of the edge is excess, and W' = 0.
+    """
+    J_ss = information[:, d:, d:].copy()
+    filled_axes = with_empty_axes_filled(information[:, :d])
+    is_regular = are_definite(filled_axes[:, :, :d], LEAST_SCALED)
+    for k in np.flatnonzero(is_regular & information[:, :d, d:].any(axis=(1, 2))):
+        I_tr = information[k, :d, d:]
+        schur = I_tr.T @ np.linalg.solve(filled_axes[k, :, :d], I_tr)
+        margin = _MARGIN * np.diag(np.diag(schur))
+        matrix = information[k].copy()
+        matrix[d:, d:] = 0.5 * (schur + schur.T) + margin
+        if is_semidefinite_exactly(matrix):
+            J_ss[k] = matrix[d:, d:]
+    return J_ss
 
 
 def _block_sizes(d: int, trace: Array, trace_R: Array) -> Array:
@@ -250,25 +274,15 @@ def _block_sizes(d: int, trace: Array, trace_R: Array) -> Array:
     return OUTWARD * np.sqrt(d * traces)
 
 
-def _check_excess(graph: PoseGraph, tau: Array, J: Array, margin: Array) -> None:
+def _check_excess(
+    graph: PoseGraph, tau: Array, J: Array, margin: Array, is_singular: BoolArray
+) -> None:
     """Raise a GraphError where tau is not positive, or J less the margin is not definite.
 
-    The margin has shape (m, q).
+    The margin has shape (m, q). Singular matrices, (m,), have neither.
     """
     least = margin[:, :, None] * np.eye(J.shape[1])
-    _check(graph, (tau > 0.0) & are_definite(J - least, 0.0))
-
-
-def _check_positions(graph: PoseGraph, blocks: _Information) -> None:
-    """Raise a GraphError for an edge of a rotation alone, whose I_tt is zero."""
-    is_zero = ~blocks.I_tt.any(axis=(1, 2))
-    if is_zero.any():
-        first = int(np.argmax(is_zero))
-        edge = graph.edge_label(first)
-        raise GraphError(
-            f"chi2 of {edge}, of a rotation alone, is unknown beside others' matrices; "
-            "leave out one kind"
-        )
+    _check(graph, is_singular | ((tau > 0.0) & are_definite(J - least, 0.0)))
 
 
 def convex_cost(information: Array, d: int) -> EdgeCost:

@@ -20,7 +20,8 @@ def note_of(problem: PGOProblem, certificate: Certificate, lacks: str = "") -> s
     """
     absence = note_of_absence(len(problem.graph.absent))
     reason = note_of_weights(problem.graph, certificate) or note_of_tangent(problem, certificate)
-    return joined_notes(absence, note_of_coupling(problem), reason, lacks)
+    free = problem.graph.free
+    return joined_notes(absence, free, note_of_coupling(problem), reason, lacks)
 
 
 def joined_notes(*notes: str) -> str:

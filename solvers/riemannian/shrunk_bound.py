@@ -19,7 +19,10 @@ from pgo_models.certificates.lower_bound import (
     prove_at,
 )
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
-from pgo_models.certificates.shrunk_information import shrink_information
+from pgo_models.certificates.shrunk_information import (
+    shrink_information,
+    without_singular_blocks,
+)
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -46,7 +49,9 @@ def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
     The search for the minima of the smaller costs begins at the poses given.
     """
     best = ShrunkBound(NO_BOUND, poses, np.zeros_like(poses.R))
-    I_tt = filled(proper_information(problem.graph)[:, : problem.d, : problem.d])
+    d = problem.d
+    information = without_singular_blocks(proper_information(problem.graph), d)
+    I_tt = filled(information[:, :d, :d])
     low = 0.0
     high = math.log(1.0 + float(np.linalg.cond(I_tt).max()))
     has_bound, best = _try_cap(problem, math.exp(low), best)

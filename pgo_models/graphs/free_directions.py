@@ -1,0 +1,289 @@
+"""Directions of a map that no edge measures, and the conventions that hold them.
+
+Where the cost is the same along a direction, a convention says which of the equal maps is meant: an
+edge gets information along it. Each convention here is exact. From all poses others of the same
+cost lead to where the added term is zero, so that the least cost, and every bound on it, is that of
+the file. There are four kinds:
+
+- a single prior: the map can be moved so that it fits, whatever it says;
+- an edge between two parts that nothing else joins: one part can be moved so that it fits;
+- an axis of the world along which no prior measures a position: the map can be shifted along it;
+- the turn about an axis of the world that no prior measures: the map can be turned about it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information
+from pgo_models.graphs.precisions import edge_precisions, partial_edges
+
+_AXES = "xyz"
+_MOST_NAMED = 3  # edges that are named one by one
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """The priors of a graph in the axes of the world."""
+
+    priors: IntArray  # numbers of those of poses
+    I_tt: Array  # (k, d, d)
+    I_tr: Array  # (k, d, p)
+    I_rr: Array  # (k, p, p)
+    # (k, d): whether an axis of the world is the same axis of the measured pose, exactly.
+    keeps_axis: BoolArray
+
+    @property
+    def sees_shift(self) -> BoolArray:
+        """Whether a prior measures, or may measure, a shift along an axis, (d,)."""
+        is_measured = self.I_tt.any(axis=2)
+        # In turned axes rounding hides what a partial matrix leaves out.
+        is_hidden = self.I_tt.any(axis=(1, 2))[:, None] & ~self.keeps_axis
+        return np.asarray((is_measured | is_hidden).any(axis=0))
+
+    @property
+    def sees_turn(self) -> BoolArray:
+        """Whether a prior measures, or may measure, a turn about an axis of the world.
+
+        Shape (1,) in the plane and (3,) in space. A position that is measured away from the axis
+        does, and so do two rotations about different axes with different information.
+        """
+        if self.I_rr.shape[1] == 1:
+            is_seen = self.I_tt.any() or self.I_rr.any()
+            return np.array([bool(is_seen)])
+        is_seen = np.zeros(3, dtype=bool)
+        for k in range(3):
+            others = [axis for axis in range(3) if axis != k]
+            positions = self.I_tt[:, others].any()
+            about_k = self.I_rr[:, k].any()
+            first, second = others
+            in_plane = self.I_rr[:, first, first] != self.I_rr[:, second, second]
+            in_plane |= self.I_rr[:, first, second] != 0.0
+            is_turned = self.I_rr.any(axis=(1, 2)) & ~self.keeps_axis[:, k]
+            is_coupled = self.I_tr.any()
+            is_seen[k] = (
+                positions or about_k or is_coupled or in_plane.any() or is_turned.any()
+            )
+        return is_seen
+
+
+def with_free_directions_held(graph: PoseGraph) -> PoseGraph:
+    """Return the graph with conventions for directions that no edge measures.
+
+    Its `free` names the directions and says how they are held. A graph without such directions is
+    returned as it is.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Any connected graph.
+
+    Returns
+    -------
+    PoseGraph
+        The same measurements; the information of one edge a direction is larger.
+
+    Examples
+    --------
+    >>> from pgo_models.graphs.scenes import grid
+    >>> graph = grid(np.random.default_rng(0))
+    >>> with_free_directions_held(graph) is graph
+    True
+    """
+    partial = partial_edges(graph)
+    if graph.world is None and not partial.any():
+        return graph
+    if not graph.has_translations or not graph.is_connected:
+        return graph
+    if partial.any():
+        graph = _with_bridges_held(graph, partial)
+    if graph.world is None:
+        return graph
+    if graph.is_prior.sum() == 1:
+        return _with_single_prior_held(graph)
+    return _with_frame_held(graph, np.flatnonzero(graph.is_prior))
+
+
+def _with_single_prior_held(graph: PoseGraph) -> PoseGraph:
+    """The graph whose only prior is an anchor: it has the weights of a usual edge."""
+    prior = int(np.flatnonzero(graph.is_prior)[0])
+    if graph.j[prior] in graph.landmarks or graph.is_prior.all():
+        return graph
+    kappa, tau = _usual_weights(graph)
+    text = (
+        f"the prior of pose {graph.pose_name(int(graph.j[prior]))} is the only one: it places the "
+        "map, and says nothing of its shape"
+    )
+    information = isotropic_information(np.array([kappa]), np.array([tau]), graph.d)
+    held = _with_information(graph, np.array([prior]), information, text)
+    return _with_rest_of_estimate(held, graph, prior)
+
+
+def _with_rest_of_estimate(held: PoseGraph, graph: PoseGraph, prior: int) -> PoseGraph:
+    """The graph with the estimate of what its only prior does not measure, if it has one."""
+    if graph.initial is None or graph.world is None:
+        return held
+    seen = graph.initial.with_gauge_at(graph.world)
+    pose = int(graph.j[prior])
+    R_ij = graph.R_ij.copy()
+    t_ij = graph.t_ij.copy()
+    if graph.kappa[prior] == 0.0:
+        R_ij[prior] = seen.R[pose]
+    if graph.tau[prior] == 0.0:
+        t_ij[prior] = seen.t[pose]
+    return replace(held, R_ij=R_ij, t_ij=t_ij)
+
+
+def _with_bridges_held(graph: PoseGraph, partial: BoolArray) -> PoseGraph:
+    """The graph with all of a measurement held where it alone joins two parts."""
+    held = partial_bridges(graph, partial)
+    # The world of a single prior is placed as a whole, and positions alone turn no pose.
+    held = held[~graph.is_prior[held] & ~np.isin(graph.j[held], graph.landmarks)]
+    if not len(held):
+        return graph
+    kappa, tau = _usual_weights(graph)
+    information = np.repeat(
+        isotropic_information(np.array([kappa]), np.array([tau]), graph.d), len(held), axis=0
+    )
+    names = ", ".join(graph.edge_label(int(e)) for e in held[:_MOST_NAMED])
+    if len(held) > _MOST_NAMED:
+        names += f" and {len(held) - _MOST_NAMED} more"
+    text = (
+        "what single edges between two parts of the map leave out is free, and held as they have "
+        f"it: {names}"
+    )
+    return _with_information(graph, held, information, text)
+
+
+def partial_bridges(graph: PoseGraph, partial: BoolArray) -> IntArray:
+    """Those of the chosen edges, (m,), that no cycle of the graph goes through, ascending."""
+    n = graph.num_poses
+    links = np.flatnonzero(partial)
+    rest = csr_array(
+        (np.ones(graph.num_edges - len(links)), (graph.i[~partial], graph.j[~partial])),
+        shape=(n, n),
+    )
+    num_parts, part = connected_components(rest, directed=False)
+    ends = np.sort(np.stack([part[graph.i[links]], part[graph.j[links]]]), axis=0)
+    between = ends[0] != ends[1]
+    links = links[between]
+    if not len(links):
+        return links
+    pairs, number, counts = np.unique(
+        ends[:, between], axis=1, return_inverse=True, return_counts=True
+    )
+    tree = csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=(num_parts, num_parts))
+    order, parent = breadth_first_order(tree, 0, directed=False)
+    # Every pair that is not in the tree gets a random label, which both ends have. The labels below
+    # an edge of the tree cancel if no other pair leads out.
+    is_branch = (parent[pairs[0]] == pairs[1]) | (parent[pairs[1]] == pairs[0])
+    labels = np.random.default_rng(0).integers(1, 2**62, size=pairs.shape[1])
+    below = np.zeros(num_parts, dtype=np.int64)
+    for end in pairs:
+        np.bitwise_xor.at(below, end[~is_branch], labels[~is_branch])
+    for node in order[:0:-1].tolist():
+        below[parent[node]] ^= below[node]
+    child = np.where(parent[pairs[1]] == pairs[0], pairs[1], pairs[0])
+    is_bridge = is_branch & (counts == 1) & (below[child] == 0)
+    return links[is_bridge[number.ravel()]]
+
+
+def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:
+    """The graph with information along the axes of the world that its priors leave out."""
+    frame = _frame_of(graph, priors)
+    free_shifts = np.flatnonzero(~frame.sees_shift)
+    free_turns = np.flatnonzero(~frame.sees_turn)
+    if not len(free_shifts) and not len(free_turns):
+        return graph
+    d = graph.d
+    # The prior that is completed is one that keeps all axes that are free.
+    axes = free_shifts
+    if d == 3:
+        axes = np.union1d(free_shifts, free_turns)
+    is_of_pose = ~np.isin(graph.j[priors], graph.landmarks)
+    keeps_all = is_of_pose & frame.keeps_axis[:, axes].all(axis=1)
+    shifts_alone = len(free_shifts) == d and not len(free_turns)
+    candidates = is_of_pose if shifts_alone else keeps_all
+    if not candidates.any():
+        return graph
+    with_position = candidates & frame.I_tt.any(axis=(1, 2))
+    place = int(np.argmax(with_position if with_position.any() else candidates))
+    kappa, tau = _usual_weights(graph)
+    usual = isotropic_information(np.array([kappa]), np.array([tau]), d)
+    added = np.zeros_like(usual)
+    added[0, free_shifts, free_shifts] = usual[0, free_shifts, free_shifts]
+    added[0, d + free_turns, d + free_turns] = usual[0, d + free_turns, d + free_turns]
+    edge = priors[[place]]
+    if graph.information is None:
+        before = isotropic_information(graph.kappa[edge], graph.tau[edge], d)
+    else:
+        before = graph.information[edge]
+    pose = graph.pose_name(int(graph.j[edge[0]]))
+    text = _text_of_frame(d, free_shifts, free_turns, pose)
+    return _with_information(graph, edge, before + added, text)
+
+
+def _frame_of(graph: PoseGraph, priors: IntArray) -> _Frame:
+    """The priors with their matrices, and the axes that they have in common with the world."""
+    d = graph.d
+    information = graph.information
+    if information is None:
+        information = isotropic_information(graph.kappa, graph.tau, d)
+    matrices = information[priors]
+    R = graph.R_ij[priors]
+    identity = np.eye(d)
+    keeps_axis = (R == identity).all(axis=2) & (R == identity).all(axis=1)
+    return _Frame(
+        priors, matrices[:, :d, :d], matrices[:, :d, d:], matrices[:, d:, d:], keeps_axis
+    )
+
+
+def _text_of_frame(d: int, shifts: IntArray, turns: IntArray, pose: str) -> str:
+    """Sentence on the free directions of the frame of the priors."""
+    names = []
+    if len(shifts) == d:
+        names.append("the position of the map")
+    elif d == 3 and shifts.tolist() == [2]:
+        names.append("the height of the map")
+    elif len(shifts):
+        along = " and ".join(_AXES[k] for k in shifts)
+        names.append(f"the position of the map along {along}")
+    if len(turns):
+        about = "" if d == 2 else " about " + " and ".join(_AXES[k] for k in turns)
+        names.append(f"the turn of the map{about}")
+    verb = "is" if len(names) == 1 else "are"
+    subject = " and ".join(names)
+    return (
+        f"{subject} {verb} free: no edge or prior measures it; "
+        f"pose {pose} is held where its prior has it"
+    )
+
+
+def _usual_weights(graph: PoseGraph) -> tuple[float, float]:
+    """Medians of the positive kappa and tau of edges between poses."""
+    between = ~graph.is_prior
+    kappa = graph.kappa[between & (graph.kappa > 0.0)]
+    tau = graph.tau[between & (graph.tau > 0.0)]
+    kappa_median = float(np.median(kappa)) if len(kappa) else 1.0
+    tau_median = float(np.median(tau)) if len(tau) else 1.0
+    return kappa_median, tau_median
+
+
+def _with_information(
+    graph: PoseGraph, edges: IntArray, information: Array, text: str
+) -> PoseGraph:
+    """The graph with other information matrices, (k, q, q), of some edges, and what is free."""
+    kappa_of_edges, tau_of_edges = edge_precisions(information)
+    kappa = graph.kappa.copy()
+    tau = graph.tau.copy()
+    kappa[edges] = kappa_of_edges
+    tau[edges] = tau_of_edges
+    matrices = graph.information
+    if matrices is not None:
+        matrices = matrices.copy()
+        matrices[edges] = information
+    free = f"{graph.free}; {text}" if graph.free else text
+    return replace(graph, kappa=kappa, tau=tau, information=matrices, free=free)
