@@ -42,6 +42,7 @@ from solvers.place import (
 )
 from solvers.result import History, Outcome, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton
+from solvers.riemannian.other_starts import KINDS_OF_STARTS, best_of_starts
 from solvers.riemannian.polish import polish
 from solvers.riemannian.prefixes import GrowingStart, entry_tree
 from solvers.riemannian.shrunk_bound import with_shrunk_information
@@ -189,6 +190,39 @@ class Here(Place):
             return None
         isotropic = PGOProblem(problem.graph, problem.backend, Weighting.ISOTROPIC)
         return polish(isotropic, chordal_start(isotropic))
+
+    def try_other_starts(self, best: Attempt, newton: Newton) -> Attempt:
+        """Return the better of the answer and an attempt from the best of some other starts."""
+        name = Step.STARTS.value
+        for kind in KINDS_OF_STARTS:
+            began = time.perf_counter()
+            starts = kind(self.problem, best.known_poses)
+            with self.monitor.showing(name, self.problem.side):
+                found = best_of_starts(
+                    self.problem,
+                    starts,
+                    best.known_poses,
+                    best.proof.objective,
+                    self.monitor.seconds_left,
+                )
+            if not found.num_tried:
+                continue
+            seconds = time.perf_counter() - began
+            stage = Stage(
+                f"{name}{self.where}: {found.name}",
+                Status.CONVERGED,
+                found.num_tried,
+                found.objective,
+                seconds,
+                History(),
+            )
+            self.table.add(stage)
+            if found.poses is not best.known_poses:
+                attempt = self.run_newton(Attempt(found.poses), newton)
+                best = self.better(best, self.certify(attempt))
+            if not best.is_open:
+                break
+        return best
 
     def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Run the Riemannian staircase from the best poses, and round its solution.

@@ -62,6 +62,7 @@ class Step(enum.Enum):
     GROWING = "growing start"
     LAST_STEPS = "last steps of Newton"
     SECOND = "second attempt"
+    STARTS = "other starts"
     STAIRCASE = "staircase"
     SMALLER_MATRICES = "smaller matrices"
     COMPLEX = "complex numbers"
@@ -282,6 +283,10 @@ class Place(ABC):
     def start_again(self) -> Poses | None:
         """Return where a second attempt starts without SOC; None where it runs SOC once more."""
         raise self._refusal(Step.SECOND.value)
+
+    def try_other_starts(self, best: Attempt, newton: Newton) -> Attempt:
+        """Return the better of the answer and an attempt from the best of some other starts."""
+        raise self._refusal(Step.STARTS.value)
 
     def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Solve the semidefinite relaxation from the best poses, and round its solution."""

@@ -14,7 +14,8 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
    On graphs with landmarks Newton of the first attempt has few steps, as this attempt may follow.
    If this attempt does not close the gap, the first one takes the rest of its steps.
 6. A second attempt: by a finer SOC, or by Newton from the optimum of F where the cost is a chi2
-   that SOC cannot run on.
+   that SOC cannot run on. Then Newton from other starts: the estimate of the file, a spanning tree
+   and, on small graphs, random poses. The table of stages says which of them is the best.
 7. A relaxation of the cost: poses that its solution rounds to, and its bound. In the plane it has
    rotations as complex numbers, and is never worse than the semidefinite one, which the staircase
    solves. For chi2, bounds by smaller information matrices, whose cost is below chi2.
@@ -80,6 +81,7 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
         go_on = partial(with_last_steps, first)
         best = unless_it_fails(Step.LAST_STEPS, go_on, place, settings, best)
     best = improved(Step.SECOND, from_second_start, place, settings, best)  # step 6
+    best = improved(Step.STARTS, from_other_starts, place, settings, best)
     best = by_relaxation(place, settings, best)  # step 7
     return by_handedness(place, settings, best)  # step 8
 
@@ -222,6 +224,12 @@ def from_second_start(place: Place, settings: Pipeline, best: Attempt) -> Attemp
     start = place.start_again()
     soc = finer(settings.soc) if start is None else None
     return place.better(best, attempt(place, soc, settings.newton, start))
+
+
+def from_other_starts(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """The better of the answer and an attempt from the best of some other starts."""
+    place.table.begin_attempt()
+    return place.try_other_starts(best, settings.newton)
 
 
 def finer(soc: FirstStage) -> SOC | PaperSOC:

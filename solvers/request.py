@@ -148,6 +148,7 @@ class Pipeline:
         return {
             Step.GROWING: self.growing is not None,
             Step.SECOND: self.second_try,
+            Step.STARTS: self.second_try,
             Step.STAIRCASE: has_relaxation,
             Step.SMALLER_MATRICES: has_relaxation,
             Step.COMPLEX: has_relaxation and search is not None,

@@ -5,6 +5,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scipy.sparse import csc_array
+
 from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.proof_file import save_proof
@@ -17,7 +19,7 @@ from pgo_models.plots.graph_plots import compare_poses
 from pgo_models.plots.style import is_picture, save_figure
 from pgo_models.problem.hessian import riemannian_hessian, unknowns_of
 from pgo_models.problem.initialization import spanning_tree_start
-from pgo_models.problem.marginals import Marginals
+from pgo_models.problem.marginals import Marginals, with_infinite_variances
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.carry.ledger import Ledger
@@ -158,8 +160,8 @@ class Solution:
         """Return the joint covariance of some poses, or of every pose on its own.
 
         These are blocks of (Hess F / 2)^-1 relative to an anchor; in a problem of rotations alone
-        they are of the rotations. `Marginals`, which answers many such questions with one
-        factorisation, has units, axes and errors.
+        they are of the rotations. What no edge measures has an infinite variance. `Marginals`,
+        which answers many such questions with one factorisation, has units, axes and errors.
 
         Parameters
         ----------
@@ -174,13 +176,19 @@ class Solution:
             Shape (k p, k p) for k poses, or (n, p, p) for every pose, with p = d(d+1)/2, and
             p = d(d-1)/2 for rotations.
         """
-        problem = self.problem
+        problem = self.problem.measured
         at = problem.graph.near_zero(self.poses)
         hessian = riemannian_hessian(problem.at(at), multipliers(problem, at))
         hessian, layout = unknowns_of(problem, hessian)
         anchor = self.anchor if anchor is None else anchor
-        marginals = Marginals(hessian, layout, anchor, problem.backend)
-        return marginals.joint(*poses) if poses else marginals.diagonal
+
+        def covariances(hessian: csc_array) -> Array:
+            marginals = Marginals(hessian, layout, anchor, problem.backend)
+            return marginals.joint(*poses) if poses else marginals.diagonal
+
+        if problem.has_free_directions:
+            return with_infinite_variances(hessian, covariances)
+        return covariances(hessian)
 
     def save(self, path: Path | str) -> None:
         """Write the solution in the format that the suffix of the path names.

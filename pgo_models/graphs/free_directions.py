@@ -8,7 +8,8 @@ the file. There are four kinds:
 - a single prior: the map can be moved so that it fits, whatever it says;
 - an edge between two parts that nothing else joins: one part can be moved so that it fits;
 - an axis of the world along which no prior measures a position: the map can be shifted along it;
-- the turn about an axis of the world that no prior measures: the map can be turned about it.
+- the turn about an axis of the world, or about the line of all fixes, that no prior measures: the
+  map can be turned about it.
 """
 
 from dataclasses import dataclass, replace
@@ -64,9 +65,7 @@ class _Frame:
             in_plane |= self.I_rr[:, first, second] != 0.0
             is_turned = self.I_rr.any(axis=(1, 2)) & ~self.keeps_axis[:, k]
             is_coupled = self.I_tr.any()
-            is_seen[k] = (
-                positions or about_k or is_coupled or in_plane.any() or is_turned.any()
-            )
+            is_seen[k] = positions or about_k or is_coupled or in_plane.any() or is_turned.any()
         return is_seen
 
 
@@ -104,7 +103,36 @@ def with_free_directions_held(graph: PoseGraph) -> PoseGraph:
         return graph
     if graph.is_prior.sum() == 1:
         return _with_single_prior_held(graph)
+    if graph.is_world_loose and not graph.is_prior.all():
+        axis = graph.line_of_fixes()
+        if axis is not None:
+            return _with_turn_held(graph, axis)
     return _with_frame_held(graph, np.flatnonzero(graph.is_prior))
+
+
+def _with_turn_held(graph: PoseGraph, axis: Array) -> PoseGraph:
+    """The graph of which positions are known on a line along an axis, or in a point (zeros).
+
+    The turns that leave the positions where they are are free. One pose is held.
+    """
+    candidates = np.flatnonzero(graph.is_prior & ~np.isin(graph.j, graph.landmarks))
+    if not len(candidates):
+        return graph
+    edge = candidates[:1]
+    kappa, _ = _usual_weights(graph)
+    d = graph.d
+    before = isotropic_information(graph.kappa[edge], graph.tau[edge], d)
+    usual = isotropic_information(np.array([kappa]), np.zeros(1), d)
+    pose = graph.pose_name(int(graph.j[edge[0]]))
+    which = "the turn of the map about the point of its fixes"
+    if axis.any():
+        which = "the turn of the map about the line through its fixes"
+        usual[0, d:, d:] = 2.0 * kappa * np.outer(axis, axis)
+    text = (
+        f"{which} is free: no edge or prior measures it; pose {pose} is held unturned about it, "
+        "and variances along it are infinite"
+    )
+    return _with_information(graph, edge, before + usual, text, is_of_F=False)
 
 
 def _with_single_prior_held(graph: PoseGraph) -> PoseGraph:
@@ -223,7 +251,13 @@ def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:
         before = graph.information[edge]
     pose = graph.pose_name(int(graph.j[edge[0]]))
     text = _text_of_frame(d, free_shifts, free_turns, pose)
-    return _with_information(graph, edge, before + added, text)
+    held = _with_information(graph, edge, before + added, text, is_of_F=False)
+    if len(free_shifts) < d:
+        return held
+    # Where no prior has a position F has the tau of one, which is exact for it, too.
+    tau_of_priors = graph.tau.copy()
+    tau_of_priors[edge] = tau
+    return replace(held, tau=tau_of_priors)
 
 
 def _frame_of(graph: PoseGraph, priors: IntArray) -> _Frame:
@@ -235,10 +269,8 @@ def _frame_of(graph: PoseGraph, priors: IntArray) -> _Frame:
     matrices = information[priors]
     R = graph.R_ij[priors]
     identity = np.eye(d)
-    keeps_axis = (R == identity).all(axis=2) & (R == identity).all(axis=1)
-    return _Frame(
-        priors, matrices[:, :d, :d], matrices[:, :d, d:], matrices[:, d:, d:], keeps_axis
-    )
+    keeps_axis = (identity == R).all(axis=2) & (identity == R).all(axis=1)
+    return _Frame(priors, matrices[:, :d, :d], matrices[:, :d, d:], matrices[:, d:, d:], keeps_axis)
 
 
 def _text_of_frame(d: int, shifts: IntArray, turns: IntArray, pose: str) -> str:
@@ -258,7 +290,7 @@ def _text_of_frame(d: int, shifts: IntArray, turns: IntArray, pose: str) -> str:
     subject = " and ".join(names)
     return (
         f"{subject} {verb} free: no edge or prior measures it; "
-        f"pose {pose} is held where its prior has it"
+        f"pose {pose} is held where its prior has it, and variances along it are infinite"
     )
 
 
@@ -273,17 +305,24 @@ def _usual_weights(graph: PoseGraph) -> tuple[float, float]:
 
 
 def _with_information(
-    graph: PoseGraph, edges: IntArray, information: Array, text: str
+    graph: PoseGraph, edges: IntArray, information: Array, text: str, is_of_F: bool = True
 ) -> PoseGraph:
-    """The graph with other information matrices, (k, q, q), of some edges, and what is free."""
-    kappa_of_edges, tau_of_edges = edge_precisions(information)
+    """The graph with other information matrices, (k, q, q), of some edges, and what is free.
+
+    F has one weight for all directions: it has new ones only where this is exact for it, too.
+    """
     kappa = graph.kappa.copy()
     tau = graph.tau.copy()
-    kappa[edges] = kappa_of_edges
-    tau[edges] = tau_of_edges
+    if is_of_F:
+        kappa[edges], tau[edges] = edge_precisions(information)
     matrices = graph.information
     if matrices is not None:
         matrices = matrices.copy()
         matrices[edges] = information
     free = f"{graph.free}; {text}" if graph.free else text
-    return replace(graph, kappa=kappa, tau=tau, information=matrices, free=free)
+    unheld = graph.unheld
+    if unheld is None:
+        unheld = graph.information
+    if unheld is None:
+        unheld = isotropic_information(graph.kappa, graph.tau, graph.d)
+    return replace(graph, kappa=kappa, tau=tau, information=matrices, free=free, unheld=unheld)

@@ -37,8 +37,18 @@ _NAMED_COMPONENTS = 5  # components that an error names
 
 _WHOLE_NUMBERS = ("num_poses", "world")
 _WHOLE_ARRAYS = ("i", "j", "ids", "robot", "fixed", "landmarks", "absent")
-_REAL_ARRAYS = ("R_ij", "t_ij", "kappa", "tau", "information", "times", "written_error", "origin")
-_OPTIONAL = ("world", "ids", "robot", "information", "times", "written_error", "origin")
+_REAL_ARRAYS = (
+    "R_ij",
+    "t_ij",
+    "kappa",
+    "tau",
+    "information",
+    "unheld",
+    "times",
+    "written_error",
+    "origin",
+)
+_OPTIONAL = ("world", "ids", "robot", "information", "unheld", "times", "written_error", "origin")
 _EDGE_FIELDS = (
     "i",
     "j",
@@ -47,6 +57,7 @@ _EDGE_FIELDS = (
     "kappa",
     "tau",
     "information",
+    "unheld",
     "uncoupled",
     "written_error",
 )
@@ -136,6 +147,8 @@ class PoseGraph(ReadOnly):
     free : str
         Which directions of the map no edge measures, and how they are held: a sentence, "" for none
         (`pgo_models.graphs.free_directions`).
+    unheld : Array, (m, k, k), optional
+        Information matrices before that: what the edges measure.
 
     Raises
     ------
@@ -178,6 +191,7 @@ class PoseGraph(ReadOnly):
     weights_error: float = 0.0
     origin: Array | None = None
     free: str = ""
+    unheld: Array | None = None
 
     _way_out = "pgo_models.load(..) reads a graph, and `.graph` of a problem is one"
 
@@ -554,6 +568,7 @@ class PoseGraph(ReadOnly):
             "kappa": (m,),
             "tau": (m,),
             "information": (m, k, k),
+            "unheld": (m, k, k),
             "uncoupled": (m,),
             "written_error": (m, 2),
             "ids": (n,),
@@ -701,8 +716,8 @@ class PoseGraph(ReadOnly):
         GraphError
             When the graph has several components, which the message names; when no edge with a
             positive precision ties the positions or rotations of some poses to those of the
-            others; when there are priors of positions alone, and no edges between poses, or of
-            rotations alone; or when priors of positions do not fix the rotation of the world.
+            others; or when there are priors of positions alone, and no edges between poses, or of
+            rotations alone.
         """
         if not self.has_translations:
             self.check_rotations_connected()
@@ -712,8 +727,6 @@ class PoseGraph(ReadOnly):
             self._check_kinds_of_priors()
         self._check_tied("tau", "position")
         self._check_tied("kappa", "rotation")
-        if self.is_world_loose:
-            self._check_priors_fix_world()
 
     def check_rotations_connected(self) -> None:
         """Check that the measured rotations determine those of all poses up to one gauge.
@@ -824,16 +837,31 @@ class PoseGraph(ReadOnly):
         _, first = np.unique(self.j[priors], return_index=True)
         return self.t_ij[priors][first]
 
-    def _check_priors_fix_world(self) -> None:
-        """Raise a GraphError when priors of positions lie in a point or, in space, on a line."""
-        if not self.is_world_fixed(self.is_prior):
-            measured = self._first_positions(self.is_prior)
-            needed = "two poses apart" if self.d == 2 else "three poses that are not on a line"
-            raise GraphError(
-                f"the priors do not fix the gauge: positions of {len(measured)} poses, in a point "
-                "or on a line, leave turns of the world open; give positions of "
-                f"{needed}, a prior with a rotation, or no priors"
-            )
+    def line_of_fixes(self) -> Array | None:
+        """Axis of the turns of the world that priors of positions leave free, exactly.
+
+        Returns
+        -------
+        Array or None
+            A unit vector, (d,), along the line that all measured positions lie on; zeros where they
+            are one point; None where the positions, or what is known of them in some direction, fix
+            the turn of the world, if by a little only.
+        """
+        priors = self.is_prior
+        if self.information is not None:
+            d = self.d
+            I_tt = self.information[priors][:, :d, :d]
+            if (I_tt != I_tt[:, :1, :1] * np.eye(d)).any():
+                return None
+        offsets = self.t_ij[priors] - self.t_ij[priors][0]
+        longest = offsets[np.argmax(np.abs(offsets).max(axis=1))]
+        if not longest.any():
+            return np.zeros(self.d)
+        products = offsets[:, :, None] * longest[None, None, :]
+        is_parallel = (products == np.swapaxes(products, 1, 2)).all()
+        if self.d == 2 or not is_parallel:
+            return None
+        return np.asarray(longest / np.linalg.norm(longest))
 
     # Other graphs made of this one
 
@@ -950,7 +978,9 @@ class PoseGraph(ReadOnly):
         PoseGraph
             The same measurements; information matrices as read are left out.
         """
-        return replace(self, kappa=kappa, tau=tau, information=None, weights_error=0.0)
+        return replace(
+            self, kappa=kappa, tau=tau, information=None, unheld=None, weights_error=0.0
+        )
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
         """Return the graph with other owners of the poses.
@@ -1033,6 +1063,7 @@ class PoseGraph(ReadOnly):
         offsets = measured.t - np.where((i == self.world)[:, None], self.world_point, 0.0)
         kappa_rows = _rows_of_weights(kappa, len(i), "kappa")
         tau_rows = _rows_of_weights(tau, len(i), "tau")
+        information = isotropic_information(kappa_rows, tau_rows, self.d)
         new_rows = {
             "i": i,
             "j": j,
@@ -1040,7 +1071,8 @@ class PoseGraph(ReadOnly):
             "t_ij": offsets,
             "kappa": kappa_rows,
             "tau": tau_rows,
-            "information": isotropic_information(kappa_rows, tau_rows, self.d),
+            "information": information,
+            "unheld": information,
             "uncoupled": np.zeros(len(kappa_rows), dtype=bool),
             "written_error": np.zeros((len(kappa_rows), 2)),
         }

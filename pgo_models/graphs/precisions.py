@@ -22,6 +22,8 @@ _SURELY_NEGATIVE = -1e-10
 LEAST_DEFINITE = 1e-13
 # Negative eigenvalues down to here are what six digits make of a zero.
 ROUNDED_EIGENVALUE = 1e-5
+# Negative eigenvalues up to here are hidden by the rounding of doubles, see `_ROUNDED_ENTRIES`.
+_NO_ROUNDING = 2.0**-46
 # Information of directions without any, in F, as a share of the largest of the block.
 UNMEASURED_SHARE = 1e-6
 _REMEMBERED = 2**16  # matrices of which exact arithmetic has said whether they are semidefinite
@@ -111,30 +113,37 @@ def partial_edges(graph: PoseGraph) -> BoolArray:
 
 
 def without_negative_rounding(information: Array, d: int) -> tuple[Array, BoolArray]:
-    """Matrices, (m, k, k), whose blocks are semidefinite, and which of them had to be changed.
+    """Semidefinite matrices, (m, k, k), for those that are but for the digits of their file.
 
-    A file with few digits can have a semidefinite block with a negative eigenvalue: that is taken
-    for zero. Blocks with a larger one (`lowest_scaled`) are left alone.
+    Also returned is which of them had to be changed. A matrix that measures no more than a few
+    directions has eigenvalues that are zero, and written with a few digits some become negative:
+    these are taken for zero. Matrices with a larger negative eigenvalue (`lowest_scaled`) are left
+    alone.
     """
     is_changed = np.zeros(len(information), dtype=bool)
     settled = information
-    for block in (slice(0, d), slice(d, None)):
-        blocks = information[:, block, block]
+    for block in (slice(0, d), slice(d, None), slice(0, None)):
+        blocks = settled[:, block, block]
         doubtful = np.flatnonzero(are_singular(blocks))
-        lowest = lowest_scaled(blocks[doubtful])
-        is_rounded = (lowest < _SURELY_NEGATIVE) & (lowest >= -ROUNDED_EIGENVALUE)
-        rounded = doubtful[is_rounded]
-        if not len(rounded):
+        if not len(doubtful):
             continue
-        if settled is information:
-            settled = information.copy()
-        scaled, scale = scaled_blocks(blocks[rounded])
-        values, vectors = np.linalg.eigh(scaled)
-        raised = (vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-        raised = 0.5 * (raised + np.swapaxes(raised, 1, 2))
-        settled[rounded, block, block] = raised / (scale[:, :, None] * scale[:, None, :])
-        is_changed[rounded] = True
+        lowest = lowest_scaled(blocks[doubtful])
+        is_rounded = (lowest < -_NO_ROUNDING) & (lowest >= -ROUNDED_EIGENVALUE)
+        rounded = doubtful[is_rounded]
+        if len(rounded):
+            settled = settled.copy()
+            settled[rounded, block, block] = _clipped_at_zero(blocks[rounded])
+            is_changed[rounded] = True
     return settled, is_changed
+
+
+def _clipped_at_zero(blocks: Array) -> Array:
+    """Blocks, (m, k, k), with zero for their negative eigenvalues after `scaled_blocks`."""
+    scaled, scale = scaled_blocks(blocks)
+    values, vectors = np.linalg.eigh(scaled)
+    raised = (vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    raised = 0.5 * (raised + np.swapaxes(raised, 1, 2))
+    return np.asarray(raised / (scale[:, :, None] * scale[:, None, :]))
 
 
 def lowest_scaled(blocks: Array) -> Array:

@@ -15,6 +15,7 @@ from pgo_models.geometry.rotations import (
     vee,
 )
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts
+from pgo_models.graphs.precisions import partial_edges
 from pgo_models.problem.cholesky import analyze, factorize_damped
 from pgo_models.problem.costs import EdgeCost
 from pgo_models.problem.matrices import assemble, rotation_columns
@@ -107,10 +108,17 @@ def spanning_tree(graph: PoseGraph, root: int) -> tuple[IntArray, IntArray, IntA
     """Breadth-first tree: poses in its order, the parent of every pose, and the edges to order[1:].
 
     The tree has edges with a rotation weight only, so that a world pose of which positions alone
-    are known is not in it.
+    are known is not in it. Edges that do not measure all of a pose are in it only where the others
+    do not lead to every pose.
     """
     n = graph.num_poses
     usable = np.flatnonzero(graph.kappa > 0)
+    complete = usable[(graph.tau[usable] > 0) & ~partial_edges(graph)[usable]]
+    if len(complete) < len(usable):
+        reached = breadth_first_order(
+            edge_counts(graph.i[complete], graph.j[complete], n), root, directed=False
+        )[0]
+        usable = complete if len(reached) == n else usable
     i = graph.i[usable]
     j = graph.j[usable]
     order, parent = breadth_first_order(edge_counts(i, j, n), root, directed=False)

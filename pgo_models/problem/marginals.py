@@ -8,14 +8,14 @@ F / 2)^-1. Here tau is the information of a coordinate and 2 kappa that of an an
 I_theta with `RotationWeight.GAUSSIAN`, and 2 I_theta with the kappa of SE-Sync in the plane.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, diags_array
 
 from pgo_models.errors import NotPositiveDefiniteError, SettingError
 from pgo_models.files import replace_when_done
@@ -27,6 +27,9 @@ from pgo_models.problem.hessian import TangentLayout
 from pgo_models.problem.matrices import block_entries, entry_positions
 from pgo_models.problem.selected_inversion import selected_inverse
 
+# Shares of its diagonal by which a singular Hessian is raised, the second this many times as large.
+_RAISED = 1e-11
+_MORE = 100.0
 # Names of the p numbers of a move, by p.
 _NAMES_OF_POSES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _NAMES_OF_ROTATIONS = {1: ("theta",), 3: ("rx", "ry", "rz")}
@@ -186,6 +189,28 @@ class Marginals(ReadOnly):
             whole_number(pose, "a pose", SettingError)
             if not 0 <= pose <= last:
                 raise SettingError(f"there is no pose {pose}; give one of 0 to {last}")
+
+
+def with_infinite_variances(hessian: csc_array, covariances: Callable[[csc_array], Array]) -> Array:
+    """Covariances with inf for the variances of what no edge measures, and zeros beside them.
+
+    A Hessian that is singular is raised by two small shares of its diagonal. A variance that falls
+    as the share grows has no bound without it.
+    """
+    diagonal = np.abs(hessian.diagonal())
+    least = _RAISED * float(np.median(diagonal[diagonal > 0.0]))
+
+    def raised(factor: float) -> Array:
+        shift = factor * np.maximum(_RAISED * diagonal, least)
+        return covariances(csc_array(hessian + diags_array(shift)))
+
+    covariance = raised(1.0).copy()
+    variances = np.einsum("...kk->...k", covariance)
+    variances_less = np.einsum("...kk->...k", raised(_MORE))
+    is_free = variances > 0.1 * _MORE * variances_less
+    covariance[is_free[..., :, None] | is_free[..., None, :]] = 0.0
+    variances[is_free] = np.inf
+    return covariance
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, stack_transposes, vee
 from pgo_models.graphs.free_directions import with_free_directions_held
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import proper_information
+from pgo_models.graphs.precisions import edge_precisions, partial_edges, proper_information
 from pgo_models.problem import matrices
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
@@ -90,12 +90,13 @@ class PGOProblem(ReadOnly):
 
     def __post_init__(self) -> None:
         check_settings(self)
+        if self.weighting in (Weighting.OWN, Weighting.ISOTROPIC, Weighting.INFORMATION):
+            object.__setattr__(self, "graph", with_free_directions_held(self.graph))
         if self.weighting is Weighting.OWN:
             object.__setattr__(self, "weighting", own_weighting(self.graph))
         if self.weighting is Weighting.ROTATIONS:
             self.graph.check_rotations_connected()
         else:
-            object.__setattr__(self, "graph", with_free_directions_held(self.graph))
             self.graph.check_connected()
         if self.weighting is Weighting.ISOTROPIC and not self.graph.has_translations:
             object.__setattr__(self, "weighting", Weighting.ROTATIONS)
@@ -138,6 +139,27 @@ class PGOProblem(ReadOnly):
     def information(self) -> Array:
         """Information matrices of chi2, (m, k, k)."""
         return proper_information(self.graph)
+
+    @property
+    def has_free_directions(self) -> bool:
+        """Whether nothing may measure some direction of the map."""
+        return bool(self.graph.free) or bool(partial_edges(self.graph).any())
+
+    @property
+    def measured(self) -> "PGOProblem":
+        """The problem without conventions for what no edge measures (`PoseGraph.free`)."""
+        unheld = self.graph.unheld
+        if unheld is None:
+            return self
+        if self.weighting is Weighting.INFORMATION:
+            cost = information_cost(self.graph, unheld)
+        else:
+            kappa, tau = edge_precisions(unheld)
+            is_held = (unheld != self.information).any(axis=(1, 2))
+            kappa = np.where(is_held, kappa, self.graph.kappa)
+            tau = np.where(is_held, tau, self.graph.tau)
+            cost = matrices.isotropic_weights(replace(self.graph, kappa=kappa, tau=tau))
+        return _SharingProblem(self.graph, self.backend, cost, original=self)
 
     @cached_property
     def right_costs(self) -> RightCosts:
@@ -263,6 +285,7 @@ class PGOProblem(ReadOnly):
             kappa=np.concatenate([graph.kappa, ones]),
             tau=np.concatenate([graph.tau, ones]),
             information=None,
+            unheld=None,
             initial=None,
             truth=None,
             written_error=None,

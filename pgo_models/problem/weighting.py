@@ -133,7 +133,7 @@ class _Information:
     @property
     def is_singular(self) -> BoolArray:
         """Whether I_tt does not measure every direction, (m,): then tau is zero."""
-        return np.asarray(self.smallest <= _ROUNDED * self.trace)
+        return np.asarray(self.smallest <= 2.0 * self.margin)
 
     @property
     def margin(self) -> Array:
@@ -246,7 +246,7 @@ def _coupled_tau(information: Array, blocks: _Information) -> Array:
 
 
 def _rotation_part_of_excess(information: Array, d: int) -> Array:
-    """J_ss, (k, p, p), with (I_tt, I_tr; I_tr^T, J_ss) semidefinite, of matrices with singular I_tt.
+    """J_ss, (k, p, p), of matrices with a singular I_tt: (I_tt, I_tr; ., J_ss) is semidefinite.
 
     It is just above the Schur complement where exact arithmetic agrees, and I_rr itself elsewhere:
     then all of the edge is excess, and W' = 0.

@@ -373,6 +373,10 @@ class PlaceOfRobots(Place):
         self.driver.set_poses(grown.known_poses)
         return Attempt(status=grown.status)
 
+    def try_other_starts(self, best: Attempt, newton: Newton) -> Attempt:
+        """Try other starts, in one place."""
+        return self.known_here.try_other_starts(best, newton)
+
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Try smaller information matrices, in one place."""
         return self.known_here.bound_by_smaller_matrices(best)
