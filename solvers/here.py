@@ -193,8 +193,7 @@ class Here(Place):
 
     def try_other_starts(self, best: Attempt, newton: Newton) -> Attempt:
         """Return the better of the answer and an attempt from the best of some other starts."""
-        name = Step.STARTS.value
-        for kind in KINDS_OF_STARTS:
+        for name, kind in KINDS_OF_STARTS:
             began = time.perf_counter()
             starts = kind(self.problem, best.known_poses)
             with self.monitor.showing(name, self.problem.side):
@@ -207,17 +206,20 @@ class Here(Place):
                 )
             if not found.num_tried:
                 continue
-            seconds = time.perf_counter() - began
+            is_better = found.poses is not best.known_poses
+            if is_better:
+                self.table.begin_attempt()
             stage = Stage(
                 f"{name}{self.where}: {found.name}",
                 Status.CONVERGED,
                 found.num_tried,
                 found.objective,
-                seconds,
+                time.perf_counter() - began,
                 History(),
+                finds_poses=is_better,
             )
             self.table.add(stage)
-            if found.poses is not best.known_poses:
+            if is_better:
                 attempt = self.run_newton(Attempt(found.poses), newton)
                 best = self.better(best, self.certify(attempt))
             if not best.is_open:

@@ -228,7 +228,6 @@ def from_second_start(place: Place, settings: Pipeline, best: Attempt) -> Attemp
 
 def from_other_starts(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """The better of the answer and an attempt from the best of some other starts."""
-    place.table.begin_attempt()
     return place.try_other_starts(best, settings.newton)
 
 

@@ -978,9 +978,7 @@ class PoseGraph(ReadOnly):
         PoseGraph
             The same measurements; information matrices as read are left out.
         """
-        return replace(
-            self, kappa=kappa, tau=tau, information=None, unheld=None, weights_error=0.0
-        )
+        return replace(self, kappa=kappa, tau=tau, information=None, unheld=None, weights_error=0.0)
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
         """Return the graph with other owners of the poses.

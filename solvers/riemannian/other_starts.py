@@ -51,11 +51,11 @@ def random_starts(problem: PGOProblem, best: Poses) -> Iterator[tuple[str, Poses
             R = _turned_from_some_pose_on(best.R, rng)
         else:
             R = _random_rotations(problem.num_poses, problem.d, rng)
-        yield f"random {k + 1}", problem.convex_part.with_best_translations(R)
+        yield str(k + 1), problem.convex_part.with_best_translations(R)
 
 
-# In the order in which they are tried, while the answer is open.
-KINDS_OF_STARTS = (starts_of_graph, random_starts)
+# In the order in which they are tried, while the answer is open, with their names.
+KINDS_OF_STARTS = (("other starts", starts_of_graph), ("random starts", random_starts))
 
 
 def best_of_starts(

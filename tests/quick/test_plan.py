@@ -141,6 +141,8 @@ def test_attempts_are_numbered_and_a_step_that_does_not_suit_the_graph_has_a_lin
         (0, "growing start"),
         (2, "chordal start"),
         (2, "Newton"),
+        (0, "other starts: none is better"),
+        (0, "random starts: none is better"),
     ]
     skipped = solution.stages[2]
     assert skipped.status is Status.SKIPPED
@@ -157,7 +159,8 @@ def test_a_first_attempt_at_its_limit_is_why_no_other_is_made() -> None:
         replace(FIRST_ALONE, second_try=True), newton=solvers.Newton(max_iterations=1)
     )
     solution = solvers.solve(loose_problem(), few_steps)
-    assert solution.stages[-1].ending == "skipped: the attempt before it ended with MAX_ITERATIONS"
+    endings = [stage.ending for stage in solution.stages]
+    assert "skipped: the attempt before it ended with MAX_ITERATIONS" in endings
 
 
 def test_the_table_of_a_certified_solve_has_neither_numbers_nor_skipped_steps() -> None:
