@@ -43,7 +43,12 @@ from pgo_models.graphs.precisions import (
     edge_precisions,
     without_negative_rounding,
 )
-from pgo_models.graphs.written_digits import most_digits, written_errors
+from pgo_models.graphs.written_digits import (
+    WrittenDigits,
+    digits_of,
+    most_digits,
+    written_errors,
+)
 
 MOST_SYMBOLS = len(LETTERS)  # robots whose poses can be named by GTSAM symbols
 COMPRESSED = ".gz"  # suffix of a file that is compressed by gzip
@@ -334,6 +339,12 @@ def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
     row = order[np.searchsorted(ascending_ids, ids)]
     R, t = poses_of(file.d, file.vertices[row])
     return graph.completed(Poses(R, t))
+
+
+def digits_of_vertices(path: Path) -> WrittenDigits:
+    """Digits that the poses on the VERTEX lines of a g2o file are written with."""
+    file = read_lines(path, skip_unknown=True, needs_matrices=False)
+    return digits_of(file.vertices.ravel())
 
 
 def _check_same_poses(file: G2OLines, graph: PoseGraph) -> None:

@@ -6,14 +6,20 @@ from typing import Annotated
 
 import typer
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, Certificate
+from pgo_models.certificates.certificate import DEFAULT_GAP, Certificate, Verdict
 from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import SettingError
+from pgo_models.figures import rounded_up
 from pgo_models.files import check_writable
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
 from solvers.cli.explanations import edge_fit, explained_by_its_graph, show_advice, warn_of_weights
-from solvers.cli.inputs import GraphOptions, estimated_poses, graph_in_commands
+from solvers.cli.inputs import (
+    GraphOptions,
+    digits_of_estimate,
+    estimated_poses,
+    graph_in_commands,
+)
 from solvers.cli.options import (
     CostOption,
     DropCouplingOption,
@@ -37,10 +43,10 @@ from solvers.cli.shell import (
     wrapped,
 )
 from solvers.reporting.json_records import certificate_json, write_json
-from solvers.reporting.notes import verdict_suffix
+from solvers.reporting.notes import joined_notes, verdict_suffix
 from solvers.reporting.two_costs import both_costs, facts_of_unknowns, other_cost
 from solvers.reporting.versions import installed_versions
-from solvers.solves.given_poses import certify
+from solvers.solves.given_poses import certify, certify_to_digits
 
 _INDENT = 13  # columns of the labels of a certificate
 
@@ -94,7 +100,15 @@ def certify_command(
     problem = source.problem(source.loaded())
     poses = estimated_poses(problem.graph, estimate)
     certificate = certify(problem, poses, gap)
+    to_digits = None
+    if not certificate.is_certified:
+        written = digits_of_estimate(graph, estimate)
+        to_digits = certify_to_digits(problem, poses, written, gap)
     record = _record(problem, poses, certificate)
+    if to_digits is not None:
+        record["note"] = joined_notes(_text_of_digits(to_digits), str(record["note"]))
+        record["optimal_to_digits"] = True
+        record["polished_gap"] = to_digits.proven_gap
     files = ((out, partial(write_json, record)), (proof, partial(save_proof, problem, certificate)))
     targets = [(path, save) for path, save in files if path is not None]
 
@@ -107,8 +121,16 @@ def certify_command(
 
     save_then_show(targets, show, (lambda: record) if as_json else None, quiet)
     warn_of_weights(graph, problem, certificate, drop_edge)
-    holds = certificate.is_certified and not len(problem.graph.absent)
+    is_optimal = certificate.is_certified or to_digits is not None
+    holds = is_optimal and not len(problem.graph.absent)
     raise typer.Exit(DONE if holds else NOT_CERTIFIED)
+
+
+def _text_of_digits(polished: Certificate) -> str:
+    """Sentence on poses that are optimal but for the digits that they are written with."""
+    gap = rounded_up(polished.printed_gap, 1)
+    what = "exact" if polished.verdict is Verdict.EXACT else f"the gap is {gap}"
+    return f"optimal to the digits written; polished, {what}"
 
 
 def _record(problem: PGOProblem, poses: Poses, certificate: Certificate) -> dict[str, object]:

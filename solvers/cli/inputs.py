@@ -14,7 +14,7 @@ from pgo_models.errors import FileFormatError, GraphError, GraphWarning, PGOErro
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate, places_of_edges
-from pgo_models.graphs.g2o import read_g2o_poses
+from pgo_models.graphs.g2o import digits_of_vertices, read_g2o_poses
 from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.partitioning import Partition, PartitionMethod, partition, suited_partition
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -24,6 +24,7 @@ from pgo_models.graphs.precisions import (
     without_indefinite_coupling,
 )
 from pgo_models.graphs.trajectories import read_kitti, read_times, read_tum
+from pgo_models.graphs.written_digits import ALL_DIGITS, WrittenDigits, digits_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.cli.options import Cost, Split
@@ -332,6 +333,23 @@ def estimated_poses(graph: PoseGraph, path: Path | None) -> Poses:
         problem = f"{poses.num_poses} poses, {known}; give one each, or a .g2o file"
         raise FileFormatError(path, None, problem)
     return graph.completed(poses)
+
+
+def digits_of_estimate(graph: str, estimate: Path | None) -> WrittenDigits:
+    """Digits that the poses of `estimated_poses` are written with.
+
+    All digits where they come from neither a g2o file nor a trajectory.
+    """
+    path = Path(graph) if estimate is None else estimate
+    if not path.is_file():
+        return ALL_DIGITS
+    if path.suffix.lower() in (".tum", ".txt", ".kitti"):
+        return digits_of(np.loadtxt(path, ndmin=2)[:, -7:].ravel())
+    if path.suffix.lower() != ".g2o":
+        return ALL_DIGITS
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GraphWarning)  # they have been shown
+        return digits_of_vertices(path)
 
 
 def _read_trajectory(path: Path, d: int) -> Poses:

@@ -10,6 +10,8 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
     BoundSource,
@@ -23,6 +25,7 @@ from pgo_models.errors import FAILURES, GraphWarning
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
+from pgo_models.graphs.written_digits import ALL_DIGITS, WrittenDigits
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
@@ -90,6 +93,59 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
         near = problem.graph.near_zero(poses)
         return judge(problem, poses, _certificate_near(problem, near, gap))
     return _certificate_near(problem, poses, gap)
+
+
+def certify_to_digits(
+    problem: PGOProblem, poses: Poses, written: WrittenDigits, gap: float = DEFAULT_GAP
+) -> Certificate | None:
+    """Certificate of the optimum that poses of a file are, to the digits that they are written in.
+
+    A few digits of optimal poses cost more than the optimum, most on graphs with little noise.
+
+    Parameters
+    ----------
+    problem : PGOProblem
+        The problem.
+    poses : Poses
+        The poses of the file.
+    written : WrittenDigits
+        Its digits.
+    gap : float
+        The relative gap to certify.
+
+    Returns
+    -------
+    Certificate or None
+        That of the stationary poses that Newton leads to; None where they are not certified, or do
+        not round to the poses given.
+    """
+    if written == ALL_DIGITS:
+        return None
+    near = problem.graph.near_zero(problem.graph.completed(poses))
+    polished = polish(problem, near)
+    if not _round_to(polished.aligned_to(near), near, written, problem.graph):
+        return None
+    certificate = certify(problem, polished, gap)
+    return certificate if certificate.is_certified else None
+
+
+def _round_to(poses: Poses, given: Poses, written: WrittenDigits, graph: PoseGraph) -> bool:
+    """Whether poses are the given ones but for a unit of the last digit of each number.
+
+    Half of it is that of the given poses, the other half makes up for the alignment.
+    """
+    chosen = graph.in_files
+    t = given.t[chosen]
+    largest = np.abs(t + graph.world_point).max(initial=1.0)
+    unit_t = float(written.units(np.array([largest]))[0])
+    if np.abs(poses.t[chosen] - t).max() > unit_t:
+        return False
+    # An angle has up to pi, and the numbers of a quaternion up to one turn by twice their errors.
+    unit_R = float(written.units(np.array([np.pi if graph.d == 2 else 0.5]))[0])
+    bodies = graph.bodies
+    turns = np.swapaxes(given.R[bodies], 1, 2) @ poses.R[bodies] - np.eye(graph.d)
+    angles = np.linalg.norm(turns, axis=(1, 2)) / np.sqrt(2.0)
+    return bool(angles.max() <= (1.0 if graph.d == 2 else 4.0) * unit_R)
 
 
 def _certificate_near(problem: PGOProblem, poses: Poses, gap: float) -> Certificate:
