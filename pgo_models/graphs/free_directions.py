@@ -40,10 +40,11 @@ class _Frame:
     @property
     def sees_shift(self) -> BoolArray:
         """Whether a prior measures, or may measure, a shift along an axis, (d,)."""
-        is_measured = self.I_tt.any(axis=2)
+        is_measured: BoolArray = np.any(self.I_tt, axis=2)
+        has_position: BoolArray = np.any(self.I_tt, axis=(1, 2))
         # In turned axes rounding hides what a partial matrix leaves out.
-        is_hidden = self.I_tt.any(axis=(1, 2))[:, None] & ~self.keeps_axis
-        return np.asarray((is_measured | is_hidden).any(axis=0))
+        is_hidden = has_position[:, None] & ~self.keeps_axis
+        return np.asarray(np.any(is_measured | is_hidden, axis=0))
 
     @property
     def sees_turn(self) -> BoolArray:
@@ -53,20 +54,27 @@ class _Frame:
         does, and so do two rotations about different axes with different information.
         """
         if self.I_rr.shape[1] == 1:
-            is_seen = self.I_tt.any() or self.I_rr.any()
-            return np.array([bool(is_seen)])
-        is_seen = np.zeros(3, dtype=bool)
-        for k in range(3):
-            others = [axis for axis in range(3) if axis != k]
-            positions = self.I_tt[:, others].any()
-            about_k = self.I_rr[:, k].any()
-            first, second = others
-            in_plane = self.I_rr[:, first, first] != self.I_rr[:, second, second]
-            in_plane |= self.I_rr[:, first, second] != 0.0
-            is_turned = self.I_rr.any(axis=(1, 2)) & ~self.keeps_axis[:, k]
-            is_coupled = self.I_tr.any()
-            is_seen[k] = positions or about_k or is_coupled or in_plane.any() or is_turned.any()
-        return is_seen
+            measures = bool(self.I_tt.any()) or bool(self.I_rr.any())
+            return np.array([measures])
+        is_seen = [self._sees_turn_about(axis) for axis in range(3)]
+        return np.array(is_seen)
+
+    def _sees_turn_about(self, axis: int) -> bool:
+        """Whether a prior measures, or may measure, a turn about an axis of the world in space."""
+        first, second = (other for other in range(3) if other != axis)
+        I_rr = self.I_rr
+        measures: BoolArray = np.any(self.I_tt, axis=(1, 2)) | np.any(I_rr, axis=(1, 2))
+        is_uneven = (I_rr[:, first, first] != I_rr[:, second, second]) | (
+            I_rr[:, first, second] != 0.0
+        )
+        reasons = (
+            self.I_tt[:, [first, second]],  # a position beside the axis
+            self.I_tr,
+            I_rr[:, axis],
+            is_uneven,
+            measures & ~self.keeps_axis[:, axis],
+        )
+        return any(bool(np.any(reason)) for reason in reasons)
 
 
 def with_free_directions_held(graph: PoseGraph) -> PoseGraph:
@@ -189,21 +197,23 @@ def _with_bridges_held(graph: PoseGraph, partial: BoolArray) -> PoseGraph:
 def partial_bridges(graph: PoseGraph, partial: BoolArray) -> IntArray:
     """Those of the chosen edges, (m,), that no cycle of the graph goes through, ascending."""
     n = graph.num_poses
-    links = np.flatnonzero(partial)
+    links: IntArray = np.flatnonzero(partial)
     rest = csr_array(
         (np.ones(graph.num_edges - len(links)), (graph.i[~partial], graph.j[~partial])),
         shape=(n, n),
     )
-    num_parts, part = connected_components(rest, directed=False)
+    num_parts, label = connected_components(rest, directed=False)
+    part = np.asarray(label)
     ends = np.sort(np.stack([part[graph.i[links]], part[graph.j[links]]]), axis=0)
     between = ends[0] != ends[1]
-    links = links[between]
+    links = np.asarray(links[between])
     if not len(links):
         return links
-    pairs, number, counts = np.unique(
-        ends[:, between], axis=1, return_inverse=True, return_counts=True
-    )
-    tree = csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=(num_parts, num_parts))
+    keys = ends[0, between].astype(np.int64) * num_parts + ends[1, between]
+    distinct, number, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    pairs = np.stack(np.divmod(distinct, num_parts))
+    shape = (int(num_parts), int(num_parts))
+    tree = csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=shape)
     order, parent = breadth_first_order(tree, 0, directed=False)
     # Every pair that is not in the tree gets a random label, which both ends have. The labels below
     # an edge of the tree cancel if no other pair leads out.
@@ -216,7 +226,7 @@ def partial_bridges(graph: PoseGraph, partial: BoolArray) -> IntArray:
         below[parent[node]] ^= below[node]
     child = np.where(parent[pairs[1]] == pairs[0], pairs[1], pairs[0])
     is_bridge = is_branch & (counts == 1) & (below[child] == 0)
-    return links[is_bridge[number.ravel()]]
+    return np.asarray(links[is_bridge[number.ravel()]])
 
 
 def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:

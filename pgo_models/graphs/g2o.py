@@ -24,6 +24,7 @@ from pgo_models.graphs.g2o_folder import (
     LETTERS,
     absent_ids,
     check_one_graph,
+    robot_letters,
 )
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
 from pgo_models.graphs.g2o_readings import Reading
@@ -512,16 +513,36 @@ def pose_names(graph: PoseGraph) -> list[str]:
     """
     names = [graph.pose_name(pose) for pose in range(graph.num_poses)]
     poses = graph.in_files.tolist()
-    ids = {pose: int(names[pose]) for pose in poses}
-    codes = {symbol >> LETTER_SHIFT for symbol in ids.values()}
-    if not codes <= set(LETTER_CODES):
+    ids = np.array([int(names[pose]) for pose in poses], dtype=np.int64)
+    letters, num_bits = robot_letters(ids)
+    if not np.isin(letters, LETTER_CODES).all():
         return names
-    index_bits = (1 << LETTER_SHIFT) - 1
-    for pose, symbol in ids.items():
-        letter = chr(symbol >> LETTER_SHIFT)
-        index = symbol & index_bits
-        names[pose] = f"{letter}{index}"
+    index_bits = (1 << num_bits) - 1
+    for pose, letter, symbol in zip(poses, letters.tolist(), ids.tolist(), strict=True):
+        names[pose] = f"{chr(letter)}{symbol & index_bits}"
     return names
+
+
+def trajectories_of_robots(graph: PoseGraph) -> list[tuple[str, IntArray, IntArray]]:
+    """Name, poses and numbers of the poses of every robot of a graph.
+
+    The name is the letter that the ids have for it, and the numbers are their indices; else the
+    number of the robot, and the ids themselves.
+    """
+    bodies = graph.bodies
+    ids = graph.pose_ids[bodies].astype(np.int64)
+    robots = graph.robots[bodies]
+    letters, num_bits = robot_letters(ids)
+    has_letters = bool(np.isin(letters, LETTER_CODES).all())
+    trajectories = []
+    for robot in range(graph.num_robots):
+        own = robots == robot
+        if not own.any():
+            continue
+        name = chr(int(letters[own][0])) if has_letters else str(robot)
+        numbers = ids[own] & ((1 << num_bits) - 1) if has_letters else ids[own]
+        trajectories.append((name, bodies[own], numbers))
+    return trajectories
 
 
 def name_of(path: Path) -> str:
@@ -709,7 +730,7 @@ def _robots(
     ids: IntArray, files: list[G2OLines], letters_of_robots: Sequence[int]
 ) -> IntArray | None:
     """Robot of every pose by the cases (a) and (b) of `read_g2o`; None in case (c)."""
-    letters = ids >> LETTER_SHIFT
+    letters, _ = robot_letters(ids)
     if np.isin(letters, letters_of_robots).all():
         return _ranks(letters)
     if len(files) == 1:

@@ -22,6 +22,9 @@ from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
 LETTER_CODES = [ord(letter) for letter in LETTERS]
 LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
+# A GTSAM LabeledSymbol has the label of its robot in the second byte. Symbols have no index so
+# large.
+LABEL_SHIFT = 48
 # Numbers are nearly equal that may be one number, written with two digits or more: rounding to two
 # digits changes a number by up to 5 %. Lengths are compared with the longer one, positions with the
 # extent of their file, and angles with 1 rad.
@@ -128,6 +131,18 @@ def _check_kinds(files: Sequence[G2OLines]) -> None:
                 raise FileFormatError(file.path, int(lines[first]), problem)
 
 
+def robot_letters(ids: IntArray) -> tuple[IntArray, int]:
+    """Codes of the letters that may name robots in ids, and how many bits the index below has.
+
+    They are the labels where all ids are LabeledSymbols, and else the top bytes.
+    """
+    letters = ids >> LETTER_SHIFT
+    labels = (ids >> LABEL_SHIFT) & 0xFF
+    if len(ids) and np.isin(letters, LETTER_CODES).all() and np.isin(labels, LETTER_CODES).all():
+        return labels, LABEL_SHIFT
+    return letters, LETTER_SHIFT
+
+
 def placed_poses(file: G2OLines) -> Rows:
     """VERTEX lines of a file, without those of neighbours.
 
@@ -142,7 +157,7 @@ def placed_poses(file: G2OLines) -> Rows:
     if extent == 0.0:
         extent = float(np.abs(t).max(initial=0.0))
     rows = Rows(str(file.path), file.vertex_lines, file.vertex_ids, file.vertices, extent)
-    letters = file.vertex_ids >> LETTER_SHIFT
+    letters, _ = robot_letters(file.vertex_ids)
     if len(letters) == 0 or not np.isin(letters, LETTER_CODES).all():
         return rows
     own_letter = np.bincount(letters).argmax()

@@ -245,6 +245,7 @@ class _Assembly:
         self.notes: list[str] = []
         self.weights_error = 0.0
         self._source = source
+        self._poses: IntArray = np.zeros(0, dtype=np.int64)  # ids of VERTEX lines of poses alone
         self._d = d
         self._reading = reading
 
@@ -257,6 +258,9 @@ class _Assembly:
         self._note_noise()
         digits = self._digits()
         vertices = self._without_repetitions(self._joined(is_edge=False))
+        self._poses = np.setdiff1d(
+            vertices.ids[~vertices.is_point, 1], vertices.ids[vertices.is_point, 1]
+        )
         edges = self._joined(is_edge=True)
         edge_ids, edge_rows = edges_as(
             self._reading, edges.ids, edges.numbers, self._d, edges.is_point
@@ -493,7 +497,20 @@ class _Assembly:
         ids_behind_world = np.insert(ids, 0, WORLD_ID, axis=1)
         last_two_ids = ids_behind_world[:, -2:]
         is_point = np.full(len(part.lines), kind.to_landmark)
+        if kind.to_landmark and kind.is_position:
+            is_of_pose = np.isin(last_two_ids[:, 1], self._poses)
+            is_point &= ~is_of_pose
+            self._note_positions(int(is_of_pose.sum()))
         return _Rows(last_two_ids, numbers, part.lines, is_point)
+
+    def _note_positions(self, count: int) -> None:
+        """Note how many priors of points are those of poses, as RTAB-Map writes fixes of GPS."""
+        if count:
+            tag = "EDGE_PRIOR_XY" if self._d == 2 else "EDGE_POINTXYZ_PRIOR"
+            self.notes.append(
+                f"{count} {tag} lines name poses, as RTAB-Map writes GPS: they are read as "
+                "positions of these poses"
+            )
 
     def _with_known_weights(self, part: ParsedLines, errors: Array) -> ParsedLines:
         """Lines with information that doubles can hold, by its errors, (n,), which are noted."""
@@ -564,6 +581,12 @@ class _Assembly:
 
         0 is then a sensor at its pose, and g2o measures the position of the pose itself.
         """
+        if offset_id == 0 and (kind.to_landmark or kind.num_offsets == 2):
+            self.notes.append(
+                f"{len(lines)} lines name sensor 0 (the first is line {lines[0]}), and no "
+                f"{OFFSET_TAGS[self._d]} line says where it is: it is taken to be at the pose; "
+                "add the line if it is not"
+            )
         if offset_id in (0, NO_OFFSET) or kind.is_position:
             return
         tag = OFFSET_TAGS[self._d]

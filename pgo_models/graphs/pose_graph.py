@@ -773,8 +773,8 @@ class PoseGraph(ReadOnly):
             raise GraphError(
                 f"pose graph has {len(parts)} components "
                 f"(sizes {sizes}{rest}; with poses {firsts}{rest}); add edges between them, "
-                "or solve the first with --largest-component, and each with PoseGraph.components "
-                "and PoseGraph.subgraph"
+                "or solve the first with --largest-component, and each with --all-components "
+                "(PoseGraph.components and PoseGraph.subgraph)"
             )
 
     def _check_tied(self, precision: str, quantity: str) -> None:

@@ -150,6 +150,7 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
     """Edges of a g2o file; a FileFormatError names the line that is wrong."""
     edges: list[Edge] = []
     landmarks: set[int] = set()
+    point_vertices: set[int] = set()
     pose_vertices: set[int] = set()
     offset_line = 0  # of a sensor that is not at its pose
     lines = read_text(path).split("\n")
@@ -158,10 +159,8 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
         if tag in TAGS:
             edge = read_edge(path, number, TAGS[tag], words)
             edges.append(edge)
-            if edge.tag.to_landmark:
-                landmarks.add(edge.j)
         elif tag in LANDMARK_TAGS:
-            landmarks.add(read_id(path, number, words[0] if words else ""))
+            point_vertices.add(read_id(path, number, words[0] if words else ""))
         elif tag in POSE_TAGS:
             pose_vertices.add(read_id(path, number, words[0] if words else ""))
         elif tag == "PARAMS_SE3OFFSET":
@@ -170,9 +169,18 @@ def read_graph(path: Path, skip_unknown: bool) -> Graph:
         elif not skip_unknown:
             check_ignored_tag(path, number, tag)
     check_offset(path, edges, offset_line)
+    edges = [positions_of_poses(edge, pose_vertices - point_vertices) for edge in edges]
+    landmarks |= point_vertices | {edge.j for edge in edges if edge.tag.to_landmark}
     edges = in_order_of_toro(in_order_of_isam(edges))
     edges, landmarks = apart_from_poses(edges, landmarks, pose_vertices)
     return checked_graph(path, edges, landmarks)
+
+
+def positions_of_poses(edge: Edge, poses: set[int]) -> Edge:
+    """The edge; where it is a prior of a point that is a pose, one of the position of the pose."""
+    if edge.tag.to_landmark and edge.tag.num_ids == 1 and edge.j in poses:
+        return replace(edge, tag=replace(edge.tag, to_landmark=False))
+    return edge
 
 
 def checked_graph(path: Path, edges: list[Edge], landmarks: set[int]) -> Graph:

@@ -67,6 +67,7 @@ COMMANDS = {
                 "skip_unknown",
                 "trust_folder",
                 "largest_component",
+                "all_components",
                 "drop_edge",
                 "robust",
                 "known",

@@ -232,6 +232,30 @@ def _largest_component(graph: PoseGraph) -> PoseGraph:
     return part
 
 
+def components_of(graph: PoseGraph) -> list[PoseGraph]:
+    """Components of a graph that have edges, the largest first, each with its number in its name.
+
+    A GraphWarning says how many poses have no edges.
+    """
+    parts = graph.components()
+    with_edges = [part for part in parts if len(part) > 1]
+    num_alone = len(parts) - len(with_edges)
+    if num_alone:
+        first = graph.pose_name(int(next(part[0] for part in parts if len(part) == 1)))
+        warnings.warn(
+            f"{graph.name}: {num_alone} poses without edges (the first is {first}) are left out",
+            GraphWarning,
+            stacklevel=2,
+        )
+    if len(with_edges) == 1 and not num_alone:
+        return [graph]
+    components = []
+    for number, part in enumerate(with_edges, 1):
+        name = f"{graph.name}, component {number} of {len(with_edges)}"
+        components.append(replace(graph.subgraph(part), name=name))
+    return components
+
+
 def kept_edges(graph: str, dropped: Dropped) -> tuple[BoolArray, list[str]]:
     """Whether each edge is kept, (m,), and `file:line` of those that are.
 

@@ -108,6 +108,14 @@ LargestComponentOption = Annotated[
         "parts, and poses without edges.",
     ),
 ]
+AllComponentsOption = Annotated[
+    bool,
+    typer.Option(
+        "--all-components",
+        help="Solve every component of a graph in parts, each on its own; files of the second are "
+        "named NAME.2, and so on.",
+    ),
+]
 EstimateNoiseOption = Annotated[
     bool,
     typer.Option(

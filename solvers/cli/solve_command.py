@@ -37,11 +37,13 @@ from solvers.cli.inputs import (
     GraphOptions,
     check_outputs_differ,
     chosen_partition,
+    components_of,
     pose_named,
     takes_long_to_read,
     with_times,
 )
 from solvers.cli.options import (
+    AllComponentsOption,
     BackEndName,
     Cost,
     CostOption,
@@ -177,6 +179,7 @@ def solve_command(
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
     largest_component: LargestComponentOption = False,
+    all_components: AllComponentsOption = False,
     estimate_noise: EstimateNoiseOption = False,
     anchor: Annotated[
         int | None,
@@ -279,31 +282,16 @@ def solve_command(
         loaded = with_times(source.loaded(), times)
     if network.has_no_driver and source.chosen_cost is None and not rotations:
         source = replace(source, cost=Cost.ISOTROPIC)
-    problem = source.problem(loaded)
-    outputs.check_drawable(problem)
-    outputs.check_writable(problem.graph.num_robots)
-    stages.check_robust()
-    place = network.chosen_for(problem.graph, stages)
-    solution = solve(
-        problem,
-        stages.pipeline(place.method, place.partition, not network.has_no_driver),
-        choices.chosen_start(problem, start),
-        robust=stages.wrong_edges,
-        robots=network.robots_at(place),
-        anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
-        time_limit=time_limit,
-        verbose=verbose,
-        progress=display.has_bar,
-    )
-    if prove_outliers:
-        from solvers.robust_solves.outlier_proof import prove_outliers as with_proof
-
-        solution = with_proof(solution, time_limit)
-    solution = with_places(solution, graph, drop_edge)
-    _save_and_show(solution, source, stages, outputs, display)
-    warn_of_weights(graph, problem, solution.certificate, drop_edge)
-    num_absent = len(problem.graph.absent)
-    raise typer.Exit(_exit_code(solution.status, solution.is_certified, num_absent))
+    extras = SolveExtras(anchor, prove_outliers)
+    if not all_components:
+        raise typer.Exit(_solve_graph(loaded, source, stages, network, outputs, display, extras))
+    if largest_component:
+        raise SettingError("--largest-component takes one component, and --all-components each")
+    codes = []
+    for number, component in enumerate(components_of(loaded), 1):
+        named = outputs if number == 1 else outputs.numbered(number)
+        codes.append(_solve_graph(component, source, stages, network, named, display, extras))
+    raise typer.Exit(max(codes))
 
 
 @dataclass(frozen=True)
@@ -503,6 +491,18 @@ class Outputs:
             if not is_standard_output(path):
                 check_format(path)
 
+    def numbered(self, number: int) -> "Outputs":
+        """The same files with a number in their names, NAME.2.g2o for NAME.g2o."""
+
+        def with_number(path: Path | None) -> Path | None:
+            if path is None or is_standard_output(path):
+                return path
+            return path.with_name(f"{path.stem}.{number}{path.suffix}")
+
+        out = [path for path in map(with_number, self.out) if path is not None]
+        others = (self.report, self.film, self.covariances, self.proof, self.resume)
+        return Outputs(out, *map(with_number, others))
+
     def check_pages(self) -> None:
         """Raise an error where report, film or covariances have a name of another format."""
         if self.report is not None:
@@ -530,6 +530,52 @@ class Outputs:
         for other in (self.report, self.film, self.resume, self.covariances, self.proof):
             if other is not None:
                 check_writable(other)
+
+
+@dataclass(frozen=True)
+class SolveExtras:
+    """The pose that the frame is held by, and whether rejected edges are to be proven wrong."""
+
+    anchor: int | None
+    prove_outliers: bool
+
+
+def _solve_graph(
+    loaded: PoseGraph,
+    source: GraphOptions,
+    stages: StageOptions,
+    network: RobotOptions,
+    outputs: Outputs,
+    display: Display,
+    extras: SolveExtras,
+) -> int:
+    """Solve a graph that has been read, write and show the solution; the exit code."""
+    problem = source.problem(loaded)
+    outputs.check_drawable(problem)
+    outputs.check_writable(problem.graph.num_robots)
+    stages.check_robust()
+    place = network.chosen_for(problem.graph, stages)
+    anchor = extras.anchor
+    solution = solve(
+        problem,
+        stages.pipeline(place.method, place.partition, not network.has_no_driver),
+        choices.chosen_start(problem, stages.start),
+        robust=stages.wrong_edges,
+        robots=network.robots_at(place),
+        anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
+        time_limit=stages.time_limit,
+        verbose=display.verbose,
+        progress=display.has_bar,
+    )
+    if extras.prove_outliers:
+        from solvers.robust_solves.outlier_proof import prove_outliers as with_proof
+
+        solution = with_proof(solution, stages.time_limit)
+    solution = with_places(solution, source.graph, source.drop_edge)
+    _save_and_show(solution, source, stages, outputs, display)
+    warn_of_weights(source.graph, problem, solution.certificate, source.drop_edge)
+    num_absent = len(problem.graph.absent)
+    return _exit_code(solution.status, solution.is_certified, num_absent)
 
 
 def _given_options(arguments: dict[str, object]) -> set[str]:
