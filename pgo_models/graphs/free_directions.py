@@ -211,17 +211,19 @@ def partial_bridges(graph: PoseGraph, partial: BoolArray) -> IntArray:
         return links
     keys = ends[0, between].astype(np.int64) * num_parts + ends[1, between]
     distinct, number, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    pairs = np.stack(np.divmod(distinct, num_parts))
+    pairs = np.array([distinct // num_parts, distinct % num_parts])
     shape = (int(num_parts), int(num_parts))
     tree = csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=shape)
-    order, parent = breadth_first_order(tree, 0, directed=False)
+    order, predecessors = breadth_first_order(tree, 0, directed=False)
+    parent = np.asarray(predecessors)
     # Every pair that is not in the tree gets a random label, which both ends have. The labels below
     # an edge of the tree cancel if no other pair leads out.
     is_branch = (parent[pairs[0]] == pairs[1]) | (parent[pairs[1]] == pairs[0])
     labels = np.random.default_rng(0).integers(1, 2**62, size=pairs.shape[1])
     below = np.zeros(num_parts, dtype=np.int64)
-    for end in pairs:
-        np.bitwise_xor.at(below, end[~is_branch], labels[~is_branch])
+    others = np.flatnonzero(~is_branch)
+    for row in range(2):
+        np.bitwise_xor.at(below, pairs[row, others], labels[others])
     for node in order[:0:-1].tolist():
         below[parent[node]] ^= below[node]
     child = np.where(parent[pairs[1]] == pairs[0], pairs[1], pairs[0])

@@ -40,6 +40,8 @@ from solvers.result import Outcome
 from solvers.riemannian.polish import polish, relative_decrement
 from solvers.riemannian.shrunk_bound import bound_is_tight, with_shrunk_information
 
+_HALF = 0.5 * (1.0 + 1e-3)  # of the unit of the last digit, and what Newton leaves
+
 
 def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
     """Judge anybody's poses by a proven lower bound on the global optimum.
@@ -130,22 +132,30 @@ def certify_to_digits(
 
 
 def _round_to(poses: Poses, given: Poses, written: WrittenDigits, graph: PoseGraph) -> bool:
-    """Whether poses are the given ones but for a unit of the last digit of each number.
+    """Whether poses, moved as a whole, round to the given ones.
 
-    Half of it is that of the given poses, the other half makes up for the alignment.
+    A file mostly has some pose at the identity, exactly: then that is where both agree. Else they
+    are aligned, which takes another half of a unit of the last digit.
     """
     chosen = graph.in_files
+    is_identity = (given.t == 0.0).all(axis=1) & (np.eye(graph.d) == given.R).all(axis=(1, 2))
+    anchors = chosen[is_identity[chosen] & ~np.isin(chosen, graph.landmarks)]
+    halves = 1.0 if len(anchors) else 2.0
+    moved = poses.anchored_to(given, int(anchors[0])) if len(anchors) else poses.aligned_to(given)
     t = given.t[chosen]
-    largest = np.abs(t + graph.world_point).max(initial=1.0)
-    unit_t = float(written.units(np.array([largest]))[0])
-    if np.abs(poses.t[chosen] - t).max() > unit_t:
+    sizes = np.abs(t + graph.world_point).max(axis=1)
+    units_t = written.units(np.where(sizes > 0.0, sizes, np.abs(t).max(initial=1.0)))
+    if not len(anchors):
+        units_t = np.maximum(units_t, np.median(units_t))
+    if (np.abs(moved.t[chosen] - t).max(axis=1) > _HALF * halves * units_t).any():
         return False
     # An angle has up to pi, and the numbers of a quaternion up to one turn by twice their errors.
     unit_R = float(written.units(np.array([np.pi if graph.d == 2 else 0.5]))[0])
     bodies = graph.bodies
-    turns = np.swapaxes(given.R[bodies], 1, 2) @ poses.R[bodies] - np.eye(graph.d)
+    turns = np.swapaxes(given.R[bodies], 1, 2) @ moved.R[bodies] - np.eye(graph.d)
     angles = np.linalg.norm(turns, axis=(1, 2)) / np.sqrt(2.0)
-    return bool(angles.max() <= (1.0 if graph.d == 2 else 4.0) * unit_R)
+    most = _HALF * halves * unit_R * (1.0 if graph.d == 2 else 4.0)
+    return bool(angles.max() <= most)
 
 
 def _certificate_near(problem: PGOProblem, poses: Poses, gap: float) -> Certificate:
