@@ -21,6 +21,7 @@ LARGEST = 1e100  # beyond it squares and determinants would overflow; no measure
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
 LONGEST = 10_000  # characters of a line of numbers; an edge in space with all its digits has 750
 LONGEST_OF_ALL = 2**16  # bytes of any line, comments included
+_EQUAL_LINES = 3  # with the same problem, each of which is named
 _NAMED_LINES = 20  # wrong lines of a file that an error names
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
 BLOCK = 2**24  # bytes of a file that are split into lines at a time
@@ -144,7 +145,8 @@ def check_lines(
 ) -> None:
     """Raise a FileFormatError when there are problems in the lines of a file.
 
-    It has `file:line: problem` for each of the first 20 wrong lines, and their number. Of several
+    It has `file:line: problem` for each of the first 20 wrong lines, and their number. Where more
+    than three lines all have the same problem, it is said of the first, with a count. Of several
     problems of a line the first is named. `unit` is what is counted in place of lines, and `hint`
     ends the message.
     """
@@ -154,8 +156,12 @@ def check_lines(
     for line, problem in problems:
         problem_of_line.setdefault(line, problem)
     lines = sorted(problem_of_line)
-    named = lines[:_NAMED_LINES]
     place = printable(str(path))
+    if len(lines) > _EQUAL_LINES and len(set(problem_of_line.values())) == 1:
+        # One systematic error, said once.
+        text = f"{problem_of_line[lines[0]]}{hint}\nso are {len(lines) - 1} more {unit}, "
+        raise FileFormatError(path, lines[0], f"{text}up to {place}:{lines[-1]}")
+    named = lines[:_NAMED_LINES]
     texts = [f"{place}:{line}: {problem_of_line[line]}" for line in named]
     if len(lines) > len(named):
         texts.append(f"{len(lines)} {unit} are wrong; the first {len(named)} are named")

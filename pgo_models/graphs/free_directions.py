@@ -209,9 +209,9 @@ def partial_bridges(graph: PoseGraph, partial: BoolArray) -> IntArray:
     links = np.asarray(links[between])
     if not len(links):
         return links
-    keys = ends[0, between].astype(np.int64) * num_parts + ends[1, between]
+    keys: Array = ends[0, between].astype(np.int64) * num_parts + ends[1, between]
     distinct, number, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    pairs = np.array([distinct // num_parts, distinct % num_parts])
+    pairs: Array = np.stack([distinct // num_parts, distinct % num_parts])
     shape = (int(num_parts), int(num_parts))
     tree = csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=shape)
     order, predecessors = breadth_first_order(tree, 0, directed=False)
@@ -219,7 +219,7 @@ def partial_bridges(graph: PoseGraph, partial: BoolArray) -> IntArray:
     # Every pair that is not in the tree gets a random label, which both ends have. The labels below
     # an edge of the tree cancel if no other pair leads out.
     is_branch = (parent[pairs[0]] == pairs[1]) | (parent[pairs[1]] == pairs[0])
-    labels = np.random.default_rng(0).integers(1, 2**62, size=pairs.shape[1])
+    labels = np.asarray(np.random.default_rng(0).integers(1, 2**62, size=pairs.shape[1]))
     below = np.zeros(num_parts, dtype=np.int64)
     others = np.flatnonzero(~is_branch)
     for row in range(2):

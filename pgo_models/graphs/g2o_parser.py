@@ -34,7 +34,7 @@ from pgo_models.graphs.g2o_dialects import (
     order_of_edge2,
     order_of_edge_se2,
 )
-from pgo_models.graphs.g2o_readings import Reading, edges_as, noise_as, numbers_as
+from pgo_models.graphs.g2o_readings import ROTATION_FIRST, Reading, edges_as, noise_as, numbers_as
 from pgo_models.graphs.g2o_rows import information_of
 from pgo_models.graphs.g2o_source import ParsedLines, Source
 from pgo_models.graphs.g2o_tags import (
@@ -333,6 +333,8 @@ class _Assembly:
         """Settle the order of the matrices on EDGE_SE2 lines, which is by rows afterwards."""
         parts = self._source.parsed["EDGE_SE2"]
         if not parts or noise_as(self._reading, TAGS["EDGE_SE2"]) is Noise.SQUARE_ROOT:
+            return
+        if self._reading in ROTATION_FIRST:
             return
         if self._reading is Reading.TORO_ORDER:
             self._reorder("EDGE_SE2")

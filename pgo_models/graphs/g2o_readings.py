@@ -9,6 +9,7 @@ import enum
 import numpy as np
 
 from pgo_models.errors import SettingError
+from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
@@ -32,10 +33,15 @@ class Reading(enum.Enum):
     W_FIRST = "w-first"
     DEGREES = "degrees"
     TORO_ORDER = "toro-order"
+    ROTATION_FIRST = "rotation-first"
     COVARIANCES = "covariances"
     SQUARE_ROOTS = "square-roots"
     CLOSURES_IN_MILLIMETRES = "closures-in-millimetres"
     ODOMETRY_IN_MILLIMETRES = "odometry-in-millimetres"
+    REVERSED_ROTATION_FIRST = "reversed-rotation-first"
+    CLOSURES_REVERSED_ROTATION_FIRST = "closures-reversed-rotation-first"
+    REVERSED_W_FIRST = "reversed-w-first"
+    CLOSURES_REVERSED_W_FIRST = "closures-reversed-w-first"
 
     @classmethod
     def of(cls, given: object) -> "Reading":
@@ -66,8 +72,14 @@ class Reading(enum.Enum):
     @property
     def dimension(self) -> int | None:
         """The dimension, 2 or 3, of the files that can be read like this; None for both."""
-        of_one_dimension = {Reading.W_FIRST: 3, Reading.DEGREES: 2, Reading.TORO_ORDER: 2}
+        of_one_dimension = dict.fromkeys(_W_FIRST, 3)
+        of_one_dimension |= {Reading.DEGREES: 2, Reading.TORO_ORDER: 2}
         return of_one_dimension.get(self)
+
+    @property
+    def is_pair(self) -> bool:
+        """Whether two things differ from what is written."""
+        return self in _REVERSED and self in _W_FIRST | ROTATION_FIRST
 
     @property
     def converts_units(self) -> bool:
@@ -83,14 +95,37 @@ _TEXTS = {
     Reading.W_FIRST: "with w first in quaternions",
     Reading.DEGREES: "with angles in degrees",
     Reading.TORO_ORDER: "with matrices in TORO's order, ff fs ss rr fr sr",
+    Reading.ROTATION_FIRST: "with the rotation first in matrices",
     Reading.COVARIANCES: "with covariances in place of information matrices",
     Reading.SQUARE_ROOTS: "with square roots U of information matrices U^T U",
     Reading.CLOSURES_IN_MILLIMETRES: "with the closures in millimetres",
     Reading.ODOMETRY_IN_MILLIMETRES: "with the odometry in millimetres",
+    Reading.REVERSED_ROTATION_FIRST: ("with all edges reversed and the rotation first in matrices"),
+    Reading.CLOSURES_REVERSED_ROTATION_FIRST: (
+        "with the closures reversed and the rotation first in matrices"
+    ),
+    Reading.REVERSED_W_FIRST: "with all edges reversed and w first in quaternions",
+    Reading.CLOSURES_REVERSED_W_FIRST: ("with the closures reversed and w first in quaternions"),
 }
-_REVERSED = {Reading.CLOSURES_REVERSED, Reading.ODOMETRY_REVERSED, Reading.REVERSED}
+ROTATION_FIRST = {
+    Reading.ROTATION_FIRST,
+    Reading.REVERSED_ROTATION_FIRST,
+    Reading.CLOSURES_REVERSED_ROTATION_FIRST,
+}
+_W_FIRST = {Reading.W_FIRST, Reading.REVERSED_W_FIRST, Reading.CLOSURES_REVERSED_W_FIRST}
+_ALL_REVERSED = {
+    Reading.REVERSED,
+    Reading.REVERSED_ROTATION_FIRST,
+    Reading.REVERSED_W_FIRST,
+}
+_CLOSURES_REVERSED = {
+    Reading.CLOSURES_REVERSED,
+    Reading.CLOSURES_REVERSED_ROTATION_FIRST,
+    Reading.CLOSURES_REVERSED_W_FIRST,
+}
+_REVERSED = {Reading.ODOMETRY_REVERSED, *_ALL_REVERSED, *_CLOSURES_REVERSED}
 _IN_MILLIMETRES = {Reading.CLOSURES_IN_MILLIMETRES, Reading.ODOMETRY_IN_MILLIMETRES}
-_OF_CLOSURES = {Reading.CLOSURES_REVERSED, Reading.CLOSURES_IN_MILLIMETRES}
+_OF_CLOSURES = {Reading.CLOSURES_IN_MILLIMETRES, *_CLOSURES_REVERSED}
 
 
 def noise_as(reading: Reading, tag: Tag) -> Noise:
@@ -104,7 +139,9 @@ def noise_as(reading: Reading, tag: Tag) -> Noise:
 
 def numbers_as(reading: Reading, tag: Tag, numbers: Array) -> Array:
     """Numbers on lines of a tag, (n, num_numbers), with quaternions and angles as g2o has them."""
-    if reading is Reading.W_FIRST and tag.has_quaternion:
+    if reading in ROTATION_FIRST and tag.has_matrix and not tag.is_toro:
+        numbers = _with_translation_first(tag, numbers)
+    if reading in _W_FIRST and tag.has_quaternion:
         w_last = [*range(3), 4, 5, 6, 3, *range(7, numbers.shape[1])]
         return np.asarray(numbers[:, w_last])
     has_heading = tag.d == 2 and not tag.is_point
@@ -112,6 +149,23 @@ def numbers_as(reading: Reading, tag: Tag, numbers: Array) -> Array:
         numbers = numbers.copy()
         numbers[:, 2] = np.deg2rad(numbers[:, 2])
     return numbers
+
+
+def _with_translation_first(tag: Tag, numbers: Array) -> Array:
+    """Numbers on lines whose matrices have the rotation first, with the translation first.
+
+    Matrices of points and of rotations alone stay as they are.
+    """
+    side = 3 * tag.d - 3
+    places = triangle_places(side)
+    if numbers.shape[1] != tag.num_measured + side * (side + 1) // 2:
+        return numbers
+    first = side - tag.d  # where the translation stands in the line's matrix
+    order = [*range(first, side), *range(first)]
+    rows, columns = np.triu_indices(side)
+    moved = places[np.ix_(order, order)][rows, columns]
+    measured = numbers[:, : tag.num_measured]
+    return np.concatenate([measured, numbers[:, tag.num_measured + moved]], axis=1)
 
 
 def edges_as(
@@ -125,7 +179,7 @@ def edges_as(
         return ids, rows
     between_poses = (ids[:, 0] != WORLD_ID) & ~to_landmark
     chosen = between_poses
-    if reading is not Reading.REVERSED:
+    if reading not in _ALL_REVERSED:
         is_odometry = _joins_neighbours(ids, between_poses)
         chosen = between_poses & (is_odometry != (reading in _OF_CLOSURES))
     if reading in _REVERSED:

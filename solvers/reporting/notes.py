@@ -5,8 +5,14 @@ import math
 import numpy as np
 
 from pgo_models.certificates.certificate import Certificate, Verdict
-from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import extreme_weight, proper_information
+from pgo_models.geometry.rotations import tangent_dimension
+from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
+from pgo_models.graphs.precisions import (
+    LEAST_SCALED,
+    extreme_weight,
+    proper_information,
+    scaled_blocks,
+)
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -20,8 +26,46 @@ def note_of(problem: PGOProblem, certificate: Certificate, lacks: str = "") -> s
     """
     absence = note_of_absence(len(problem.graph.absent))
     reason = note_of_weights(problem.graph, certificate) or note_of_tangent(problem, certificate)
-    free = problem.graph.free
-    return joined_notes(absence, free, note_of_coupling(problem), reason, lacks)
+    graph = problem.graph
+    unchecked = note_of_redundancy(problem)
+    return joined_notes(absence, unchecked, graph.free, note_of_coupling(problem), reason, lacks)
+
+
+def note_of_redundancy(problem: PGOProblem) -> str:
+    """Say that measurements have no cycle, where none of them checks another; "" where one does.
+
+    There are then no more measured numbers than unknowns, and the least cost is zero.
+    """
+    graph = problem.graph
+    num_nodes = graph.num_poses
+    if graph.num_edges > num_nodes and graph.world is None:
+        return ""  # as of most graphs, which have cycles
+    if _num_measured(problem) > _num_unknowns(problem):
+        return ""
+    return "no cycle: every measurement fits whatever it is, and nothing checks it"
+
+
+def _num_unknowns(problem: PGOProblem) -> int:
+    """Number of unknowns beyond the frame."""
+    graph = problem.graph
+    p = tangent_dimension(graph.d)
+    of_pose = p + (graph.d if problem.has_translations else 0)
+    num_poses = graph.num_poses - len(graph.landmarks)
+    return of_pose * (num_poses - 1) + graph.d * len(graph.landmarks)
+
+
+def _num_measured(problem: PGOProblem) -> int:
+    """Number of directions that the edges measure."""
+    graph = problem.graph
+    d = graph.d
+    information = graph.unheld if graph.unheld is not None else graph.information
+    if information is None:
+        information = isotropic_information(graph.kappa, graph.tau, d)
+    scaled, _ = scaled_blocks(information)
+    blocks = [scaled[~np.isin(graph.j, graph.landmarks)][:, d:, d:]]
+    if problem.has_translations:
+        blocks.append(scaled[:, :d, :d])
+    return sum(int((np.linalg.eigvalsh(block) > LEAST_SCALED).sum()) for block in blocks)
 
 
 def joined_notes(*notes: str) -> str:

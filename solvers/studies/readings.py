@@ -20,7 +20,7 @@ from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import g2o_files
 from pgo_models.graphs.g2o_parser import read_lines
-from pgo_models.graphs.g2o_readings import Reading
+from pgo_models.graphs.g2o_readings import ROTATION_FIRST, Reading
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import edge_residuals
@@ -41,6 +41,8 @@ _OF_SOME_EDGES = (
     Reading.ODOMETRY_REVERSED,
     Reading.CLOSURES_IN_MILLIMETRES,
     Reading.ODOMETRY_IN_MILLIMETRES,
+    Reading.CLOSURES_REVERSED_ROTATION_FIRST,
+    Reading.CLOSURES_REVERSED_W_FIRST,
 )
 # A reading is proposed from this evidence on, odds of 10,000 to one. It also has to be clearly
 # better: its cost is smaller by the next factor. Where the weights are others, so that the costs
@@ -53,8 +55,13 @@ _LEAST_MISFIT = {
     Reading.COVARIANCES: 30.0,
     Reading.SQUARE_ROOTS: 1000.0,
     Reading.TORO_ORDER: 1000.0,
+    **dict.fromkeys(ROTATION_FIRST, 30.0),
 }
+# Orders of matrices may make the cost too large as well, by this factor at least.
+_ORDERS = {Reading.TORO_ORDER, *ROTATION_FIRST}
+_LEAST_EXCESS = 1000.0
 _MOST_MISFIT = 10.0
+_MOST_MISFIT_OF_BLOCKS = 2.0  # where blocks are exchanged, which changes the cost either way
 _CLOSE = math.log(1e3)  # difference of evidence up to which a reading is named beside the best
 _TURN = 2.0 * math.pi  # no program writes larger angles in radians
 # There is nothing to gain from a second attempt or a better bound under a wrong reading.
@@ -72,6 +79,11 @@ _QUESTIONS = {
     Reading.W_FIRST: "were they written as w x y z?",
     Reading.DEGREES: "were they written in degrees?",
     Reading.TORO_ORDER: "were they written in this order?",
+    Reading.ROTATION_FIRST: "were they written with the rotation first, as GTSAM has it?",
+    Reading.REVERSED_ROTATION_FIRST: "were they written so?",
+    Reading.CLOSURES_REVERSED_ROTATION_FIRST: "were they written so?",
+    Reading.REVERSED_W_FIRST: "were they written so?",
+    Reading.CLOSURES_REVERSED_W_FIRST: "were they written so?",
     Reading.COVARIANCES: "are they covariances?",
     Reading.SQUARE_ROOTS: "are they square roots?",
     Reading.CLOSURES_IN_MILLIMETRES: "were they written in millimetres?",
@@ -138,20 +150,35 @@ class ReadingComparison(Summarised):
     proposed : tuple of ReadingFit
         Those that fit better beyond chance, the best first. It is empty for files that mean what
         they say, and where nothing can be told.
+    invalid : str
+        Why the file cannot be read as written; "" where it can.
     """
 
     cost_name: str
     written: ReadingFit
     others: tuple[ReadingFit, ...]
     proposed: tuple[ReadingFit, ...]
+    invalid: str = ""
 
     def sentence(self) -> str:
         """Return the costs as written and as proposed, and the question that they raise."""
         written = _with_share(self.written)
+        if self.invalid:
+            return self._sentence_on_invalid()
         if not self.proposed:
             return f"{self.cost_name} {written}: no other reading fits better beyond chance."
         best, *others = self.proposed
         text = f"{self.cost_name} {written}, {_with_share(best)}: {best.question}"
+        if others:
+            text += f" Nearly as likely: {' or '.join(fit.text for fit in others)}."
+        return text
+
+    def _sentence_on_invalid(self) -> str:
+        text = f"As written the file is invalid: {self.invalid}."
+        if not self.proposed:
+            return f"{text} No other reading fits."
+        best, *others = self.proposed
+        text += f" {self.cost_name} {_with_share(best)}: {best.question}"
         if others:
             text += f" Nearly as likely: {' or '.join(fit.text for fit in others)}."
         return text
@@ -172,7 +199,8 @@ def compare_readings(
 ) -> ReadingComparison:
     """Solve a g2o file as written and under every other `Reading`, and compare the costs.
 
-    Each reading is solved once, by Newton's method from its usual start: ten solves at most.
+    Each reading is solved once, by Newton's method from its usual start. Where none of them fits
+    better and the cost is far off, pairs of readings are tried.
     Nothing is claimed of a file whose edges all fit as closely as its numbers can tell, and nothing
     that chance could explain.
 
@@ -191,7 +219,7 @@ def compare_readings(
     Raises
     ------
     PGOError
-        As for `load` and `solve`, when the file cannot be read or solved as written.
+        As for `load` and `solve`, when the file can neither be read as written nor otherwise.
 
     Examples
     --------
@@ -209,7 +237,10 @@ def compare_readings(
             trust_folder=trust_folder,
         )
 
-    graph = read(Reading.AS_WRITTEN)
+    try:
+        graph = read(Reading.AS_WRITTEN)
+    except FileFormatError as error:
+        return _readings_of_invalid(error, read)
     problem = PGOProblem(graph)
     solution = solve(problem, _PLAIN)
     residuals = edge_residuals(problem, solution.poses)
@@ -217,9 +248,58 @@ def compare_readings(
     has_large_angles = _has_large_angles(name_or_path, graph.d)
     trial = _Trial(graph, written, residuals.freedom, read, has_large_angles)
     with warnings.catch_warnings(action="ignore"):  # of the reader, once more
-        fits = [trial.fit(reading) for reading in Reading if reading is not Reading.AS_WRITTEN]
-    others = tuple(fit for fit in fits if fit is not None)
-    return ReadingComparison(problem.cost_name, written, others, _proposed(others, written))
+        others = trial.fits([reading for reading in Reading if not reading.is_pair])
+        proposed = _proposed(others, written)
+        best = proposed[0] if proposed else written
+        if _may_be_pair(best):
+            pairs = trial.fits([reading for reading in Reading if reading.is_pair])
+            others += pairs
+            proposed = _proposed(pairs, best) or proposed
+    return ReadingComparison(problem.cost_name, written, others, proposed)
+
+
+def _may_be_pair(best: ReadingFit) -> bool:
+    """Whether the cost of the best fit is so far from what is expected that more may be wrong."""
+    is_too_small = best.times_expected <= 1.0 / _LEAST_MISFIT[Reading.ROTATION_FIRST]
+    return is_too_small or best.times_expected >= _LEAST_EXCESS
+
+
+def _readings_of_invalid(
+    error: FileFormatError, read: Callable[[Reading], PoseGraph]
+) -> ReadingComparison:
+    """Readings that make sense of a file which has none as written; the error where none does.
+
+    Proposed are those of which the cost is what their matrices make expected, or nearly so.
+    """
+    written = ReadingFit(Reading.AS_WRITTEN, 0)
+    fits: list[ReadingFit] = []
+    proposed: list[ReadingFit] = []
+    cost_name = "F"
+    for are_pairs in (False, True):
+        for reading in Reading:
+            if proposed or reading.is_pair is not are_pairs:
+                continue
+            with warnings.catch_warnings(action="ignore"):
+                try:
+                    problem = PGOProblem(read(reading))
+                    solution = solve(problem, _PLAIN)
+                    overall = edge_residuals(problem, solution.poses).overall
+                except (FileFormatError, *FAILURES):
+                    continue
+            cost_name = problem.cost_name
+            num_edges = problem.graph.num_edges
+            fits.append(ReadingFit(reading, num_edges, solution.objective, overall))
+        proposed = [fit for fit in fits if _log_misfit(fit) <= math.log(_MOST_MISFIT)]
+    if not fits:
+        raise error
+    proposed.sort(key=_log_misfit)
+    invalid = error.problem.partition(";")[0]
+    return ReadingComparison(cost_name, written, tuple(fits), tuple(proposed), invalid)
+
+
+def _log_misfit(fit: ReadingFit) -> float:
+    """How far the cost is from what is expected, on the scale of logarithms."""
+    return abs(math.log(fit.times_expected)) if fit.times_expected > 0.0 else math.inf
 
 
 @dataclass(frozen=True)
@@ -231,6 +311,11 @@ class _Trial:
     freedom: float
     read: Callable[[Reading], PoseGraph]
     has_large_angles: bool
+
+    def fits(self, readings: list[Reading]) -> tuple[ReadingFit, ...]:
+        """Fits under those readings that are for this file and change something."""
+        fits = [self.fit(reading) for reading in readings if reading is not Reading.AS_WRITTEN]
+        return tuple(fit for fit in fits if fit is not None)
 
     def fit(self, reading: Reading) -> ReadingFit | None:
         """The fit under a reading; None if it is not for this file, or changes nothing."""
@@ -286,14 +371,15 @@ def _is_clear(fit: ReadingFit, written: ReadingFit) -> bool:
     """Whether a reading fits not only beyond chance, but clearly better."""
     if fit.reading not in _LEAST_MISFIT:
         return fit.cost * _LEAST_RATIO <= written.cost
-    if not 1.0 / _MOST_MISFIT <= fit.times_expected <= _MOST_MISFIT:
+    most_misfit = _MOST_MISFIT_OF_BLOCKS if fit.reading in ROTATION_FIRST else _MOST_MISFIT
+    if not 1.0 / most_misfit <= fit.times_expected <= most_misfit:
         return False
     # Covariances and square roots of less than one make the cost too small. One that is too large
     # is more often that of a wrong edge, which larger covariances would only hide.
     least_misfit = _LEAST_MISFIT[fit.reading]
     is_too_small = written.times_expected <= 1.0 / least_misfit
-    is_too_large = written.times_expected >= least_misfit
-    return is_too_small or (is_too_large and fit.reading is Reading.TORO_ORDER)
+    is_too_large = written.times_expected >= _LEAST_EXCESS
+    return is_too_small or (is_too_large and fit.reading in _ORDERS)
 
 
 def _changed_edges(graph: PoseGraph, other: PoseGraph) -> BoolArray:

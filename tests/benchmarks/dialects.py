@@ -132,6 +132,68 @@ def forms(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "covariances", changed(plane, inverted)
     gps = [f"EDGE_PRIOR_SE2_XY {k} {k} 0 1 0 1" for k in range(5)]
     yield "gps_alone", gps
+    yield from partial_forms(plane, space)
+    yield from exported_forms(plane, space)
+
+
+def partial_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, list[str]]]:
+    """Files with measurements that do not measure every direction."""
+    places = {}
+    for line in space:
+        if line.startswith("VERTEX"):
+            _, name, *numbers = line.split()
+            places[int(name)] = numbers
+    every_tenth = range(0, 60, 10)
+    heights = "0 0 0 0 0 25"
+    offset = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"
+    fixes = [f"EDGE_SE3_XYZ_PRIOR {k} 0 {' '.join(places[k][:3])}" for k in every_tenth]
+    yield "gps_without_height", [offset, *space, *(f"{fix} 4 0 0 4 0 0" for fix in fixes)]
+    yield "barometer", [offset, *space, *(f"{fix} {heights}" for fix in fixes)]
+    level = "0 0 0 0 0 0 1 " + " ".join("0" for _ in range(15))
+    gravity = [f"EDGE_SE3_PRIOR {k} 0 {level} 900 0 0 900 0 0" for k in every_tenth]
+    yield "gravity", [offset, *space, *gravity]
+    compass = [f"EDGE_PRIOR_SE2 {k} 0 0 0 0 0 0 0 0 2500" for k in range(0, 60, 30)]
+    yield "compass", [*plane, *compass]
+    yield "corridor", changed(plane, without_x)
+    yield "single_prior", [*plane, "EDGE_PRIOR_SE2 0 5 5 1 1e12 0 0 1e12 0 1e12"]
+    yield "indefinite", changed(plane, lambda words: [*words[:7], "1e9", *words[8:]])
+
+
+def without_x(words: list[str]) -> list[str]:
+    return [*words[:6], "0", "0", "0", *words[9:]] if is_closure(words) else words
+
+
+def exported_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, list[str]]]:
+    """Files as other programs export them."""
+    fixes = [f"EDGE_POINTXYZ_PRIOR {k} {k % 7} {k % 5} 0 1 0 0 1 0 1" for k in range(0, 60, 9)]
+    yield "rtabmap_fixes", [*space, *fixes]
+    key = 103 << 56
+    robots = changed(space, lambda words: named_by_labels(words, key), "")
+    yield "labeled_symbols", robots
+    yield "rotation_first", changed(space, with_rotation_first)
+    yield (
+        "reversed_rotation_first",
+        changed(
+            changed(space, with_rotation_first),
+            lambda words: [words[0], words[2], words[1], *words[3:]],
+        ),
+    )
+
+
+def named_by_labels(words: list[str], key: int) -> list[str]:
+    count = 2 if words[0].startswith("EDGE") else 1
+    ids = [str(key | (65 + int(name) // 30) << 48 | int(name)) for name in words[1 : 1 + count]]
+    return [words[0], *ids, *words[1 + count :]]
+
+
+def with_rotation_first(words: list[str]) -> list[str]:
+    """Matrices with the rotation first, of diagonal ones in space."""
+    triangle = words[10:]
+    places = [0, 6, 11, 15, 18, 20]  # of the diagonal
+    swapped = list(triangle)
+    for k, place in enumerate(places):
+        swapped[place] = triangle[places[(k + 3) % 6]]
+    return [*words[:10], *swapped]
 
 
 def without_path(text: str, path: Path) -> str:

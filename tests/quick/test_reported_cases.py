@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import solvers
 from pgo_models import PoseGraph, Reading
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 
@@ -218,3 +219,168 @@ def test_a_cost_far_below_what_is_expected_is_reported(pgo_command: Call, tmp_pa
     assert code == 0
     assert "times what is expected: the information matrices claim too little" in text
     assert "or they are covariances. pgo doctor" in text
+
+
+# Name, least cost, most relative gap proven (none where only zero bounds it), and what is free.
+PARTIAL = [
+    ("a1_gps_xy_only", 13.14184, 1e-6, "the height of the map is free"),
+    ("a3_gravity_only", 38.08793, 1e-9, "the position of the map is free"),
+    ("a5_corridor_2d", 0.348717, 1.0, ""),
+    ("a6_compass_2d", 4.5634562, 1e-9, "the position of the map is free"),
+    ("i3_gauge_prior_1e12", 0.88126963, 1e-9, "the prior of pose 0 is the only one"),
+]
+
+
+@pytest.mark.parametrize(("name", "least", "gap", "free"), PARTIAL)
+def test_directions_that_nothing_measures_are_named_and_held(
+    name: str, least: float, gap: float, free: str, pgo_command: Call
+) -> None:
+    code, out, err = pgo_command("solve", CASES / f"{name}.g2o", "--json")
+    record = json.loads(out)
+    assert code == (0 if gap < 1.0 else 3), err
+    assert record["status"] == "CONVERGED"
+    assert record["objective"] == pytest.approx(least, rel=2e-6)
+    assert record["lower_bound"] <= record["objective"]
+    assert record["proven_gap"] <= gap
+    assert free in record["note"]
+
+
+@pytest.mark.parametrize(
+    ("name", "infinite"),
+    [
+        ("a1_gps_xy_only", [2]),
+        ("a3_gravity_only", [0, 1, 2]),
+        ("a6_compass_2d", [0, 1]),
+        ("i3_gauge_prior_1e12", []),
+    ],
+)
+def test_what_nothing_measures_has_an_infinite_variance(name: str, infinite: list[int]) -> None:
+    solution = solvers.solve(read_g2o(CASES / f"{name}.g2o"))
+    variances = np.einsum("nkk->nk", solution.marginals())[solution.problem.graph.bodies]
+    is_infinite = np.zeros(variances.shape[1], dtype=bool)
+    is_infinite[infinite] = True
+    assert (np.isinf(variances) == is_infinite).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "most", "start"),
+    [
+        ("a1b_gps_weak_height_local_minimum", 13.2323409, "file"),
+        ("a4b_compass_yaw_only_not_converged", 8.0811827, "tree"),
+    ],
+)
+def test_other_starts_lead_to_a_better_minimum(
+    name: str, most: float, start: str, pgo_command: Call
+) -> None:
+    code, out, _ = pgo_command("solve", CASES / f"{name}.g2o", "--json")
+    record = json.loads(out)
+    assert record["objective"] <= most
+    assert f"other starts: {start}" in [stage["name"] for stage in record["stages"]]
+    assert code == (0 if record["verdict"] == "CERTIFIED" else 3)
+    assert (record["verdict"] == "CERTIFIED") is (start == "file")
+
+
+def test_poses_with_six_digits_are_optimal_to_them(pgo_command: Call, tmp_path: Path) -> None:
+    square = CASES / "q1_noise_free_square.g2o"
+    code, out, _ = pgo_command("certify", square, "--estimate", CASES / "q1_estimate_6_digits.g2o")
+    assert code == 0
+    assert "optimal to the digits written; polished, exact" in " ".join(out.split())
+    moved = (CASES / "q1_estimate_6_digits.g2o").read_text().replace("2 1 -1", "2 1.00002 -1")
+    (tmp_path / "moved.g2o").write_text(moved)
+    assert pgo_command("certify", square, "--estimate", tmp_path / "moved.g2o")[0] == 3
+
+
+def test_fixes_of_rtabmap_are_positions_of_poses(pgo_command: Call, tmp_path: Path) -> None:
+    case = CASES / "c1_rtabmap_gps_pointxyz_prior.g2o"
+    proof = tmp_path / "proof.json"
+    code, out, err = said(pgo_command, "solve", case, "--json", "--proof", proof)
+    assert code == 0
+    assert "7 EDGE_POINTXYZ_PRIOR lines name poses" in err
+    assert json.loads(out)["objective"] == pytest.approx(17.4374882, rel=1e-7)
+    assert pgo_command("verify", case, proof)[0] == 0
+
+
+def test_labels_of_symbols_name_robots(pgo_command: Call, tmp_path: Path) -> None:
+    case = CASES / "f1_swarm_labeledsymbol.g2o"
+    assert read_g2o(case).num_robots == 3
+    solved(pgo_command, "f1_swarm_labeledsymbol", "--out", tmp_path / "map.tum")
+    for letter in "ABC":
+        times = np.loadtxt(tmp_path / f"map.{letter}.tum")[:, 0]
+        np.testing.assert_array_equal(times, np.arange(len(times)))
+
+
+def test_a_sensor_without_a_place_is_said_to_be_at_its_pose(pgo_command: Call) -> None:
+    _, _, err = said(pgo_command, "solve", CASES / "l3_trackxyz_missing_params.g2o")
+    assert "no PARAMS_SE3OFFSET line says where it is" in err
+
+
+@pytest.mark.parametrize(
+    ("name", "reading", "cost"),
+    [
+        ("n3_square_roots_correlated", "square-roots", 16.538022),
+        ("b4_rotation_first_matrices", "rotation-first", 30.7577607),
+    ],
+)
+def test_the_doctor_reads_matrices_in_another_form(
+    name: str, reading: str, cost: float, pgo_command: Call
+) -> None:
+    code, out, _ = pgo_command("doctor", CASES / f"{name}.g2o", "--json")
+    record = json.loads(out)
+    assert code == 0
+    assert record["proposed"] == [reading]
+    assert record["readings"][reading]["cost"] == pytest.approx(cost, rel=1e-6)
+
+
+def test_two_things_at_once_may_be_other_than_written(pgo_command: Call, tmp_path: Path) -> None:
+    lines = []
+    for line in (CASES / "b4_rotation_first_matrices.g2o").read_text().splitlines():
+        tag, *words = line.split()
+        if tag.startswith("EDGE"):
+            words[:2] = words[1], words[0]
+        lines.append(" ".join([tag, *words]))
+    (tmp_path / "both.g2o").write_text("\n".join(lines))
+    _, out, _ = pgo_command("doctor", tmp_path / "both.g2o", "--json")
+    assert json.loads(out)["proposed"] == ["reversed-rotation-first"]
+
+
+def test_every_component_is_solved_when_asked(pgo_command: Call, tmp_path: Path) -> None:
+    edges = [(0, 1), (1, 2), (2, 0), (7, 8), (8, 9), (9, 7), (9, 8)]
+    matrix = "100 0 0 100 0 400"
+    lines = [f"EDGE_SE2 {i} {j} 1 0 {2.0 + 0.1 * k} {matrix}" for k, (i, j) in enumerate(edges)]
+    (tmp_path / "parts.g2o").write_text("\n".join(lines))
+    written = tmp_path / "map.g2o"
+    code, out, _ = pgo_command(
+        "solve", tmp_path / "parts.g2o", "--all-components", "--out", written
+    )
+    assert code in (0, 3)
+    assert "component 1 of 2: 3 poses, 3 edges" in out
+    assert "component 2 of 2: 3 poses, 4 edges" in out
+    assert read_g2o(tmp_path / "map.2.g2o").pose_ids.tolist() == [7, 8, 9]
+
+
+def test_measurements_without_a_cycle_are_said_to_check_nothing(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    chain = ["EDGE_SE2 0 1 1 0 0 4 0 0 4 0 9", "EDGE_SE2 1 2 1 0 0 4 0 0 4 0 9"]
+    fix = "EDGE_PRIOR_SE2_XY 0 1 2 4 0 4"
+    for lines in (chain, [*chain, fix]):
+        (tmp_path / "chain.g2o").write_text("\n".join(lines))
+        _, out, _ = pgo_command("solve", tmp_path / "chain.g2o", "--json")
+        assert "no cycle: every measurement fits whatever it is" in json.loads(out)["note"]
+    cycle = [*chain, "EDGE_SE2 0 2 2 0 0 4 0 0 4 0 9"]
+    (tmp_path / "cycle.g2o").write_text("\n".join(cycle))
+    _, out, _ = pgo_command("solve", tmp_path / "cycle.g2o", "--json")
+    assert "no cycle" not in json.loads(out)["note"]
+
+
+def test_an_indefinite_matrix_is_refused_with_its_line_and_eigenvalue(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    line = "EDGE_SE2 {} {} 1 0 0 4 5 0 4 0 9"
+    lines = [line.format(k, k + 1) for k in range(6)]
+    (tmp_path / "bad.g2o").write_text("\n".join(lines))
+    code, _, err = pgo_command("solve", tmp_path / "bad.g2o")
+    assert code == 1
+    assert "bad.g2o:1: translation block of the information matrix is indefinite" in err
+    assert "(smallest eigenvalue -1)" in err
+    assert "so are 5 more lines, up to" in err  # one error, said once

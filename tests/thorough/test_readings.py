@@ -85,7 +85,7 @@ def test_a_planted_reading_is_named_and_the_corrected_file_is_right(
     written(graph, path, which, change)
     comparison = compare_readings(path)
     assert [fit.reading for fit in comparison.proposed] == [reading], comparison.sentence()
-    assert len(comparison.others) <= 9  # ten solves
+    assert len(comparison.others) <= 14  # fifteen solves, those of pairs among them
     corrected = tmp_path / "corrected.g2o"
     code, _, err = pgo_command("info", path, "--reading", reading.value, "--out", corrected)
     assert code == 0, err

@@ -204,11 +204,11 @@ def test_info_writes_another_dialect_as_g2o(pgo_command, tmp_path):
 
 def test_all_wrong_lines_of_a_file_are_printed(pgo_command, tmp_path):
     path = tmp_path / "bad.g2o"
-    path.write_text("EDGE_SE2 0 1 x 0 0 4 0 0 4 0 9\n" * 25)
+    path.write_text("".join(f"EDGE_SE2 0 1 x{k} 0 0 4 0 0 4 0 9\n" for k in range(25)))
     code, out, err = pgo_command("solve", path)
     lines = err.splitlines()
     assert (code, out) == (1, "")
-    assert lines[0].startswith(f"pgo: {path}:1: 'x' is no number")
+    assert lines[0].startswith(f"pgo: {path}:1: 'x0' is no number")
     assert [line.split(": ")[0] for line in lines[1:20]] == [f"{path}:{k}" for k in range(2, 21)]
     assert lines[20:] == ["25 lines are wrong; the first 20 are named"]
 

@@ -266,6 +266,7 @@ def offset_line(d: int, number: int, sensors: Poses) -> str:
     return f"{tag} {number} {words(numbers_of(sensors.R, sensors.t)[number - 1])}"
 
 
+@pytest.mark.filterwarnings("ignore:.*lines name sensor 0")
 @given(seed=SEEDS, d=DIMENSIONS)
 def test_a_landmark_seen_by_a_sensor_costs_what_the_sensor_sees(
     tmp_path_factory: pytest.TempPathFactory, seed: int, d: int
