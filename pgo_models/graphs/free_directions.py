@@ -112,10 +112,35 @@ def with_free_directions_held(graph: PoseGraph) -> PoseGraph:
     if graph.is_prior.sum() == 1:
         return _with_single_prior_held(graph)
     if graph.is_world_loose and not graph.is_prior.all():
-        axis = graph.line_of_fixes()
+        axis = _line_of_fixes(graph)
         if axis is not None:
             return _with_turn_held(graph, axis)
     return _with_frame_held(graph, np.flatnonzero(graph.is_prior))
+
+
+def _line_of_fixes(graph: PoseGraph) -> Array | None:
+    """Axis of the turns of the world that priors of positions leave free, exactly.
+
+    It is a unit vector, (d,), along the line that all measured positions lie on; zeros where they
+    are one point; None where the positions, or what is known of them in some direction, fix the
+    turn of the world, if by a little only.
+    """
+    priors = graph.is_prior
+    d = graph.d
+    if graph.information is not None:
+        I_tt = graph.information[priors][:, :d, :d]
+        if (I_tt != I_tt[:, :1, :1] * np.eye(d)).any():
+            return None
+    positions = graph.t_ij[priors]
+    offsets = positions - positions[0]
+    longest = offsets[np.argmax(np.abs(offsets).max(axis=1))]
+    if not longest.any():
+        return np.zeros(d)
+    products = offsets[:, :, None] * longest
+    is_parallel = bool((products == np.swapaxes(products, 1, 2)).all())
+    if d == 2 or not is_parallel:
+        return None
+    return np.asarray(longest / np.linalg.norm(longest))
 
 
 def _with_turn_held(graph: PoseGraph, axis: Array) -> PoseGraph:

@@ -837,32 +837,6 @@ class PoseGraph(ReadOnly):
         _, first = np.unique(self.j[priors], return_index=True)
         return self.t_ij[priors][first]
 
-    def line_of_fixes(self) -> Array | None:
-        """Axis of the turns of the world that priors of positions leave free, exactly.
-
-        Returns
-        -------
-        Array or None
-            A unit vector, (d,), along the line that all measured positions lie on; zeros where they
-            are one point; None where the positions, or what is known of them in some direction, fix
-            the turn of the world, if by a little only.
-        """
-        priors = self.is_prior
-        if self.information is not None:
-            d = self.d
-            I_tt = self.information[priors][:, :d, :d]
-            if (I_tt != I_tt[:, :1, :1] * np.eye(d)).any():
-                return None
-        offsets = self.t_ij[priors] - self.t_ij[priors][0]
-        longest = offsets[np.argmax(np.abs(offsets).max(axis=1))]
-        if not longest.any():
-            return np.zeros(self.d)
-        products = offsets[:, :, None] * longest[None, None, :]
-        is_parallel = (products == np.swapaxes(products, 1, 2)).all()
-        if self.d == 2 or not is_parallel:
-            return None
-        return np.asarray(longest / np.linalg.norm(longest))
-
     # Other graphs made of this one
 
     def subgraph(self, poses: IntArray) -> PoseGraph:
