@@ -19,7 +19,7 @@ from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information, middle_pose
-from pgo_models.graphs.precisions import edge_precisions
+from pgo_models.graphs.precisions import are_singular, edge_precisions, partial_edges
 from pgo_models.problem.costs import ExcessCost
 from pgo_models.problem.excess import CoupledExcess
 from pgo_models.problem.problem import PGOProblem
@@ -205,6 +205,9 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
     J_ss = cost.excess.J_ss if isinstance(cost.excess, CoupledExcess) else None
     if J_ss is not None and graph.d == 3:
         J_ss = np.swapaxes(graph.R_ij, 1, 2) @ J_ss @ graph.R_ij
+        # Axes about which nothing is measured: the turn back has left rounding in their rows.
+        is_empty = ~_information_of(graph)[:, 3:].any(axis=2)
+        J_ss[is_empty[:, :, None] | is_empty[:, None, :]] = 0.0
     rows: list[dict[str, object]] = []
     for e in range(graph.num_edges):
         row: dict[str, object] = {
@@ -326,11 +329,40 @@ def _name(graph: PoseGraph, pose: int) -> int | str:
     return "world" if pose == graph.world else int(graph.pose_ids[pose])
 
 
+def _check_conventions(graph: PoseGraph) -> None:
+    """Raise a SettingError where a free direction is held in a way that `pgo verify` does not know.
+
+    It knows what places the map as a whole: positions of poses where priors measure none, and a
+    single prior.
+    """
+    if graph.unheld is None:
+        return
+    d = graph.d
+    information = _information_of(graph)
+    is_prior = graph.is_prior
+    changed = (information != graph.unheld).any(axis=(1, 2))
+    is_single = is_prior.sum() == 1 and not (changed & ~is_prior).any()
+    is_complete = not are_singular(graph.unheld[changed]).any()
+    of_rotations = (information - graph.unheld)[:, d:].any()
+    places_map = not graph.unheld[is_prior, :d].any() and not of_rotations
+    if not (is_single and is_complete) and not (places_map and is_prior[changed].all()):
+        raise SettingError(
+            f"no proof to write: {graph.free}, by a convention that pgo verify does not have; "
+            "leave out --proof"
+        )
+
+
 def _cost_name(problem: PGOProblem) -> str:
     """Name of the cost in a proof; a SettingError where no file states it."""
     graph = problem.graph
+    _check_conventions(graph)
     if problem.weighting is Weighting.INFORMATION and graph.information is not None:
         return "chi2"
+    if problem.weighting is Weighting.ISOTROPIC and partial_edges(graph).any():
+        raise SettingError(
+            "no proof to write: F has one weight for directions with and without information; "
+            "solve chi2 of the file, or leave out --proof"
+        )
     turns = ~np.isin(graph.j, graph.landmarks)  # of a landmark no rotation is measured
     if isinstance(problem.weighting, Weighting):
         of_rotations = problem.weighting is Weighting.ROTATIONS

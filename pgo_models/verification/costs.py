@@ -26,6 +26,9 @@ value at Z' is <C, Z'>, and being convex it is at least its tangent 2 <C, Z> - <
 Any tau and J_ss will do that make J positive semidefinite, of which J_ss is a block. A proof may
 say which: its multipliers and its handedness terms belong to the form that follows from them.
 
+**A matrix that does not measure every direction** is semidefinite, and tau is zero where its I_tt
+is singular: J is then semidefinite, which is checked exactly.
+
 **A matrix that is semidefinite but for rounding**, as a file of so many digits has it, would make
 chi2 negative somewhere. As everywhere in this project, chi2 is then that of the matrix with 2^-45
 of its diagonal added (`proper_edge`).
@@ -287,8 +290,6 @@ def proper_triangle(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> tuple
     """Upper triangle of the matrix of `proper_edge`."""
     side = information_side(d, is_point)
     rows = symmetric(triangle, side)
-    check_weights([row[:d] for row in rows[:d]])
-    check_weights([row[d:] for row in rows[d:]])
     if is_semidefinite(rows):
         return triangle
     for a in range(side):
@@ -312,6 +313,10 @@ def translation_weight(
     tau = own_translation_weight(edge.triangle, d, edge.tag.is_point)
     if not any(I_tr.entries()):
         return tau, fmpq_mat(num_axes, num_axes)
+    if tau == 0:
+        # J is the matrix of the file: all of the edge is in the tangent.
+        axes = range(d, edge.tag.side)
+        return tau, edge.block(axes, axes)
     translation = range(d)
     I_tt = edge.block(translation, translation)
     I_tt_less_tau = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
@@ -340,7 +345,7 @@ def own_translation_weight(triangle: tuple[fmpq, ...], d: int, is_point: bool) -
     What it may be is below the largest tau with I - blockdiag(tau I, 0) positive definite, which
     keeps the term with W_R convex. A coupled I that is only semidefinite leaves no such tau: there
     it is a small share of the smallest eigenvalue of I_tt, and W_R a little indefinite, of which
-    the proof asks nothing.
+    the proof asks nothing. It is zero where I_tt does not measure every direction.
     """
     rows = symmetric(triangle, information_side(d, is_point))
     I_tt = [row[:d] for row in rows[:d]]
@@ -354,9 +359,9 @@ def own_translation_weight(triangle: tuple[fmpq, ...], d: int, is_point: bool) -
         first_entry = I_tt[0][0]
         is_isotropic = not is_nonzero(less_tau(I_tt, first_entry, d))
         tau = first_entry if is_isotropic else definite_tau(I_tt, d, BELOW)
-    if tau is None:
+    if tau is None and first_bad_pivot(I_tt) is None:
         raise StepFailedError("the weights: an information matrix is all but singular")
-    return tau
+    return fmpq(0) if tau is None else tau
 
 
 def definite_tau(rows: list[list[fmpq]], d: int, share: float) -> fmpq | None:

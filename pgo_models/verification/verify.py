@@ -55,6 +55,11 @@ with n rotations, the bound of weak duality in Rosen et al. 2019.)
 rows R_i^T alone. Then the rows t_i^T are left out of S, G and Z as those of pose r are, and the
 proof is the same without the shift of X.
 
+**Parts that nothing places.** Where no edge measures translations between two parts of the map, as
+with a compass and no position, a common shift of one part does not change the right side either. So
+one pose of it may be shifted to where X' V has it, and the row of Z of its translation is zero: it
+is left out, too.
+
 **The world pose.** Priors measure from it, and where it stands is a matter of names: with another
 point o of its frame in its place, t_w + R_w o is the unknown, and positions p in its frame become
 p - o, which leaves every residual t_j - t_w - R_w p as it is. Where a proof has the world pose
@@ -422,6 +427,9 @@ def lower_bound(
     H = without_pose(form.S, proof.ground)
     if is_of_rotations(graph, proof):
         H, right_sides = without_translations(H, right_sides)
+    else:
+        for pose in held_poses(graph, proof.ground):
+            without_translation_of(pose, H, right_sides)
     if proof.is_complex:
         H, right_sides = in_complex_numbers(H, right_sides)
     products = eliminate(H, right_sides)
@@ -613,6 +621,43 @@ def without_translations(
     return H_of_rotations, of_rotations
 
 
+def held_poses(graph: Graph, ground: int) -> list[int]:
+    """A pose of every part of the map whose position beside that of the `ground` nothing measures.
+
+    The parts are joined by edges that measure translations.
+    """
+    part_of = {node: {node} for node in graph.nodes}
+    for edge in graph.edges:
+        first, second = part_of[edge.i], part_of[edge.j]
+        if first is second or not measures_translation(edge):
+            continue
+        larger, smaller = (first, second) if len(first) >= len(second) else (second, first)
+        larger |= smaller
+        for node in smaller:
+            part_of[node] = larger
+    held = []
+    seen = [part_of[ground]]
+    for node in sorted(graph.nodes - graph.landmarks):
+        if not any(part_of[node] is known for known in seen):
+            seen.append(part_of[node])
+            held.append(node)
+    return held
+
+
+def without_translation_of(
+    pose: int, H: dict[int, dict[int, arb_mat]], right_sides: dict[int, arb_mat]
+) -> None:
+    """Leave the translation of a pose out of H and the right-hand sides."""
+    rows = range(1, right_sides[pose].nrows())
+    right_sides[pose] = part(right_sides[pose], rows, range(right_sides[pose].ncols()))
+    for other, block in H[pose].items():
+        if other != pose:
+            without_first_row = part(block, rows, range(block.ncols()))
+            H[pose][other] = without_first_row
+            H[other][pose] = without_first_row.transpose()
+    H[pose][pose] = part(H[pose][pose], rows, rows)
+
+
 def in_complex_numbers(
     H: dict[int, dict[int, arb_mat]], right_sides: dict[int, arb_mat]
 ) -> tuple[dict[int, dict[int, arb_mat]], dict[int, arb_mat]]:
@@ -639,7 +684,12 @@ def sum_of_columns(U: tuple[arb_mat, arb_mat], of_0: arb_mat, of_1: arb_mat) -> 
 
 
 def columns_of_numbers(num_rows: int) -> tuple[arb_mat, arb_mat]:
-    """U_0 and U_1 of a pose, whose rows are three, or of a landmark, which has one."""
+    """U_0 and U_1 of a pose, whose rows are three, or of a landmark, which has one.
+
+    A pose whose translation is held has the two rows of its rotation.
+    """
+    if num_rows == 2:
+        return arb_mat([[1, 0], [0, -1]]), arb_mat([[0, 1], [1, 0]])
     U_0 = [[1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]]
     U_1 = [[0, 1, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]]
     size = 4 if num_rows == 3 else 2

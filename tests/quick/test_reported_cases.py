@@ -245,6 +245,17 @@ def test_directions_that_nothing_measures_are_named_and_held(
     assert free in record["note"]
 
 
+@pytest.mark.parametrize("name", ["a3_gravity_only", "a6_compass_2d", "i3_gauge_prior_1e12"])
+def test_a_bound_with_free_directions_is_proven_of_the_file(
+    name: str, pgo_command: Call, tmp_path: Path
+) -> None:
+    proof = tmp_path / "proof.json"
+    solved(pgo_command, name, "--proof", proof)
+    code, out, _ = pgo_command("verify", CASES / f"{name}.g2o", proof)
+    assert code == 0, out
+    assert "VERIFIED: no poses" in out
+
+
 @pytest.mark.parametrize(
     ("name", "infinite"),
     [
