@@ -109,7 +109,11 @@ def partial_edges(graph: PoseGraph) -> BoolArray:
     d = graph.d
     of_translations = are_singular(graph.information[:, :d, :d])
     of_rotations = are_singular(graph.information[:, d:, d:])
-    return of_translations | of_rotations
+    is_partial = of_translations | of_rotations
+    # Indefinite matrices are none.
+    _, is_indefinite = _semidefinite(graph.information[is_partial], d)
+    is_partial[is_partial] = ~is_indefinite
+    return is_partial
 
 
 def without_negative_rounding(information: Array, d: int) -> tuple[Array, BoolArray]:

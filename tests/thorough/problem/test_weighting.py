@@ -130,13 +130,15 @@ def test_rotation_information_is_in_every_matrix() -> None:
     assert np.sum(X[n:] * (problem.Q @ X[n:])) == pytest.approx(best, rel=1e-9)
 
 
-def test_matrices_beyond_double_precision_are_refused_by_name() -> None:
+def test_matrices_beyond_double_precision_have_no_tau() -> None:
+    """All of their translations is in the excess, whose rounding is counted in bounds."""
     graph = informed(0, 6, 2, coupled=False)
     information = graph.information.copy()  # type: ignore[union-attr]
     information[2, :2, :2] = np.diag([1.0, 1e14])
     problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
-    with pytest.raises(GraphError, match=r"edge 2 .* spans more orders of magnitude"):
-        problem.objective(random_poses(6, 2, 0))
+    assert problem.weights.tau[2] == 0.0
+    assert (np.delete(problem.weights.tau, 2) > 0.0).all()
+    assert problem.objective(random_poses(6, 2, 0)) > 0.0
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -166,7 +168,7 @@ def test_indefinite_blocks_are_refused(d: int, block: str, isotropic: bool) -> N
         problem = PGOProblem(
             replace(graph, information=information), weighting=Weighting.INFORMATION
         )
-        with pytest.raises(GraphError, match=r"edge 3 .* is singular or indefinite, or spans"):
+        with pytest.raises(GraphError, match=r"indefinite \(first edge 3 .*: eigenvalue -"):
             problem.objective(random_poses(6, d, 0))
 
 
