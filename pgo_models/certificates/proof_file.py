@@ -17,7 +17,7 @@ from pgo_models.figures import scaled_below
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information, middle_pose
 from pgo_models.graphs.precisions import are_singular, edge_precisions, partial_edges
 from pgo_models.problem.costs import ExcessCost
@@ -206,7 +206,7 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
     if J_ss is not None and graph.d == 3:
         J_ss = np.swapaxes(graph.R_ij, 1, 2) @ J_ss @ graph.R_ij
         # Axes about which nothing is measured: the turn back has left rounding in their rows.
-        is_empty = ~_information_of(graph)[:, 3:].any(axis=2)
+        is_empty: BoolArray = np.all(_information_of(graph)[:, 3:] == 0.0, axis=2)
         J_ss[is_empty[:, :, None] | is_empty[:, None, :]] = 0.0
     rows: list[dict[str, object]] = []
     for e in range(graph.num_edges):

@@ -122,11 +122,13 @@ def _line_of_fixes(graph: PoseGraph) -> Array | None:
     """Axis of the turns of the world that priors of positions leave free, exactly.
 
     It is a unit vector, (d,), along the line that all measured positions lie on; zeros where they
-    are one point; None where the positions, or what is known of them in some direction, fix the
-    turn of the world, if by a little only.
+    are one point, or those of one pose; None where the positions, or what is known of them in some
+    direction, fix the turn of the world, if by a little only.
     """
     priors = graph.is_prior
     d = graph.d
+    if len(np.unique(graph.j[priors])) == 1:
+        return np.zeros(d)  # wherever this pose is, the map turns about it
     if graph.information is not None:
         I_tt = graph.information[priors][:, :d, :d]
         if (I_tt != I_tt[:, :1, :1] * np.eye(d)).any():
@@ -165,7 +167,8 @@ def _with_turn_held(graph: PoseGraph, axis: Array) -> PoseGraph:
         f"{which} is free: no edge or prior measures it; pose {pose} is held unturned about it, "
         "and variances along it are infinite"
     )
-    return _with_information(graph, edge, before + usual, text, is_of_F=False)
+    is_of_F = not axis.any()
+    return _with_information(graph, edge, before + usual, text, is_of_F)
 
 
 def _with_single_prior_held(graph: PoseGraph) -> PoseGraph:

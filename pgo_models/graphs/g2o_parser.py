@@ -717,8 +717,8 @@ def _problems_of_blocks(file: G2OLines, name: str, blocks: Array) -> list[Proble
     if not len(doubtful):
         return []
     lowest = lowest_scaled(blocks[doubtful])
-    largest = np.abs(blocks[doubtful]).max(axis=(1, 2))
-    is_tiny = largest <= 1.0 / LARGEST
+    diagonals = np.abs(np.einsum("mkk->mk", blocks[doubtful]))
+    is_tiny = ((diagonals > 0.0) & (diagonals <= 1.0 / LARGEST)).any(axis=1)
     is_wrong = (lowest < -ROUNDED_EIGENVALUE) | is_tiny
     wrong = doubtful[is_wrong]
     smallest = np.linalg.eigvalsh(blocks[wrong])[:, 0].tolist()

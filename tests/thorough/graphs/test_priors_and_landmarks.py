@@ -8,9 +8,10 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem, PoseGraph, Poses, grid, victoria_park
+from pgo_models import PGOProblem, PoseGraph, Poses, chordal_start, grid, victoria_park
 from pgo_models.errors import GraphError
 from pgo_models.problem.hessian import riemannian_hessian
+from solvers import polish
 
 
 def chain(d: int = 3, n: int = 4) -> PoseGraph:
@@ -136,28 +137,43 @@ def line(k: int, d: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("graph", "message"),
+    ("graph", "free"),
     [
         (
             chain(3).with_position_prior(np.arange(4), line(4, 3), 1.0),
-            "on a line, leave turns of the world open",
+            "the turn of the map about the line through its fixes is free",
         ),
         (
             chain(3).with_position_prior(np.arange(2), np.eye(3)[:2], 1.0),
-            "the priors do not fix the gauge",
+            "the turn of the map about the line through its fixes is free",
         ),
         (
             chain(2).with_position_prior(np.arange(1), np.ones((1, 2)), 1.0),
-            "the priors do not fix the gauge",
+            "the prior of pose 0 is the only one",
         ),
         (
             chain(2).with_position_prior(np.zeros(3, int), np.eye(3)[:, :2], 1.0),
-            "positions of 1 poses",
+            "the turn of the map about the point of its fixes is free",
         ),
         (
-            chain().with_prior(np.array([1]), Poses.identity(1, 3), 1.0, 0.0),
-            "the priors of chain measure rotations alone",
+            chain().with_prior(np.arange(2), Poses.identity(2, 3), 1.0, 0.0),
+            "the position of the map is free",
         ),
+    ],
+)
+def test_what_is_free_is_said_and_held(graph, free):
+    problem = PGOProblem(graph)
+    assert free in problem.graph.free
+    poses = polish(problem, chordal_start(problem.convex_part))
+    costs = problem.edge_costs(poses)
+    # What is held costs nothing: the least cost is that of the graph as it was.
+    as_measured = problem.measured.edge_costs(poses)
+    np.testing.assert_allclose(costs, as_measured, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("graph", "message"),
+    [
         (
             chain().with_weights(np.array([1.0, 0, 1]), np.ones(3)),
             r"rotation of 2 poses \(with 2\).*kappa > 0",
