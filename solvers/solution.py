@@ -199,8 +199,9 @@ class Solution:
         ----------
         path : Path or str
             `.g2o`: the graph with the solved poses; without a suffix: a folder with one such file a
-            robot. `.tum` or `.txt`: a TUM trajectory. `.kitti`: a KITTI one. `.json`: all but the
-            measurements. `.png`, `.svg` or `.pdf`: the picture of `plot`.
+            robot. `.tum` or `.txt`: a TUM trajectory, of several robots one for each, too.
+            `.kitti`: a KITTI one. `.json`: all but the measurements. `.png`, `.svg` or `.pdf`: the
+            picture of `plot`.
 
         Raises
         ------

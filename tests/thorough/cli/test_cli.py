@@ -119,7 +119,8 @@ def test_results_are_written_in_every_format(pgo_command, tmp_path):
         "solve", "robots", *(part for path in paths for part in ("--out", path))
     )
     assert code == 0
-    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    of_robots = [tmp_path / f"result.{letter}.tum" for letter in "abcd"]
+    assert sorted(tmp_path.iterdir()) == sorted([*paths, *of_robots])
     assert all(f"written: {path}" in out for path in paths)
     assert json.loads((tmp_path / "result.json").read_text())["verdict"] == "CERTIFIED"
     for suffix in ("g2o", "tum", "kitti"):
