@@ -159,7 +159,7 @@ class PGOProblem(ReadOnly):
             kappa = np.where(is_held, kappa, self.graph.kappa)
             tau = np.where(is_held, tau, self.graph.tau)
             cost = matrices.isotropic_weights(replace(self.graph, kappa=kappa, tau=tau))
-        return _SharingProblem(self.graph, self.backend, cost, original=self)
+        return _SameGraph(self.graph, self.backend, cost, original=self)
 
     @cached_property
     def right_costs(self) -> RightCosts:
