@@ -56,18 +56,22 @@ class OwnStart(enum.Enum):
 
 
 class Step(enum.Enum):
-    """Steps of a solve after its first attempt, each of which may improve the answer."""
+    """Steps of a solve after its first attempt, each of which may improve the answer.
+
+    The value names a step that was skipped or failed. A step that is one stage has the name of that
+    stage.
+    """
 
     AGAIN = "complete solve"
     GROWING = "growing start"
     LAST_STEPS = "last steps of Newton"
     SECOND = "second attempt"
     STARTS = "other starts"
-    STAIRCASE = "staircase"
+    STAIRCASE = "Staircase"
     SMALLER_MATRICES = "smaller matrices"
-    COMPLEX = "complex numbers"
-    TERMS = "handedness terms"
-    HULLS = "hulls of rotations"
+    COMPLEX = "ComplexRelaxation"
+    TERMS = "HandednessAscent"
+    HULLS = "HullLagrangian"
 
 
 @dataclass(frozen=True)

@@ -56,8 +56,8 @@ def test_a_step_that_fails_leaves_the_answer_before_it(
     assert before.certificate.can_improve  # else the step would not be taken
     monkeypatch.setattr(solvers.Staircase, "init", failing(error))
     solution = solvers.solve(problem, WITH_STAIRCASE)
-    assert "staircase" in [stage.name for stage in solution.stages if stage.status is Status.FAILED]
-    assert f"staircase failed ({error}); the answer before it stands" in solution.note
+    assert "Staircase" in [stage.name for stage in solution.stages if stage.status is Status.FAILED]
+    assert f"Staircase failed ({error}); the answer before it stands" in solution.note
     np.testing.assert_array_equal(solution.poses.t, before.poses.t)
     assert solution.lower_bound == before.lower_bound
     assert solution.status is before.status
@@ -174,5 +174,5 @@ def test_chi2_that_has_no_relaxation_says_so() -> None:
         loose_problem_of_chi2(), replace(FIRST_ALONE, staircase=solvers.Staircase())
     )
     skipped = [(stage.name, stage.reason) for stage in solution.stages if not stage.was_taken]
-    assert skipped == [("staircase", "the cost is not convex and quadratic")]
+    assert skipped == [("Staircase", "the cost is not convex and quadratic")]
     assert solution.stages[-1].name == "smaller matrices"

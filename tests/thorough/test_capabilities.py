@@ -252,13 +252,13 @@ def certifies_by_terms(place: Place) -> bool:
     noise = np.deg2rad(70.0)
     graph = noisy_scene(SweptScene.CIRCLE, noise, np.random.default_rng(0))
     answer = place.solve(graph, weighting=Weighting.ISOTROPIC)
-    refuse_what_the_note_names(answer, "handedness terms")
+    refuse_what_the_note_names(answer, "HandednessAscent")
     return answer.certificate.bound.terms is not None
 
 
 def certifies_in_complex_numbers(place: Place) -> bool:
     answer = place.solve(planar_lattice(4, 4, 0.5), weighting=Weighting.ISOTROPIC)
-    refuse_what_the_note_names(answer, "complex numbers")
+    refuse_what_the_note_names(answer, "ComplexRelaxation")
     return answer.certificate.bound.is_complex
 
 
