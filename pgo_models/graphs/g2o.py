@@ -76,6 +76,10 @@ def read_g2o(
     every pose has a VERTEX line. Where at least half of the poses of one file have one, the others
     are placed along edges, with a warning; it is None otherwise.
 
+    Read are also the pose graphs of Open3D (JSON), view graphs with lines i j, a rotation by rows
+    and a translation, of which the rotations are taken, and tables with a header such as
+    i,j,x,y,theta, with the upper triangles of information matrices or without.
+
     Where the lines leave a choice, a `GraphWarning` says what was assumed:
 
     - EDGE2, EDGE3 and LANDMARK2 have information matrices, although iSAM's files have square roots

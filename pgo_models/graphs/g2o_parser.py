@@ -24,6 +24,7 @@ from pgo_models.files import (
     zero_quaternion_lines,
 )
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.foreign_files import as_g2o
 from pgo_models.graphs.g2o_dialects import (
     NO_OFFSET,
     MatrixOrder,
@@ -121,7 +122,8 @@ def read_lines(
     beside lines in 3D.
     """
     path = Path(path)
-    return parse_lines(path, read_blocks(path), skip_unknown, reading, needs_matrices)
+    blocks = as_g2o(path, read_blocks(path))
+    return parse_lines(path, blocks, skip_unknown, reading, needs_matrices)
 
 
 def parse_lines(

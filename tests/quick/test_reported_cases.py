@@ -11,6 +11,7 @@ import pytest
 
 import solvers
 from pgo_models import PoseGraph, Reading
+from pgo_models.errors import FileFormatError, GraphWarning
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 
 pytest.importorskip("flint")
@@ -395,3 +396,63 @@ def test_an_indefinite_matrix_is_refused_with_its_line_and_eigenvalue(
     assert "bad.g2o:1: translation block of the information matrix is indefinite" in err
     assert "(smallest eigenvalue -1)" in err
     assert "so are 5 more lines, up to" in err  # one error, said once
+
+
+def test_pose_graphs_of_open3d_are_read() -> None:
+    """An edge of Open3D has the pose of its source as seen from its target."""
+    with pytest.warns(GraphWarning, match="22 of 22 edges are uncertain"):
+        graph = read_g2o(CASES / "b1_open3d_posegraph.json")
+    same = read_g2o(CASES / "b2_tls_all_uncertain.g2o")
+    np.testing.assert_array_equal(graph.i, same.j)
+    np.testing.assert_array_equal(graph.j, same.i)
+    np.testing.assert_allclose(graph.R_ij, np.swapaxes(same.R_ij, 1, 2), rtol=0, atol=1e-5)
+    there_and_back = same.t_ij + np.einsum("mab,mb->ma", same.R_ij, graph.t_ij)
+    np.testing.assert_allclose(there_and_back, 0.0, rtol=0, atol=1e-4)
+    diagonal = np.diagonal(graph.information[0])
+    np.testing.assert_array_equal(diagonal, [5000.0] * 3 + [200000.0] * 3)
+
+
+@pytest.mark.parametrize("is_of_cameras", [False, True])
+def test_the_rotations_of_view_graphs_are_read(
+    is_of_cameras: bool, pgo_command: Call, tmp_path: Path
+) -> None:
+    lines = []
+    for line in (CASES / "EGs.txt").read_text().splitlines():
+        words = line.split()
+        R = np.array(words[2:11]).reshape(3, 3)
+        R = R.T if is_of_cameras else R
+        lines.append(" ".join([*words[:2], *R.ravel(), *words[11:]]))
+    (tmp_path / "EGs.txt").write_text("\n".join(lines))
+    code, out, err = said(pgo_command, "solve", tmp_path / "EGs.txt", "--rotations", "--json")
+    assert code == 0
+    assert "a view graph, of which the rotations are read" in err
+    assert json.loads(out)["objective"] == pytest.approx(13.86581241, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("i,j,x,y,theta,xx,xy,xt,yy,yt,tt", "{},{},1,0,2,100,0,0,100,0,400"),
+        ("from to dx dy yaw xx xy xt yy yt tt", "{} {} 1 0 2 100 0 0 100 0 400"),
+    ],
+)
+def test_tables_with_a_header_are_read(header: str, line: str, tmp_path: Path) -> None:
+    ends = [(0, 1), (1, 2), (2, 0)]
+    rows = [line.format(*pair) for pair in ends]
+    (tmp_path / "table.csv").write_text("\n".join([header, *rows]))
+    with pytest.warns(GraphWarning, match="a table of EDGE_SE2 measurements, with the upper"):
+        graph = read_g2o(tmp_path / "table.csv")
+    np.testing.assert_array_equal(np.stack([graph.i, graph.j], axis=1), ends)
+    np.testing.assert_array_equal(graph.information[0], np.diag([100.0, 100.0, 400.0]))
+    (tmp_path / "table.csv").write_text("\n".join([header, rows[0], "1,2", rows[2]]))
+    with pytest.raises(FileFormatError, match=r"table.csv:3: .* columns"):
+        read_g2o(tmp_path / "table.csv")
+
+
+def test_files_that_are_no_text_of_measurements_are_named(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    (tmp_path / "map.db").write_text("SQLite format 3")
+    code, _, err = pgo_command("solve", tmp_path / "map.db")
+    assert code == 1
+    assert "rtabmap-export --poses_format 4" in err

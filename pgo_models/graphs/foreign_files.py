@@ -1,0 +1,252 @@
+"""Files of other programs as lines of g2o: Open3D's pose graphs, view graphs, and tables.
+
+What a file is follows from its first line. A table and a view graph become a file with the same
+number of lines, so that messages name the lines of the file itself.
+"""
+
+import json
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import FileFormatError, GraphWarning, printable
+from pgo_models.geometry.rotations import Array, project_to_rotations, quaternions_from_rotations
+
+_VIEW_WORDS = 14  # i j, a rotation by rows, a translation
+_UNIT_ROTATION = " ".join(["0"] * 15 + ["1 0 0 1 0 1"])  # information of a rotation alone
+_NAMES_OF_FIRST = {"i", "from", "id1", "id_1", "id_a", "source", "src", "start", "pose_i"}
+_NAMES_OF_SECOND = {"j", "to", "id2", "id_2", "id_b", "target", "dst", "end", "pose_j"}
+_ALIASES = {"dx": "x", "dy": "y", "dz": "z", "tx": "x", "ty": "y", "tz": "z"}
+_ALIASES |= {"dtheta": "theta", "yaw": "theta", "heading": "theta", "angle": "theta"}
+_ALIASES |= {"th": "theta", "t": "theta"}
+_PLANE = ["x", "y", "theta"]
+_SPACE = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+_FEW_TRIANGLES = 2000  # of views that are compared
+# Files that are no text of measurements, and what exports them.
+_EXPORTED_BY = {
+    ".pbstream": "a state of Cartographer; its constraints are printed by cartographer_pbstream "
+    "info --all_debug_strings: write them as lines of g2o",
+    ".posegraph": "a graph that slam_toolbox has serialized; load it with deserialize_map, and "
+    "write its constraints as lines of g2o",
+    ".pyfg": "a factor graph of PyFG; read it with py_factor_graph (read_from_pyfg_text), and "
+    "write its measurements as lines of g2o",
+    ".db": "a data base, as of RTAB-Map; rtabmap-export --poses_format 4 writes g2o: give that",
+}
+
+
+@dataclass
+class _Table:
+    """Columns of a table with a header."""
+
+    separator: str | None
+    first: int
+    second: int
+    measured: list[int]
+    matrix: list[int] = field(default_factory=list)
+
+    @property
+    def tag(self) -> str:
+        """Tag of its edges."""
+        return "EDGE_SE2" if len(self.measured) == 3 else "EDGE_SE3:QUAT"
+
+
+def as_g2o(path: Path, blocks: Iterable[str]) -> Iterator[str]:
+    """Blocks of lines of g2o, of a file of another program or of g2o itself."""
+    if path.suffix in _EXPORTED_BY:
+        raise FileFormatError(path, None, _EXPORTED_BY[path.suffix])
+    stream = iter(blocks)
+    opening = next(stream, "")
+    first = next((line for line in opening.split("\n") if _has_words(line)), "")
+    rest = chain([opening], stream)
+    if first.lstrip().startswith("{"):
+        return iter([_of_open3d(path, "".join(rest))])
+    if _is_view(first.split()):
+        return iter([_of_views(path, "".join(rest))])
+    table = _table_of(first)
+    if table is not None:
+        return iter([_of_table(path, table, "".join(rest))])
+    return rest
+
+
+def _has_words(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith(("#", "//", "%"))
+
+
+# Open3D
+
+
+def _of_open3d(path: Path, text: str) -> str:
+    """Lines of g2o of Open3D's PoseGraph.
+
+    An edge has the transformation X from source to target, which is x_target^-1 x_source, and the
+    information of its error, the rotation first. Both are stored by columns.
+    """
+    try:
+        record = json.loads(text)
+        nodes = record["nodes"]
+        edges = record["edges"]
+        lines = [_vertex_line(k, node) for k, node in enumerate(nodes)]
+        lines += [_edge_line(edge) for edge in edges]
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        problem = "JSON, but no PoseGraph of Open3D; give what write_pose_graph writes"
+        raise FileFormatError(path, None, problem) from error
+    num_uncertain = sum(bool(edge.get("uncertain")) for edge in edges)
+    if num_uncertain:
+        warnings.warn(
+            f"{printable(str(path))}: {num_uncertain} of {len(edges)} edges are uncertain, as "
+            "Open3D marks loop closures; --robust gnc finds wrong ones",
+            GraphWarning,
+            stacklevel=2,
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _vertex_line(number: int, node: dict[str, list[float]]) -> str:
+    pose = np.array(node["pose"], dtype=float).reshape(4, 4).T
+    return f"VERTEX_SE3:QUAT {number} {_words_of_pose(pose[:3, :3], pose[:3, 3])}"
+
+
+def _edge_line(edge: dict[str, list[float]]) -> str:
+    X = np.array(edge["transformation"], dtype=float).reshape(4, 4).T
+    information = np.array(edge["information"], dtype=float).reshape(6, 6)
+    translation_first = np.roll(information, 3, axis=(0, 1))
+    triangle = 0.5 * (translation_first + translation_first.T)[np.triu_indices(6)]
+    ends = f"{edge['target_node_id']} {edge['source_node_id']}"
+    words = _words_of_pose(X[:3, :3], X[:3, 3])
+    return f"EDGE_SE3:QUAT {ends} {words} {_words(triangle)}"
+
+
+def _words_of_pose(R: Array, t: Array) -> str:
+    quaternion = quaternions_from_rotations(project_to_rotations(R[None]))[0]
+    return f"{_words(t)} {_words(quaternion)}"
+
+
+def _words(numbers: Array) -> str:
+    return " ".join(map(repr, numbers.tolist()))
+
+
+# View graphs
+
+
+def _is_view(words: list[str]) -> bool:
+    """Whether a line has two ids, and a rotation by rows with a translation."""
+    if len(words) != _VIEW_WORDS or not all(word.isdigit() for word in words[:2]):
+        return False
+    try:
+        R = np.array(words[2:11], dtype=float).reshape(3, 3)
+    except ValueError:
+        return False
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-3)
+
+
+def _of_views(path: Path, text: str) -> str:
+    """Lines of g2o of a view graph: rotations alone, as the translations have no length.
+
+    Programs differ in whether R_ij is R_i^T R_j or R_j R_i^T of cameras that see the world: cycles
+    of three views tell.
+    """
+    lines = text.split("\n")
+    rotations = {}
+    for place, line in enumerate(lines):
+        words = line.split()
+        if not _has_words(line):
+            continue
+        if not _is_view(words):
+            problem = "no view: give i j, a rotation by rows, and a translation"
+            raise FileFormatError(path, place + 1, problem)
+        rotations[place] = np.array(words[2:11], dtype=float).reshape(3, 3)
+    ends = {}
+    for place in rotations:
+        first, second = lines[place].split()[:2]
+        ends[place] = (int(first), int(second))
+    are_transposed = _are_transposed({ends[place]: R for place, R in rotations.items()})
+    written = [""] * len(lines)
+    for place, R in rotations.items():
+        i, j = ends[place]
+        pose = _words_of_pose(R.T if are_transposed else R, np.zeros(3))
+        written[place] = f"EDGE_SE3:QUAT {i} {j} {pose} {_UNIT_ROTATION}"
+    kind = "R_j R_i^T of R_i, from the world to camera i" if are_transposed else "R_i^T R_j"
+    warnings.warn(
+        f"{printable(str(path))}: a view graph, of which the rotations are read, as {kind}",
+        GraphWarning,
+        stacklevel=2,
+    )
+    return "\n".join(written)
+
+
+def _are_transposed(rotations: dict[tuple[int, int], Array]) -> bool:
+    """Whether cycles of three views fit R_jk R_ij = R_ik better than R_ij R_jk = R_ik."""
+    successors: dict[int, list[int]] = {}
+    for i, j in rotations:
+        successors.setdefault(i, []).append(j)
+    misfits: list[tuple[float, float]] = []
+    for (i, j), first in rotations.items():
+        for k in successors.get(j, []):
+            if (i, k) in rotations and len(misfits) < _FEW_TRIANGLES:
+                second = rotations[j, k]
+                third = rotations[i, k]
+                direct = np.linalg.norm(first @ second - third)
+                transposed = np.linalg.norm(second @ first - third)
+                misfits.append((float(direct), float(transposed)))
+    if not misfits:
+        return False
+    of_direct, of_transposed = np.median(misfits, axis=0)
+    return bool(of_transposed < of_direct)
+
+
+# Tables
+
+
+def _table_of(line: str) -> _Table | None:
+    """Columns of a table that has this header; None where it is none."""
+    separator = next((mark for mark in (",", ";", "\t") if mark in line), None)
+    names = [word.strip().strip('"').lower() for word in line.split(separator)]
+    places = {_ALIASES.get(name, name): place for place, name in reversed(list(enumerate(names)))}
+    first = [place for name, place in places.items() if name in _NAMES_OF_FIRST]
+    second = [place for name, place in places.items() if name in _NAMES_OF_SECOND]
+    if not first or not second:
+        return None
+    in_space = [places[name] for name in _SPACE if name in places]
+    in_plane = [places[name] for name in _PLANE if name in places]
+    if len(in_space) == len(_SPACE):
+        columns, side = in_space, 6
+    elif len(in_plane) == len(_PLANE):
+        columns, side = in_plane, 3
+    else:
+        return None
+    table = _Table(separator, first[0], second[0], columns)
+    used = {table.first, table.second, *columns}
+    others = [place for place in range(len(names)) if place not in used]
+    if len(others) == side * (side + 1) // 2:
+        table.matrix = others
+    return table
+
+
+def _of_table(path: Path, table: _Table, text: str) -> str:
+    """Lines of g2o of a table, whose header becomes an empty line."""
+    lines = text.split("\n")
+    written = [""] * len(lines)
+    is_header = True
+    for place, line in enumerate(lines):
+        if not _has_words(line):
+            continue
+        if is_header:
+            is_header = False
+            continue
+        words = [word.strip() for word in line.split(table.separator)]
+        columns = [table.first, table.second, *table.measured, *table.matrix]
+        if len(words) <= max(columns):
+            problem = f"{len(words)} columns, and the header has {max(columns) + 1} or more"
+            raise FileFormatError(path, place + 1, f"{problem}; complete the line")
+        written[place] = " ".join([table.tag, *(words[column] for column in columns)])
+    matrix = "the upper triangle of information matrices" if table.matrix else "no matrices"
+    warnings.warn(
+        f"{printable(str(path))}: a table of {table.tag} measurements, with {matrix}",
+        GraphWarning,
+        stacklevel=2,
+    )
+    return "\n".join(written)
