@@ -22,7 +22,7 @@ from pgo_models.graphs.written_digits import WrittenDigits
 from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.low_rank import LiftedPoses
 
-VERSION = 9
+VERSION = 10
 K = TypeVar("K", bound=type)
 F = TypeVar("F", bound=Callable[..., Any])
 # Records of a package that knows nothing of messages.

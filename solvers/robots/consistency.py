@@ -4,7 +4,9 @@ Closures between two robots touch some poses of each. A robot sends its neighbou
 one of these poses to the next, in one message. Then both know the cycles of all closures between
 them, and compute the same largest set that agrees (`solvers.robust.consistency`). A robot judges
 the closures with itself alone. It tells the driver how many closures with each neighbour agree, and
-the driver answers with the neighbours whose closures stay.
+the driver answers with the neighbours whose closures stay. `largest_sets` judges here as it does in
+one place; what differs is who knows a cycle: `consistency.pairwise_consistent` has the chains of
+all robots, a robot its own and what its neighbours send of theirs.
 """
 
 from __future__ import annotations
@@ -27,9 +29,7 @@ from solvers.riemannian.polish import polish
 from solvers.robots.agent import Agent
 from solvers.robots.own_file import (
     Border,
-    CostedFile,
-    JoinedFile,
-    PlacedFile,
+    OwnGraph,
     border_of,
 )
 from solvers.robust.chains import (
@@ -94,10 +94,10 @@ class ConsistentPart:
 @order("consistency.tell_trajectories")
 def tell_trajectories(agent: Agent, _: None) -> Messages[Trajectory]:
     """Order: tell every neighbour of the own poses that edges between the two touch."""
-    return _trajectories(agent.robot, agent.known(JoinedFile))
+    return _trajectories(agent.robot, agent.known(OwnGraph))
 
 
-def _trajectories(robot: int, joined: JoinedFile) -> Messages[Trajectory]:
+def _trajectories(robot: int, joined: OwnGraph) -> Messages[Trajectory]:
     graph = joined.graph
     is_own = joined.owners == robot
     chains = Chains.of(graph, own_odometry(graph, is_own))
@@ -129,7 +129,7 @@ def tell_error_scale(agent: Agent, request: tuple[Weighting, float]) -> float:
     (`error_scale`). The request is the cost that is solved, and the quantile.
     """
     weighting, quantile = request
-    own_graph, odometry, _ = _own_part(agent.known(JoinedFile), agent.robot)
+    own_graph, odometry, _ = _own_part(agent.known(OwnGraph), agent.robot)
     if own_graph is None:
         return math.nan
     distances = distances_from_odometry(own_graph, odometry)
@@ -153,7 +153,7 @@ def judge_closures(
 ) -> AgreeingCounts:
     """Order: find what agrees, with the neighbours' trajectories, a quantile and an error scale."""
     received, quantile, scale = request
-    joined = agent.known(JoinedFile)
+    joined = agent.known(OwnGraph)
     robot = agent.robot
     kept = np.zeros(joined.graph.num_edges, dtype=bool)
     own_graph, odometry, among_own = _own_part(joined, robot)
@@ -179,7 +179,7 @@ def _own_agreeing(
     return largest_sets(Chains.of(own_graph, odometry), is_tested, quantile, scale)
 
 
-def _own_part(joined: JoinedFile, robot: int) -> tuple[PoseGraph | None, BoolArray, IntArray]:
+def _own_part(joined: OwnGraph, robot: int) -> tuple[PoseGraph | None, BoolArray, IntArray]:
     """Graph of the edges among own poses, whether each is odometry, (k,), and which they are.
 
     There is no graph without edges.
@@ -197,7 +197,7 @@ def keep_agreeing(agent: Agent, neighbours: IntArray) -> ConsistentPart:
 
     It may be given again.
     """
-    everything = everything_of(joined_of(agent))
+    everything = everything_of(agent.known(OwnGraph))
     assert everything.agrees is not None
     stays = np.isin(everything.owners, [agent.robot, *neighbours.tolist()])
     graph = everything.graph
@@ -205,19 +205,12 @@ def keep_agreeing(agent: Agent, neighbours: IntArray) -> ConsistentPart:
     return go_on_with(agent, with_edges(everything, agent.robot, kept))
 
 
-def joined_of(agent: Agent) -> JoinedFile:
-    """What is joined of the robot, whether it has a cost and a place yet or not."""
-    record = agent.record
-    assert isinstance(record, JoinedFile | CostedFile | PlacedFile)
-    return record if isinstance(record, JoinedFile) else record.joined
-
-
-def everything_of(joined: JoinedFile) -> JoinedFile:
+def everything_of(joined: OwnGraph) -> OwnGraph:
     """What was joined at first."""
     return joined if joined.everything is None else joined.everything
 
 
-def with_edges(everything: JoinedFile, robot: int, kept: BoolArray) -> JoinedFile:
+def with_edges(everything: OwnGraph, robot: int, kept: BoolArray) -> OwnGraph:
     """What is joined by the edges kept, (m_a,), with all own poses."""
     graph = everything.graph
     is_used = everything.owners == robot
@@ -236,7 +229,7 @@ def with_edges(everything: JoinedFile, robot: int, kept: BoolArray) -> JoinedFil
     )
 
 
-def go_on_with(agent: Agent, remaining: JoinedFile) -> ConsistentPart:
+def go_on_with(agent: Agent, remaining: OwnGraph) -> ConsistentPart:
     """Go on with what is left, and report it."""
     everything = everything_of(remaining)
     graph = everything.graph
@@ -247,7 +240,7 @@ def go_on_with(agent: Agent, remaining: JoinedFile) -> ConsistentPart:
 
 
 def _agree(
-    joined: JoinedFile, between: IntArray, both: list[Trajectory], quantile: float, scale: float
+    joined: OwnGraph, between: IntArray, both: list[Trajectory], quantile: float, scale: float
 ) -> BoolArray:
     """Which of the edges between two robots are kept: both find the same."""
     graph = joined.graph
@@ -275,19 +268,19 @@ def own_odometry(graph: PoseGraph, is_own: BoolArray) -> BoolArray:
     return np.asarray(are_neighbours & is_own[graph.i] & is_own[graph.j])
 
 
-def neighbours_of(joined: JoinedFile, robot: int) -> list[int]:
+def neighbours_of(joined: OwnGraph, robot: int) -> list[int]:
     """Other robots at the far ends of a robot's edges."""
     return [int(other) for other in np.unique(joined.owners) if other != robot]
 
 
-def edges_between(joined: JoinedFile, robot: int, other: int) -> IntArray:
+def edges_between(joined: OwnGraph, robot: int, other: int) -> IntArray:
     """Edges between poses of the robot and of another one, in order."""
     owners = joined.owners[np.stack([joined.graph.i, joined.graph.j])]
     are_between = (owners == robot).any(axis=0) & (owners == other).any(axis=0)
     return _in_order(joined, np.flatnonzero(are_between))
 
 
-def _in_order(joined: JoinedFile, edges: IntArray) -> IntArray:
+def _in_order(joined: OwnGraph, edges: IntArray) -> IntArray:
     """Edges in an order that does not depend on the files: by their ends, then by their numbers.
 
     To first order the distance between two closures depends a little on which of them comes first.

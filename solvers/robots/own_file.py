@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -52,7 +51,7 @@ from solvers.robots.agent import Agent, held_poses
 from solvers.robots.driver import order_interior
 from solvers.robots.part import Interior
 from solvers.robots.poses import set_poses
-from solvers.soc.subgraph import PartProblem, Placement, RobotSummary, Subgraph
+from solvers.soc.subgraph import PartProblem, Placement, RobotSummary
 
 READ_HERE = (
     "have the graph read in one process: --split given, or solve(read_g2o(folder), robots=..)"
@@ -82,36 +81,27 @@ class OwnedRuns:
         return np.searchsorted(self.first, ids, side="right") - 1
 
 
-@record("Edges")
+@record("NumberedLines")
 @dataclass(frozen=True, eq=False)
-class Edges:
-    """Edges of a file, and the numbers and owners of their ends, (m, 2)."""
+class NumberedLines:
+    """EDGE lines of a file with the numbers and owners of their ends, (m, 2), and VERTEX lines.
 
-    rows: Rows
+    A robot tells another the edges that touch its poses, and the VERTEX lines of these.
+    """
+
+    edges: Rows
     numbers: IntArray
     owners: IntArray
-
-    def some(self, chosen: IntArray | BoolArray | slice) -> Edges:
-        """Some of the edges."""
-        return Edges(self.rows.some(chosen), self.numbers[chosen], self.owners[chosen])
-
-
-class _JoinedEdges(NamedTuple):
-    """Edges of several files: ids, rows of numbers as in `G2OLines`, and as in `Edges`."""
-
-    ids: IntArray
-    rows: Array
-    numbers: IntArray
-    owners: IntArray
-
-
-@record("Told")
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What a robot tells another: edges that touch its poses, and VERTEX lines of these."""
-
-    edges: Edges
     places: Rows
+
+    def some(self, edges: IntArray | BoolArray | slice, places: BoolArray | slice) -> NumberedLines:
+        """Some of the lines."""
+        return NumberedLines(
+            self.edges.some(edges),
+            self.numbers[edges],
+            self.owners[edges],
+            self.places.some(places),
+        )
 
 
 @record("Border")
@@ -160,28 +150,20 @@ class MovedAnswer:
     F: float
 
 
-# What a robot knows, one record after every order of the set-up.
-
-
-@dataclass(frozen=True, eq=False)
-class ReadFile:
-    """After `read_file`: the lines of its file."""
-
-    lines: G2OLines
+# What a robot knows of its own lines, until the set-up has made its graph and after.
 
 
 @dataclass(frozen=True, eq=False)
 class NumberedFile:
-    """After `number_poses`: the numbers of its poses, and what its own file says of these."""
+    """The lines of a robot's file, with the digits of all files, and what they say of own poses."""
 
     lines: G2OLines
-    own: Told
-    digits: WrittenDigits  # of all files
+    own: NumberedLines
 
 
 @dataclass(frozen=True, eq=False)
-class JoinedFile:
-    """After `join_neighbours`: its graph, of its own poses and those at the far end of its edges.
+class OwnGraph:
+    """The graph of a robot with own lines: own poses, and those at the far end of its edges.
 
     The orders of a robust solve leave another one, with some of the edges.
 
@@ -195,49 +177,41 @@ class JoinedFile:
         As in `Answer`.
     rejected : (k, 2) array
         Ids of the ends of edges that were left out.
-    everything : JoinedFile, optional
+    everything : OwnGraph, optional
         What was joined at first, with m edges; none if it is this.
     edges : (m_a,) array
         The edges of everything that are left; empty if this is everything.
     agrees : (m,) array, optional
         Of everything in a robust solve: whether an edge agrees pairwise.
-    before : JoinedFile, optional
+    before : OwnGraph, optional
         During a robust solve: what to go back to.
     thresholds : (m_a,) array, optional
         During a robust solve: those of the edges.
     solved : Poses, optional
         Own poses that the solve before has found.
+    problem : PartProblem, optional
+        The cost that is solved, from `take_cost` to `place_cover`.
+    answer : Poses, optional
+        Poses that `keep_answer` kept.
+    within : (m_a,) array, optional
+        During a robust solve: edges within their thresholds, as far as this robot counts them.
+    near : (m,) array, optional
+        During a robust solve: edges of everything that are near the map.
     """
 
     graph: PoseGraph
     numbers: IntArray
     owners: IntArray
-    given: Array  # as in `Answer`
+    given: Array
     rejected: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
-    everything: JoinedFile | None = None
+    everything: OwnGraph | None = None
     edges: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     agrees: BoolArray | None = None
-    before: JoinedFile | None = None
+    before: OwnGraph | None = None
     thresholds: Array | None = None
     solved: Poses | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class CostedFile:
-    """After `take_cost`: the cost that is solved, of its edges."""
-
-    joined: JoinedFile
-    problem: PartProblem
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedFile:
-    """After `place_cover`: its agent has its subgraph, as one that was given it."""
-
-    joined: JoinedFile
-    answer: Poses | None = None  # the poses that were kept
-    # Of a robust solve: edges within their thresholds, (m_a,), as far as this robot counts them,
-    # and edges of everything that are near the map.
+    problem: PartProblem | None = None
+    answer: Poses | None = None
     within: BoolArray | None = None
     near: BoolArray | None = None
 
@@ -246,6 +220,12 @@ class PlacedFile:
         """The poses that `keep_answer` kept."""
         assert self.answer is not None
         return self.answer
+
+    def to_go_back_to(self, solved: Poses) -> OwnGraph:
+        """The same edges, at own poses that were found, before anything was done with them."""
+        return replace(
+            self, solved=solved, before=None, problem=None, answer=None, within=None, near=None
+        )
 
 
 @order("files.read_file")
@@ -259,38 +239,37 @@ def read_file(agent: Agent, _: None) -> Claim:
         raise GraphError(
             f"{agent.own_lines.path} has priors or landmarks, which all robots share; {READ_HERE}"
         )
-    agent.record = ReadFile(lines)
+    agent.record = lines
     ids_of_edges_alone = np.setdiff1d(lines.edge_ids, lines.vertex_ids)
     runs_of_vertices = _runs(np.unique(lines.vertex_ids))
     return lines.d, runs_of_vertices, _runs(ids_of_edges_alone), lines.digits
 
 
 @order("files.number_poses")
-def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[Told]:
+def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[NumberedLines]:
     """Take numbers and owners for the ids; return what others are to be told of their poses.
 
     They are messages, by the number of the other robot.
     """
-    lines = agent.known(ReadFile).lines
+    lines = agent.known(G2OLines)
     rows = measured_edges(lines)
     run = runs.of(rows.ids)
     numbers = runs.number[run] + rows.ids - runs.first[run]
     owners = runs.owner[run]
-    edges = Edges(rows, numbers, owners)
     places = placed_poses(lines)
+    numbered = NumberedLines(rows, numbers, owners, places)
     owners_of_places = runs.owner[runs.of(places.ids)]
-    messages: Messages[Told] = Messages()
+    messages: Messages[NumberedLines] = Messages()
     for robot in np.unique(np.append(owners, owners_of_places)).tolist():
         touches = (owners == robot).any(axis=1)
-        messages[robot] = Told(edges.some(touches), places.some(owners_of_places == robot))
-    no_lines = slice(0)
-    own_message = messages.pop(agent.robot, Told(edges.some(no_lines), places.some(no_lines)))
-    agent.record = NumberedFile(lines, own_message, runs.digits)
+        messages[robot] = numbered.some(touches, owners_of_places == robot)
+    own_message = messages.pop(agent.robot, numbered.some(slice(0), slice(0)))
+    agent.record = NumberedFile(replace(lines, digits=runs.digits), own_message)
     return messages
 
 
 @order("files.join_neighbours")
-def join_neighbours(agent: Agent, request: tuple[Messages[Told], bool]) -> Border:
+def join_neighbours(agent: Agent, request: tuple[Messages[NumberedLines], bool]) -> Border:
     """Make the graph of the robot: its own edges, and those that others have of its poses.
 
     FIX lines of its own poses count. The request is what others told the robot, and whether the
@@ -302,20 +281,20 @@ def join_neighbours(agent: Agent, request: tuple[Messages[Told], bool]) -> Borde
     parts = [part for _, part in sorted({**received, agent.robot: known.own}.items())]
     if not is_trusted:
         check_places(lines.d, [part.places for part in parts])
-        check_measurements(lines.d, [part.edges.rows for part in parts])
-    edges = _joined_edges([part.edges for part in parts])
-    if not len(edges.numbers):
+        check_measurements(lines.d, [part.edges for part in parts])
+    ids_of_ends, rows, numbers_of_ends, owners_of_ends = _joined_edges(parts)
+    if not len(rows):
         raise GraphError(
             f"{agent.own_lines.path}: no edge touches a pose of this robot; "
             "add one, or remove the file"
         )
-    numbers, first, ends = np.unique(edges.numbers, return_index=True, return_inverse=True)
-    owners = edges.owners.ravel()[first]
-    ids = edges.ids.ravel()[first]
+    numbers, first, ends = np.unique(numbers_of_ends, return_index=True, return_inverse=True)
+    owners = owners_of_ends.ravel()[first]
+    ids = ids_of_ends.ravel()[first]
     i, j = ends.reshape(-1, 2).T
     is_own = owners == agent.robot
-    R_ij, t_ij = poses_of(lines.d, edges.rows)
-    information = information_of(lines.d, edges.rows)
+    R_ij, t_ij = poses_of(lines.d, rows)
+    information = information_of(lines.d, rows)
     kappa, tau = edge_precisions(information)
     fixed = np.flatnonzero(is_own & np.isin(ids, lines.fixed))
     graph = PoseGraph(
@@ -330,22 +309,25 @@ def join_neighbours(agent: Agent, request: tuple[Messages[Told], bool]) -> Borde
         ids=ids,
         fixed=fixed,
         name=agent.own_lines.path.stem,
-        written_error=written_errors(measurements_of(lines.d, edges.rows), known.digits),
+        written_error=written_errors(measurements_of(lines.d, rows), lines.digits),
         weights_error=lines.weights_error,
     )
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
-    joined = JoinedFile(graph, numbers, owners, _given_pose(lines, ids[holding]))
+    joined = OwnGraph(graph, numbers, owners, _given_pose(lines, ids[holding]))
     agent.record = joined
     return border_of(agent.robot, joined)
 
 
-def _joined_edges(files: Sequence[Edges]) -> _JoinedEdges:
-    """Edges of several files as one, in which an edge of several files counts once."""
-    kept_of_files = edge_rows_to_keep([(file.rows.ids, file.rows.numbers) for file in files])
-    parts = [file.some(kept) for file, kept in zip(files, kept_of_files, strict=True)]
-    return _JoinedEdges(
-        np.concatenate([part.rows.ids for part in parts]),
-        np.concatenate([part.rows.numbers for part in parts]),
+def _joined_edges(files: Sequence[NumberedLines]) -> tuple[IntArray, Array, IntArray, IntArray]:
+    """Edges of several files as one, in which an edge of several files counts once.
+
+    They are the ids of the ends, rows as in `G2OLines`, and numbers and owners of the ends.
+    """
+    kept = edge_rows_to_keep([(file.edges.ids, file.edges.numbers) for file in files])
+    parts = [file.some(chosen, slice(0)) for file, chosen in zip(files, kept, strict=True)]
+    return (
+        np.concatenate([part.edges.ids for part in parts]),
+        np.concatenate([part.edges.numbers for part in parts]),
         np.concatenate([part.numbers for part in parts]),
         np.concatenate([part.owners for part in parts]),
     )
@@ -359,7 +341,7 @@ def _given_pose(lines: G2OLines, pose_id: int) -> Array:
     return Poses(*poses_of(lines.d, rows)).stacked()
 
 
-def border_of(robot: int, joined: JoinedFile) -> Border:
+def border_of(robot: int, joined: OwnGraph) -> Border:
     """Border of a robot whose graph is known."""
     graph = joined.graph
     numbers = joined.numbers
@@ -395,7 +377,7 @@ def take_cost(agent: Agent, weighting: Weighting) -> bool:
 
     A GraphError for a matrix that chi2 cannot have, and where chi2 is one of rotations alone.
     """
-    joined = agent.known(JoinedFile)
+    joined = agent.known(OwnGraph)
     problem = PartProblem(joined.graph, weighting=weighting)
     try:
         cost = problem.weights
@@ -403,7 +385,7 @@ def take_cost(agent: Agent, weighting: Weighting) -> bool:
         raise GraphError(f"{agent.own_lines.path}: {error}") from error
     if not cost.has_translations:
         raise GraphError(f"{agent.own_lines.path}: no edge measures a translation; {READ_HERE}")
-    agent.record = CostedFile(joined, problem)
+    agent.record = replace(joined, problem=problem)
     return cost.is_quadratic and cost.is_convex
 
 
@@ -415,22 +397,25 @@ def place_cover(agent: Agent, place: tuple[Placement, bool]) -> RobotSummary:
     robot is an agent like any other.
     """
     placement, has_two_costs = place
-    costed = agent.known(CostedFile)
-    joined = costed.joined
-    graph = joined.graph
-    known = agent.robot, graph, joined.numbers, joined.owners
-    edges = np.arange(graph.num_edges)
-    problem = costed.problem
+    own = agent.known(OwnGraph)
+    problem = own.problem
+    assert problem is not None
     weights = problem.weights
     final = None
     if has_two_costs:
         final = weights
-        weights = convex_cost(problem.information, graph.d)
-    subgraph = Subgraph(
-        *known, *placement.of(*known), edges, weights, final, thresholds=joined.thresholds
-    )
-    subgraph = subgraph.for_driver()
-    agent.record = PlacedFile(joined)
+        weights = convex_cost(problem.information, own.graph.d)
+    subgraph = placement.subgraph(
+        agent.robot,
+        own.graph,
+        own.numbers,
+        own.owners,
+        np.arange(own.graph.num_edges),
+        weights,
+        final,
+        own.thresholds,
+    ).for_driver()
+    agent.record = replace(own, problem=None)  # the subgraph has its weights
     agent.take_part(subgraph)
     return replace(subgraph.summary, part=None)
 
@@ -438,20 +423,19 @@ def place_cover(agent: Agent, place: tuple[Placement, bool]) -> RobotSummary:
 @order("files.keep_answer")
 def keep_answer(agent: Agent, cover: Poses) -> Answer:
     """Keep the current poses for the answer; the driver sends those of the cover."""
-    placed = agent.known(PlacedFile)
-    joined = placed.joined
+    own = agent.known(OwnGraph)
     answer = held_poses(agent, cover)
-    agent.record = replace(placed, answer=answer)
+    agent.record = replace(own, answer=answer)
     interior = agent.interior
-    fixed = joined.graph.fixed
+    fixed = own.graph.fixed
     holding = int(fixed[0] if len(fixed) else np.argmax(agent.subgraph.is_own))
     rounding = NO_ROUNDING
     if interior is not None:
         rounding = objective_rounding(interior.problem, interior.poses)
-    number = int(joined.numbers[holding])
-    pose_id = int(joined.graph.pose_ids[holding])
+    number = int(own.numbers[holding])
+    pose_id = int(own.graph.pose_ids[holding])
     solved = answer[np.array([holding])].stacked()
-    return Answer(rounding, (len(fixed) > 0, number, pose_id), solved, joined.given)
+    return Answer(rounding, (len(fixed) > 0, number, pose_id), solved, own.given)
 
 
 @order("files.return_to_answer")
@@ -465,9 +449,8 @@ def return_to_answer(agent: Agent, _: None) -> None:
 @order("files.move_answer")
 def move_answer(agent: Agent, motion: tuple[Array, Array]) -> MovedAnswer:
     """Move the poses that were kept by (R, t); return the part of the cost there."""
-    placed = agent.known(PlacedFile)
-    placed = replace(placed, answer=placed.kept.moved(*motion))
-    agent.record = placed
+    own = agent.known(OwnGraph)
+    agent.record = replace(own, answer=own.kept.moved(*motion))
     if agent.interior is None:
         return MovedAnswer(0.0, NO_ROUNDING, 0.0)
     problem = agent.interior.problem
@@ -479,7 +462,7 @@ def move_answer(agent: Agent, motion: tuple[Array, Array]) -> MovedAnswer:
 
 def _interior_answer(agent: Agent, interior: Interior) -> Poses:
     """Poses that were kept, of those that the interior's problem has."""
-    kept = agent.known(PlacedFile).kept
+    kept = agent.known(OwnGraph).kept
     return kept[np.searchsorted(agent.subgraph.poses, interior.part.poses)]
 
 
@@ -487,9 +470,9 @@ def _interior_answer(agent: Agent, interior: Interior) -> Poses:
 def write_answer(folder: Path, agent: Agent, _: None) -> None:
     """Write the poses that were kept, and the robot's edges."""
     make_folder(folder)
-    placed = agent.known(PlacedFile)
+    own = agent.known(OwnGraph)
     path = folder / f"{agent.robot}.g2o"
-    write_g2o(placed.joined.graph, path, placed.kept, agent.subgraph.is_own)
+    write_g2o(own.graph, path, own.kept, agent.subgraph.is_own)
 
 
 def _runs(ids: IntArray) -> IntArray:

@@ -44,13 +44,12 @@ from solvers.robots.consistency import (
     edges_between,
     everything_of,
     go_on_with,
-    joined_of,
     neighbours_of,
     own_odometry,
     with_edges,
 )
 from solvers.robots.driver import Driver, order_interior
-from solvers.robots.own_file import Border, JoinedFile, PlacedFile, border_of
+from solvers.robots.own_file import Border, OwnGraph, border_of
 from solvers.robots.reweigh import SharedGNC, stage_of, sum_truncated
 from solvers.robots.setup import OpenedFiles
 from solvers.robust.chains import is_whole
@@ -234,8 +233,8 @@ class Links:
 @order("revision.tell_solved")
 def tell_solved(agent: Agent, _: None) -> Messages[NumberedPoses]:
     """Order: tell every neighbour of the own poses found that edges between the two touch."""
-    placed = agent.known(PlacedFile)
-    everything = everything_of(placed.joined)
+    own = agent.known(OwnGraph)
+    everything = everything_of(own)
     solved = _own_poses_of(agent)
     own_poses = np.flatnonzero(everything.owners == agent.robot)
     messages: Messages[NumberedPoses] = Messages()
@@ -257,8 +256,8 @@ def judge_near(
     both have the same edges.
     """
     received, weighting, quantile = request
-    placed = agent.known(PlacedFile)
-    everything = everything_of(placed.joined)
+    own = agent.known(OwnGraph)
+    everything = everything_of(own)
     graph = everything.graph
     is_own = everything.owners == agent.robot
     R = np.tile(np.eye(graph.d), (graph.num_poses, 1, 1))
@@ -270,8 +269,8 @@ def judge_near(
         R[places], t[places] = theirs.poses.R, theirs.poses.t
     problem = PartProblem(graph, weighting=weighting)
     near = problem.edge_costs(Poses(R, t)) <= _NEAR * chi2_thresholds(problem, quantile)
-    near[placed.joined.edges] = True
-    agent.record = replace(placed, near=near)
+    near[own.edges] = True
+    agent.record = replace(own, near=near)
     messages: Messages[BoolArray] = Messages()
     for other in neighbours_of(everything, agent.robot):
         if other > agent.robot:
@@ -286,20 +285,20 @@ def take_back(agent: Agent, request: TakenBack) -> Border:
     Own odometry is known to be right.
     """
     robot = agent.robot
-    placed = agent.known(PlacedFile)
-    everything = everything_of(placed.joined)
+    own = agent.known(OwnGraph)
+    everything = everything_of(own)
     solved = _own_poses_of(agent)
     assert everything.agrees is not None
     if request.comes_back is ComesBack.AGREEING:
         candidates = everything.agrees
     elif request.comes_back is ComesBack.NEAR:
-        assert placed.near is not None
-        candidates = placed.near.copy()
+        assert own.near is not None
+        candidates = own.near.copy()
         for other, near in request.near.items():
             candidates[edges_between(everything, robot, other)] = near
     else:
         candidates = np.ones(everything.graph.num_edges, dtype=bool)
-    before = placed.joined
+    before = own
     if request.is_first:
         before = with_edges(everything, robot, everything.agrees)
     joined = with_edges(everything, robot, candidates)
@@ -308,7 +307,7 @@ def take_back(agent: Agent, request: TakenBack) -> Border:
     known = own_odometry(graph, joined.owners == robot) & is_whole(graph)
     joined = replace(
         joined,
-        before=replace(before, solved=solved, before=None),
+        before=before.to_go_back_to(solved),
         thresholds=np.where(known, np.inf, thresholds),
         solved=solved,
     )
@@ -319,24 +318,24 @@ def take_back(agent: Agent, request: TakenBack) -> Border:
 @order("revision.tell_cover")
 def tell_cover(agent: Agent, _: None) -> NumberedPoses:
     """Order: return the own poses that were found, of those in the cover."""
-    placed = agent.known(PlacedFile)
+    own = agent.known(OwnGraph)
     subgraph = agent.subgraph
     own_separators = np.flatnonzero(subgraph.is_own)
     in_cover = np.flatnonzero(subgraph.is_separator[own_separators])
-    return NumberedPoses(subgraph.poses[own_separators[in_cover]], _solved(placed.joined)[in_cover])
+    return NumberedPoses(subgraph.poses[own_separators[in_cover]], _solved(own)[in_cover])
 
 
 @order("revision.go_to_solved")
 def go_to_solved(agent: Agent, cover: Poses) -> None:
     """Order: go to the poses that were found; the driver sends those of the cover."""
-    placed = agent.known(PlacedFile)
+    own = agent.known(OwnGraph)
     subgraph = agent.subgraph
     if agent.interior is None:
         return
     everywhere = held_poses(agent, cover)
     R = everywhere.R.copy()
     t = everywhere.t.copy()
-    solved = _solved(placed.joined)
+    solved = _solved(own)
     R[subgraph.is_own] = solved.R
     t[subgraph.is_own] = solved.t
     places = np.searchsorted(subgraph.poses, agent.interior.part.poses)
@@ -350,9 +349,8 @@ def tell_links(agent: Agent, request: tuple[float, Poses]) -> Links:
     The request is the scale of the thresholds, and the poses of the cover.
     """
     scale, cover = request
-    placed = agent.known(PlacedFile)
-    joined = placed.joined
-    graph = joined.graph
+    own = agent.known(OwnGraph)
+    graph = own.graph
     subgraph = agent.subgraph
     ratio = np.zeros(graph.num_edges)
     if agent.interior is not None:
@@ -361,8 +359,8 @@ def tell_links(agent: Agent, request: tuple[float, Poses]) -> Links:
         ratio[part.edges] = part.ratios(agent.interior.poses, scale)
     own_poses = held_poses(agent, cover)[np.flatnonzero(subgraph.is_own)]
     links = _counted_links(agent)
-    agent.record = replace(placed, joined=replace(joined, solved=own_poses), within=ratio <= 1.0)
-    owners = np.stack([joined.owners[graph.i[links]], joined.owners[graph.j[links]]], axis=1)
+    agent.record = replace(own, solved=own_poses, within=ratio <= 1.0)
+    owners = np.stack([own.owners[graph.i[links]], own.owners[graph.j[links]]], axis=1)
     return Links(owners, ratio[links])
 
 
@@ -372,25 +370,24 @@ def tell_kept(agent: Agent, is_held: BoolArray) -> Messages[BoolArray]:
 
     Each is told of the edges that both have, (2, k), whether this robot counts and keeps it.
     """
-    placed = agent.known(PlacedFile)
-    joined = placed.joined
+    own = agent.known(OwnGraph)
     subgraph = agent.subgraph
-    assert placed.within is not None
-    kept = placed.within.copy()
+    assert own.within is not None
+    kept = own.within.copy()
     kept[_counted_links(agent)[is_held]] = True
-    agent.record = replace(placed, within=kept)
+    agent.record = replace(own, within=kept)
     messages: Messages[BoolArray] = Messages()
-    for other in neighbours_of(joined, agent.robot):
-        between = edges_between(joined, agent.robot, other)
+    for other in neighbours_of(own, agent.robot):
+        between = edges_between(own, agent.robot, other)
         messages[other] = np.stack([subgraph.is_counted[between], kept[between]])
     return messages
 
 
 def _counted_links(agent: Agent) -> IntArray:
     """Edges to other robots that this robot counts."""
-    placed = agent.known(PlacedFile)
-    graph = placed.joined.graph
-    owners = placed.joined.owners
+    own = agent.known(OwnGraph)
+    graph = own.graph
+    owners = own.owners
     is_link = owners[graph.i] != owners[graph.j]
     return np.flatnonzero(is_link & agent.subgraph.is_counted)
 
@@ -398,34 +395,33 @@ def _counted_links(agent: Agent) -> IntArray:
 @order("revision.keep")
 def keep(agent: Agent, received: Messages[BoolArray]) -> ConsistentPart:
     """Order: leave out the edges that are not kept by the robot that counts them."""
-    placed = agent.known(PlacedFile)
-    joined = placed.joined
-    assert placed.within is not None
-    kept = placed.within.copy()
+    own = agent.known(OwnGraph)
+    assert own.within is not None
+    kept = own.within.copy()
     for other, (is_counted, is_kept) in received.items():
-        between = edges_between(joined, agent.robot, other)
+        between = edges_between(own, agent.robot, other)
         kept[between[is_counted]] = is_kept[is_counted]
-    everything = everything_of(joined)
+    everything = everything_of(own)
     stays = np.zeros(everything.graph.num_edges, dtype=bool)
-    stays[joined.edges[kept]] = True
+    stays[own.edges[kept]] = True
     remaining = with_edges(everything, agent.robot, stays)
-    return go_on_with(agent, replace(remaining, solved=joined.solved, before=joined.before))
+    return go_on_with(agent, replace(remaining, solved=own.solved, before=own.before))
 
 
 @order("revision.go_back")
 def go_back(agent: Agent, _: None) -> ConsistentPart:
     """Order: go back to the edges before, or to what agrees pairwise, at the poses found before."""
-    before = joined_of(agent).before
+    before = agent.known(OwnGraph).before
     assert before is not None
     return go_on_with(agent, before)
 
 
 def _own_poses_of(agent: Agent) -> Poses:
     """Poses of the robot at the end of the last solve."""
-    return agent.known(PlacedFile).kept[np.flatnonzero(agent.subgraph.is_own)]
+    return agent.known(OwnGraph).kept[np.flatnonzero(agent.subgraph.is_own)]
 
 
-def _solved(joined: JoinedFile) -> Poses:
+def _solved(joined: OwnGraph) -> Poses:
     """Own poses that were found."""
     assert joined.solved is not None
     return joined.solved

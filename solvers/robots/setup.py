@@ -299,7 +299,10 @@ def borders_of(parts: Sequence[ConsistentPart]) -> tuple[list[Border], int]:
 
 
 def _own_weighting(borders: Sequence[Border]) -> Weighting:
-    """The cost that is the own one of all robots' files together, as `weighting.own_weighting`."""
+    """The cost that is the own one of all robots' files together, as `weighting.own_weighting`.
+
+    No process has all matrices: every robot has reported of its own.
+    """
     is_F = all(border.is_isotropic for border in borders)
     if is_F or any(border.has_indefinite for border in borders):
         return Weighting.ISOTROPIC
@@ -369,6 +372,8 @@ def _check_claims(claims: Sequence[Claim], files: Sequence[OwnLines], owners: In
 def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: Path) -> None:
     """Raise a GraphError unless the robots' graphs together are connected.
 
+    `PoseGraph.check_connected` is for a graph that one process has; here none has the edges within
+    the robots, which have reported the components of their own graphs.
     Positions have to be connected by edges with tau > 0, rotations by edges with kappa > 0. A
     component of one robot that has a shared pose is a vertex, as the shared poses are; the rest are
     components of their own.

@@ -223,10 +223,21 @@ class Placement:
     copies: IntArray
     common: tuple[tuple[int, IntArray], ...]  # positions in `poses`
 
-    def of(
-        self, robot: int, graph: PoseGraph, poses: IntArray, owner: IntArray
-    ) -> tuple[BoolArray, BoolArray, IntArray, tuple[tuple[int, IntArray], ...]]:
-        """`is_separator`, `is_counted`, `copies` and `common` of the robot's subgraph."""
+    def subgraph(
+        self,
+        robot: int,
+        graph: PoseGraph,
+        poses: IntArray,
+        owner: IntArray,
+        edges: IntArray,
+        weights: EdgeCost,
+        final: EdgeCost | None,
+        thresholds: Array | None,
+    ) -> Subgraph:
+        """The robot's subgraph, whether its edges are cut from a graph or its own lines.
+
+        What is given are fields of `Subgraph`.
+        """
         positions = np.searchsorted(poses, self.poses)
         is_separator = np.zeros(len(poses), dtype=bool)
         is_separator[positions] = self.is_separator
@@ -236,7 +247,20 @@ class Placement:
         # the same owner. Else the owner of the first end counts it.
         counted_by = np.where(is_separator[graph.j], owner[graph.i], owner[graph.j])
         common = tuple((other, positions[shared]) for other, shared in self.common)
-        return is_separator, counted_by == robot, copies, common
+        return Subgraph(
+            robot,
+            graph,
+            poses,
+            owner,
+            is_separator,
+            counted_by == robot,
+            copies,
+            common,
+            edges,
+            weights,
+            final,
+            thresholds,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,16 +384,11 @@ def _subgraph(
         weights_error=graph.weights_error,
     )
     convex_part = problem.convex_part
-    is_separator, is_counted, copies, common = placement.of(robot, local, poses, owner)
-    return Subgraph(
+    return placement.subgraph(
         robot,
         local,
         poses,
         owner,
-        is_separator,
-        is_counted,
-        copies,
-        common,
         edges,
         weights=convex_part.weights.of_edges(edges),
         final=None if convex_part is problem else problem.weights.of_edges(edges),

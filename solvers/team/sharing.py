@@ -17,7 +17,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from solvers.carry.registry import order, record
 from solvers.robots.agent import Agent
-from solvers.robots.own_file import PlacedFile
+from solvers.robots.own_file import OwnGraph
 from solvers.solution import Solution
 
 
@@ -75,12 +75,11 @@ def answer_of(agent: Agent) -> OwnAnswer | None:
     """Return what the agent of a robot knows of its poses; None before the end of a solve."""
     if isinstance(agent.record, OwnAnswer):
         return agent.record
-    if not isinstance(agent.record, PlacedFile) or agent.record.answer is None:
+    if not isinstance(agent.record, OwnGraph) or agent.record.answer is None:
         return None
-    joined = agent.record.joined
     own_poses = np.flatnonzero(agent.subgraph.is_own)
-    ids = joined.graph.pose_ids[own_poses]
-    return OwnAnswer(ids, agent.record.answer[own_poses], None, joined.rejected)
+    ids = agent.record.graph.pose_ids[own_poses]
+    return OwnAnswer(ids, agent.record.answer[own_poses], None, agent.record.rejected)
 
 
 @order("team.give_measurements")

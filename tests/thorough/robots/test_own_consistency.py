@@ -17,7 +17,7 @@ from pgo_models import PoseGraph, read_g2o
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.g2o import write_g2o_folder
-from solvers.robots.own_file import PlacedFile
+from solvers.robots.own_file import OwnGraph
 from solvers.robust.consistency import pairwise_consistent
 
 
@@ -57,7 +57,7 @@ def test_the_robots_keep_what_pairwise_consistency_of_the_whole_graph_keeps(
     solution = solvers.solve_folder(
         folder, robust=solvers.PCM(), robots=solvers.Robots(engine=engine), trust_folder=True
     )
-    parts = [agent.known(PlacedFile).joined.graph for agent in engine.agents]
+    parts = [agent.known(OwnGraph).graph for agent in engine.agents]
     kept = set().union(*(edges_of(part) for part in parts))
     assert kept == edges_of(graph.without_edges(~expected))
     assert solution.num_rejected == (~expected).sum()

@@ -23,7 +23,7 @@ from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import Sharing
 from solvers.carry.messages import Token
 from solvers.carry.wire import opened, sealed
-from solvers.robots.own_file import Told
+from solvers.robots.own_file import NumberedLines
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.messages import Ask, Ended, Heard, Letter, Reply
@@ -130,7 +130,7 @@ def test_what_two_robots_tell_each_other_does_not_pass_the_one_that_drives() -> 
     assert network.is_settled
     letters = [message for message in heard["r1", "r2"] if isinstance(message, Letter)]
     kinds = {kind for letter in letters for kind in kinds_in(letter.content)}
-    assert {Told, RowChange, NeighbourMessage} <= kinds
+    assert {NumberedLines, RowChange, NeighbourMessage} <= kinds
     answers = [message.answer for message in heard["r1", "r0"] if isinstance(message, Reply)]
     tokens = [token for answer in answers for token in to_robot(2, answer)]
     assert len(tokens) == sum(len(letter.content) for letter in letters) > 0
