@@ -423,8 +423,10 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
     problem = pgo.PGOProblem(graph, weighting=isotropic)
     pipeline = solvers.Pipeline(growing=None, handedness=None)
     central = solvers.solve(problem, pipeline, robots=pgo.partition(graph, 4))
-    assert taken(solution.stages) == taken(central.stages)
-    assert "Staircase" in taken(solution.stages)
+    # What robots lack is named so: with the graph of all of them, starts are tried in one place.
+    by_robots = [name for name in taken(central.stages) if "in one place" not in name]
+    assert taken(solution.stages) == by_robots
+    assert "Staircase" in by_robots
     assert solution.certificate.source is central.certificate.source is BoundSource.RELAXATION
     assert solution.certificate.lower_bound == pytest.approx(central.lower_bound, rel=1e-6)
     written = read_g2o(tmp_path / "out")
