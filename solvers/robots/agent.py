@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -158,6 +159,8 @@ class Agent:
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this robot."""
+        # A process that has just begun knows the records of an algorithm once its file is imported.
+        import_module("solvers.robots.place")
         record: AgentRecord = deserialize(snapshot)
         held = self._restored(record.held)
         self.interior = held.interior

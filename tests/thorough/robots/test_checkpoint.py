@@ -1,6 +1,7 @@
 import hashlib
 import io
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from budget import examples
 from graphs import varied_graph
 from hypothesis import HealthCheck, given, settings as hypothesis_settings, strategies as st
 from processes import long_run
-from robots import Killed
+from robots import Killed, Recording
 
 import pgo_models as pgo
 import solvers
@@ -65,6 +66,34 @@ def assert_same(found, expected):
         assert repr(one.method) == repr(other.method)
         np.testing.assert_array_equal(one.history.objective, other.history.objective)
         assert (np.diff(one.history.seconds) >= 0).all()
+
+
+@pytest.mark.parametrize("stage", ["SOC", "PaperSOC", "Newton"])
+def test_a_robot_in_a_new_process_goes_on_wherever_it_was(stage, tmp_path):
+    """The new process has done nothing before: it has imported the robot alone."""
+    engine = Recording()
+    soc = solvers.PaperSOC() if stage == "PaperSOC" else solvers.SOC()
+    calls = {"SOC": 2, "PaperSOC": 2, "Newton": 1}
+
+    def callback(state, record):
+        is_newton = "Newton" in type(state).__name__
+        return is_newton == (stage == "Newton") and record.k >= calls[stage]
+
+    robots = solvers.Robots(2, engine=engine)
+    solvers.solve(pgo.load("grid"), solvers.Pipeline(soc=soc), robots=robots, callback=callback)
+    agent = engine.agents[0]
+    path = tmp_path / "robot"
+    path.write_bytes(pickle.dumps((agent.subgraph, agent.snapshot())))
+    code = (
+        "import pickle, sys; from solvers.robots.agent import Agent\n"
+        "subgraph, snapshot = pickle.load(open(sys.argv[1], 'rb'))\n"
+        "agent = Agent(subgraph); agent.restore(snapshot)\n"
+        "print(agent.interior.poses.t.tolist(), type(agent.interior.state.session).__name__)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
+    interior = agent.interior
+    expected = f"{interior.poses.t.tolist()} {type(interior.state.session).__name__}"
+    assert ended.stdout.strip() == expected, ended.stderr
 
 
 @pytest.mark.parametrize(
