@@ -35,25 +35,18 @@ from solvers.robust.chains import Motions, inverse, product
 _MOST_STEPS = 300
 _MOST_WITHOUT_SUCCESS = 100
 _TENURE = 7
-# The loss of a closure is what F falls by without it. A map was bent to a closure whose loss is at
-# least this share of its threshold, and its residual at most this share of its loss. Wrong closures
-# kept by maps of MIT have 0.5 to 1.1 and 0.03.
-_LEAST_LOSS = 0.4
-_SMALL_RESIDUAL = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class LinearChoice:
     """Model of k closures at the poses of a map.
 
-    `errors` (k, p) are u, `covariance` (k p, k p) is C + A H^-1 A^T, `allowed` is c^2, and
-    `residuals` (k,) are r_e^T C_e^-1 r_e.
+    `errors` (k, p) are u, `covariance` (k p, k p) is C + A H^-1 A^T, and `allowed` is c^2.
     """
 
     errors: Array
     covariance: Array
     allowed: float
-    residuals: Array
 
     @classmethod
     def of(
@@ -79,24 +72,16 @@ class LinearChoice:
         joint = Marginals(hessian, layout, backend=staying.backend).joint(*ends.tolist())
         moved = (derivative @ joint @ derivative.T).reshape(k, p, k, p)
         forces = np.linalg.solve(measured, errors[:, :, None])[:, :, 0]
-        residuals = np.einsum("ka,ka->k", errors, forces)
         errors = errors + np.einsum("kasb,sb->ka", moved[:, :, kept], forces[kept])
         moved[np.arange(k), :, np.arange(k)] += measured
-        return cls(errors, moved.reshape(k * p, k * p), allowed, residuals)
+        return cls(errors, moved.reshape(k * p, k * p), allowed)
 
-    def best(
-        self,
-        chosen: IntArray,
-        excluded: int | None = None,
-        has_time: Callable[[], bool] = lambda: True,
-    ) -> IntArray:
-        """The best set found from the closures chosen, (s,), without one that is excluded.
+    def best(self, chosen: IntArray, has_time: Callable[[], bool] = lambda: True) -> IntArray:
+        """The best set found from the closures chosen, (s,).
 
         The search ends early once `has_time` is false.
         """
         k = len(self.errors)
-        if excluded is not None:
-            chosen = np.setdiff1d(chosen, [excluded])
         current = self.choose(chosen)
         best = current.chosen.copy()
         least_cost = np.inf
@@ -112,8 +97,6 @@ class LinearChoice:
             changes = current.changes()
             # A closure that has to stay as it is may change all the same for a new best set.
             is_allowed = (free_at <= step) | (current.cost + changes < least_cost)
-            if excluded is not None:
-                is_allowed[excluded] = False
             if not is_allowed.any():
                 break
             e = int(np.where(is_allowed, changes, np.inf).argmin())
@@ -131,17 +114,6 @@ class LinearChoice:
         for e in chosen.tolist():
             choice.change(e)
         return choice
-
-    def suspects(self, chosen: IntArray) -> IntArray:
-        """Chosen closures, (s,), that may have bent the map to them, the worst first.
-
-        What such a closure costs is not small, but its own residual is: the other edges pay.
-        """
-        losses = self.allowed - self.choose(chosen).changes()[chosen]
-        is_bent_to = self.residuals[chosen] <= _SMALL_RESIDUAL * losses
-        is_suspect = is_bent_to & (losses >= _LEAST_LOSS * self.allowed)
-        worst_first = np.argsort(-losses, kind="stable")
-        return chosen[worst_first][is_suspect[worst_first]]
 
 
 @dataclass(eq=False)

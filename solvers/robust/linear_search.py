@@ -23,9 +23,7 @@ from solvers.robust.revision import Fit, inlier_problem, is_held
 # keeps at most: more make it too stiff to bend.
 _MOST_CLOSURES = 400
 _MOST_KEPT = 40
-# Choices in a row before the search gives up, and where a closure is left out.
-_MOST_CHOICES = 6
-_MOST_CHOICES_WITHOUT = 3
+_MOST_CHOICES = 6  # in a row before the search gives up
 # Where the edges that stay leave poses loose, or rounding makes a matrix singular.
 _NO_MODEL = (NotPositiveDefiniteError, np.linalg.LinAlgError)
 
@@ -43,19 +41,28 @@ class LinearSearch:
         return cls(sets, np.flatnonzero(~sets.known & is_whole(sets.problem.graph)))
 
     def exchanged(self, fit: Fit) -> Fit | None:
-        """A better fit, with any closures in place of any of those kept."""
-        model = self._first_model(fit)
-        return None if model is None else self._chosen(fit, model, None, _MOST_CHOICES)
+        """A better fit, with any closures in place of any of those kept.
 
-    def without_one(self, fit: Fit) -> Fit | None:
-        """A better fit, without one of the closures kept, to which the map may have been bent."""
-        model = self._first_model(fit)
-        if model is None:
+        It is made by choices in a row, of which all but the last may be worse.
+        """
+        if not self._has_few(fit):
             return None
-        for suspect in model.suspects(self._kept(fit)).tolist():
-            other = self._chosen(fit, model, suspect, _MOST_CHOICES_WITHOUT)
-            if other is not None:
-                return other
+        current = fit
+        for _ in range(_MOST_CHOICES):
+            if not self.sets.has_time():
+                return None
+            kept = self._kept(current)
+            try:
+                chosen = self._model(current).best(kept, self.sets.has_time)
+            except _NO_MODEL:
+                return None
+            if np.isin(chosen, kept).all():
+                # Nothing comes in: whether edges have to go is for other tests to say.
+                return None
+            edges = with_edges(self._staying(fit), self.closures[chosen])
+            current = self.sets.settled(edges, current.poses)
+            if self.sets.is_better(current, fit):
+                return current
         return None
 
     def _kept(self, fit: Fit) -> IntArray:
@@ -68,41 +75,13 @@ class LinearSearch:
         staying[self.closures] = False
         return staying
 
-    def _first_model(self, fit: Fit) -> LinearChoice | None:
-        """The model at a fit; None where there is too much or nothing to choose from.
+    def _has_few(self, fit: Fit) -> bool:
+        """Whether there is something to choose from and not too much.
 
         The edges that are not chosen among have to hold the poses.
         """
         are_few = 0 < len(self.closures) <= _MOST_CLOSURES and len(self._kept(fit)) <= _MOST_KEPT
-        if not are_few or not is_held(self.sets.problem.graph, self._staying(fit)):
-            return None
-        try:
-            return self._model(fit)
-        except _NO_MODEL:
-            return None
-
-    def _chosen(
-        self, fit: Fit, first_model: LinearChoice, excluded: int | None, most_choices: int
-    ) -> Fit | None:
-        """A better fit by choices in a row, of which all but the last may be worse."""
-        current = fit
-        for _ in range(most_choices):
-            if not self.sets.has_time():
-                return None
-            kept = self._kept(current)
-            try:
-                model = first_model if current is fit else self._model(current)
-                chosen = model.best(kept, excluded, self.sets.has_time)
-            except _NO_MODEL:
-                return None
-            if np.isin(chosen, kept).all():
-                # Nothing comes in: whether edges have to go is for other tests to say.
-                return None
-            edges = with_edges(self._staying(fit), self.closures[chosen])
-            current = self.sets.settled(edges, current.poses)
-            if self.sets.is_better(current, fit):
-                return current
-        return None
+        return are_few and is_held(self.sets.problem.graph, self._staying(fit))
 
     def _model(self, fit: Fit) -> LinearChoice:
         sets = self.sets

@@ -81,8 +81,7 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        contradict (`drop_contradicted`). It ends early when no further attempt is needed
        (`Choice.is_enough`). Without known edges, trees of edges whose cycles agree come first
        (`best_by_agreement`). Odometry that nobody has named, and that cycles contradict, is not
-       known in further attempts (`with_odometry_doubted`). Where few closures hold the map of the
-       cheapest one, each is left out in turn (`linear_search`).
+       known in further attempts (`with_odometry_doubted`).
     3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
        whether it is certified or not. Newton and all further steps of the pipeline
        (`solvers.plan`) solve for the edges kept.
@@ -476,29 +475,16 @@ class _RobustSolve:
         return self._result(solution, chosen.kept, chosen.scale, chosen.attempt.name)
 
     def _finished(self, cheapest: Estimate) -> Estimate:
-        """The cheapest attempt, improved by what is too slow for each, or to be done once.
+        """The cheapest attempt, to which edges come back that are likely right.
 
-        Where few closures hold its map, which then bends to fit a wrong one, each is left out in
-        turn; what is better is revised, and all are left out anew. In the end edges come back that
-        are likely right although they are beyond the quantile, which may raise the truncated cost.
-        An update of a graph that has grown goes without, as it has to be fast.
+        They are beyond the quantile, and may raise the truncated cost. An update of a graph that
+        has grown goes without, as it has to be fast.
         """
-        kept_before: set[bytes] = set()
+        if not self._has_time() or cheapest.status in OUT_OF_TIME:
+            return cheapest
         try:
-            # The loop ends, as no set of edges comes again. Costs do not tell, as thresholds may
-            # change with the least error scale of all attempts.
-            while self._has_time() and cheapest.status not in OUT_OF_TIME:
-                kept_before.add(cheapest.kept.tobytes())
-                search = self._search(self.choice)
-                fit = Fit.of(self.doubted.problem, cheapest.kept, cheapest.poses)
-                other = search.linear.without_one(fit)
-                if other is None:
-                    return self._replaced(cheapest, search.with_likely(fit))
-                improved = search.improved(other.kept, other.poses)
-                better = min(improved, other, key=search.sets.cost)
-                if better.kept.tobytes() in kept_before:
-                    return cheapest
-                cheapest = self._replaced(cheapest, better)
+            fit = Fit.of(self.doubted.problem, cheapest.kept, cheapest.poses)
+            return self._replaced(cheapest, self._search(self.choice).with_likely(fit))
         except FAILURES as error:
             self.failures.append(f"the last search failed ({error}); what it began with stands")
         return cheapest

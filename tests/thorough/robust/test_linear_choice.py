@@ -117,7 +117,7 @@ def test_the_search_finds_the_best_of_all_sets() -> None:
         root = rng.standard_normal((k * p, k * p))
         covariance = root @ root.T / (k * p) + 0.1 * np.eye(k * p)
         errors = rng.standard_normal((k, p)) * rng.choice([1.0, 4.0], k)[:, None]
-        model = LinearChoice(errors, covariance, ALLOWED, np.zeros(k))
+        model = LinearChoice(errors, covariance, ALLOWED)
 
         cost = partial(cost_of, model)
         sets = itertools.chain.from_iterable(
@@ -126,8 +126,6 @@ def test_the_search_finds_the_best_of_all_sets() -> None:
         least = min(map(cost, sets))
         best = model.best(np.zeros(0, dtype=int))
         num_found += cost(tuple(best)) <= (1.0 + 1e-9) * least
-        without = model.best(best, excluded=int(best[0]))
-        assert best[0] not in without
     assert num_found == 8
 
 
@@ -142,21 +140,11 @@ def test_a_changed_closure_stays_as_it_is_for_a_time_that_grows_with_their_numbe
     covariance = root @ root.T / rank * rng.choice([1.0, 5.0, 30.0]) + 0.1 * np.eye(3 * k)
     errors = rng.standard_normal((k, 3)) * rng.choice([1.0, 4.0], k)[:, None]
     errors *= rng.choice([1.0, 2.0])
-    model = LinearChoice(errors, covariance, ALLOWED, np.zeros(k))
+    model = LinearChoice(errors, covariance, ALLOWED)
     sets = [kept for size in range(k + 1) for kept in itertools.combinations(range(k), size)]
     least = min(cost_of(model, kept) for kept in sets)
     best = model.best(np.zeros(0, dtype=int))
     assert cost_of(model, tuple(best)) == pytest.approx(least, rel=1e-9)
-
-
-def test_a_map_is_bent_to_closures_that_cost_much_and_show_little_of_it() -> None:
-    costs = np.array([6.0, 9.0, 6.0, 2.0, 12.0])
-    residuals = np.array([0.6, 0.9, 3.0, 0.2, 0.1])
-    errors = np.zeros((5, 3))
-    errors[:, 0] = np.sqrt(costs)
-    model = LinearChoice(errors, np.eye(15), ALLOWED, residuals)
-    # The third shows what it costs, the fourth costs little, and the last is not chosen.
-    assert model.suspects(np.arange(4)).tolist() == [1, 0]
 
 
 def test_a_map_that_was_bent_to_a_wrong_closure_comes_back() -> None:
@@ -174,6 +162,7 @@ def test_a_map_that_was_bent_to_a_wrong_closure_comes_back() -> None:
         planted = sets.settled(~is_wrong, graph.truth)
         wrong = np.flatnonzero(is_wrong)[:1]
         fit = sets.settled(with_edges(known, wrong), pgo.odometry_start(graph))
+        assert LinearSearch.of(sets_of(problem, has_time=False)).exchanged(fit) is None
         search = LinearSearch.of(sets)
         while True:
             other = search.exchanged(fit)
@@ -183,21 +172,3 @@ def test_a_map_that_was_bent_to_a_wrong_closure_comes_back() -> None:
             fit = other
         num_back += sets.cost(fit) <= 1.001 * sets.cost(planted)
     assert num_back >= 3
-
-
-def test_without_one_leaves_a_wrong_closure_out() -> None:
-    noise = NoiseModel(0.02, 0.05)
-    right = pgo.grid_world(
-        1, 300, np.random.default_rng(1), d=2, loop_closure_probability=0.02, noise=noise
-    )
-    graph, is_wrong = spoiled(right, 0.3, "random", 1)
-    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
-    known = odometry(graph)
-    ran_out = sets_of(problem, has_time=False)
-    wrong = np.flatnonzero(is_wrong)[:1]
-    fit = ran_out.settled(with_edges(known, wrong), pgo.odometry_start(graph))
-    assert LinearSearch.of(ran_out).without_one(fit) is None
-    sets = sets_of(problem)
-    other = LinearSearch.of(sets).without_one(fit)
-    assert other is not None
-    assert sets.is_better(other, fit)
