@@ -117,6 +117,23 @@ class Orthonormal(ConstraintSet):
         smallest = np.linalg.eigvalsh(Lambda)[0]
         return max(0.0, float(-smallest))
 
+    def tangent_basis(self, P: Array) -> Array:
+        """Orthonormal basis of the tangent space, one direction a column, entries column-major.
+
+        It is P Omega + P_perp K with Omega skew.
+        """
+        n, p = P.shape
+        complete = np.concatenate([P, np.linalg.qr(P, mode="complete")[0][:, p:]], axis=1)
+        above = np.triu_indices(p, 1)
+        directions = np.zeros((len(above[0]) + (n - p) * p, p, n))
+        skew = np.arange(len(above[0]))
+        directions[skew, above[1], above[0]] = np.sqrt(0.5)
+        directions[skew, above[0], above[1]] = -np.sqrt(0.5)
+        outside = directions[len(skew) :].reshape(p, n - p, p, n)
+        for a in range(p):
+            outside[a, np.arange(n - p), a, np.arange(p, n)] = 1.0
+        return np.asarray((directions @ complete.T).reshape(len(directions), n * p).T)
+
     def distance(self, P: Array) -> float:
         """||P^T P - I||_F."""
         gram = P.T @ P
@@ -182,6 +199,17 @@ class UnitColumns(ConstraintSet):
         """Largest -Lambda_j, with N = P diag(Lambda)."""
         Lambda = self._products(P, N)
         return max(0.0, float(-np.min(Lambda)))
+
+    def tangent_basis(self, P: Array) -> Array:
+        """As `Orthonormal.tangent_basis`: what is orthogonal to each of the vectors."""
+        places = self._columns(np.arange(P.size).reshape(P.shape, order="F"))
+        vectors = self._columns(P).reshape(len(places), -1)
+        bases = []
+        for vector, place in zip(vectors.T, places.reshape(vectors.shape).T, strict=True):
+            basis = np.zeros((P.size, len(vector) - 1))
+            basis[place] = np.linalg.qr(vector[:, None], mode="complete")[0][:, 1:]
+            bases.append(basis)
+        return np.concatenate(bases, axis=1)
 
     def distance(self, P: Array) -> float:
         """Norm of the vector of ||p_j||^2 - 1."""

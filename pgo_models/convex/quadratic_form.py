@@ -1,0 +1,511 @@
+"""A quadratic cvxpy model as one quadratic form, from the numbers that cvxpy gives a solver.
+
+cvxpy states a convex quadratic model as
+
+    minimise 1/2 z^T P z + c^T z + constant   subject to   A z = b,
+
+where z holds the model's variables and cvxpy's own ones, as the residuals of a sum of squares. Each
+of the latter that stands in one equality alone, with the factor 1 or -1, is what that equality
+says; written so, z = T w exactly, and w = (variables, 1). A rotation of the plane (a, -b; b, a) is
+two numbers, so that w = spread u with entries 0, 1 and -1. What remains is
+
+    J = u^T Q u,   Q = spread^T T^T P T spread / 2 + sym(e (T spread)^T c) + constant e e^T,
+
+with e the last unit vector, equalities E u = 0, and coordinates of u that equalities fix.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+from scipy.linalg import qr
+from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_array, eye_array
+from scipy.sparse.linalg import splu
+
+from pgo_models.convex.constraint_sets import ConstraintSet, Rotations
+from pgo_models.convex.orthogonality import OrthogonalProblem
+from pgo_models.errors import SettingError
+from pgo_models.geometry.arrays import ReadOnly
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.floating_point import exact_sum, gamma
+
+# of the linear equations for variables without a set: their regularisation, and what is left of
+# the right side where they have no solution, both as shares
+_DAMPING = 1e-9
+_REFINEMENTS = 4
+_INCONSISTENT = 1e-6
+_MOST_FLAT = 8  # directions in which J may be constant
+_LARGEST_DENSE = 300  # side up to which y is found by one dense matrix
+_FLAT = 1e-3  # share of a random direction that is left where J is constant
+
+
+class NotQuadraticError(SettingError):
+    """A model is no quadratic form with linear equalities; a solver of cvxpy makes step (a)."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A constrained variable among the coordinates of u.
+
+    Parameters
+    ----------
+    start : int
+        Its first coordinate. Entries follow column by column; of a rotation of the plane there are
+        two, its first column.
+    shape : tuple of ints
+        Shape of the variable.
+    sets : tuple of ConstraintSet
+        What it is in.
+    """
+
+    start: int
+    shape: tuple[int, ...]
+    sets: tuple[ConstraintSet, ...]
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether it is a rotation of the plane, (a, -b; b, a)."""
+        return self.shape == (2, 2) and any(isinstance(each, Rotations) for each in self.sets)
+
+    @property
+    def size(self) -> int:
+        """Number of its coordinates."""
+        return 2 if self.is_plane else int(np.prod(self.shape))
+
+    @property
+    def coordinates(self) -> slice:
+        """Where they are in u."""
+        return slice(self.start, self.start + self.size)
+
+    def value(self, x: Array) -> Array:
+        """The variable, in its shape, of its coordinates."""
+        if self.is_plane:
+            a, b = x
+            return np.array([[a, -b], [b, a]])
+        return x.reshape(self.shape, order="F")
+
+    def coordinates_of(self, value: Array) -> Array:
+        """Its coordinates of the variable."""
+        return value.reshape(-1, order="F")[: self.size]
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticForm(ReadOnly):
+    """J = u^T Q u with u = (x_1, .., x_m, y, 1), subject to E u = 0.
+
+    x_k are the entries of `problem.variables[k]`, column by column (of a rotation of the plane its
+    first column), y those of `problem.others` in their order, then numbers of cvxpy's own, if any.
+    P, c, A, b and the constant are the model as cvxpy hands it to a solver, of which a bound is
+    proven. Made by `quadratic_form`.
+
+    Parameters
+    ----------
+    P, c, A, b, constant
+        1/2 z^T P z + c^T z + constant and A z = b.
+    T : (len(c), k) sparse array
+        z = T w, exactly.
+    spread : (k, N) sparse array
+        w = spread u, entries 0, 1 and -1.
+    E : (rows, N) sparse array
+        Equalities E u = 0 that are left.
+    fixed : (N,) array
+        The values that equalities give to coordinates, nan where they give none. The last is 1.
+    blocks : tuple of Block
+        One for every constrained variable.
+    names : tuple of (int, str)
+        First coordinate and name of every variable.
+    """
+
+    P: csc_array
+    c: Array
+    A: csc_array
+    b: Array
+    constant: float
+    T: csc_array
+    spread: csc_array
+    E: csr_array
+    fixed: Array
+    blocks: tuple[Block, ...]
+    names: tuple[tuple[int, str], ...]
+
+    @property
+    def side(self) -> int:
+        """N, the number of coordinates of u."""
+        return len(self.fixed)
+
+    @property
+    def num_constrained(self) -> int:
+        """Number of coordinates of x."""
+        return self.blocks[-1].coordinates.stop
+
+    @property
+    def is_free(self) -> BoolArray:
+        """Which coordinates are not fixed, (N,)."""
+        return np.isnan(self.fixed)
+
+    @cached_property
+    def from_u(self) -> csc_array:
+        """T spread, (len(c), N), rounded where two entries of T meet in a plane rotation."""
+        return csc_array(self.T @ self.spread)
+
+    @cached_property
+    def Q(self) -> csc_array:
+        """The matrix of the form, (N, N), in doubles, with all of its diagonal stored."""
+        return self._assembled(self.P, self.c, self.constant, self.T, self.spread)
+
+    @cached_property
+    def Q_error(self) -> csc_array:
+        """Bound on the rounding of every entry of Q, (N, N)."""
+        # Entries are sums of at most so many products, at most three factors each.
+        most_of_P = np.diff(csr_array(self.P).indptr).max(initial=0)
+        most_of_T = np.diff(self.T.indptr).max(initial=0)
+        share = gamma(float(most_of_P + most_of_T) + 12.0)
+        sizes = abs(self.P), abs(self.c), abs(self.constant), abs(self.T), abs(self.spread)
+        return csc_array(share * self._assembled(*sizes))
+
+    def _assembled(
+        self, P: csc_array, c: Array, constant: float, T: csc_array, spread: csc_array
+    ) -> csc_array:
+        quadratic = coo_array(0.5 * (spread.T @ (T.T @ (P @ T)) @ spread))
+        linear = coo_array(0.5 * (spread.T @ (T.T @ c))[:, None])
+        last = self.side - 1
+        rows = [linear.row, np.full(linear.nnz, last), np.arange(self.side), [last]]
+        columns = [np.full(linear.nnz, last), linear.row, np.arange(self.side), [last]]
+        data = [linear.data, linear.data, np.zeros(self.side), [constant]]
+        rows.append(quadratic.row)
+        columns.append(quadratic.col)
+        data.append(quadratic.data)
+        entries = np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))
+        return csc_array(coo_array(entries, shape=(self.side, self.side)))
+
+    def objective(self, u: Array) -> float:
+        """J at u, from the residuals rather than from Q."""
+        z = self.T @ (self.spread @ u)
+        return float(0.5 * z @ (self.P @ z) + self.c @ z + self.constant)
+
+    def rounding_level(self, u: Array) -> float:
+        """J, less its constant, where all of z is as large as the rounding of u makes it."""
+        z = gamma(4.0) * (abs(self.T) @ (abs(self.spread) @ abs(u)))
+        return float(0.5 * z @ (abs(self.P) @ z))
+
+    @property
+    def is_sum_of_squares(self) -> bool:
+        """Whether J is a sum of weighted squares and thus never negative."""
+        has_squares_alone = not self.c.any() and self.constant >= 0.0
+        off_diagonal = self.P - diags_array(self.P.diagonal())
+        return bool(has_squares_alone and not off_diagonal.count_nonzero()) and bool(
+            (self.P.diagonal() >= 0.0).all()
+        )
+
+    def values(self, u: Array) -> list[Array]:
+        """The constrained variables at u, each in its shape."""
+        return [block.value(u[block.coordinates]) for block in self.blocks]
+
+    def u_of(self, values: Sequence[Array]) -> Array:
+        """The u of constrained variables, with the best values of all others."""
+        u = np.where(self.is_free, 0.0, self.fixed)
+        for block, value in zip(self.blocks, values, strict=True):
+            u[block.coordinates] = block.coordinates_of(value)
+        return self.with_best_others(u)
+
+    # Variables without a set.
+
+    @cached_property
+    def free_others(self) -> IntArray:
+        """Coordinates that are neither fixed nor of a constrained variable."""
+        positions = np.flatnonzero(self.is_free)
+        return positions[positions >= self.num_constrained]
+
+    def with_best_others(self, u: Array) -> Array:
+        """u with the coordinates of y at which J is least, for its x.
+
+        Raises a NotQuadraticError where equalities hold of x alone, and a SettingError where J has
+        no minimum over y.
+        """
+        best = u.copy()
+        y = self.free_others
+        if not len(y) and not self.E.shape[0]:
+            return best
+        if self.side <= _LARGEST_DENSE:
+            best[y] = self._others_of_constrained @ u
+            return best
+        best[y] = 0.0
+        best[y] = self._solve_for_others(self._right_side(best[:, None]))[:, 0]
+        return best
+
+    def _right_side(self, u: Array) -> Array:
+        """Right side of `other_equations` at several u with y = 0."""
+        return np.concatenate([-2.0 * (self.Q @ u)[self.free_others], -(self.E @ u)])
+
+    @cached_property
+    def _others_of_constrained(self) -> Array:
+        """Matrix with y = matrix u, (len(y), N), for small models."""
+        without = np.eye(self.side)
+        without[self.free_others] = 0.0
+        return self._solve_for_others(self._right_side(without))
+
+    @cached_property
+    def other_equations(self) -> tuple[csc_array, Any]:
+        """Optimality conditions of y, regularised for the factor that solves them."""
+        y = self.free_others
+        H = 2.0 * self.Q[y][:, y]
+        E = self.E[:, y]
+        equations = csc_array(block_array([[H, E.T], [E, None]])) if E.shape[0] else csc_array(H)
+        damping = np.full(equations.shape[0], _DAMPING * max(abs(equations).max(), 1e-300))
+        damping[len(y) :] *= -1.0
+        return equations, splu(csc_array(equations + diags_array(damping)))
+
+    def _solve_for_others(self, right: Array) -> Array:
+        equations, factor = self.other_equations
+        solution = np.zeros(right.shape)
+        residual = right
+        for _ in range(_REFINEMENTS):
+            solution = solution + factor.solve(residual)
+            residual = right - equations @ solution
+        num_others = len(self.free_others)
+        sizes = np.linalg.norm(right, axis=0)
+        scale = sizes + np.linalg.norm(solution, axis=0) * abs(equations).max()
+        of_equalities = np.linalg.norm(residual[num_others:], axis=0)
+        if (of_equalities > _INCONSISTENT * scale).any():
+            raise NotQuadraticError(
+                "equalities hold of the constrained variables alone; "
+                "a bound takes those that fix single entries"
+            )
+        is_slope = abs(residual[:num_others]) > _INCONSISTENT * scale
+        if is_slope.any():
+            steepest = self.free_others[np.argmax(is_slope.any(axis=1))]
+            raise SettingError(
+                f"the objective is not bounded below in {self.name_of(int(steepest))}; "
+                "bound it by a square or an equality"
+            )
+        return solution[:num_others]
+
+    def name_of(self, coordinate: int) -> str:
+        """Name of the variable that a coordinate is of."""
+        return [name for start, name in self.names if start <= coordinate][-1]
+
+    @cached_property
+    def grounded(self) -> IntArray:
+        """Coordinates of y that may be held wherever they are, since a shift changes nothing.
+
+        A common shift of all translations leaves most models as they are. Held are coordinates
+        with whose help every such shift, all of whose entries are 0, 1 and -1, can be undone. That
+        T and E do not see it is checked exactly.
+        """
+        y = self.free_others
+        basis = self._flat_directions()
+        if basis is None:
+            return y[:0]
+        pivots = qr(basis.T, mode="r", pivoting=True)[1][: basis.shape[1]]
+        shifts = np.round(basis @ np.linalg.inv(basis[pivots]))
+        seen = csr_array(self.from_u[:, y])
+        with_weight = abs(self.P).sum(axis=0) + abs(self.c) > 0.0
+        of_all = [seen[np.flatnonzero(with_weight)], self.E[:, y]]
+        held = []
+        for pivot, shift in zip(pivots, shifts.T, strict=True):
+            is_plain = np.isin(shift, (-1.0, 0.0, 1.0)).all()
+            if is_plain and all(_is_zero(rows, shift) for rows in of_all):
+                held.append(y[pivot])
+        return np.array(sorted(held), dtype=int)
+
+    def _flat_directions(self) -> Array | None:
+        """Basis of the directions of y in which J is constant, None where there are none."""
+        y = self.free_others
+        if not len(y):
+            return None
+        equations, factor = self.other_equations
+        draws = np.zeros((equations.shape[0], _MOST_FLAT))
+        draws[: len(y)] = np.random.default_rng(0).standard_normal((len(y), _MOST_FLAT))
+        flat = draws
+        for _ in range(_REFINEMENTS):
+            flat = flat - factor.solve(equations @ flat)
+        sizes, directions = np.linalg.svd(flat[: len(y)], full_matrices=False)[1::-1]
+        directions = directions[:, sizes > _FLAT]
+        return directions if directions.shape[1] else None
+
+
+def _is_zero(rows: csr_array, shift: Array) -> bool:
+    """Whether rows @ shift is zero in exact arithmetic, for a shift of 0, 1 and -1."""
+    if (rows @ shift).any():
+        return False
+    is_long = np.diff((rows @ diags_array(abs(shift))).indptr) > 2  # of two, zero is exact
+    for row in np.flatnonzero(is_long):
+        entries = slice(rows.indptr[row], rows.indptr[row + 1])
+        if exact_sum(rows.data[entries] * shift[rows.indices[entries]]) != 0.0:
+            return False
+    return True
+
+
+def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
+    """The quadratic form of a convex quadratic model with linear equalities.
+
+    Parameters
+    ----------
+    problem : OrthogonalProblem
+        The model.
+
+    Returns
+    -------
+    QuadraticForm
+        J = u^T Q u.
+
+    Raises
+    ------
+    NotQuadraticError
+        If the objective is no convex quadratic, or there are other constraints than equalities.
+    SettingError
+        If a Parameter has no value, or the data have nan or inf.
+
+    Examples
+    --------
+    >>> X = cp.Variable((2, 2))
+    >>> nearest = cp.Problem(cp.Minimize(cp.sum_squares(X - np.eye(2))))
+    >>> form = quadratic_form(OrthogonalProblem(nearest, rotations=[X]))
+    >>> form.Q.toarray()
+    array([[ 2.,  0., -2.],
+           [ 0.,  2.,  0.],
+           [-2.,  0.,  2.]])
+    """
+    data, columns, constant = _canonical_data(problem)
+    c = np.asarray(data["c"], dtype=float)
+    b = np.asarray(data["b"], dtype=float)
+    A = csc_array(data["A"])
+    P = _symmetric_of_upper(data.get("P"), len(c))
+    for name, numbers in (("objective", P.data), ("objective", c), ("data", A.data), ("data", b)):
+        if not np.isfinite(numbers).all():
+            raise SettingError(f"the {name} of the model has nan or inf; check the data")
+    w_columns, blocks, names, spread = _coordinates(problem, columns)
+    T, rows_left, w_columns = _without_residuals(A, b, w_columns)
+    names = [*names, (spread.shape[1], "a number of cvxpy's own")]
+    num_own = len(w_columns) - spread.shape[0]
+    spread = csc_array(block_array([[spread, None], [None, eye_array(num_own + 1)]]))
+    in_w = csc_array(A)[rows_left][:, w_columns]
+    equalities = block_array([[in_w, csc_array(-b[rows_left][:, None])]])
+    E = csr_array(csr_array(equalities) @ spread)
+    fixed, is_left = _fixed_coordinates(E)
+    return QuadraticForm(
+        P, c, A, b, constant, T, spread, csr_array(E[is_left]), fixed, tuple(blocks), tuple(names)
+    )
+
+
+def _canonical_data(problem: OrthogonalProblem) -> tuple[dict[str, Any], dict[int, int], float]:
+    """What cvxpy hands to a solver, the first column of every variable, and the constant."""
+    for parameter in problem.problem.parameters():
+        if parameter.value is None:
+            raise SettingError(f"the Parameter {parameter.name()} has no value; set it first")
+    if not problem.J.is_qpwa():
+        raise NotQuadraticError("the objective is not quadratic")
+    model = cp.Problem(cp.Minimize(problem.J), problem.problem.constraints)
+    try:
+        data, _, inverse = model.get_problem_data(cp.CLARABEL)
+    except ValueError as error:  # cvxpy's of nan and inf in the data
+        raise SettingError(f"the model has nan or inf: {error}") from error
+    if data["dims"].zero != data["A"].shape[0]:
+        raise NotQuadraticError("there are other constraints than linear equalities")
+    columns = data["param_prob"].var_id_to_col
+    for variable in (*problem.variables, *problem.others):
+        if variable.id not in columns:
+            raise NotQuadraticError(f"{variable.name()} has attributes, which are constraints")
+    return data, columns, float(inverse[-1]["offset"])
+
+
+def _symmetric_of_upper(P: Any, side: int) -> csc_array:
+    """The symmetric matrix whose upper triangle a solver takes."""
+    if P is None:
+        return csc_array((side, side))
+    upper = coo_array(P)
+    is_above = upper.row < upper.col
+    rows = np.concatenate([upper.row[upper.row <= upper.col], upper.col[is_above]])
+    columns = np.concatenate([upper.col[upper.row <= upper.col], upper.row[is_above]])
+    data = np.concatenate([upper.data[upper.row <= upper.col], upper.data[is_above]])
+    return csc_array(coo_array((data, (rows, columns)), shape=(side, side)))
+
+
+def _coordinates(
+    problem: OrthogonalProblem, columns: dict[int, int]
+) -> tuple[IntArray, list[Block], list[tuple[int, str]], csc_array]:
+    """Columns of z that are the variables', blocks and names, and w from u without its 1."""
+    w_columns = []
+    blocks = []
+    names = []
+    spreads = []
+    start = 0
+    for position, variable in enumerate((*problem.variables, *problem.others)):
+        first = columns[variable.id]
+        w_columns.append(np.arange(first, first + variable.size))
+        names.append((start, variable.name()))
+        size = variable.size
+        spread = eye_array(variable.size)
+        if position < len(problem.variables):
+            block = Block(start, variable.shape, tuple(problem.terms_of(position)))
+            blocks.append(block)
+            size = block.size
+            if block.is_plane:
+                spread = csc_array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]])
+        spreads.append(spread)
+        start += size
+    grid: list[list[Any]] = [[None] * len(spreads) for _ in spreads]
+    for k, spread in enumerate(spreads):
+        grid[k][k] = spread
+    return np.concatenate(w_columns), blocks, names, csc_array(block_array(grid))
+
+
+def _without_residuals(
+    A: csc_array, b: Array, w_columns: IntArray
+) -> tuple[csc_array, IntArray, IntArray]:
+    """T with z = T w, the rows of A that it does not use, and the columns of w without its 1.
+
+    Of a column j with one entry, 1 or -1, row i of A z = b says z_j = A_ij (b_i - the others).
+    """
+    num_columns = A.shape[1]
+    is_own = np.ones(num_columns, dtype=bool)
+    is_own[w_columns] = False
+    candidates = np.flatnonzero(is_own & (np.diff(A.indptr) == 1))
+    candidates = candidates[abs(A.data[A.indptr[candidates]]) == 1.0]
+    rows, first = np.unique(A.indices[A.indptr[candidates]], return_index=True)
+    residuals = candidates[first]
+    signs = A.data[A.indptr[residuals]]
+    is_own[residuals] = False
+    w_columns = np.concatenate([w_columns, np.flatnonzero(is_own)])
+    identity = coo_array(
+        (np.ones(len(w_columns)), (w_columns, np.arange(len(w_columns)))),
+        shape=(num_columns, len(w_columns) + 1),
+    )
+    others = coo_array(diags_array(-signs) @ csr_array(A)[rows][:, w_columns])
+    is_constant = b[rows] != 0.0
+    entries = [identity.data, others.data, (signs * b[rows])[is_constant]]
+    in_rows = [identity.row, residuals[others.row], residuals[is_constant]]
+    in_columns = [identity.col, others.col, np.full(is_constant.sum(), len(w_columns))]
+    T = coo_array(
+        (np.concatenate(entries), (np.concatenate(in_rows), np.concatenate(in_columns))),
+        shape=identity.shape,
+    )
+    return csc_array(T), np.setdiff1d(np.arange(A.shape[0]), rows), w_columns
+
+
+def _fixed_coordinates(E: csr_array) -> tuple[Array, BoolArray]:
+    """Values of the coordinates that one row of E u = 0 fixes exactly, and the other rows."""
+    E.eliminate_zeros()
+    last = E.shape[1] - 1
+    fixed = np.full(E.shape[1], np.nan)
+    fixed[last] = 1.0
+    is_left = np.ones(E.shape[0], dtype=bool)
+    for row in range(E.shape[0]):
+        entries = slice(E.indptr[row], E.indptr[row + 1])
+        constant = sum(E.data[entries][E.indices[entries] == last])
+        of_variables = E.indices[entries] != last
+        if of_variables.sum() != 1:
+            continue
+        factor = float(E.data[entries][of_variables][0])
+        position = int(E.indices[entries][of_variables][0])
+        value = -constant / factor
+        is_exact = Fraction(value) * Fraction(factor) == -Fraction(float(constant))
+        if is_exact and np.isnan(fixed[position]):
+            fixed[position] = value
+            is_left[row] = False
+    return fixed, is_left

@@ -1,0 +1,198 @@
+"""The quadratic equations that hold of points of the sets: u^T A_k u = 0.
+
+Columns are orthonormal, and rows, too, where X is square. In SO(3) every column is the cross
+product of the two others, which is linear beside quadratic and tells rotations from reflections
+(Briales & Gonzalez-Jimenez 2017). A rotation of the plane is (a, -b; b, a), so that only a^2 + b^2
+= 1 is left to say. An equality E_r u = 0 holds times every coordinate of u.
+
+Multipliers l of these equations make the Lagrangian u^T S u, S = Q - sum_k l_k A_k, which is J
+wherever the equations hold.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array
+
+from pgo_models.convex.constraint_sets import Orthonormal, Rotations, UnitColumns, UnitRows
+from pgo_models.convex.quadratic_form import Block, NotQuadraticError, QuadraticForm
+from pgo_models.geometry.arrays import ReadOnly
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
+
+# An equation of one block: terms (a, b, value) of value u_a u_b; -1 stands for the last of u.
+_Terms = list[tuple[int, int, float]]
+_ONE = -1
+
+
+@dataclass(frozen=True, eq=False)
+class SetEquations(ReadOnly):
+    """Symmetric matrices A_k, their entries in one list.
+
+    Parameters
+    ----------
+    side : int
+        N, the number of coordinates of u.
+    number : int
+        How many A_k there are.
+    num_basic : int
+        How many of them, the first ones, say that columns (or rows) have norm 1 and are orthogonal.
+    k, i, j, entries
+        Entry (i, j) of A_k; the same (k, i, j) may come again and is then added.
+    of_equalities : array of int
+        The k that are E_r u itself, times the last of u.
+    penalty : (number,) array
+        Multipliers l with sum l_k u^T A_k u = -||E u||^2.
+    norms : (number,) array
+        Multipliers l, 0 and 1, with sum l_k u^T A_k u = ||x||^2 less the number of columns (or
+        rows) of norm 1.
+    """
+
+    side: int
+    number: int
+    num_basic: int
+    k: IntArray
+    i: IntArray
+    j: IntArray
+    entries: Array
+    of_equalities: IntArray
+    penalty: Array
+    norms: Array
+
+    def combined(self, multipliers: Array) -> csc_array:
+        """The sum of l_k A_k, (N, N)."""
+        data = multipliers[self.k] * self.entries
+        return csc_array(coo_array((data, (self.i, self.j)), shape=(self.side, self.side)))
+
+    def sizes(self, multipliers: Array) -> csc_array:
+        """The sum of |l_k| |A_k|, (N, N)."""
+        data = abs(multipliers[self.k] * self.entries)
+        return csc_array(coo_array((data, (self.i, self.j)), shape=(self.side, self.side)))
+
+    def products(self, u: Array) -> csc_array:
+        """The columns A_k u, (N, number)."""
+        data = self.entries * u[self.j]
+        return csc_array(coo_array((data, (self.i, self.k)), shape=(self.side, self.number)))
+
+    def terms(self, multipliers: Array, u: Array) -> Array:
+        """The terms of sum l_k u^T A_k u, of at most four factors each."""
+        return multipliers[self.k] * self.entries * u[self.i] * u[self.j]
+
+
+def set_equations(form: QuadraticForm) -> SetEquations:
+    """The equations of all sets and equalities of a form.
+
+    Parameters
+    ----------
+    form : QuadraticForm
+        The form.
+
+    Returns
+    -------
+    SetEquations
+        Basic ones first.
+
+    Raises
+    ------
+    NotQuadraticError
+        If a variable is in a set without such equations.
+    """
+    basic: list[_Terms] = []
+    further: list[_Terms] = []
+    norms: list[bool] = []
+    for block in form.blocks:
+        for each in block.sets:
+            if not isinstance(each, Orthonormal | UnitColumns):
+                raise NotQuadraticError(f"{each!r} is no set of quadratic equations")
+        sets = (UnitColumns(),) if block.is_plane else block.sets
+        for position, each in enumerate(sets):
+            first, others = _equations_of(each, (2, 1) if block.is_plane else block.shape)
+            basic += [_shifted(terms, block.start) for terms in first]
+            further += [_shifted(terms, block.start) for terms in others]
+            norms += [position == 0 and (_ONE, _ONE, -1.0) in terms for terms in first]
+    last = form.side - 1
+    of_equalities = []
+    penalty = [0.0] * (len(basic) + len(further))
+    for row in range(form.E.shape[0]):
+        entries = slice(form.E.indptr[row], form.E.indptr[row + 1])
+        equality = dict(zip(form.E.indices[entries].tolist(), form.E.data[entries], strict=True))
+        of_equalities.append(len(penalty))
+        for times in (last, *(position for position in equality if position != last)):
+            further.append([(position, times, factor) for position, factor in equality.items()])
+            penalty.append(-equality.get(times, 0.0))
+    is_norm = np.zeros(len(penalty))
+    is_norm[: len(basic)] = norms
+    return SetEquations(
+        form.side,
+        len(penalty),
+        len(basic),
+        *_entries(form.side, basic + further),
+        np.array(of_equalities, dtype=int),
+        np.array(penalty),
+        is_norm,
+    )
+
+
+def _equations_of(kind: object, shape: tuple[int, ...]) -> tuple[list[_Terms], list[_Terms]]:
+    """Basic and further equations of one variable in one set."""
+    n, p = shape if len(shape) == 2 else (shape[0], 1)
+    columns = [[a + n * b for a in range(n)] for b in range(p)]
+    rows = [[a + n * b for b in range(p)] for a in range(n)]
+    if isinstance(kind, UnitRows):
+        vectors = rows if len(shape) == 2 else [[a] for a in range(n)]
+        return [_product(vector, vector, 1.0) for vector in vectors], []
+    if isinstance(kind, UnitColumns):
+        return [_product(column, column, 1.0) for column in columns], []
+    further = []
+    if n == p:
+        further = _orthonormal(rows)[:-1]  # the norms of columns and rows have one sum
+    if isinstance(kind, Rotations) and n == 3:
+        for a in range(3):
+            further += _cross_product(columns[a], columns[(a + 1) % 3], columns[(a + 2) % 3])
+    return _orthonormal(columns), further
+
+
+def _orthonormal(vectors: Sequence[Sequence[int]]) -> list[_Terms]:
+    equations = []
+    for b, second in enumerate(vectors):
+        for first in vectors[: b + 1]:
+            equations.append(_product(first, second, float(first is second)))
+    return equations
+
+
+def _product(first: Sequence[int], second: Sequence[int], value: float) -> _Terms:
+    """<first, second> = value."""
+    terms = [(a, b, 1.0) for a, b in zip(first, second, strict=True)]
+    return [*terms, (_ONE, _ONE, -value)] if value else terms
+
+
+def _cross_product(
+    first: Sequence[int], second: Sequence[int], third: Sequence[int]
+) -> list[_Terms]:
+    """Entries of first x second = third."""
+    equations = []
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        plus = (first[b], second[c], 1.0)
+        minus = (first[c], second[b], -1.0)
+        equations.append([plus, minus, (third[a], _ONE, -1.0)])
+    return equations
+
+
+def _shifted(terms: _Terms, start: int) -> _Terms:
+    return [
+        (a if a == _ONE else a + start, b if b == _ONE else b + start, value)
+        for a, b, value in terms
+    ]
+
+
+def _entries(side: int, equations: list[_Terms]) -> tuple[IntArray, IntArray, IntArray, Array]:
+    """All equations as one list of entries; a term of two coordinates is half above, half below."""
+    k = np.repeat(np.arange(len(equations)), [len(terms) for terms in equations])
+    flat = np.array([term for terms in equations for term in terms]).reshape(-1, 3)
+    a = flat[:, 0].astype(int) % side
+    b = flat[:, 1].astype(int) % side
+    half = 0.5 * flat[:, 2]
+    k, i, j = (np.concatenate(both) for both in ((k, k), (a, b), (b, a)))
+    return k, i, j, np.concatenate([half, half])
