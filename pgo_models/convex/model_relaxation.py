@@ -100,7 +100,7 @@ def solve_model_relaxation(
     PGOError
         If the solver ends without a solution.
     """
-    D = _reduction(form, keeps_others=form.E.shape[0] > 0)
+    D = _reduction(form)
     side = D.shape[1]
     scale = _scale(form)
     Q = (D.T @ (form.Q @ D)) / scale
@@ -123,17 +123,14 @@ def solve_model_relaxation(
     return RelaxedModel(scale * float(g.value), scale * np.asarray(l.value), u)
 
 
-def _reduction(form: QuadraticForm, *, keeps_others: bool) -> Array:
-    """D with u = D (free x, 1), or (free x, free y, 1): fixed ones put in, y at its best."""
+def _reduction(form: QuadraticForm) -> Array:
+    """D with u = D (free x, 1), or (free x, free y, 1) where equalities have multipliers."""
+    if form.reduction is not None and not form.E.shape[0]:
+        return form.reduction
     free = np.flatnonzero(form.is_free)
-    kept = free if keeps_others else free[free < form.num_constrained]
-    D = np.zeros((form.side, len(kept) + 1))
-    D[kept, np.arange(len(kept))] = 1.0
-    fixed = np.flatnonzero(~form.is_free)
-    D[fixed, -1] = form.fixed[fixed]
-    if not keeps_others:
-        for k in range(D.shape[1]):
-            D[:, k] = form.with_best_others(D[:, k])
+    D = np.zeros((form.side, len(free) + 1))
+    D[free, np.arange(len(free))] = 1.0
+    D[:, -1] = np.where(form.is_free, 0.0, form.fixed)
     return D
 
 

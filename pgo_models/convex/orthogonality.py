@@ -359,16 +359,31 @@ class OrthogonalProblem(HoldsModel):
             Norm of all violations: of the sets, of the agreement between the copies of a variable,
             and of the convex constraints.
         """
-        values = self.values(copies)
-        of_terms = list(zip(self.terms, copies, strict=True))
-        violations = [term.constraint.distance(copy) for term, copy in of_terms]
-        for term, copy in of_terms:
-            difference = copy - values[term.variable]
-            violations.append(float(np.linalg.norm(difference)))
-        self.assign(values, others)
+        violations = [self.distance(copies)]
+        self.assign(self.values(copies), others)
         for constraint in self.problem.constraints:
             violation = constraint.violation()
             violations.append(float(np.linalg.norm(violation)))
+        return float(np.linalg.norm(violations))
+
+    def distance(self, copies: Sequence[Array]) -> float:
+        """Measure how far copies are from their sets and from agreement.
+
+        Parameters
+        ----------
+        copies : sequence of arrays
+            One for every term, in the shape of its variable.
+
+        Returns
+        -------
+        float
+            Norm of these violations.
+        """
+        values = self.values(copies)
+        violations = []
+        for term, copy in zip(self.terms, copies, strict=True):
+            violations.append(term.constraint.distance(copy))
+            violations.append(float(np.linalg.norm(copy - values[term.variable])))
         return float(np.linalg.norm(violations))
 
     def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
@@ -418,6 +433,10 @@ class SplitProblem(HoldsModel):
     root: cp.Parameter
     shifts: tuple[cp.Parameter, ...]
     solver: ConvexSolver | str = COLD
+
+    def at(self, rho: float) -> "SplitProblem":
+        """The same: a new rho does not compile again."""
+        return self
 
     def solve(self, V: Sequence[Array], rho: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Minimisers X, one for every variable, and y, given one V for every term.

@@ -285,6 +285,23 @@ class QuadraticForm(ReadOnly):
             )
         return solution[:num_others]
 
+    @cached_property
+    def reduction(self) -> Array | None:
+        """D with u = D (free x, 1) where fixed coordinates and the best y are put in.
+
+        None of a model with many coordinates.
+        """
+        if self.side > _LARGEST_DENSE:
+            return None
+        constrained = np.flatnonzero(self.is_free[: self.num_constrained])
+        D = np.zeros((self.side, len(constrained) + 1))
+        D[constrained, np.arange(len(constrained))] = 1.0
+        D[:, -1] = np.where(self.is_free, 0.0, self.fixed)
+        y = self.free_others
+        if len(y) or self.E.shape[0]:
+            D[y] = self._others_of_constrained @ D
+        return D
+
     def name_of(self, coordinate: int) -> str:
         """Name of the variable that a coordinate is of."""
         return [name for start, name in self.names if start <= coordinate][-1]
@@ -388,9 +405,11 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     equalities = block_array([[in_w, csc_array(-b[rows_left][:, None])]])
     E = csr_array(csr_array(equalities) @ spread)
     fixed, is_left = _fixed_coordinates(E)
-    return QuadraticForm(
+    form = QuadraticForm(
         P, c, A, b, constant, T, spread, csr_array(E[is_left]), fixed, tuple(blocks), tuple(names)
     )
+    form.with_best_others(np.cos(np.arange(form.side)))  # refuses what has no best ones
+    return form
 
 
 def _canonical_data(problem: OrthogonalProblem) -> tuple[dict[str, Any], dict[int, int], float]:

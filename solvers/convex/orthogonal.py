@@ -11,6 +11,7 @@ A variable may be in two sets; it then has a copy P and a multiplier B for each.
 Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014, Algorithm 1.
 """
 
+import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,8 @@ from pgo_models.convex.orthogonality import (
     SplitProblem,
     norm_of_all,
 )
+from pgo_models.convex.quadratic_form import NotQuadraticError, quadratic_form
+from pgo_models.convex.quadratic_split import QuadraticSplit
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
@@ -45,6 +48,14 @@ _BALANCE_UNTIL = 500
 _BALANCE_RATIO = 10.0
 
 
+class XStep(enum.Enum):
+    """What makes step (a)."""
+
+    AUTOMATIC = "matrices of a quadratic model, and the convex solver of others"
+    FACTORIZED = "matrices, factored once; for quadratic models with linear equalities"
+    CONVEX_SOLVER = "the convex solver"
+
+
 @dataclass(frozen=True, eq=False)
 class OrthogonalState(Summarised):
     """Iterate k.
@@ -63,8 +74,8 @@ class OrthogonalState(Summarised):
         Scaled multipliers, one for every term.
     rho : float
         Penalty.
-    split : SplitProblem
-        The compiled step (a).
+    split : SplitProblem or QuadraticSplit
+        Step (a), compiled or factored.
     scale : float
         Largest norm of a subgradient of J so far.
     primal_residual : float
@@ -81,7 +92,7 @@ class OrthogonalState(Summarised):
     copies: tuple[Array, ...]
     B: tuple[Array, ...]
     rho: float
-    split: SplitProblem
+    split: SplitProblem | QuadraticSplit
     scale: float = 0.0
     primal_residual: float = math.inf
     dual_residual: float = math.inf
@@ -112,6 +123,8 @@ class OrthogonalSOC:
         Iterations at most.
     solver : ConvexSolver or str
         Solver of step (a); Clarabel without warm start unless given.
+    x_step : XStep
+        What makes step (a).
 
     Raises
     ------
@@ -141,6 +154,7 @@ class OrthogonalSOC:
     tolerance: float = 1e-6
     max_iterations: int = 1000
     solver: ConvexSolver | str = COLD
+    x_step: XStep = XStep.AUTOMATIC
 
     def __post_init__(self) -> None:
         check_settings(
@@ -157,11 +171,11 @@ class OrthogonalSOC:
         if start is None:
             start = problem.point([_identity(variable.shape) for variable in problem.variables])
         problem.check_point(start)
-        split = problem.split(self.solver)
+        split = split_by(self.x_step, problem, self.solver)
         rho, others = self._first_penalty(split, start)
         X = problem.values(start.copies)
         B = tuple(normal / rho for normal in start.normals)
-        return OrthogonalState(0, X, others, start.copies, B, rho, split)
+        return OrthogonalState(0, X, others, start.copies, B, rho, split.at(rho))
 
     def step(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalState:
         """Make one iteration: (a), (b), (c)."""
@@ -180,8 +194,13 @@ class OrthogonalSOC:
 
     def measure(self, problem: OrthogonalProblem, state: OrthogonalState) -> Measurement:
         """J at the copies (those in a variable's first set), and the residuals."""
-        infeasibility = problem.infeasibility(state.copies, state.others)
-        objective = problem.objective(problem.values(state.copies), state.others)
+        values = problem.values(state.copies)
+        if isinstance(state.split, QuadraticSplit):
+            objective = state.split.objective(values)
+            infeasibility = problem.distance(state.copies)
+        else:
+            objective = problem.objective(values, state.others)
+            infeasibility = problem.infeasibility(state.copies, state.others)
         return Measurement(objective, state.primal_residual, state.dual_residual, infeasibility)
 
     def converged(self, state: OrthogonalState, measurement: Measurement) -> Status | None:
@@ -205,7 +224,7 @@ class OrthogonalSOC:
     # The penalty.
 
     def _first_penalty(
-        self, split: SplitProblem, point: OrthogonalPoint
+        self, split: SplitProblem | QuadraticSplit, point: OrthogonalPoint
     ) -> tuple[float, tuple[Array, ...]]:
         """The first rho, and the other variables at the start.
 
@@ -221,7 +240,7 @@ class OrthogonalSOC:
         return rho, others
 
     def _probed_penalty(
-        self, split: SplitProblem, point: OrthogonalPoint
+        self, split: SplitProblem | QuadraticSplit, point: OrthogonalPoint
     ) -> tuple[float, tuple[Array, ...]]:
         """The first rho of a start without multipliers, and the other variables at the start.
 
@@ -261,7 +280,8 @@ class OrthogonalSOC:
         rho = self._adapted_penalty(problem, state)
         if rho == state.rho:
             return state
-        return replace(state, rho=rho, B=tuple(state.rho / rho * B for B in state.B))
+        B = tuple(state.rho / rho * B for B in state.B)
+        return replace(state, rho=rho, B=B, split=state.split.at(rho))
 
     def _adapted_penalty(self, problem: OrthogonalProblem, state: OrthogonalState) -> float:
         least_penalties = []
@@ -407,6 +427,20 @@ def solve_orthogonal(
         outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes
     )
     return OrthogonalSolution(problem, values, state.others, best.objective, kkt, best, objectives)
+
+
+def split_by(
+    x_step: XStep, problem: OrthogonalProblem, solver: ConvexSolver | str = COLD
+) -> SplitProblem | QuadraticSplit:
+    """Step (a) of a problem, made as it says; a SettingError where that cannot be."""
+    if x_step is XStep.CONVEX_SOLVER:
+        return problem.split(solver)
+    try:
+        return QuadraticSplit(problem, quadratic_form(problem))
+    except NotQuadraticError:
+        if x_step is XStep.FACTORIZED:
+            raise
+        return problem.split(solver)
 
 
 def _size_of(copies: Sequence[Array]) -> float:
