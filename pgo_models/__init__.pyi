@@ -17,7 +17,12 @@ from pgo_models.convex.graph_subproblem import (
     ModelChange as ModelChange,
     graph_qp as graph_qp,
 )
+from pgo_models.convex.model_certificate import ModelCertificate as ModelCertificate
 from pgo_models.convex.orthogonality import OrthogonalProblem as OrthogonalProblem
+from pgo_models.convex.quadratic_form import (
+    QuadraticForm as QuadraticForm,
+    quadratic_form as quadratic_form,
+)
 from pgo_models.errors import PGOError as PGOError
 from pgo_models.geometry.poses import (
     Poses as Poses,
@@ -112,7 +117,7 @@ __all__ += ["Certificate", "Verdict", "certificate_matrix", "certify_at"]
 __all__ += ["multipliers", "prove_bound"]
 __all__ += ["save_proof", "verify_proof"]
 __all__ += ["BregmanProblem", "ConstraintSet", "ConvexSolver", "ModelChange"]
-__all__ += ["OrthogonalProblem"]
+__all__ += ["ModelCertificate", "OrthogonalProblem", "QuadraticForm", "quadratic_form"]
 __all__ += ["graph_qp", "solve_relaxation"]
 __all__ += ["animate", "animate_poses", "compare_poses", "explore_graph", "plot_graph"]
 # Types in the signatures of the names above.

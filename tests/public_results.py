@@ -1,4 +1,4 @@
 """Public classes whose objects functions make."""
 
 # Users only read them: their fields are not checked once more.
-RESULTS = {"Certificate", "GraphQP", "Measurement", "Solution"}
+RESULTS = {"Certificate", "ModelCertificate", "QuadraticForm", "GraphQP", "Measurement", "Solution"}

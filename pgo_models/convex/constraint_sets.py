@@ -64,6 +64,13 @@ class ConstraintSet(ABC):
         """
         return 0.0
 
+    def tangent_basis(self, P: Array) -> Array:
+        """Orthonormal basis of the tangent space, one direction a column, entries column-major.
+
+        Known of orthonormal and of unit columns and rows alone.
+        """
+        raise NotImplementedError
+
     def distance(self, P: Array) -> float:
         """How far P is from satisfying the equations of the set; here from its projection."""
         return float(np.linalg.norm(P - self.project(P)))
@@ -202,7 +209,8 @@ class UnitColumns(ConstraintSet):
 
     def tangent_basis(self, P: Array) -> Array:
         """As `Orthonormal.tangent_basis`: what is orthogonal to each of the vectors."""
-        places = self._columns(np.arange(P.size).reshape(P.shape, order="F"))
+        counted = np.arange(float(P.size)).reshape(P.shape, order="F")
+        places = self._columns(counted).astype(int)
         vectors = self._columns(P).reshape(len(places), -1)
         bases = []
         for vector, place in zip(vectors.T, places.reshape(vectors.shape).T, strict=True):

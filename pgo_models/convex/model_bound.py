@@ -28,7 +28,7 @@ from pgo_models.certificates.definiteness import (
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.convex.set_equations import SetEquations
 from pgo_models.geometry.arrays import ReadOnly
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.problem.cholesky import analyze
 from pgo_models.problem.floating_point import OUTWARD, exact_sum, gamma
 
@@ -69,12 +69,10 @@ class _Lagrangian:
     multipliers: Array
     S: csc_array
     S_error: csc_array
-    is_free: Array  # neither fixed nor grounded, (N,)
+    is_free: BoolArray  # neither fixed nor grounded, (N,)
 
     @classmethod
-    def of(
-        cls, form: QuadraticForm, equations: SetEquations, multipliers: Array
-    ) -> "_Lagrangian":
+    def of(cls, form: QuadraticForm, equations: SetEquations, multipliers: Array) -> "_Lagrangian":
         S = csc_array(form.Q - equations.combined(multipliers))
         most = np.bincount(equations.i, minlength=form.side).max(initial=0) + 4.0
         sizes = abs(form.Q) + equations.sizes(multipliers)
@@ -107,7 +105,7 @@ class _Lagrangian:
     def gradient(self, u: Array) -> tuple[Array, Array]:
         """G_r = (S u)_r and a bound on its error, zeros where left out."""
         form = self.form
-        z, z_error = self._z(u)
+        z, z_error = form.residuals(u)
         terms_of_P = np.diff(form.P.indptr).max(initial=0)
         count = gamma(float(np.diff(form.T.indptr).max(initial=0) + terms_of_P + 12.0))
         of_P = form.P @ z + form.c
@@ -122,24 +120,7 @@ class _Lagrangian:
 
     def value(self, u: Array) -> tuple[float, float]:
         """The Lagrangian at u, and a bound on its error."""
-        form = self.form
-        z, z_error = self._z(u)
-        Pz = form.P @ z
-        size = abs(form.P) @ (abs(z) + z_error)
-        most = gamma(float(np.diff(form.P.indptr).max(initial=0) + 6.0))
-        of_equations = self.equations.terms(self.multipliers, u)
-        parts = [0.5 * z * Pz, form.c * z, [form.constant], -of_equations]
-        error = most * (0.5 * abs(z) @ size + abs(form.c) @ abs(z) + np.sum(abs(of_equations)))
-        error += z_error @ size + abs(form.c) @ z_error
-        value = exact_sum(np.concatenate(parts).tolist())
-        return value, OUTWARD * float(error + gamma(1.0) * abs(value))
-
-    def _z(self, u: Array) -> tuple[Array, Array]:
-        """z = T spread u and a bound on its error."""
-        form = self.form
-        count = np.bincount(form.T.indices, minlength=len(form.c)) + 4.0
-        sizes = abs(form.T) @ (abs(form.spread) @ abs(u))
-        return form.T @ (form.spread @ u), gamma(count) * sizes
+        return self.form.evaluated(u, -self.equations.terms(self.multipliers, u))
 
 
 def prove_model_bound(

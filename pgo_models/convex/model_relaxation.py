@@ -54,7 +54,7 @@ def moved_multipliers(
     residual = form.Q @ u - equations.combined(multipliers) @ u
     free = form.is_free
     products = equations.products(u)[free].toarray()
-    return multipliers + np.linalg.lstsq(products, residual[free])[0]
+    return np.asarray(multipliers + np.linalg.lstsq(products, residual[free])[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,17 +110,19 @@ def solve_model_relaxation(
     rows = column[equations.i] + side * column[equations.j]
     data = equations.entries * factor[equations.i] * factor[equations.j]
     C = csc_array(coo_array((data, (rows, equations.k)), shape=(side**2, equations.number)))
-    l = cp.Variable(equations.number)
+    multipliers = cp.Variable(equations.number)
     g = cp.Variable()
     corner = np.zeros((side, side))
     corner[-1, -1] = 1.0
-    M = Q - cp.reshape(C @ l, (side, side), order="F") - g * corner
+    M = Q - cp.reshape(C @ multipliers, (side, side), order="F") - g * corner
     is_semidefinite = M >> 0
     model = cp.Problem(cp.Maximize(g), [is_semidefinite])
-    solve_compiled(model, "relaxation", tolerance=1e-10, solver=solver, accepted=cp.OPTIMAL_INACCURATE)
+    solve_compiled(
+        model, "relaxation", tolerance=1e-10, solver=solver, accepted=cp.OPTIMAL_INACCURATE
+    )
     Z = np.asarray(is_semidefinite.dual_value)
     u = D @ (Z[:, -1] / Z[-1, -1])
-    return RelaxedModel(scale * float(g.value), scale * np.asarray(l.value), u)
+    return RelaxedModel(scale * float(g.value), scale * np.asarray(multipliers.value), u)
 
 
 def _reduction(form: QuadraticForm) -> Array:

@@ -9,7 +9,7 @@ in solvers/convex/orthogonal.py.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import cvxpy as cp
 import numpy as np
@@ -227,6 +227,35 @@ class OrthogonalProblem(HoldsModel):
             normals.append(np.zeros(copy.shape))
         return OrthogonalPoint(tuple(copies), tuple(normals))
 
+    def near_point(self, values: Sequence[Array]) -> OrthogonalPoint:
+        """Project values that are in the sets to 1e-6.
+
+        Parameters
+        ----------
+        values : sequence of arrays
+            One for every variable of `variables`, in its shape.
+
+        Returns
+        -------
+        OrthogonalPoint
+            The projections.
+
+        Raises
+        ------
+        SettingError
+            As `point`, and if a value is farther away from its set.
+        """
+        point = self.point(values)
+        for term, copy in zip(self.terms, point.copies, strict=True):
+            value = np.asarray(values[term.variable], dtype=float)
+            distance = float(np.linalg.norm(value - copy))
+            if distance > _IN_SET:
+                raise SettingError(
+                    f"the value of {self.variables[term.variable].name()} is {distance:.2g} away "
+                    f"from {term.constraint}; project it, as problem.point does"
+                )
+        return point
+
     def check_point(self, point: OrthogonalPoint) -> None:
         """Check that a point fits this problem.
 
@@ -417,6 +446,13 @@ class OrthogonalProblem(HoldsModel):
         return SplitProblem(problem, self.variables, self.others, self.terms, root, shifts, solver)
 
 
+class Split(Protocol):
+    """Step (a) of a problem."""
+
+    def solve(self, V: Sequence[Array], rho: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Return X, one for every variable, and y, given one V for every term."""
+
+
 @dataclass(frozen=True, eq=False)
 class SplitProblem(HoldsModel):
     """The compiled subproblem: min J(X, y) + sum over the terms of rho/2 ||X - V_term||^2, convex.
@@ -487,8 +523,11 @@ def kkt_residuals(
     point: OrthogonalPoint,
     rho: float,
     solver: ConvexSolver | str = COLD,
+    split: Split | None = None,
 ) -> KKTResiduals:
-    """Check the KKT conditions of a point by one convex solve, with any solver's point.
+    """Check the KKT conditions of a point by one step (a), with any solver's point.
+
+    It is compiled for the solver unless it is given.
 
     rho should be of the order of the curvature of J. The normals N of the point, projected once
     more onto the normal spaces, are its multipliers: for X^T X = I they are -X Lambda. X is
@@ -504,7 +543,7 @@ def kkt_residuals(
         normal = term.constraint.normal_part(copy, given)
         normals.append(normal)
         V.append(copy - normal / rho)
-    Z, others = problem.split(solver).solve(V, rho)
+    Z, others = (split or problem.split(solver)).solve(V, rho)
     gaps = [np.zeros(minimiser.shape) for minimiser in Z]
     for term, copy in zip(problem.terms, point.copies, strict=True):
         gaps[term.variable] += rho * (copy - Z[term.variable])

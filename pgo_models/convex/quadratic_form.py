@@ -32,7 +32,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.floating_point import exact_sum, gamma
+from pgo_models.problem.floating_point import OUTWARD, exact_sum, gamma
 
 # of the linear equations for variables without a set: their regularisation, and what is left of
 # the right side where they have no solution, both as shares
@@ -141,7 +141,8 @@ class QuadraticForm(ReadOnly):
     @property
     def num_constrained(self) -> int:
         """Number of coordinates of x."""
-        return self.blocks[-1].coordinates.stop
+        last = self.blocks[-1]
+        return last.start + last.size
 
     @property
     def is_free(self) -> BoolArray:
@@ -164,7 +165,7 @@ class QuadraticForm(ReadOnly):
         # Entries are sums of at most so many products, at most three factors each.
         most_of_P = np.diff(csr_array(self.P).indptr).max(initial=0)
         most_of_T = np.diff(self.T.indptr).max(initial=0)
-        share = gamma(float(most_of_P + most_of_T) + 12.0)
+        share: float = gamma(float(most_of_P + most_of_T) + 12.0)
         sizes = abs(self.P), abs(self.c), abs(self.constant), abs(self.T), abs(self.spread)
         return csc_array(share * self._assembled(*sizes))
 
@@ -174,9 +175,9 @@ class QuadraticForm(ReadOnly):
         quadratic = coo_array(0.5 * (spread.T @ (T.T @ (P @ T)) @ spread))
         linear = coo_array(0.5 * (spread.T @ (T.T @ c))[:, None])
         last = self.side - 1
-        rows = [linear.row, np.full(linear.nnz, last), np.arange(self.side), [last]]
-        columns = [np.full(linear.nnz, last), linear.row, np.arange(self.side), [last]]
-        data = [linear.data, linear.data, np.zeros(self.side), [constant]]
+        rows: list[Any] = [linear.row, np.full(linear.nnz, last), np.arange(self.side), [last]]
+        columns: list[Any] = [np.full(linear.nnz, last), linear.row, np.arange(self.side), [last]]
+        data: list[Any] = [linear.data, linear.data, np.zeros(self.side), [constant]]
         rows.append(quadratic.row)
         columns.append(quadratic.col)
         data.append(quadratic.data)
@@ -187,6 +188,28 @@ class QuadraticForm(ReadOnly):
         """J at u, from the residuals rather than from Q."""
         z = self.T @ (self.spread @ u)
         return float(0.5 * z @ (self.P @ z) + self.c @ z + self.constant)
+
+    def residuals(self, u: Array) -> tuple[Array, Array]:
+        """Z at u, and a bound on its rounding."""
+        count = np.bincount(self.T.indices, minlength=len(self.c)).astype(float) + 4.0
+        sizes = abs(self.T) @ (abs(self.spread) @ abs(u))
+        return self.T @ (self.spread @ u), gamma(count) * sizes
+
+    def evaluated(self, u: Array, others: Array | None = None) -> tuple[float, float]:
+        """J at u plus the terms of another sum, and a bound on the rounding of both.
+
+        The terms are products of at most four factors.
+        """
+        terms = np.zeros(0) if others is None else others
+        z, z_error = self.residuals(u)
+        Pz = self.P @ z
+        size = abs(self.P) @ (abs(z) + z_error)
+        share = gamma(float(np.diff(self.P.indptr).max(initial=0) + 6.0))
+        parts = np.concatenate([0.5 * z * Pz, self.c * z, [self.constant], terms])
+        error = share * (0.5 * abs(z) @ size + abs(self.c) @ abs(z) + np.sum(abs(terms)))
+        error += z_error @ size + abs(self.c) @ z_error
+        value = exact_sum(parts.tolist())
+        return value, OUTWARD * float(error + gamma(1.0) * abs(value))
 
     def rounding_level(self, u: Array) -> float:
         """J, less its constant, where all of z is as large as the rounding of u makes it."""
@@ -222,7 +245,7 @@ class QuadraticForm(ReadOnly):
         return positions[positions >= self.num_constrained]
 
     def with_best_others(self, u: Array) -> Array:
-        """u with the coordinates of y at which J is least, for its x.
+        """U with the coordinates of y at which J is least, for its x.
 
         Raises a NotQuadraticError where equalities hold of x alone, and a SettingError where J has
         no minimum over y.
@@ -255,8 +278,9 @@ class QuadraticForm(ReadOnly):
         y = self.free_others
         H = 2.0 * self.Q[y][:, y]
         E = self.E[:, y]
-        equations = csc_array(block_array([[H, E.T], [E, None]])) if E.shape[0] else csc_array(H)
-        damping = np.full(equations.shape[0], _DAMPING * max(abs(equations).max(), 1e-300))
+        blocks: list[list[Any]] = [[H, E.T], [E, None]]
+        equations = csc_array(block_array(blocks)) if E.shape[0] else csc_array(H)
+        damping = np.full(equations.shape[0], _DAMPING * (abs(self.Q).max() or 1.0))
         damping[len(y) :] *= -1.0
         return equations, splu(csc_array(equations + diags_array(damping)))
 
@@ -269,7 +293,7 @@ class QuadraticForm(ReadOnly):
             residual = right - equations @ solution
         num_others = len(self.free_others)
         sizes = np.linalg.norm(right, axis=0)
-        scale = sizes + np.linalg.norm(solution, axis=0) * abs(equations).max()
+        scale = sizes + np.linalg.norm(solution, axis=0) * abs(self.Q).max() * _DAMPING
         of_equalities = np.linalg.norm(residual[num_others:], axis=0)
         if (of_equalities > _INCONSISTENT * scale).any():
             raise NotQuadraticError(
@@ -400,10 +424,13 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     T, rows_left, w_columns = _without_residuals(A, b, w_columns)
     names = [*names, (spread.shape[1], "a number of cvxpy's own")]
     num_own = len(w_columns) - spread.shape[0]
-    spread = csc_array(block_array([[spread, None], [None, eye_array(num_own + 1)]]))
+    corners: list[list[Any]] = [[spread, None], [None, eye_array(num_own + 1)]]
+    spread = csc_array(block_array(corners))
     in_w = csc_array(A)[rows_left][:, w_columns]
     equalities = block_array([[in_w, csc_array(-b[rows_left][:, None])]])
     E = csr_array(csr_array(equalities) @ spread)
+    if E.nnz < equalities.nnz:  # two entries of a rotation of the plane are summed, and rounded
+        raise NotQuadraticError("an equality has entries of a rotation of the plane that are equal")
     fixed, is_left = _fixed_coordinates(E)
     form = QuadraticForm(
         P, c, A, b, constant, T, spread, csr_array(E[is_left]), fixed, tuple(blocks), tuple(names)
@@ -433,7 +460,7 @@ def _canonical_data(problem: OrthogonalProblem) -> tuple[dict[str, Any], dict[in
     return data, columns, float(inverse[-1]["offset"])
 
 
-def _symmetric_of_upper(P: Any, side: int) -> csc_array:
+def _symmetric_of_upper(P: csc_array | None, side: int) -> csc_array:
     """The symmetric matrix whose upper triangle a solver takes."""
     if P is None:
         return csc_array((side, side))
@@ -459,7 +486,7 @@ def _coordinates(
         w_columns.append(np.arange(first, first + variable.size))
         names.append((start, variable.name()))
         size = variable.size
-        spread = eye_array(variable.size)
+        spread = csc_array(eye_array(variable.size))
         if position < len(problem.variables):
             block = Block(start, variable.shape, tuple(problem.terms_of(position)))
             blocks.append(block)
@@ -524,7 +551,7 @@ def _fixed_coordinates(E: csr_array) -> tuple[Array, BoolArray]:
         position = int(E.indices[entries][of_variables][0])
         value = -constant / factor
         is_exact = Fraction(value) * Fraction(factor) == -Fraction(float(constant))
-        if is_exact and np.isnan(fixed[position]):
+        if is_exact and (np.isnan(fixed[position]) or fixed[position] == value):
             fixed[position] = value
             is_left[row] = False
     return fixed, is_left

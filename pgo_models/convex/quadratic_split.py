@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.sparse import csc_array, diags_array
 
-from pgo_models.convex.orthogonality import OrthogonalProblem, Term
+from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, Term
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
@@ -76,6 +76,25 @@ class QuadraticSplit(ReadOnly):
             values.append(entries.reshape(variable.shape, order="F"))
             start += variable.size
         return tuple(values)
+
+    def stationary_point(self, u: Array) -> OrthogonalPoint:
+        """The point u with the multipliers that it has if it is stationary: minus the gradient.
+
+        Every variable has to be in one set.
+        """
+        form = self.form
+        gradient = form.T.T @ (form.P @ form.residuals(u)[0] + form.c)
+        normals = []
+        start = 0
+        for variable in self.problem.variables:
+            entries = gradient[start : start + variable.size]
+            normals.append(-entries.reshape(variable.shape, order="F"))
+            start += variable.size
+        values = form.values(u)
+        ordered = [term.variable for term in self.terms]
+        return OrthogonalPoint(
+            tuple(values[place] for place in ordered), tuple(normals[place] for place in ordered)
+        )
 
     def objective(self, values: Sequence[Array]) -> float:
         """J at values of the constrained variables, with the best ones of all others."""

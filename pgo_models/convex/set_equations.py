@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, UnitColumns, UnitRows
-from pgo_models.convex.quadratic_form import Block, NotQuadraticError, QuadraticForm
+from pgo_models.convex.quadratic_form import NotQuadraticError, QuadraticForm
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray

@@ -75,7 +75,7 @@ class ModelNewton(ReadOnly):
         return u
 
     def on_sets(self, u: Array) -> Array:
-        """u with x projected onto the sets, and y at its best."""
+        """U with x projected onto the sets, and y at its best."""
         projected = []
         for block, value in zip(self.form.blocks, self.form.values(u), strict=True):
             projected.append(block.sets[0].projected(value))
@@ -86,10 +86,10 @@ class ModelNewton(ReadOnly):
         return self.form.side <= _LARGEST_DENSE
 
     @cached_property
-    def _Q(self) -> Any:
+    def _Q(self) -> Any:  # noqa: ANN401 - dense or sparse
         return self.form.Q.toarray() if self._is_dense else self.form.Q
 
-    def _lagrangian(self, u: Array) -> Any:
+    def _lagrangian(self, u: Array) -> Any:  # noqa: ANN401 - dense or sparse
         """S with the multipliers of u."""
         equations = self.equations
         if not self._is_dense or len(equations.of_equalities):
@@ -106,7 +106,7 @@ class ModelNewton(ReadOnly):
         combined = np.bincount(i * side + j, multipliers[k] * entries, side**2)
         return self._Q - combined.reshape(side, side)
 
-    def _tangent_bases(self, u: Array) -> Any:
+    def _tangent_bases(self, u: Array) -> Any:  # noqa: ANN401 - dense or sparse
         """N, (N, dimension)."""
         form = self.form
         bases = []
@@ -142,20 +142,21 @@ class ModelNewton(ReadOnly):
         return None, J
 
 
-def _damped(convex: Any, gradient: Array) -> Array:
+def _damped(convex: Array | csc_array, gradient: Array) -> Array:
     """The step of the convex part with the least damping that makes it definite."""
     scale = convex.diagonal().max(initial=0.0) or 1.0
     identity = np.eye(len(gradient)) if isinstance(convex, np.ndarray) else eye_array(len(gradient))
     damping = _FIRST_DAMPING
     while damping <= _LARGEST_DAMPING:
-        step = _solved(convex + damping * scale * identity, gradient)
+        damped: Any = convex + damping * scale * identity
+        step = _solved(damped, gradient)
         if step is not None:
             return step
         damping *= _DAMPING_GROWTH
     return -gradient / scale
 
 
-def _solved(matrix: Any, gradient: Array) -> Array | None:
+def _solved(matrix: Array | csc_array, gradient: Array) -> Array | None:
     """-matrix^-1 gradient, or None where the matrix is not positive definite."""
     try:
         if isinstance(matrix, np.ndarray):

@@ -18,8 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex import orthogonality
 from pgo_models.convex.convex_solver import COLD, ConvexSolver, as_solver
+from pgo_models.convex.model_certificate import ModelCertificate, judge_values
 from pgo_models.convex.orthogonality import (
     OrthogonalPoint,
     OrthogonalProblem,
@@ -28,9 +30,12 @@ from pgo_models.convex.orthogonality import (
 )
 from pgo_models.convex.quadratic_form import NotQuadraticError, quadratic_form
 from pgo_models.convex.quadratic_split import QuadraticSplit
+from pgo_models.convex.set_equations import set_equations
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
+from solvers.convex.certify_model import best_bound, without_bound
+from solvers.convex.model_newton import ModelNewton
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
 from solvers.soc.anderson import over_relax
@@ -51,7 +56,7 @@ _BALANCE_RATIO = 10.0
 class XStep(enum.Enum):
     """What makes step (a)."""
 
-    AUTOMATIC = "matrices of a quadratic model, and the convex solver of others"
+    AUTOMATIC = "matrices of a quadratic model, unless a solver is named; else the convex solver"
     FACTORIZED = "matrices, factored once; for quadratic models with linear equalities"
     CONVEX_SOLVER = "the convex solver"
 
@@ -123,8 +128,8 @@ class OrthogonalSOC:
         Iterations at most.
     solver : ConvexSolver or str
         Solver of step (a); Clarabel without warm start unless given.
-    x_step : XStep
-        What makes step (a).
+    x_step : XStep or QuadraticSplit
+        What makes step (a); a QuadraticSplit is that of a model whose form is at hand.
 
     Raises
     ------
@@ -154,7 +159,7 @@ class OrthogonalSOC:
     tolerance: float = 1e-6
     max_iterations: int = 1000
     solver: ConvexSolver | str = COLD
-    x_step: XStep = XStep.AUTOMATIC
+    x_step: XStep | QuadraticSplit = XStep.AUTOMATIC
 
     def __post_init__(self) -> None:
         check_settings(
@@ -318,6 +323,8 @@ class OrthogonalSolution(Summarised):
         The best run: status, history, state.
     objectives : tuple of floats
         J of every start, nan where a run did not converge.
+    certificate : ModelCertificate
+        The proven bound beside J, or why there is none.
     """
 
     problem: OrthogonalProblem
@@ -327,6 +334,27 @@ class OrthogonalSolution(Summarised):
     kkt: orthogonality.KKTResiduals
     outcome: Outcome[OrthogonalState]
     objectives: tuple[float, ...]
+    certificate: ModelCertificate
+
+    @property
+    def lower_bound(self) -> float:
+        """Proven: J >= lower_bound at all points of the sets; -inf where nothing is proven."""
+        return self.certificate.lower_bound
+
+    @property
+    def gap(self) -> float:
+        """(J - lower_bound) / |J|, rounded up."""
+        return self.certificate.gap
+
+    @property
+    def verdict(self) -> Verdict:
+        """What is proven of the values."""
+        return self.certificate.verdict
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the values are proven to be globally optimal within the gap of the verdict."""
+        return self.certificate.is_certified
 
     @property
     def status(self) -> Status:
@@ -350,7 +378,7 @@ class OrthogonalSolution(Summarised):
             f"J            {self.objective:.10g}, the least of {len(self.objectives)} starts{ends}",
             f"KKT          stationarity {self.kkt.stationarity:.1e}, feasibility "
             f"{self.kkt.feasibility:.1e}",
-            "lower bound  none: the sets are not convex, and another start may end lower",
+            *(f"{label:<12} {text}" for label, text in self.certificate.facts()),
         ]
         return "\n".join(lines)
 
@@ -364,10 +392,13 @@ def solve_orthogonal(
     solver: ConvexSolver | str | None = None,
     verbose: bool = False,
 ) -> OrthogonalSolution:
-    """Run SOC from random starts and keep the best run.
+    """Run SOC from random starts, keep the best run, and prove how good it is.
 
-    Runs that converged come first, then the lowest J. Nothing proves that the best of the
-    stationary points is the global minimum.
+    Runs that converged come first, then the lowest J. Of a quadratic model with linear equalities
+    (`pgo_models.convex.quadratic_form`) step (a) takes no convex solver, Newton moves the best run
+    to a stationary point, and a lower bound on J at all points of the sets is proven; where the
+    relaxation that gives the bound leads to a better point, that one is returned. Of other models
+    nothing proves that the best of the stationary points is the global minimum.
 
     Parameters
     ----------
@@ -411,29 +442,69 @@ def solve_orthogonal(
     method = soc if soc is not None else OrthogonalSOC()
     if solver is not None:
         method = replace(method, solver=solver)
+    split = split_by(method.x_step, problem, method.solver)
+    prepared = replace(method, x_step=split) if isinstance(split, QuadraticSplit) else method
     outcomes = list[Outcome[OrthogonalState]]()
     for _ in range(starts):
-        outcomes.append(run(method, problem, problem.random_point(rng), verbose=verbose))
+        outcomes.append(run(prepared, problem, problem.random_point(rng), verbose=verbose))
         if outcomes[-1].status is Status.INTERRUPTED:
             break
     best = min(outcomes, key=lambda outcome: (not outcome.status.is_success, outcome.objective))
     state = best.state
-    values = problem.values(state.copies)
-    kkt = orthogonality.kkt_residuals(
-        problem, method.point(problem, state), state.rho, method.solver
-    )
-    problem.assign(values, state.others)
-    objectives = tuple(
+    ends = tuple(
         outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes
     )
-    return OrthogonalSolution(problem, values, state.others, best.objective, kkt, best, objectives)
+    try:
+        return _certified(problem, method, best, ends)
+    except NotQuadraticError as error:
+        certificate = without_bound(best.objective, error)
+    values = problem.values(state.copies)
+    point = method.point(problem, state)
+    kkt = orthogonality.kkt_residuals(problem, point, state.rho, method.solver)
+    problem.assign(values, state.others)
+    return OrthogonalSolution(
+        problem, values, state.others, best.objective, kkt, best, ends, certificate
+    )
+
+
+def _certified(
+    problem: OrthogonalProblem,
+    method: OrthogonalSOC,
+    best: Outcome[OrthogonalState],
+    ends: tuple[float, ...],
+) -> OrthogonalSolution:
+    """The stationary point beside the best run, or a better one, and its certificate.
+
+    A NotQuadraticError where the model has no quadratic form, or no equations of its sets.
+    """
+    state = best.state
+    split = state.split
+    if not isinstance(split, QuadraticSplit):
+        split = QuadraticSplit(problem, quadratic_form(problem))
+    form = split.form
+    equations = set_equations(form)
+    bound, u = best_bound(form, equations, form.u_of(problem.values(state.copies)), DEFAULT_GAP)
+    certificate = judge_values(form, equations, u, bound)
+    point = method.point(problem, state)
+    if ModelNewton(form, equations).is_possible and not form.E.shape[0]:
+        point = split.stationary_point(u)
+    kkt = orthogonality.kkt_residuals(problem, point, state.rho, split=split)
+    values = tuple(form.values(u))
+    others = split.others(u)
+    problem.assign(values, others)
+    return OrthogonalSolution(
+        problem, values, others, certificate.objective, kkt, best, ends, certificate
+    )
 
 
 def split_by(
-    x_step: XStep, problem: OrthogonalProblem, solver: ConvexSolver | str = COLD
+    x_step: XStep | QuadraticSplit, problem: OrthogonalProblem, solver: ConvexSolver | str = COLD
 ) -> SplitProblem | QuadraticSplit:
     """Step (a) of a problem, made as it says; a SettingError where that cannot be."""
-    if x_step is XStep.CONVEX_SOLVER:
+    if isinstance(x_step, QuadraticSplit):
+        return x_step
+    is_asked_for = x_step is XStep.AUTOMATIC and solver is not COLD
+    if is_asked_for or x_step is XStep.CONVEX_SOLVER:
         return problem.split(solver)
     try:
         return QuadraticSplit(problem, quadratic_form(problem))

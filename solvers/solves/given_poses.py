@@ -7,8 +7,9 @@ handedness terms in space, complex numbers in the plane.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, cast, overload
 
 import numpy as np
 
@@ -21,8 +22,9 @@ from pgo_models.certificates.certificate import (
     with_terms,
 )
 from pgo_models.certificates.lower_bound import has_complex_form
-from pgo_models.errors import FAILURES, GraphWarning
+from pgo_models.errors import FAILURES, GraphWarning, SettingError
 from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.graphs.written_digits import ALL_DIGITS, WrittenDigits
@@ -42,9 +44,25 @@ from solvers.riemannian.shrunk_bound import bound_is_tight, with_shrunk_informat
 
 _HALF = 0.5 * (1.0 + 1e-3)  # of the unit of the last digit, and what Newton leaves
 
+if TYPE_CHECKING:
+    from pgo_models.convex.model_certificate import ModelCertificate
+    from pgo_models.convex.orthogonality import OrthogonalProblem
 
-def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP) -> Certificate:
-    """Judge anybody's poses by a proven lower bound on the global optimum.
+
+@overload
+def certify(
+    problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP
+) -> Certificate: ...
+@overload
+def certify(
+    problem: "OrthogonalProblem", poses: Sequence[Array], gap: float = DEFAULT_GAP
+) -> "ModelCertificate": ...
+def certify(
+    problem: "PGOProblem | PoseGraph | OrthogonalProblem",
+    poses: Poses | Sequence[Array],
+    gap: float = DEFAULT_GAP,
+) -> "Certificate | ModelCertificate":
+    """Judge anybody's poses, or values of a model, by a proven lower bound on the global optimum.
 
     The bound is proved at a stationary point. Poses that are not stationary are polished first
     (damped Newton, `polish`). If this point does not give the gap, the chordal start is polished,
@@ -58,16 +76,16 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
 
     Parameters
     ----------
-    problem : PGOProblem or PoseGraph
-        The problem; of a graph it is F.
-    poses : Poses
-        The poses to judge.
+    problem : PGOProblem, PoseGraph or OrthogonalProblem
+        The problem; of a graph it is F, of a cvxpy model with rotations its objective.
+    poses : Poses or sequence of arrays
+        The poses to judge; of a model the values of its constrained `variables`.
     gap : float
         The relative gap to certify.
 
     Returns
     -------
-    Certificate
+    Certificate or ModelCertificate
         The bound, and how far the cost of the poses is above it.
 
     Raises
@@ -88,9 +106,14 @@ def certify(problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_
     >>> certificate.source.name, bool(0 < certificate.lower_bound <= certificate.poses_objective)
     ('POLISHED', True)
     """
+    if not isinstance(problem, PGOProblem | PoseGraph):
+        return _certificate_of_model(problem, poses, gap)
+    given: object = poses
+    if not isinstance(given, Poses):
+        raise SettingError(f"poses is {given!r:.60}; give Poses, as solve returns them")
     problem = as_problem(problem)
-    check_poses(problem.graph, poses)
-    poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
+    check_poses(problem.graph, given)
+    poses = problem.graph.completed(given)  # a landmark has no rotation of its own
     if problem.graph.has_far_priors:
         near = problem.graph.near_zero(poses)
         return judge(problem, poses, _certificate_near(problem, near, gap))
@@ -156,6 +179,20 @@ def _round_to(poses: Poses, given: Poses, written: WrittenDigits, graph: PoseGra
     angles = np.linalg.norm(turns, axis=(1, 2)) / np.sqrt(2.0)
     most = _HALF * halves * unit_R * (1.0 if graph.d == 2 else 4.0)
     return bool(angles.max() <= most)
+
+
+def _certificate_of_model(
+    problem: object, values: Poses | Sequence[Array], gap: float
+) -> "ModelCertificate":
+    # cvxpy is slow to import, and poses need none of it
+    from pgo_models.convex.orthogonality import OrthogonalProblem
+    from solvers.convex.certify_model import certify_model
+
+    if not isinstance(problem, OrthogonalProblem):
+        raise SettingError(
+            f"problem is {problem!r:.60}; give a PGOProblem, a PoseGraph or an OrthogonalProblem"
+        )
+    return certify_model(problem, cast(Sequence[Array], values), gap)
 
 
 def _certificate_near(problem: PGOProblem, poses: Poses, gap: float) -> Certificate:

@@ -29,6 +29,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
+from pgo_models.convex.orthogonality_examples import procrustes
 from pgo_models.graphs.datasets import SE_SYNC
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
@@ -164,6 +165,10 @@ MADE: dict[str, Make] = {
     "OrthogonalSolution": lambda: solvers.solve_orthogonal(
         smallest_eigenvectors(np.diag([1.0, 2.0, 3.0]), 1), rng=np.random.default_rng(0)
     ),
+    "ModelCertificate": lambda: (
+        solvers.solve_orthogonal(procrustes(np.eye(3), np.ones((3, 2)))).certificate
+    ),
+    "QuadraticForm": lambda: pgo.quadratic_form(procrustes(np.eye(3), np.ones((3, 2)))),
     "OutlierProof": lambda: (
         solvers.prove_outliers(solvers.solve(GRAPH, robust=solvers.GNC())).robust.proof
     ),

@@ -1,0 +1,147 @@
+"""Certificate of a model's values: their objective beside a lower bound over all values.
+
+A pose graph's is `pgo_models.certificates.certificate`; verdicts and gaps are the same.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
+from pgo_models.convex.model_bound import ModelBound
+from pgo_models.convex.quadratic_form import QuadraticForm
+from pgo_models.convex.set_equations import SetEquations
+from pgo_models.errors import ProofError, SettingError
+from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
+from pgo_models.geometry.arrays import ReadOnly
+from pgo_models.geometry.rotations import Array
+
+# J of values whose residuals are that many times what rounding makes them counts as zero
+_ROUNDING_MULTIPLE = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class ModelCertificate(ReadOnly):
+    """A proven lower bound on J over all points of the sets, beside J of given values.
+
+    Parameters
+    ----------
+    objective : float
+        J of the values, projected onto the sets, with the best values of all other variables.
+    objective_error : float
+        Bound on its rounding.
+    bound : ModelBound or None
+        The proof; None where no bound was proven.
+    is_exact : bool
+        Whether J is a sum of squares whose residuals are all zero to rounding.
+    wanted_gap : float
+        The gap that was asked for.
+    form : QuadraticForm or None
+        The model; None where it is not quadratic.
+    reason : str
+        Why there is no bound, if there is none.
+    """
+
+    objective: float
+    objective_error: float
+    bound: ModelBound | None
+    is_exact: bool
+    wanted_gap: float = DEFAULT_GAP
+    form: QuadraticForm | None = None
+    reason: str = ""
+
+    @property
+    def lower_bound(self) -> float:
+        """Proven in exact arithmetic: J >= lower_bound at all points of the sets.
+
+        It is -inf where nothing is proven.
+        """
+        if self.bound is not None:
+            return min(self.bound.value, self.objective)
+        is_sum = self.form is not None and self.form.is_sum_of_squares
+        return 0.0 if is_sum else -math.inf
+
+    @property
+    def gap(self) -> float:
+        """(objective - lower_bound) / |objective|, rounded up; 0 where the values are exact."""
+        if self.is_exact:
+            return 0.0
+        at_most = sum_above(self.objective, self.objective_error)
+        if at_most > 0.0 and self.lower_bound >= 0.0:
+            return gap_above(at_most, self.lower_bound)
+        if at_most == 0.0 or math.isinf(self.lower_bound):
+            return math.inf
+        return float(np.nextafter((at_most - self.lower_bound) / abs(at_most), math.inf))
+
+    @property
+    def verdict(self) -> Verdict:
+        """What is proven of the values."""
+        if self.is_exact:
+            return Verdict.EXACT
+        if self.bound is None:
+            return Verdict.TRIVIAL
+        return Verdict.CERTIFIED if self.gap <= self.wanted_gap else Verdict.NOT_CERTIFIED
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the values are globally optimal within the gap that was asked for."""
+        return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the figures as they are printed, with their labels."""
+        if self.bound is None and self.reason:
+            return [("lower bound", f"none: {self.reason}")]
+        bound = rounded_down(self.lower_bound) if math.isfinite(self.lower_bound) else "none"
+        rounding = ""
+        if self.bound is not None:
+            rounding = f"   (proven, less {rounded_up(self.bound.rounding, 2)} for rounding)"
+        gap = f"{rounded_up(self.gap, 3)}   (asked for: {self.wanted_gap:.3g})"
+        return [
+            ("lower bound", f"{bound}{rounding}"),
+            ("gap", "0: every residual is zero to rounding" if self.is_exact else gap),
+            ("verdict", f"{self.verdict.name}: {_SENTENCES[self.verdict]}"),
+        ]
+
+    def __str__(self) -> str:
+        facts = [("J", f"{self.objective:.12g}"), *self.facts()]
+        return "\n".join(f"{label:<12} {text}" for label, text in facts)
+
+    def __repr__(self) -> str:
+        gap = rounded_up(self.gap, 3) if math.isfinite(self.gap) else "inf"
+        return f"ModelCertificate(J={self.objective:.10g}, gap={gap}, {self.verdict.name})"
+
+
+_SENTENCES = {
+    Verdict.EXACT: "globally optimal: J is a sum of squares, and zero to rounding",
+    Verdict.CERTIFIED: Verdict.CERTIFIED.value,
+    Verdict.NOT_CERTIFIED: Verdict.NOT_CERTIFIED.value,
+    Verdict.TRIVIAL: "not shown to be optimal: no bound was found",
+}
+
+
+def judge_values(
+    form: QuadraticForm,
+    equations: SetEquations,
+    u: Array,
+    bound: ModelBound | None,
+    gap: float = DEFAULT_GAP,
+) -> ModelCertificate:
+    """Hold a point of the sets against a bound.
+
+    A ProofError where J is below the bound by more than rounding: then one of the two is wrong.
+    """
+    if not 0 < gap < math.inf:
+        raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
+    objective, error = form.evaluated(u)
+    # x is in the sets to a few roundings alone
+    gradient = 2.0 * (form.Q @ u)
+    error += 64.0 * float(np.finfo(float).eps) * float(abs(gradient) @ abs(u))
+    level = form.rounding_level(u)
+    is_exact = form.is_sum_of_squares and objective <= _ROUNDING_MULTIPLE * level
+    if bound is not None and bound.value > objective + error:
+        raise ProofError(
+            f"lower bound {bound.value!r} is above J = {objective!r}, which is known to "
+            f"{error:.2g}: a defect of pgo_models; please report it with the model"
+        )
+    return ModelCertificate(objective, error, bound, is_exact, gap, form)

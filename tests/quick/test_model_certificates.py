@@ -1,0 +1,139 @@
+"""Quadratic models with rotations are certified, and no bound is above what many starts find."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+import solvers
+from pgo_models import Verdict
+
+SETS = [
+    ("rotations", (3, 3), 1),
+    ("rotations", (3, 3), 2),
+    ("rotations", (2, 2), 1),
+    ("orthogonal", (3, 3), 1),
+    ("orthogonal", (4, 2), 1),
+    ("unit_columns", (3, 2), 1),
+    ("unit_rows", (3, 2), 1),
+]
+
+
+def random_model(seed: int, kind: str, shape: tuple[int, int], count: int):
+    """Sum of squares of affine functions of all entries and one free vector, entries N(0, 1)."""
+    rng = np.random.default_rng(seed)
+    variables = [cp.Variable(shape, name=f"X{k}") for k in range(count)]
+    y = cp.Variable(3, name="y")
+    entries = cp.hstack([cp.vec(X, order="F") for X in variables])
+    A = rng.standard_normal((entries.size + 3, entries.size))
+    C = rng.standard_normal((entries.size + 3, 3))
+    squares = cp.sum_squares(A @ entries + C @ y - rng.standard_normal(entries.size + 3))
+    problem = cp.Problem(cp.Minimize(squares + y[0]))
+    return pgo.OrthogonalProblem(problem, **{kind: variables})
+
+
+@pytest.mark.parametrize(("kind", "shape", "count"), SETS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_bound_is_never_above_the_least_of_many_starts(seed, kind, shape, count) -> None:
+    model = random_model(seed, kind, shape, count)
+    solution = solvers.solve_orthogonal(model, seed, starts=3)
+    many = solvers.solve_orthogonal(model, seed + 1, starts=30)
+    assert solution.lower_bound <= min(solution.objective, many.objective)
+    certificate = solvers.certify(model, many.values)
+    assert certificate.lower_bound <= min(solution.objective, many.objective)
+    if solution.is_certified:
+        assert solution.objective == pytest.approx(many.objective, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_random_quadratic_of_one_rotation_is_certified(seed: int) -> None:
+    solution = solvers.solve_orthogonal(random_model(seed, "rotations", (3, 3), 1), seed, starts=4)
+    assert solution.verdict is Verdict.CERTIFIED
+    assert solution.gap <= 1e-9
+
+
+def test_the_form_is_the_objective_with_the_best_free_variables() -> None:
+    model = random_model(0, "rotations", (3, 3), 1)
+    form = pgo.quadratic_form(model)
+    X, y = model.variables[0], model.others[0]
+    value = pgo.random_rotations(1, 3, np.random.default_rng(0))[0]
+    u = form.u_of([value])
+    assert model.objective([value], [u[9:12]]) == pytest.approx(form.objective(u), rel=1e-12)
+    assert u @ (form.Q @ u) == pytest.approx(form.objective(u), rel=1e-12)
+    least = cp.Problem(model.problem.objective, [X - value == 0])
+    assert least.solve() == pytest.approx(form.objective(u), rel=1e-6)
+    np.testing.assert_allclose(y.value, u[9:12], atol=1e-5)
+
+
+def poses_of_graph(graph, *, is_anchored: bool):
+    """A pose graph written as a cvxpy model."""
+    d = graph.d
+    R = [cp.Variable((d, d), name=f"R{k}") for k in range(graph.num_poses)]
+    t = cp.Variable((graph.num_poses, d), name="t")
+    terms = []
+    for edge, (i, j) in enumerate(zip(graph.i, graph.j, strict=True)):
+        kappa, tau = np.sqrt(graph.kappa[edge]), np.sqrt(graph.tau[edge])
+        terms.append(cp.vec(kappa * (R[j] - R[i] @ graph.R_ij[edge]), order="F"))
+        terms.append(tau * (t[j] - t[i] - R[i] @ graph.t_ij[edge]))
+    constraints = [R[0] == np.eye(d), t[0] == 0] if is_anchored else []
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(cp.hstack(terms))), constraints)
+    return pgo.OrthogonalProblem(problem, rotations=R)
+
+
+@pytest.mark.parametrize("is_anchored", [True, False])
+def test_a_pose_graph_written_in_cvxpy_is_certified_like_the_built_in_one(is_anchored) -> None:
+    built_in = solvers.solve(pgo.grid(np.random.default_rng(0)))
+    poses = built_in.poses
+    model = poses_of_graph(built_in.problem.graph, is_anchored=is_anchored)
+    R = poses.R[0].T @ poses.R if is_anchored else poses.R
+    certificate = solvers.certify(model, list(R))
+    assert certificate.is_certified
+    assert certificate.objective == pytest.approx(built_in.certificate.objective, rel=1e-9)
+    assert certificate.lower_bound == pytest.approx(built_in.lower_bound, rel=1e-5)
+
+
+def test_exact_data_give_exact_values() -> None:
+    rng = np.random.default_rng(0)
+    X = cp.Variable((3, 3), name="X")
+    A = rng.standard_normal((10, 3))
+    B = A @ pgo.random_rotations(1, 3, rng)[0]
+    model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(A @ X - B))), rotations=[X])
+    solution = solvers.solve_orthogonal(model, 0)
+    assert solution.verdict is Verdict.EXACT
+    assert solution.gap == 0.0
+
+
+def test_a_reflected_start_does_not_hide_the_minimum() -> None:
+    X = cp.Variable((3, 3), name="X")
+    nearest = cp.Problem(cp.Minimize(cp.sum_squares(X - np.diag([2.0, 1.0, -1.0]))))
+    for seed in range(4):
+        model = pgo.OrthogonalProblem(nearest, orthogonal=[X])
+        solution = solvers.solve_orthogonal(model, seed, starts=1)
+        assert solution.objective == pytest.approx(1.0, rel=1e-9)
+
+
+def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
+    X = cp.Variable((3, 3), name="X")
+    y = cp.Variable(name="y")
+    p = cp.Parameter(name="p")
+    squares = cp.sum_squares(X - np.eye(3))
+
+    def answer(objective, constraints=(), **sets):
+        problem = cp.Problem(cp.Minimize(objective), list(constraints))
+        return solvers.solve_orthogonal(pgo.OrthogonalProblem(problem, **sets), 0, starts=1)
+
+    with pytest.raises(pgo.PGOError, match=r"^the objective is not bounded below in y"):
+        answer(squares + y, rotations=[X])
+    with pytest.raises(pgo.PGOError, match=r"^the Parameter p has no value"):
+        answer(squares + p * X[0, 0], rotations=[X])
+    with pytest.raises(pgo.PGOError, match=r"nan or inf"):
+        answer(cp.sum_squares(X - np.full((3, 3), np.nan)), rotations=[X])
+    loose = {
+        "there are other constraints": answer(squares, [X[0, 0] <= 0.5], rotations=[X]),
+        "Sparse": answer(squares, sparse=[(X, 3)]),
+        "is not quadratic": answer(cp.norm(X - 2.0), rotations=[X]),
+    }
+    for reason, solution in loose.items():
+        assert solution.lower_bound == -np.inf
+        assert reason in str(solution)
+        assert solution.verdict is Verdict.TRIVIAL
