@@ -49,7 +49,7 @@ from pgo_models.graphs.g2o_tags import (
     supported_tags,
 )
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
-from pgo_models.graphs.precisions import ROUNDED_EIGENVALUE, are_definite, lowest_scaled
+from pgo_models.graphs.precisions import are_definite, is_negative_by_rounding
 from pgo_models.graphs.weight_errors import MOST, SINGULAR
 from pgo_models.graphs.written_digits import ALL_DIGITS, WrittenDigits, digits_of
 
@@ -718,10 +718,9 @@ def _problems_of_blocks(file: G2OLines, name: str, blocks: Array) -> list[Proble
     doubtful = np.flatnonzero(_may_be_indefinite(blocks))
     if not len(doubtful):
         return []
-    lowest = lowest_scaled(blocks[doubtful])
     diagonals = np.abs(np.einsum("mkk->mk", blocks[doubtful]))
     is_tiny = ((diagonals > 0.0) & (diagonals <= 1.0 / LARGEST)).any(axis=1)
-    is_wrong = (lowest < -ROUNDED_EIGENVALUE) | is_tiny
+    is_wrong = ~is_negative_by_rounding(blocks[doubtful]) | is_tiny
     wrong = doubtful[is_wrong]
     smallest = np.linalg.eigvalsh(blocks[wrong])[:, 0].tolist()
     lines = file.edge_lines[wrong].tolist()

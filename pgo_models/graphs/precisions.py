@@ -20,8 +20,10 @@ LEAST_SCALED = 1e-12
 _SURELY_NEGATIVE = -1e-10
 # A matrix whose smallest eigenvalue is below this has directions that it does not measure.
 LEAST_DEFINITE = 1e-13
-# Negative eigenvalues down to here are what six digits make of a zero.
-ROUNDED_EIGENVALUE = 1e-5
+# Negative eigenvalues down to here are what six significant digits make of a zero, after the
+# scaling, and six decimals, as a share of the largest eigenvalue.
+_SIX_DIGITS = 1e-5
+_SIX_DECIMALS = 1e-6
 # Negative eigenvalues up to here are hidden by the rounding of doubles, see `_ROUNDED_ENTRIES`.
 _NO_ROUNDING = 2.0**-46
 # Information of directions without any, in F, as a share of the largest of the block.
@@ -121,8 +123,7 @@ def without_negative_rounding(information: Array, d: int) -> tuple[Array, BoolAr
 
     Also returned is which of them had to be changed. A matrix that measures no more than a few
     directions has eigenvalues that are zero, and written with a few digits some become negative:
-    these are taken for zero. Matrices with a larger negative eigenvalue (`lowest_scaled`) are left
-    alone.
+    these are taken for zero. Matrices with a larger negative eigenvalue are left alone.
     """
     is_changed = np.zeros(len(information), dtype=bool)
     settled = information
@@ -132,22 +133,39 @@ def without_negative_rounding(information: Array, d: int) -> tuple[Array, BoolAr
         if not len(doubtful):
             continue
         lowest = lowest_scaled(blocks[doubtful])
-        is_rounded = (lowest < -_NO_ROUNDING) & (lowest >= -ROUNDED_EIGENVALUE)
-        rounded = doubtful[is_rounded]
-        if len(rounded):
-            settled = settled.copy()
-            settled[rounded, block, block] = _clipped_at_zero(blocks[rounded])
-            is_changed[rounded] = True
+        is_by_digits = lowest >= -_SIX_DIGITS
+        is_rounded = is_by_digits
+        if block.stop == d or block.start == d:  # entries of one unit
+            is_rounded = is_negative_by_rounding(blocks[doubtful])
+        is_rounded &= lowest < -_NO_ROUNDING
+        if not is_rounded.any():
+            continue
+        settled = settled.copy()
+        by_digits = doubtful[is_rounded & is_by_digits]
+        scaled, scale = scaled_blocks(blocks[by_digits])
+        raised = _clipped_at_zero(scaled) / (scale[:, :, None] * scale[:, None, :])
+        settled[by_digits, block, block] = raised
+        by_decimals = doubtful[is_rounded & ~is_by_digits]
+        settled[by_decimals, block, block] = _clipped_at_zero(blocks[by_decimals])
+        is_changed[doubtful[is_rounded]] = True
     return settled, is_changed
 
 
-def _clipped_at_zero(blocks: Array) -> Array:
-    """Blocks, (m, k, k), with zero for their negative eigenvalues after `scaled_blocks`."""
-    scaled, scale = scaled_blocks(blocks)
-    values, vectors = np.linalg.eigh(scaled)
+def is_negative_by_rounding(blocks: Array) -> BoolArray:
+    """Whether six digits or decimals explain the negative eigenvalues of blocks, (m, k, k).
+
+    All entries of a block have one unit. Blocks without negative eigenvalues count as explained.
+    """
+    values = np.linalg.eigvalsh(blocks)
+    is_by_decimals = values[:, 0] >= -_SIX_DECIMALS * values[:, -1]
+    return np.asarray(is_by_decimals | (lowest_scaled(blocks) >= -_SIX_DIGITS))
+
+
+def _clipped_at_zero(matrices: Array) -> Array:
+    """Symmetric matrices, (m, k, k), with zero for their negative eigenvalues."""
+    values, vectors = np.linalg.eigh(matrices)
     raised = (vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    raised = 0.5 * (raised + np.swapaxes(raised, 1, 2))
-    return np.asarray(raised / (scale[:, :, None] * scale[:, None, :]))
+    return np.asarray(0.5 * (raised + np.swapaxes(raised, 1, 2)))
 
 
 def lowest_scaled(blocks: Array) -> Array:

@@ -456,3 +456,27 @@ def test_files_that_are_no_text_of_measurements_are_named(
     code, _, err = pgo_command("solve", tmp_path / "map.db")
     assert code == 1
     assert "rtabmap-export --poses_format 4" in err
+
+
+@pytest.mark.parametrize("digits", ["{:.6g}", "{:.6f}", "{:.4f}"])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_corridor_in_any_direction_is_read_with_few_digits(
+    digits: str, seed: int, pgo_command: Call, tmp_path: Path
+) -> None:
+    """One direction is not measured; the digits make some of its zero eigenvalues negative."""
+    axis = np.random.default_rng(seed).normal(size=3)
+    axis /= np.linalg.norm(axis)
+    information = np.zeros((6, 6))
+    information[:3, :3] = 100.0 * (np.eye(3) - np.outer(axis, axis))
+    information[3:, 3:] = 400.0 * np.eye(3)
+    numbers = " ".join(digits.format(x) for x in information[np.triu_indices(6)])
+    whole = " ".join(str(x) for x in np.diag([100.0] * 3 + [400.0] * 3)[np.triu_indices(6)])
+    path = tmp_path / "corridor.g2o"
+    path.write_text(
+        f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {whole}\n"
+        f"EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 {whole}\n"
+        f"EDGE_SE3:QUAT 0 2 2.1 0.1 0 0 0 0 1 {numbers}\n"
+    )
+    code, out, err = pgo_command("solve", path)
+    assert code == 0, err
+    assert "CERTIFIED" in out
