@@ -458,6 +458,7 @@ def test_files_that_are_no_text_of_measurements_are_named(
     assert "rtabmap-export --poses_format 4" in err
 
 
+@pytest.mark.filterwarnings("ignore:.*negative eigenvalues are taken for zero")
 @pytest.mark.parametrize("digits", ["{:.6g}", "{:.6f}", "{:.4f}"])
 @pytest.mark.parametrize("seed", range(5))
 def test_a_corridor_in_any_direction_is_read_with_few_digits(
