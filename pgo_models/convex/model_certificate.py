@@ -5,11 +5,13 @@ A pose graph's is `pgo_models.certificates.certificate`; verdicts and gaps are t
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex.model_bound import ModelBound
+from pgo_models.convex.model_proof_file import write_model_proof
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.convex.set_equations import SetEquations
 from pgo_models.errors import ProofError, SettingError
@@ -87,6 +89,25 @@ class ModelCertificate(ReadOnly):
     def is_certified(self) -> bool:
         """Whether the values are globally optimal within the gap that was asked for."""
         return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
+
+    def save_proof(self, path: Path | str) -> None:
+        """Write what proves the bound, as JSON; `verify_model_proof` checks it exactly.
+
+        Parameters
+        ----------
+        path : Path or str
+            The file; it is written whole or not at all.
+
+        Raises
+        ------
+        SettingError
+            When there is no bound, or a variable is in several sets.
+        PGOError
+            When the file cannot be written.
+        """
+        if self.bound is None or self.form is None:
+            raise SettingError("no proof to write: no bound was found")
+        write_model_proof(self.form, self.bound, path)
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the figures as they are printed, with their labels."""

@@ -119,6 +119,8 @@ class QuadraticForm(ReadOnly):
         One for every constrained variable.
     names : tuple of (int, str)
         First coordinate and name of every variable.
+    columns : tuple of ints
+        First entry in z of every constrained variable.
     """
 
     P: csc_array
@@ -132,6 +134,7 @@ class QuadraticForm(ReadOnly):
     fixed: Array
     blocks: tuple[Block, ...]
     names: tuple[tuple[int, str], ...]
+    columns: tuple[int, ...]
 
     @property
     def side(self) -> int:
@@ -433,7 +436,18 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
         raise NotQuadraticError("an equality has entries of a rotation of the plane that are equal")
     fixed, is_left = _fixed_coordinates(E)
     form = QuadraticForm(
-        P, c, A, b, constant, T, spread, csr_array(E[is_left]), fixed, tuple(blocks), tuple(names)
+        P=P,
+        c=c,
+        A=A,
+        b=b,
+        constant=constant,
+        T=T,
+        spread=spread,
+        E=csr_array(E[is_left]),
+        fixed=fixed,
+        blocks=tuple(blocks),
+        names=tuple(names),
+        columns=tuple(columns[variable.id] for variable in problem.variables),
     )
     form.with_best_others(np.cos(np.arange(form.side)))  # refuses what has no best ones
     return form

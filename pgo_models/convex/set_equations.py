@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, UnitColumns, UnitRows
-from pgo_models.convex.quadratic_form import NotQuadraticError, QuadraticForm
+from pgo_models.convex.quadratic_form import Block, NotQuadraticError, QuadraticForm
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
@@ -102,15 +102,12 @@ def set_equations(form: QuadraticForm) -> SetEquations:
     further: list[_Terms] = []
     norms: list[bool] = []
     for block in form.blocks:
-        for each in block.sets:
-            if not isinstance(each, Orthonormal | UnitColumns):
-                raise NotQuadraticError(f"{each!r} is no set of quadratic equations")
-        sets = (UnitColumns(),) if block.is_plane else block.sets
-        for position, each in enumerate(sets):
-            first, others = _equations_of(each, (2, 1) if block.is_plane else block.shape)
-            basic += [_shifted(terms, block.start) for terms in first]
-            further += [_shifted(terms, block.start) for terms in others]
-            norms += [position == 0 and (_ONE, _ONE, -1.0) in terms for terms in first]
+        first, others = equations_of_block(block)
+        basic += first
+        further += others
+        of_first_set = 1 if block.is_plane else len(_equations_of(block.sets[0], block.shape)[0])
+        for position, terms in enumerate(first):
+            norms.append(position < of_first_set and (_ONE, _ONE, -1.0) in terms)
     last = form.side - 1
     of_equalities = []
     penalty = [0.0] * (len(basic) + len(further))
@@ -132,6 +129,20 @@ def set_equations(form: QuadraticForm) -> SetEquations:
         np.array(penalty),
         is_norm,
     )
+
+
+def equations_of_block(block: Block) -> tuple[list[_Terms], list[_Terms]]:
+    """Basic and further equations of one variable; a NotQuadraticError if a set has none."""
+    for each in block.sets:
+        if not isinstance(each, Orthonormal | UnitColumns):
+            raise NotQuadraticError(f"{each!r} is no set of quadratic equations")
+    basic = []
+    further = []
+    for each in (UnitColumns(),) if block.is_plane else block.sets:
+        first, others = _equations_of(each, (2, 1) if block.is_plane else block.shape)
+        basic += [_shifted(terms, block.start) for terms in first]
+        further += [_shifted(terms, block.start) for terms in others]
+    return basic, further
 
 
 def _equations_of(kind: object, shape: tuple[int, ...]) -> tuple[list[_Terms], list[_Terms]]:

@@ -1,5 +1,7 @@
 """Quadratic models with rotations are certified, and no bound is above what many starts find."""
 
+import json
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -63,6 +65,32 @@ def test_the_form_is_the_objective_with_the_best_free_variables() -> None:
     least = cp.Problem(model.problem.objective, [X - value == 0])
     assert least.solve() == pytest.approx(form.objective(u), rel=1e-6)
     np.testing.assert_allclose(y.value, u[9:12], atol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "shape", "count"), SETS)
+def test_proofs_are_verified_exactly_and_tampered_ones_rejected(kind, shape, count, tmp_path):
+    pytest.importorskip("flint")
+    path = tmp_path / "proof.json"
+    certificate = solvers.solve_orthogonal(random_model(0, kind, shape, count), 0).certificate
+    certificate.save_proof(path)
+    found = pgo.verify_model_proof(path)
+    assert found.is_verified, found.failure
+    assert certificate.bound.value <= found.bound
+    record = json.loads(path.read_text())
+
+    def is_verified(**changes) -> bool:
+        path.write_text(json.dumps({**record, **changes}))
+        return pgo.verify_model_proof(path).is_verified
+
+    raised = float(found.bound) + 1e-9 * abs(float(found.bound))
+    assert not is_verified(lower_bound=raised)
+    assert not is_verified(constant=record["constant"] - 1e-6 * abs(certificate.objective))
+    variables = json.loads(json.dumps(record["variables"]))
+    name = next(iter(variables[0]["multipliers"]))
+    variables[0]["multipliers"][name][0] += 1.0 + abs(variables[0]["multipliers"][name][0])
+    assert not is_verified(variables=variables)
+    with pytest.raises(pgo.PGOError, match="not a proof of a model"):
+        is_verified(variables=3)
 
 
 def poses_of_graph(graph, *, is_anchored: bool):
