@@ -24,7 +24,7 @@ from pgo_models.problem.floating_point import (
     exact_sum,
     gamma,
 )
-from pgo_models.problem.incidence import rows_of_blocks
+from pgo_models.problem.incidence import blocks_of_rows, rows_of_blocks
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 # of weights: products of four stay far from underflow and overflow
@@ -252,7 +252,7 @@ def rounding_of(at: EvaluatedPoses) -> ObjectiveRounding:
     e_t = errors.translation
     e_R = float(errors.rotation[0])  # the same of every edge
     delta = at.point.delta
-    weighted = problem.weights.apply_weights(delta)
+    weighted = blocks_of_rows(at.point.weighted, d)
     sizes = problem.weights.apply_absolute_weights(np.abs(delta))
     # sum ||D r|| e, the terms that are linear in the errors; a row of W r is a sum of d products.
     norms_t = block_norms(weighted[:, 0])
