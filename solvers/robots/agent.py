@@ -1,14 +1,17 @@
 """One robot as an engine runs it: its interior for the driver, and its copies for CONSENSUS."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from pgo_models.geometry.poses import Poses
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o_parser import G2OLines, parse_lines, read_lines
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend
@@ -17,17 +20,38 @@ from solvers.carry.moments import Recall
 from solvers.carry.registry import order, record
 from solvers.carry.serialization import deserialize, serialize
 from solvers.robots.part import Interior, InteriorState, interior_of
-from solvers.soc.consensus_robot import ConsensusRobot
-from solvers.soc.copies import CopiesState, CopyLayout, Rows
-from solvers.soc.paper_robot import PaperCopies, PaperRobot
+from solvers.soc.copies import CopyLayout
 from solvers.soc.subgraph import Subgraph
 
 Q = TypeVar("Q")
 A = TypeVar("A")
 K = TypeVar("K")
-# A robot that holds what its neighbours send: of CONSENSUS, or of Algorithm 1 of the paper.
-Copies = ConsensusRobot | PaperRobot
-C = TypeVar("C", ConsensusRobot, PaperRobot)
+
+
+class StateOfCopies(Protocol):
+    """What orders leave with a robot that holds what its neighbours send."""
+
+    def robot(self, layout: CopyLayout) -> Copies:
+        """The robot in this state."""
+
+
+class Copies(Protocol):
+    """A robot that holds what its neighbours send: of CONSENSUS, or of Algorithm 1 of the paper."""
+
+    @property
+    def layout(self) -> CopyLayout:
+        """What follows from its part of the graph."""
+
+    @property
+    def state(self) -> StateOfCopies:
+        """What orders have left."""
+
+    @property
+    def omega(self) -> Array:
+        """Rotations of the poses that it holds, (n_a, d, d)."""
+
+
+C = TypeVar("C", bound=Copies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +68,7 @@ class HeldStates:
     """The states of what a robot holds, without what follows from its subgraph."""
 
     interior: InteriorState | None
-    copies: CopiesState | PaperCopies | None
+    copies: StateOfCopies | None
 
 
 @record("AgentRecord")
@@ -172,15 +196,11 @@ class Agent:
         interior = self.interior
         if interior is not None and states.interior is not None:
             interior = interior.in_state_of(states.interior)
-        copies: Copies | None = None
-        if isinstance(states.copies, CopiesState):
-            copies = ConsensusRobot(self._layout, CopiesState()).restored(states.copies)
-        elif states.copies is not None:
-            copies = PaperRobot(self._layout, PaperCopies()).restored(states.copies)
+        copies = None if states.copies is None else states.copies.robot(self.layout)
         return Held(interior, copies)
 
     @property
-    def _layout(self) -> CopyLayout:
+    def layout(self) -> CopyLayout:
         """What follows from its part of the graph, for robots that hold copies."""
         if self.copies is not None:
             return self.copies.layout
@@ -203,21 +223,6 @@ def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: Agent, request: Q)
     assert copies is not None
     agent.copies, answer = order(copies, request)
     return answer
-
-
-@order("robot.begin_copies")
-def begin_copies(agent: Agent, cover: Poses) -> Rows:
-    """Start the copies at the current poses, of which the driver sends those of the cover."""
-    if not isinstance(agent.copies, ConsensusRobot):
-        agent.copies = ConsensusRobot(agent._layout, CopiesState())
-    return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))
-
-
-@order("robot.begin_paper")
-def begin_paper(agent: Agent, cover: Poses) -> Rows:
-    """Start Algorithm 1 at the current poses, of which the driver sends those of the cover."""
-    agent.copies = PaperRobot(agent._layout, PaperCopies())
-    return order_copies(PaperRobot.begin, agent, held_poses(agent, cover))
 
 
 def held_poses(agent: Agent, cover: Poses) -> Poses:

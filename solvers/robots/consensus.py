@@ -14,13 +14,15 @@ from typing import TypeVar
 import numpy as np
 
 from pgo_models.errors import SettingError, check_settings
+from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.carry.counted_pool import Count
 from solvers.carry.faults import Faults, LossyChannel
 from solvers.carry.messages import Messages
 from solvers.carry.moments import Moment
+from solvers.carry.registry import order
 from solvers.result import Measurement, Status
-from solvers.robots.agent import C, begin_copies, finish_copies, order_copies
+from solvers.robots.agent import Agent, C, finish_copies, held_poses, order_copies
 from solvers.robots.driver import Driver
 from solvers.soc.consensus import (
     Consensus,
@@ -28,7 +30,7 @@ from solvers.soc.consensus import (
     ask_all,
     objective_and_gradient,
 )
-from solvers.soc.consensus_robot import ConsensusRobot
+from solvers.soc.consensus_robot import ConsensusRobot, CopiesState
 from solvers.soc.copies import Rows, TurnSettings
 from solvers.soc.recursion_block import Rotations
 from solvers.soc.soc import SOC
@@ -296,3 +298,11 @@ class AsynchronousSOC:
         """Give driver and robots omega, and the best translations for it: two rounds."""
         driver.return_to(state.moment)
         RobotsOfDriver(driver).finish()
+
+
+@order("robot.begin_copies")
+def begin_copies(agent: Agent, cover: Poses) -> Rows:
+    """Start the copies at the current poses, of which the driver sends those of the cover."""
+    if not isinstance(agent.copies, ConsensusRobot):
+        agent.copies = CopiesState().robot(agent.layout)
+    return order_copies(ConsensusRobot.begin, agent, held_poses(agent, cover))

@@ -33,9 +33,8 @@ from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
 from solvers.soc.anderson import Anderson
-from solvers.soc.consensus_robot import ConsensusRobot
+from solvers.soc.consensus_robot import ConsensusRobot, CopiesState
 from solvers.soc.copies import (
-    CopiesState,
     CopyLayout,
     InitReply,
     RescaleCopies,
@@ -370,7 +369,7 @@ class LocalConsensus:
         robots = []
         for subgraph in split_graph(problem, self.soc.robots):
             layout = CopyLayout(subgraph, problem.backend, self.soc.r_step)
-            robots.append(ConsensusRobot(layout, CopiesState()))
+            robots.append(CopiesState().robot(layout))
         local = LocalRobots(problem, tuple(robots), start)
         state = Consensus(self.soc).init(local)
         return replace(state, robots=local.robots)

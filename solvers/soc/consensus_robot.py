@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -27,15 +27,16 @@ from pgo_models.geometry.rotations import (
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.stationarity import gradient_squares, rotation_squares
 from solvers.carry.messages import Messages
-from solvers.carry.registry import order
+from solvers.carry.registry import order, record
 from solvers.soc import copies
-from solvers.soc.anderson import AndersonSums
+from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
 from solvers.soc.recursion_block import (
     Agreement,
     RecursionBlock,
     Rotations,
+    StepSettings,
     block_at,
     nearest_rotations,
     stationary_B,
@@ -43,13 +44,117 @@ from solvers.soc.recursion_block import (
 from solvers.soc.rounding import WHOLE, PartOfSums, RowChange
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
+# An asynchronous run makes progress when a merit falls to this share of the smallest so far; it
+# stagnates when that has not happened for so many turns.
+_PROGRESS = 0.9
+_PATIENCE = 20
+
+
+@record("Waiting")
+@dataclass(frozen=True, eq=False)
+class Waiting:
+    """What a robot of an asynchronous run has received, and how far it relaxes."""
+
+    settings: copies.TurnSettings
+    newest: Mapping[int, Array]  # the newest rows from every neighbour
+    waited: Mapping[int, int]  # how many turns ago they arrived
+    excess: float = 1.0  # share of the over-relaxation that is left
+    least: float = math.inf  # the smallest merit since that share changed
+    turns_since: int = 0  # how many turns ago that merit was
+
+    def with_rows(self, rows: copies.Rows) -> Waiting:
+        """The record a turn later, with the rows that have arrived."""
+        waited = {robot: 0 if robot in rows else turns + 1 for robot, turns in self.waited.items()}
+        return replace(self, newest={**self.newest, **rows}, waited=waited)
+
+    def after(self, merit: float) -> Waiting:
+        """The record after a turn with this merit; on stagnation the robot relaxes less.
+
+        Over-relaxed steps may cycle.
+        """
+        if merit <= _PROGRESS * self.least:
+            return replace(self, least=merit, turns_since=0)
+        if self.turns_since < _PATIENCE:
+            return replace(self, turns_since=self.turns_since + 1)
+        return replace(self, excess=0.5 * self.excess, least=math.inf, turns_since=0)
+
+
+@record("ReceivedRows")
+@dataclass(frozen=True, eq=False)
+class ReceivedRows:
+    """Rows of a neighbour's s that the robot shares, and what the acceleration remembers of them.
+
+    The neighbour has the same numbers.
+    """
+
+    s: Array
+    share: AndersonShare = field(default_factory=AndersonShare)
+
+
+@record("CopiesState")
+@dataclass(frozen=True, eq=False)
+class CopiesState:
+    """What orders leave with a robot; rows are those of `CopyLayout`.
+
+    Parameters
+    ----------
+    X : (rows, d) array
+        The poses at the start, then x of the last step (a) with all translations.
+    rho : (n_a,) array
+        Penalties of the poses.
+    diagonal : (n_a, d + 1) array
+        Diagonal of M of every pose, its translation first.
+    Lambda : (n_a, d, d) array
+        Multipliers, right for own poses.
+    pull : (n_a, d^2) array
+        rho_i B_i of a stationary point.
+    force : (rows, d) array
+        -2 M_a X.
+    total_force : (rows, d) array
+        The same, summed over robots.
+    settings : StepSettings
+        Settings of the steps.
+    block : RecursionBlock or None
+        The robot's rows of the recursion.
+    origin : pair of (rows, d) arrays or None
+        omega and s when the penalties were set.
+    sums : AndersonSums
+        Of a robot that accelerates alone.
+    received : mapping from robots to ReceivedRows
+        copies.Rows of the neighbours, which are extrapolated here as there.
+    ahead : tuple or None
+        X, block and sums after the next step (a).
+    waiting : Waiting or None
+        Of an asynchronous run.
+    """
+
+    X: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    rho: Array = field(default_factory=lambda: np.zeros(0))
+    diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    Lambda: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    pull: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    force: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    total_force: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    settings: StepSettings = field(default_factory=StepSettings)
+    block: RecursionBlock | None = None
+    origin: tuple[Array, Array] | None = None
+    sums: AndersonSums = field(default_factory=AndersonSums)
+    received: Mapping[int, ReceivedRows] = field(default_factory=dict)
+    ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None
+    waiting: Waiting | None = None
+
+    def robot(self, layout: copies.CopyLayout) -> ConsensusRobot:
+        """The robot in this state."""
+        robot = ConsensusRobot(layout, self)
+        return robot if self.block is None else robot._prepared()
+
 
 @dataclass(frozen=True, eq=False)
 class ConsensusRobot:
     """A robot: its layout, the state that earlier orders left, and the back end of step (a)."""
 
     layout: copies.CopyLayout
-    state: copies.CopiesState
+    state: CopiesState
     step_a: RotationStep | None = None  # follows from layout and state
 
     # Set-up: poses and penalties.
@@ -260,16 +365,16 @@ class ConsensusRobot:
         for robot, message in messages.items():
             known = self.state.received.get(robot)
             if known is None:
-                known = copies.ReceivedRows(before.omega[self.layout.common[robot]])
+                known = ReceivedRows(before.omega[self.layout.common[robot]])
             share = known.share.after(np.zeros((0, 0)), _updated_rows(message, known.s), memory)
             rows[robot], share = share.extrapolated(agreement.gamma)
-            received[robot] = copies.ReceivedRows(rows[robot], share)
+            received[robot] = ReceivedRows(rows[robot], share)
         return self._with(X=X, block=block, sums=own_sums, received=received), rows
 
     @order("consensus.announce")
     def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
         """Send the robot's rows to every neighbour, before the first turn."""
-        waiting = copies.Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
+        waiting = Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
         return self._with(waiting=waiting)._sending(self.block)
 
     @order("consensus.turn")
@@ -387,11 +492,6 @@ class ConsensusRobot:
         return self, self._stationarity_at(self.poses)
 
     # What the orders share.
-
-    def restored(self, state: copies.CopiesState) -> ConsensusRobot:
-        """The robot with the state of a checkpoint or of another process."""
-        robot = replace(self, state=state)
-        return robot if state.block is None else robot._prepared()
 
     def _with(self, **changes: object) -> ConsensusRobot:
         """The robot with changed fields of its state, whose types mypy cannot check."""

@@ -1,8 +1,7 @@
 """Records of CONSENSUS: what a robot that holds copies knows, and the messages of such robots."""
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,18 +14,12 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.matrices import columns_of
 from solvers.carry.messages import Messages
 from solvers.carry.registry import record
-from solvers.soc.anderson import AndersonShare, AndersonSums
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
-from solvers.soc.recursion_block import RecursionBlock, StepSettings
 from solvers.soc.rounding import PartOfSums, RowChange
 from solvers.soc.subgraph import PartProblem, Subgraph
 
 Rows = Messages[Array]  # to or from every neighbour
 RowMessages = Messages[Array | RowChange]  # of rows, or of their change since the last message
-# An asynchronous run makes progress when a merit falls to this share of the smallest so far; it
-# stagnates when that has not happened for so many turns.
-_PROGRESS = 0.9
-_PATIENCE = 20
 
 
 @record("Norms")
@@ -275,97 +268,3 @@ class CopyLayout:
         return RSubproblem(
             A, w, problem.M, problem.d, problem.num_poses, penalty, problem.analysis, self.backend
         )
-
-
-@record("Waiting")
-@dataclass(frozen=True, eq=False)
-class Waiting:
-    """What a robot of an asynchronous run has received, and how far it relaxes."""
-
-    settings: TurnSettings
-    newest: Mapping[int, Array]  # the newest rows from every neighbour
-    waited: Mapping[int, int]  # how many turns ago they arrived
-    excess: float = 1.0  # share of the over-relaxation that is left
-    least: float = math.inf  # the smallest merit since that share changed
-    turns_since: int = 0  # how many turns ago that merit was
-
-    def with_rows(self, rows: Rows) -> "Waiting":
-        """The record a turn later, with the rows that have arrived."""
-        waited = {robot: 0 if robot in rows else turns + 1 for robot, turns in self.waited.items()}
-        return replace(self, newest={**self.newest, **rows}, waited=waited)
-
-    def after(self, merit: float) -> "Waiting":
-        """The record after a turn with this merit; on stagnation the robot relaxes less.
-
-        Over-relaxed steps may cycle.
-        """
-        if merit <= _PROGRESS * self.least:
-            return replace(self, least=merit, turns_since=0)
-        if self.turns_since < _PATIENCE:
-            return replace(self, turns_since=self.turns_since + 1)
-        return replace(self, excess=0.5 * self.excess, least=math.inf, turns_since=0)
-
-
-@record("ReceivedRows")
-@dataclass(frozen=True, eq=False)
-class ReceivedRows:
-    """Rows of a neighbour's s that the robot shares, and what the acceleration remembers of them.
-
-    The neighbour has the same numbers.
-    """
-
-    s: Array
-    share: AndersonShare = field(default_factory=AndersonShare)
-
-
-@record("CopiesState")
-@dataclass(frozen=True, eq=False)
-class CopiesState:
-    """What orders leave with a robot; rows are those of `CopyLayout`.
-
-    Parameters
-    ----------
-    X : (rows, d) array
-        The poses at the start, then x of the last step (a) with all translations.
-    rho : (n_a,) array
-        Penalties of the poses.
-    diagonal : (n_a, d + 1) array
-        Diagonal of M of every pose, its translation first.
-    Lambda : (n_a, d, d) array
-        Multipliers, right for own poses.
-    pull : (n_a, d^2) array
-        rho_i B_i of a stationary point.
-    force : (rows, d) array
-        -2 M_a X.
-    total_force : (rows, d) array
-        The same, summed over robots.
-    settings : StepSettings
-        Settings of the steps.
-    block : RecursionBlock or None
-        The robot's rows of the recursion.
-    origin : pair of (rows, d) arrays or None
-        omega and s when the penalties were set.
-    sums : AndersonSums
-        Of a robot that accelerates alone.
-    received : mapping from robots to ReceivedRows
-        Rows of the neighbours, which are extrapolated here as there.
-    ahead : tuple or None
-        X, block and sums after the next step (a).
-    waiting : Waiting or None
-        Of an asynchronous run.
-    """
-
-    X: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    rho: Array = field(default_factory=lambda: np.zeros(0))
-    diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    Lambda: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    pull: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    force: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    total_force: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    settings: StepSettings = field(default_factory=StepSettings)
-    block: RecursionBlock | None = None
-    origin: tuple[Array, Array] | None = None
-    sums: AndersonSums = field(default_factory=AndersonSums)
-    received: Mapping[int, ReceivedRows] = field(default_factory=dict)
-    ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None
-    waiting: Waiting | None = None

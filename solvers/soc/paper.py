@@ -15,7 +15,7 @@ the dual residual: beside the change of omega, as in Boyd et al. 2011, section 3
 frozen neighbours counts.
 
 `PaperSOC` has the blocks of all robots in one matrix. Where robots are apart
-(`solvers.soc.paper_robot`) each has its own `Blocks`, and the rotations that its neighbours have
+(`solvers.robots.paper`) each has its own `Blocks`, and the rotations that its neighbours have
 sent.
 """
 

@@ -23,7 +23,7 @@ from pgo_models.geometry.rotations import Array, tangent_dimension
 from solvers import SOC, Coupling, Pipeline, Robots, Solution, solve
 from solvers.carry.ledger import DRIVER
 from solvers.robots import handedness, newton, poses as pose_orders
-from solvers.robots.agent import begin_copies
+from solvers.robots.consensus import begin_copies
 from solvers.robots.interface import Separators
 from solvers.robots.proof import fits_part, move_proof, prove_interior
 from solvers.soc.consensus_robot import ConsensusRobot

@@ -95,8 +95,8 @@ def test_robots_alone_find_an_optimum_or_stay_at_their_start_and_claim_nothing(
     assert solution.lower_bound == 0.0
     if solution.objective > 1e-3:  # not of a tree, whose edges all fit
         assert solution.certificate.verdict is Verdict.TRIVIAL
-    assert solution.note == NO_CERTIFICATE
-    assert f"note         {NO_CERTIFICATE}" in str(solution)
+    assert solution.note.endswith(NO_CERTIFICATE)  # of a tree it says first that it has no cycle
+    assert f"note         {solution.note}" in str(solution)
     for order, _, answers in engine.log:
         assert order.startswith("ConsensusRobot.") or order in OFF or order == "begin_copies"
         if order not in OFF:
@@ -241,4 +241,4 @@ def test_rotations_alone_are_solved_without_a_driver() -> None:
     parts = metis(problem.graph, 3)
     solution = solve(problem, Pipeline(soc=SOC(robots=parts)), robots=alone(parts))
     assert solution.objective == pytest.approx(solve(problem).objective, rel=1e-6)
-    assert solution.note == NO_CERTIFICATE
+    assert solution.note.endswith(NO_CERTIFICATE)  # of a tree it says first that it has no cycle
