@@ -7,21 +7,29 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from graphs import MILD_NOISE
+from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 
-from pgo_models import PartitionMethod, PGOProblem, PoseGraph, Poses, partition, random_rotations
+from pgo_models import (
+    NoiseModel,
+    PartitionMethod,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    partition,
+    random_rotations,
+)
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
-from solvers import InProcess
+from solvers import BalancedPenalty, InProcess, MultiplierPenalty
 from solvers.carry.messages import Idle
 from solvers.carry.process import Engine, WorkerPool
 from solvers.robots.agent import Agent
@@ -31,6 +39,7 @@ from solvers.robots.interface import Interface, Separators
 from solvers.robots.setup import open_driver
 from solvers.robots.subdomain_blocks import SubdomainBlocks
 from solvers.soc import subgraph
+from solvers.soc.anderson import Anderson
 from solvers.soc.subdomains import Subdomains
 from solvers.soc.subgraph import Subgraph
 
@@ -67,6 +76,50 @@ def one_robot(graph: PoseGraph, seed: int) -> Partition:
 
 PARTITIONERS = st.sampled_from([contiguous, metis, scattered, singletons, one_robot])
 BACKENDS = st.sampled_from(list(CholeskyBackend))
+NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
+
+
+class Split(NamedTuple):
+    """A problem, and the robots that share it."""
+
+    problem: PGOProblem
+    parts: Partition
+    seed: int
+
+
+def split(
+    seed: int,
+    n: int,
+    d: int,
+    noise: NoiseModel,
+    partitioner: Partitioner,
+    backend: CholeskyBackend,
+) -> Split:
+    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    return Split(problem, partitioner(problem.graph, seed), seed)
+
+
+SPLITS = st.builds(
+    split,
+    seed=SEEDS,
+    n=st.integers(2, 20),
+    d=DIMENSIONS,
+    noise=NOISES,
+    partitioner=PARTITIONERS,
+    backend=BACKENDS,
+)
+# Rules of the penalty: for the second anything counts as stalled after three steps.
+RULES = st.sampled_from(
+    [
+        MultiplierPenalty(),
+        MultiplierPenalty(stall_window=3, stall_ratio=1e-6),
+        BalancedPenalty(),
+        BalancedPenalty(scale=30.0),
+    ]
+)
+ACCELERATIONS = st.sampled_from(
+    [None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]
+)
 
 
 def _number(graph: PoseGraph, seed: int) -> int:

@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph
+from graphs import DIMENSIONS, LOUD_NOISE, SEEDS, varied_graph
 from hypothesis import given, settings, strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at
+from robots import BACKENDS, PARTITIONERS, SPLITS, Partitioner, Split, corner_cases, driver_at
 
 from pgo_models import (
-    NoiseModel,
     PGOProblem,
     PoseGraph,
     Poses,
@@ -28,7 +27,6 @@ from solvers.robots.driver import collect
 from solvers.robots.proof import best_bound_distributed, prove_with_eta
 
 SIZES = st.integers(2, 20)
-NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 
 
 def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> None:
@@ -55,28 +53,16 @@ def check_certificate(problem: PGOProblem, parts: Partition, poses: Poses) -> No
 
 @settings(max_examples=examples(40))
 @given(
-    seed=SEEDS,
-    n=SIZES,
-    d=DIMENSIONS,
-    noise=NOISES,
-    partitioner=PARTITIONERS,
-    backend=BACKENDS,
+    split=SPLITS,
     polished=st.booleans(),
 )
 def test_the_bound_is_the_central_one_at_any_poses(
-    seed: int,
-    n: int,
-    d: int,
-    noise: NoiseModel,
-    partitioner: Partitioner,
-    backend: CholeskyBackend,
+    split: Split,
     polished: bool,
 ) -> None:
-    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    problem, parts, _ = split
     start = chordal_start(problem)
-    check_certificate(
-        problem, partitioner(problem.graph, seed), polish(problem, start) if polished else start
-    )
+    check_certificate(problem, parts, polish(problem, start) if polished else start)
 
 
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)

@@ -6,13 +6,16 @@ from itertools import islice
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
+from graphs import DIMENSIONS, SEEDS, varied_problem
 from hypothesis import example, given, settings, strategies as st
 from robots import (
-    BACKENDS,
+    ACCELERATIONS,
     PARTITIONERS,
+    RULES,
+    SPLITS,
     Partitioner,
     Recording,
+    Split,
     corner_cases,
     driver_at,
     metis,
@@ -21,7 +24,6 @@ from robots import (
 )
 
 from pgo_models import (
-    NoiseModel,
     PartitionMethod,
     PGOProblem,
     PoseGraph,
@@ -32,12 +34,9 @@ from pgo_models import (
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.cholesky import CholeskyBackend
 from solvers import (
     SOC,
-    BalancedPenalty,
     Coupling,
-    MultiplierPenalty,
     Pipeline,
     Robots,
     RStep,
@@ -56,11 +55,8 @@ from solvers.soc.penalty import PenaltyRule
 from solvers.soc.recursion_block import RecursionBlock
 
 SIZES = st.integers(2, 20)
-NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 CONVERGED = 1e-8  # only rounding is left
 SAME = 1e-7
-# anything counts as stalled after three steps
-STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)
 
 
 def check_state(expected: ConsensusState, other: ConsensusState, engine: Recording) -> None:
@@ -114,37 +110,22 @@ def check_end(problem: PGOProblem, last: ConsensusState, driver: Driver) -> None
 
 @settings(max_examples=examples(25))
 @given(
-    seed=SEEDS,
-    n=SIZES,
-    d=DIMENSIONS,
-    noise=NOISES,
-    partitioner=PARTITIONERS,
-    backend=BACKENDS,
-    rule=st.sampled_from(
-        [MultiplierPenalty(), STALLED, BalancedPenalty(), BalancedPenalty(scale=30.0)]
-    ),
+    split=SPLITS,
+    rule=RULES,
     alpha=st.sampled_from([1.0, 1.6]),
-    acceleration=st.sampled_from(
-        [None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]
-    ),
+    acceleration=ACCELERATIONS,
     local_passes=st.sampled_from([1, 10]),
     penalties=st.sampled_from([(None, None), (0.1, None), (None, 0.5), (0.02, 0.0)]),
 )
 def test_the_iterates_are_those_of_one_place(
-    seed: int,
-    n: int,
-    d: int,
-    noise: NoiseModel,
-    partitioner: Partitioner,
-    backend: CholeskyBackend,
+    split: Split,
     rule: PenaltyRule,
     alpha: float,
     acceleration: Anderson | None,
     local_passes: int,
     penalties: tuple[float | None, float | None],
 ) -> None:
-    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
-    parts = partitioner(problem.graph, seed)
+    problem, parts, _ = split
     translation_penalty, separator_penalty = penalties
     soc = SOC(
         robots=parts,

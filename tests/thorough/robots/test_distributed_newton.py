@@ -7,29 +7,21 @@ import numpy as np
 import pytest
 from budget import examples
 from graphs import (
-    DIMENSIONS,
     LOUD_NOISE,
-    MILD_NOISE,
-    SEEDS,
     random_poses,
-    varied_graph,
     varied_problem,
 )
 from hypothesis import given, settings, strategies as st
-from robots import BACKENDS, PARTITIONERS, Partitioner, corner_cases, driver_at, metis
+from robots import SPLITS, Split, corner_cases, driver_at, metis
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses, chordal_start
+from pgo_models import PGOProblem, PoseGraph, Poses, chordal_start
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers import Newton, Status, iterate, run
 from solvers.robots.driver import collect
 from solvers.robots.newton import SubstructuredNewton
-
-SIZES = st.integers(2, 20)
-NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 
 
 def near(problem: PGOProblem, seed: int, spread: float) -> Poses:
@@ -63,28 +55,18 @@ def check(problem: PGOProblem, parts: Partition, start: Poses, newton: Newton, s
 
 @settings(max_examples=examples(30))
 @given(
-    seed=SEEDS,
-    n=SIZES,
-    d=DIMENSIONS,
-    noise=NOISES,
-    partitioner=PARTITIONERS,
-    backend=BACKENDS,
+    split=SPLITS,
     second_order=st.booleans(),
     spread=st.sampled_from([0.0, 0.05, 0.5]),
 )
 def test_the_steps_are_the_central_ones(
-    seed: int,
-    n: int,
-    d: int,
-    noise: NoiseModel,
-    partitioner: Partitioner,
-    backend: CholeskyBackend,
+    split: Split,
     second_order: bool,
     spread: float,
 ) -> None:
-    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
+    problem, parts, seed = split
     newton = Newton(second_order=second_order)
-    check(problem, partitioner(problem.graph, seed), near(problem, seed, spread), newton, 5)
+    check(problem, parts, near(problem, seed, spread), newton, 5)
 
 
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)

@@ -5,32 +5,28 @@ from itertools import islice
 import numpy as np
 import pytest
 from budget import examples
-from graphs import DIMENSIONS, LOUD_NOISE, MILD_NOISE, SEEDS, varied_graph, varied_problem
+from graphs import varied_problem
 from hypothesis import given, settings, strategies as st
 from robots import (
-    BACKENDS,
-    PARTITIONERS,
-    Partitioner,
+    ACCELERATIONS,
+    RULES,
+    SPLITS,
+    Split,
     corner_cases,
     driver_at,
     metis,
 )
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, chordal_start
+from pgo_models import PGOProblem, PoseGraph, chordal_start
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.cholesky import CholeskyBackend
-from solvers import SOC, BalancedPenalty, Coupling, MultiplierPenalty, Status, iterate, run
+from solvers import SOC, Coupling, Status, iterate, run
 from solvers.robots.driver import Driver, collect
 from solvers.robots.soc import SubstructuredSOC, SubstructuredState
 from solvers.soc.anderson import Anderson
 from solvers.soc.joint import SOCState
 from solvers.soc.penalty import PenaltyRule
 
-SIZES = st.integers(2, 20)
-NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE])
 CONVERGED = 1e-8
-# anything counts as stalled after three steps
-STALLED = MultiplierPenalty(stall_window=3, stall_ratio=1e-6)
 
 
 def pairs(
@@ -86,34 +82,19 @@ def check(problem: PGOProblem, parts: Partition, soc: SOC, steps: int) -> tuple[
 
 @settings(max_examples=examples(40))
 @given(
-    seed=SEEDS,
-    n=SIZES,
-    d=DIMENSIONS,
-    noise=NOISES,
-    partitioner=PARTITIONERS,
-    backend=BACKENDS,
-    rule=st.sampled_from(
-        [MultiplierPenalty(), STALLED, BalancedPenalty(), BalancedPenalty(scale=30.0)]
-    ),
+    split=SPLITS,
+    rule=RULES,
     alpha=st.sampled_from([1.0, 1.6]),
-    acceleration=st.sampled_from(
-        [None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]
-    ),
+    acceleration=ACCELERATIONS,
 )
 def test_the_iterates_are_those_of_joint(
-    seed: int,
-    n: int,
-    d: int,
-    noise: NoiseModel,
-    partitioner: Partitioner,
-    backend: CholeskyBackend,
+    split: Split,
     rule: PenaltyRule,
     alpha: float,
     acceleration: Anderson | None,
 ) -> None:
-    problem = PGOProblem(varied_graph(seed, n, d, noise), backend)
     soc = SOC(coupling=Coupling.JOINT, penalty=rule, alpha=alpha, acceleration=acceleration)
-    check(problem, partitioner(problem.graph, seed), soc, 10)
+    check(split.problem, split.parts, soc, 10)
 
 
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
