@@ -412,11 +412,16 @@ def smallest_eigenvalues(blocks: Array) -> Array:
 
 
 def condition(blocks: Array) -> Array:
-    """Largest over smallest eigenvalue, (m,), of definite blocks (m, k, k); 1 of zero blocks."""
+    """Largest over smallest eigenvalue, (m,), of blocks (m, k, k); 1 of zero blocks.
+
+    It is inf of blocks that do not measure every direction.
+    """
     values = np.linalg.eigvalsh(filled(blocks))
-    smallest = values[:, 0]
+    smallest = np.where(are_singular(blocks), 0.0, values[:, 0])
     largest = values[:, -1]
-    return np.asarray(largest / smallest)
+    ratio = np.full(len(blocks), np.inf)
+    np.divide(largest, smallest, out=ratio, where=smallest > 0.0)
+    return ratio
 
 
 def filled(A: Array) -> Array:

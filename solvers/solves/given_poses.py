@@ -114,10 +114,13 @@ def certify(
     problem = as_problem(problem)
     check_poses(problem.graph, given)
     poses = problem.graph.completed(given)  # a landmark has no rotation of its own
-    if problem.graph.has_far_priors:
-        near = problem.graph.near_zero(poses)
-        return judge(problem, poses, _certificate_near(problem, near, gap))
-    return _certificate_near(problem, poses, gap)
+    near = problem.graph.near_zero(poses)
+    certificate = _certificate_near(problem, near, gap)
+    # What nothing measures costs nothing, wherever the poses given are.
+    measured = problem.measured
+    if measured is problem and not problem.graph.has_far_priors:
+        return certificate
+    return judge(measured, poses, certificate)
 
 
 def certify_to_digits(

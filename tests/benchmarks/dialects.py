@@ -170,6 +170,9 @@ def exported_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, li
     key = 103 << 56
     robots = changed(space, lambda words: named_by_labels(words, key), "")
     yield "labeled_symbols", robots
+    edges = [line.split()[1:] for line in plane if line.startswith("EDGE")]
+    header = "i,j,x,y,theta,xx,xy,xt,yy,yt,tt"
+    yield "table", [header, *(",".join(words) for words in edges)]
     yield "rotation_first", changed(space, with_rotation_first)
     yield (
         "reversed_rotation_first",

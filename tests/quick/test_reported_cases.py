@@ -257,6 +257,25 @@ def test_a_bound_with_free_directions_is_proven_of_the_file(
     assert "VERIFIED: no poses" in out
 
 
+@pytest.mark.parametrize("name", ["a3_gravity_only", "a6_compass_2d", "a1_gps_xy_only"])
+def test_a_shift_that_nothing_measures_costs_nothing(
+    name: str, pgo_command: Call, tmp_path: Path
+) -> None:
+    solved(pgo_command, name, "--out", tmp_path / "map.g2o")
+    lines = []
+    for line in (tmp_path / "map.g2o").read_text().splitlines():
+        tag, *words = line.split()
+        if tag.startswith("VERTEX"):
+            axis = 1 if len(words) == 4 else 3  # x in the plane, the height in space
+            words[axis] = repr(float(words[axis]) + 5.0)
+        lines.append(" ".join([tag, *words]))
+    (tmp_path / "moved.g2o").write_text("\n".join(lines))
+    case = CASES / f"{name}.g2o"
+    code, out, _ = pgo_command("certify", case, "--estimate", tmp_path / "moved.g2o")
+    assert code == 0, out
+    assert "CERTIFIED" in out
+
+
 @pytest.mark.parametrize(
     ("name", "infinite"),
     [
