@@ -36,6 +36,10 @@ from pgo_models.problem.weighting import (
     own_weighting,
 )
 
+# Share of the largest entries that is added where a matrix may be singular because edges do not
+# measure every direction. It shortens steps along these directions, and hardly any other.
+LEAST_STIFFNESS = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class PGOProblem(ReadOnly):
@@ -143,7 +147,13 @@ class PGOProblem(ReadOnly):
     @property
     def has_free_directions(self) -> bool:
         """Whether nothing may measure some direction of the map."""
-        return bool(self.graph.free) or bool(partial_edges(self.graph).any())
+        return bool(self.graph.free) or self.has_partial_edges
+
+    @cached_property
+    def has_partial_edges(self) -> bool:
+        """Whether chi2 has edges that do not measure every direction."""
+        is_chi2 = self.weighting is Weighting.INFORMATION or self.weights.is_chi2
+        return is_chi2 and bool(partial_edges(self.graph).any())
 
     @property
     def measured(self) -> "PGOProblem":
@@ -505,6 +515,11 @@ class PGOProblem(ReadOnly):
         of_edges = self.weights.translation_matrices(poses.R[self.graph.i])
         if of_edges is None:
             return None
+        if self.has_partial_edges:
+            # No direction may be left open, in which rounding would move poses far away.
+            traces = np.einsum("mkk->m", of_edges)
+            least = LEAST_STIFFNESS * float(traces.max()) * np.eye(self.d)
+            of_edges = of_edges + least
         return self._translation_laplacian.factorize(of_edges)
 
     @cached_property

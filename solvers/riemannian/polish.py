@@ -25,7 +25,7 @@ from pgo_models.problem.hessian import (
     tangent_order,
 )
 from pgo_models.problem.matrices import inner
-from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
+from pgo_models.problem.problem import LEAST_STIFFNESS, EvaluatedPoses, PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.riemannian.newton_step import (
     ModelOrder,
@@ -206,6 +206,10 @@ class CentralAlgebra:
                 Lambda = Lambda - order.eta * np.eye(problem.d)
         matrix = riemannian_hessian(here, Lambda)
         ground_pose(matrix, problem)
+        if problem.has_partial_edges:
+            diagonal = matrix.diagonal()
+            sizes = np.maximum(np.abs(diagonal), np.median(np.abs(diagonal)))
+            matrix.setdiag(diagonal + LEAST_STIFFNESS * sizes)
         if order.damping:
             matrix.setdiag(matrix.diagonal() * (1.0 + order.damping))
         return matrix

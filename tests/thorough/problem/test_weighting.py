@@ -15,7 +15,7 @@ from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.precisions import are_definite, isotropic_information
 from pgo_models.problem.costs import TangentCost
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
-from solvers import polish
+from solvers import certify, polish
 
 COUPLED = st.booleans()
 
@@ -218,3 +218,25 @@ def test_a_factor_for_the_translations_serves_nearly_the_same_rotations(
     nearly = problem.at_best_translations(turned, factor)
     lost = np.linalg.norm(turned.t - settled.t)
     assert 0.0 < np.linalg.norm(nearly.t - settled.t) <= 1e-2 * lost
+
+
+@pytest.mark.filterwarnings("ignore:a search for a better bound failed")
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_directions_without_information_leave_costs_positive_and_poses_near(
+    d: int, seed: int
+) -> None:
+    """Every edge measures all but one direction, a translation in an oblique axis."""
+    graph = informed(seed, 8, d, coupled=False)
+    rng = np.random.default_rng(seed)
+    information = graph.information.copy()  # type: ignore[union-attr]
+    for matrix in information:
+        axis = rng.standard_normal(d)
+        across = np.eye(d) - np.outer(axis, axis) / (axis @ axis)
+        matrix[:d, :d] = across @ matrix[:d, :d] @ across
+    problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+    poses = polish(problem, chordal_start(problem.convex_part))
+    assert (problem.edge_costs(poses) >= -1e-9).all()
+    assert np.abs(poses.t).max() < 1e3 * np.abs(graph.t_ij).max()
+    certificate = certify(problem, poses)
+    assert certificate.lower_bound <= problem.objective(poses) * (1 + 1e-12)
