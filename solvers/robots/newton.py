@@ -105,9 +105,10 @@ class CoverTrial:
 
 @dataclass(frozen=True)
 class EliminatedAlgebra:
-    """`newton_step.NewtonAlgebra` by driver and robots: two rounds a factorisation.
+    """`newton_step.NewtonAlgebra` by driver and robots.
 
-    A move takes two rounds, or one if it `is_straight`.
+    A factorisation goes along with the round of the move after it. A move takes two rounds, or one
+    if it `is_straight`.
     """
 
     driver: Driver

@@ -3,7 +3,7 @@
 Orders are functions of an `Interior` and a request. They leave it as it is, and return the interior
 after the order, and the answer. Requests and answers are arrays on the poses that the driver solves
 for, sums, and the two numbers per pose from which the penalty's quantile is taken. Interior poses
-and edges leave the robot when the result is collected, and not before.
+leave the robot in snapshots and when the result is collected; edges between them never leave it.
 `solvers.robots.driver` follows a whole solve, round by round.
 """
 

@@ -256,7 +256,7 @@ class PlaceOfRobots(Place):
         driver.choose_cost(final=True)
         seconds = time.perf_counter() - began
         name = type(soc).__name__
-        if driver.is_final:
+        if driver.has_two_costs:
             name = f"{name}, convex"
         self._add_stage(name, replace(finished, seconds=seconds), soc)
         if self.faults is None:
@@ -286,6 +286,7 @@ class PlaceOfRobots(Place):
         driver = self.driver
         driver.choose_cost(final=True)  # again, where a checkpoint is from before
         finished = self.journal.run(SubstructuredNewton(newton), driver, self.monitor)
+        driver.return_to(finished.state.moment)  # the best iterate, where the run was broken off
         self._add_stage("Newton", finished, newton)
         return replace(attempt, status=finished.status, decrement=finished.state.decrement)
 

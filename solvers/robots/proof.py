@@ -82,8 +82,17 @@ def best_bound_distributed(
     if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
         return central.NO_BOUND  # the poses are exact
     driver.release_newton()
+    diagonal = driver.diagonal
     if driver.is_final:
         driver.describe(Count.PIGGYBACKED)
+    try:
+        return _best_form(driver, gap, most_lost)
+    finally:
+        driver.diagonal = diagonal  # of the cost that SOC has, which may run again
+
+
+def _best_form(driver: Driver, gap: float, most_lost: float | None) -> LowerBound:
+    """The bound of the form without eta, with terms, or with the smallest eta that is found."""
     has_scale = bool((driver.diagonal > 0.0).all())
     grounded = prove_grounded(driver, 0.0) if has_scale else None
     if grounded is not None and grounded.value > 0.0:
@@ -239,7 +248,7 @@ class CoverProof:
 def _moved(
     driver: Driver, proof: InterfaceProof, free: Array, point: CoverProof
 ) -> tuple[CoverProof, float]:
-    """Proof at X - S_r^-1 S X, and the gain: two rounds."""
+    """Proof at X - S_r^-1 S X, and the gain: one round."""
     g = len(driver.cover)
     product_on_cover = np.where(
         free[:, None], point.sums.product, 0.0
