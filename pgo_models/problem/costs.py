@@ -141,13 +141,13 @@ class EdgeCost(EdgeArrays):
         """W, (m, d, d)."""
         return self.W[:, None, None] * np.eye(self.d) if self.is_isotropic else self.W
 
-    @property
+    @cached_property
     def W_norm(self) -> Array:
         """Bound on the spectral norm of the exact W, (m,)."""
         sizes = np.abs(self.kappa)
         return np.asarray((sizes if self.is_isotropic else sizes.max(axis=1)) + self.W_error)
 
-    @property
+    @cached_property
     def is_convex(self) -> bool:
         """Whether W is positive definite on every edge where it is not zero.
 
