@@ -109,6 +109,9 @@ def partial_edges(graph: PoseGraph) -> BoolArray:
     if graph.information is None:
         return np.zeros(graph.num_edges, dtype=bool)
     d = graph.d
+    is_partial = ~are_definite(graph.information, LEAST_SCALED)
+    if not is_partial.any():  # as of most graphs
+        return is_partial
     of_translations = are_singular(graph.information[:, :d, :d])
     of_rotations = are_singular(graph.information[:, d:, d:])
     is_partial = of_translations | of_rotations
@@ -513,6 +516,8 @@ def _semidefinite(information: Array, d: int) -> tuple[Array, BoolArray]:
     Of matrices without a coupling block the two blocks are judged, of which one may be zero.
     """
     is_indefinite = np.zeros(len(information), dtype=bool)
+    if are_definite(information, LEAST_SCALED).all():  # as of most graphs
+        return information, is_indefinite
     is_coupled = information[:, :d, d:].any(axis=(1, 2))
     coupled = np.flatnonzero(is_coupled)
     is_definite = are_definite(information[coupled], LEAST_SCALED)

@@ -255,6 +255,13 @@ class EdgeCost(EdgeArrays):
         """
         return None
 
+    def translation_gradients(self, point: EdgePoint) -> Array:
+        """Half the gradient of every edge in t_j, (m, d), which is minus that in t_i.
+
+        A step of the translations alone takes no other part of the gradient.
+        """
+        return self.tau[:, None] * point.delta[:, 0]
+
     # Blocks of M.
 
     def seen_offsets(self, t_ij: Array) -> Array:
@@ -510,6 +517,13 @@ class ExcessCost(EdgeCost):
     def translation_matrices(self, R_i: Array) -> Array:
         """The matrices R_i (J_tt + tau I) R_i^T, (m, d, d)."""
         return np.asarray(R_i @ self._frame_information @ np.swapaxes(R_i, 1, 2))
+
+    def translation_gradients(self, point: EdgePoint) -> Array:
+        """Half gradient tau delta_t + R_i (J u)_t of every edge in t_j, (m, d)."""
+        u = self.excess.argument(point.Z)
+        J_u_t = np.einsum("mab,mb->ma", self.excess.J[:, : self.d], u)
+        of_excess = np.einsum("mab,mb->ma", point.R_i, J_u_t)
+        return np.asarray(super().translation_gradients(point) + of_excess)
 
     def added_curvatures(self, R_i: Array, R_j: Array, difference: Array) -> Sequence[Array]:
         """The Gauss-Newton matrix of the excess.

@@ -552,7 +552,8 @@ class PGOProblem(ReadOnly):
         if factor is None:
             factor = self.translation_factor(poses)
         assert factor is not None  # the cost is not quadratic
-        half_gradient = self.at(poses).half_gradient[: self.num_poses]
+        of_edges = self.weights.translation_gradients(self.at(poses).point)
+        half_gradient = self.incidence.ends @ of_edges - self.incidence.begins @ of_edges
         step = factor.solve(half_gradient.ravel()).reshape(-1, self.d)
         return poses.with_translations(poses.t - (step - step[0]))
 
