@@ -34,7 +34,8 @@ _EXPORTED_BY = {
     "write its constraints as lines of g2o",
     ".pyfg": "a factor graph of PyFG; read it with py_factor_graph (read_from_pyfg_text), and "
     "write its measurements as lines of g2o",
-    ".db": "a data base, as of RTAB-Map; rtabmap-export --poses_format 4 writes g2o: give that",
+    ".db": "a data base, as of RTAB-Map; rtabmap-export --poses --poses_format 4 "
+    "writes g2o: give that",
 }
 
 
