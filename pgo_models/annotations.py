@@ -87,7 +87,8 @@ class _LoadedClasses(Mapping[str, object]):
         self._names = names
 
     def __getitem__(self, name: str) -> object:
-        if name in self._names or hasattr(builtins, name):
+        # No class has a name like those that a debugger or pytest asks a frame for.
+        if name in self._names or hasattr(builtins, name) or name.startswith("__"):
             raise KeyError(name)
         for module_name, module in tuple(sys.modules.items()):
             if module_name.startswith(_PACKAGES) and isinstance(vars(module).get(name), type):
