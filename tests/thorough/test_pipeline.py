@@ -178,7 +178,7 @@ def test_a_disconnected_graph_is_refused_with_its_components_named():
         ),
         (
             lambda problem: solvers.certify(problem, problem.graph.truth.R),
-            r"poses must be Poses .*, got an array of shape \(27, 3, 3\) .*; give Poses\(R, t\), or",
+            r"poses must be Poses .*, got an array of shape \(27, 3, 3\).*; give Poses\(R, t\), or",
         ),
         (
             lambda problem: solvers.solve(problem, start=problem.graph.truth.R),
