@@ -74,6 +74,7 @@ def of_convex_problems() -> Iterator[object]:
         yield solvers.run(method, constrained)
     best = solvers.solve_orthogonal(on_circle, 0)
     yield from (constrained, on_circle, on_circle.terms[0], best, best.kkt, best.outcome.state)
+    yield from (pgo.quadratic_form(on_circle), best.certificate)
 
 
 @pytest.fixture(scope="module")
