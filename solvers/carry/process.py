@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
@@ -144,16 +143,24 @@ def restarted(engine: Engine | None, run: Callable[[], T]) -> T:
     """Return the result of a run on an engine; the run begins again where it has lost robots.
 
     All robots start again from their parts: what a run keeps for itself, say in a checkpoint, saves
-    it steps. Raises an EngineError when robots are lost once more than `most_restarts`.
+    it steps. Raises an EngineError when robots are lost once more than `most_restarts`, or cannot
+    start again.
     """
     num_restarts = most_restarts(engine)
-    for _ in range(num_restarts):
-        with suppress(RobotLostError):
+    lost: RobotLostError | None = None
+    for _ in range(num_restarts + 1):
+        try:
             return run()
-    try:
-        return run()
-    except RobotLostError as error:
-        raise EngineError(
-            f"robots were lost {num_restarts + 1} times, the last time as {error}; "
-            "look at the memory of their machines, or run in this process"
-        ) from error
+        except RobotLostError as error:
+            lost = error
+        except EngineError as error:
+            if lost is None:
+                raise
+            raise EngineError(
+                f"robots were lost ({lost}) and cannot start again: {error}; "
+                "a run with --resume FILE goes on from its last checkpoint"
+            ) from error
+    raise EngineError(
+        f"robots were lost {num_restarts + 1} times, the last time as {lost}; "
+        "look at the memory of their machines, or run in this process"
+    ) from lost

@@ -148,8 +148,7 @@ def test_a_cluster_that_refuses_and_one_that_dies_are_one_line_each(head, tmp_pa
         solving.kill()
         solving.communicate()
     assert (solving.returncode, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith("pgo: the Ray cluster at ")
-    assert err.endswith(
-        "solve again when there is one: a run with --resume FILE goes on from its last checkpoint\n"
-    )
+    # The actors are gone before the cluster or after it.
+    assert err.startswith(("pgo: the Ray cluster at ", "pgo: robots were lost (the actor is gone"))
+    assert err.endswith("a run with --resume FILE goes on from its last checkpoint\n")
     assert path.exists()

@@ -106,3 +106,17 @@ def test_robots_that_are_lost_again_and_again_end_the_solve() -> None:
     ):
         solvers.solve(graph, robots=solvers.Robots(3, engine))
     assert engine.num_opened == engine.num_closed == 3
+
+
+def test_robots_that_cannot_start_again_end_the_solve_with_the_way_on() -> None:
+    class Gone(Leaky):
+        def open(self, make: Callable[[Any], Any], parts: Sequence[Any]) -> WorkerPool:
+            if self.num_opened:
+                raise EngineError("no cluster answers")
+            return super().open(make, parts)
+
+    with pytest.raises(
+        EngineError,
+        match=r"lost \(gone\) and cannot start again: no cluster answers; a run with --resume FILE",
+    ):
+        solvers.solve(varied_graph(4, 30, 2), robots=solvers.Robots(3, Gone([5])))
