@@ -474,7 +474,7 @@ def test_files_that_are_no_text_of_measurements_are_named(
     (tmp_path / "map.db").write_text("SQLite format 3")
     code, _, err = pgo_command("solve", tmp_path / "map.db")
     assert code == 1
-    assert "rtabmap-export --poses_format 4" in err
+    assert "rtabmap-export --poses --poses_format 4" in err
 
 
 @pytest.mark.filterwarnings("ignore:.*negative eigenvalues are taken for zero")
