@@ -18,7 +18,7 @@ from pgo_models.files import replace_when_done
 from pgo_models.geometry.arrays import inner_products
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information, middle_pose
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, matrices_of_edges, middle_pose
 from pgo_models.graphs.precisions import are_singular, edge_precisions, partial_edges
 from pgo_models.problem.costs import ExcessCost
 from pgo_models.problem.excess import CoupledExcess
@@ -206,7 +206,7 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
     if J_ss is not None and graph.d == 3:
         J_ss = np.swapaxes(graph.R_ij, 1, 2) @ J_ss @ graph.R_ij
         # Axes about which nothing is measured: the turn back has left rounding in their rows.
-        is_empty: BoolArray = np.all(_information_of(graph)[:, 3:] == 0.0, axis=2)
+        is_empty: BoolArray = np.all(matrices_of_edges(graph)[:, 3:] == 0.0, axis=2)
         J_ss[is_empty[:, :, None] | is_empty[:, None, :]] = 0.0
     rows: list[dict[str, object]] = []
     for e in range(graph.num_edges):
@@ -289,18 +289,11 @@ def _claimed_bound(problem: PGOProblem, certificate: Certificate, proven: _Prove
     return max(claimed, 0.0)
 
 
-def _information_of(graph: PoseGraph) -> Array:
-    """Information matrices of the edges, isotropic where the graph has none."""
-    if graph.information is None:
-        return isotropic_information(graph.kappa, graph.tau, graph.d)
-    return graph.information
-
-
 def _sizes_of_weights(problem: PGOProblem, poses: Poses) -> float:
     """Sum of tr(I_tt) ||r||^2 + tr(I_rr) 2 (1 - cos theta) over the edges."""
     graph = problem.graph
     d = graph.d
-    diagonals = np.einsum("mkk->mk", _information_of(graph))
+    diagonals = np.einsum("mkk->mk", matrices_of_edges(graph))
     poses = problem.seen_poses(poses)
     R_i = poses.R[graph.i]
     turned_offsets = np.einsum("mab,mb->ma", R_i, graph.t_ij)
@@ -338,7 +331,7 @@ def _check_conventions(graph: PoseGraph) -> None:
     if graph.unheld is None:
         return
     d = graph.d
-    information = _information_of(graph)
+    information = matrices_of_edges(graph)
     is_prior = graph.is_prior
     changed = (information != graph.unheld).any(axis=(1, 2))
     is_single = is_prior.sum() == 1 and not (changed & ~is_prior).any()

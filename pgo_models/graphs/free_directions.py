@@ -15,11 +15,15 @@ the file. There are four kinds:
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, isotropic_information
+from pgo_models.graphs.bridges import unchecked_bridges
+from pgo_models.graphs.pose_graph import (
+    IntArray,
+    PoseGraph,
+    isotropic_information,
+    matrices_of_edges,
+)
 from pgo_models.graphs.precisions import edge_precisions, partial_edges
 
 _AXES = "xyz"
@@ -203,7 +207,9 @@ def _with_rest_of_estimate(held: PoseGraph, graph: PoseGraph, prior: int) -> Pos
 
 def _with_bridges_held(graph: PoseGraph, partial: BoolArray) -> PoseGraph:
     """The graph with all of a measurement held where it alone joins two parts."""
-    held = partial_bridges(graph, partial)
+    # An edge that measures all of a pose holds its ends together.
+    everything = np.ones(graph.num_edges, dtype=bool)
+    held = np.flatnonzero(unchecked_bridges(graph, ~partial, everything))
     # The world of a single prior is placed as a whole, and positions alone turn no pose.
     held = held[~graph.is_prior[held] & ~np.isin(graph.j[held], graph.landmarks)]
     if not len(held):
@@ -220,43 +226,6 @@ def _with_bridges_held(graph: PoseGraph, partial: BoolArray) -> PoseGraph:
         f"it: {names}"
     )
     return _with_information(graph, held, information, text)
-
-
-def partial_bridges(graph: PoseGraph, partial: BoolArray) -> IntArray:
-    """Those of the chosen edges, (m,), that no cycle of the graph goes through, ascending."""
-    n = graph.num_poses
-    links: IntArray = np.flatnonzero(partial)
-    rest = csr_array(
-        (np.ones(graph.num_edges - len(links)), (graph.i[~partial], graph.j[~partial])),
-        shape=(n, n),
-    )
-    num_parts, label = connected_components(rest, directed=False)
-    part = np.asarray(label)
-    ends = np.sort(np.stack([part[graph.i[links]], part[graph.j[links]]]), axis=0)
-    between = ends[0] != ends[1]
-    links = np.asarray(links[between])
-    if not len(links):
-        return links
-    keys: Array = ends[0, between].astype(np.int64) * num_parts + ends[1, between]
-    distinct, number, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    pairs: Array = np.stack([distinct // num_parts, distinct % num_parts])
-    shape = (int(num_parts), int(num_parts))
-    tree = csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), shape=shape)
-    order, predecessors = breadth_first_order(tree, 0, directed=False)
-    parent = np.asarray(predecessors)
-    # Every pair that is not in the tree gets a random label, which both ends have. The labels below
-    # an edge of the tree cancel if no other pair leads out.
-    is_branch = (parent[pairs[0]] == pairs[1]) | (parent[pairs[1]] == pairs[0])
-    labels = np.asarray(np.random.default_rng(0).integers(1, 2**62, size=pairs.shape[1]))
-    below = np.zeros(num_parts, dtype=np.int64)
-    others = np.flatnonzero(~is_branch)
-    for row in range(2):
-        np.bitwise_xor.at(below, pairs[row, others], labels[others])
-    for node in order[:0:-1].tolist():
-        below[parent[node]] ^= below[node]
-    child = np.where(parent[pairs[1]] == pairs[0], pairs[1], pairs[0])
-    is_bridge = is_branch & (counts == 1) & (below[child] == 0)
-    return np.asarray(links[is_bridge[number.ravel()]])
 
 
 def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:
@@ -285,10 +254,7 @@ def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:
     added[0, free_shifts, free_shifts] = usual[0, free_shifts, free_shifts]
     added[0, d + free_turns, d + free_turns] = usual[0, d + free_turns, d + free_turns]
     edge = priors[[place]]
-    if graph.information is None:
-        before = isotropic_information(graph.kappa[edge], graph.tau[edge], d)
-    else:
-        before = graph.information[edge]
+    before = matrices_of_edges(graph)[edge]
     pose = graph.pose_name(int(graph.j[edge[0]]))
     text = _text_of_frame(d, free_shifts, free_turns, pose)
     held = _with_information(graph, edge, before + added, text, is_of_F=False)
@@ -303,10 +269,7 @@ def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:
 def _frame_of(graph: PoseGraph, priors: IntArray) -> _Frame:
     """The priors with their matrices, and the axes that they have in common with the world."""
     d = graph.d
-    information = graph.information
-    if information is None:
-        information = isotropic_information(graph.kappa, graph.tau, d)
-    matrices = information[priors]
+    matrices = matrices_of_edges(graph)[priors]
     R = graph.R_ij[priors]
     identity = np.eye(d)
     keeps_axis = (identity == R).all(axis=2) & (identity == R).all(axis=1)
@@ -360,9 +323,5 @@ def _with_information(
         matrices = matrices.copy()
         matrices[edges] = information
     free = f"{graph.free}; {text}" if graph.free else text
-    unheld = graph.unheld
-    if unheld is None:
-        unheld = graph.information
-    if unheld is None:
-        unheld = isotropic_information(graph.kappa, graph.tau, graph.d)
+    unheld = graph.unheld if graph.unheld is not None else matrices_of_edges(graph)
     return replace(graph, kappa=kappa, tau=tau, information=matrices, free=free, unheld=unheld)

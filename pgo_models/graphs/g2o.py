@@ -38,7 +38,7 @@ from pgo_models.graphs.g2o_rows import (
 from pgo_models.graphs.g2o_tags import G2O_TAGS, Tag
 from pgo_models.graphs.missing_poses import with_missing_poses
 from pgo_models.graphs.origin import far_middle, shifted_exactly
-from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, isotropic_information
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, matrices_of_edges
 from pgo_models.graphs.precisions import (
     RotationWeight,
     edge_precisions,
@@ -867,9 +867,7 @@ def _vertex_lines(graph: PoseGraph, poses: Poses, mine: BoolArray) -> Iterator[s
 def _edge_lines(graph: PoseGraph, edges: BoolArray) -> Iterator[str]:
     """EDGE lines of some edges, (m,)."""
     d = graph.d
-    information = graph.information
-    if information is None:
-        information = isotropic_information(graph.kappa, graph.tau, d)
+    information = matrices_of_edges(graph)
     to_landmark = np.isin(graph.j, graph.landmarks)
     # The line of a position prior has no rotation, and is read as R_ij = I with kappa = 0. A prior
     # with another R_ij, whose information is in that frame, is therefore written with a rotation.

@@ -1231,6 +1231,13 @@ def isotropic_information(kappa: Array, tau: Array, d: int) -> Array:
     return np.asarray(rows[:, :, None] * identity)
 
 
+def matrices_of_edges(graph: PoseGraph) -> Array:
+    """Information matrices of the edges, (m, k, k), isotropic where the graph has none."""
+    if graph.information is None:
+        return isotropic_information(graph.kappa, graph.tau, graph.d)
+    return graph.information
+
+
 def has_no_gap(robot: IntArray) -> bool:
     """Whether the robots are numbered 0, 1, .. and every one owns a pose."""
     if not len(robot) or robot.min() != 0 or robot.max() >= len(robot):

@@ -11,7 +11,7 @@ import numpy as np
 
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges, isotropic_information
+from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges, matrices_of_edges
 
 # Bounds on eigenvalues of a matrix that is scaled to ones on its diagonal. An eigenvalue above the
 # first counts as positive. One below the second is negative beyond all rounding, also that of the
@@ -252,7 +252,7 @@ def indefinite_edges(graph: PoseGraph) -> BoolArray:
     >>> from dataclasses import replace
     >>> from pgo_models.graphs.scenes import circle
     >>> graph = circle(np.random.default_rng(0))
-    >>> information = isotropic_information(graph.kappa, graph.tau, graph.d)
+    >>> information = matrices_of_edges(graph)
     >>> information[5, 0, 3] = information[5, 3, 0] = 1e9
     >>> coupled = replace(graph, information=information)
     >>> np.flatnonzero(indefinite_edges(coupled)).tolist()
@@ -285,7 +285,7 @@ def without_indefinite_coupling(graph: PoseGraph) -> PoseGraph:
     >>> from dataclasses import replace
     >>> from pgo_models.graphs.scenes import circle
     >>> graph = circle(np.random.default_rng(0))
-    >>> information = isotropic_information(graph.kappa, graph.tau, graph.d)
+    >>> information = matrices_of_edges(graph)
     >>> information[5, 0, 3] = information[5, 3, 0] = 1e9
     >>> changed = without_indefinite_coupling(replace(graph, information=information))
     >>> np.flatnonzero(changed.uncoupled).tolist(), float(changed.information[5, 0, 3])
@@ -496,10 +496,8 @@ def _extreme_weight_of(graph: PoseGraph, kind: str, weight: Array) -> tuple[floa
 
 
 def _symmetric_information(graph: PoseGraph) -> Array:
-    if graph.information is None:
-        return isotropic_information(graph.kappa, graph.tau, graph.d)
-    transposed = np.swapaxes(graph.information, 1, 2)
-    return np.asarray(0.5 * (graph.information + transposed))
+    information = matrices_of_edges(graph)
+    return np.asarray(0.5 * (information + np.swapaxes(information, 1, 2)))
 
 
 def _without_coupling(information: Array, chosen: BoolArray, d: int) -> Array:

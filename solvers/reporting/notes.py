@@ -6,7 +6,7 @@ import numpy as np
 
 from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.geometry.rotations import tangent_dimension
-from pgo_models.graphs.pose_graph import PoseGraph, isotropic_information
+from pgo_models.graphs.pose_graph import PoseGraph, matrices_of_edges
 from pgo_models.graphs.precisions import (
     LEAST_SCALED,
     extreme_weight,
@@ -58,9 +58,7 @@ def _num_measured(problem: PGOProblem) -> int:
     """Number of directions that the edges measure."""
     graph = problem.graph
     d = graph.d
-    information = graph.unheld if graph.unheld is not None else graph.information
-    if information is None:
-        information = isotropic_information(graph.kappa, graph.tau, d)
+    information = graph.unheld if graph.unheld is not None else matrices_of_edges(graph)
     scaled, _ = scaled_blocks(information)
     blocks = [scaled[~np.isin(graph.j, graph.landmarks)][:, d:, d:]]
     if problem.has_translations:

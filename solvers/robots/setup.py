@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.bridges import bridges
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, least_tree
 from pgo_models.graphs.written_digits import most_digits
@@ -53,7 +54,6 @@ from solvers.robots.own_file import (
     read_file,
     take_cost,
 )
-from solvers.robust.bridges import bridges
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.revision import threshold_scale

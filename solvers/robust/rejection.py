@@ -12,9 +12,9 @@ from pgo_models.certificates.certificate import Verdict
 from pgo_models.certificates.fit import NO_FIT, Fit
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.bridges import unchecked_bridges
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.summaries import Summarised
-from solvers.robust.bridges import unchecked_bridges
 from solvers.robust.outlier_record import OutlierProof
 from solvers.robust.rivals import Rival
 

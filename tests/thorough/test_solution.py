@@ -9,7 +9,7 @@ import solvers
 from pgo_models import read_kitti
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
-from pgo_models.graphs.precisions import isotropic_information
+from pgo_models.graphs.pose_graph import isotropic_information
 
 
 @pytest.fixture(scope="module")

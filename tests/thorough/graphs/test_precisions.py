@@ -10,9 +10,9 @@ import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, PoseGraph, Verdict
 from pgo_models.graphs.g2o import edge_places
+from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.precisions import (
     extreme_weight,
-    isotropic_information,
 )
 
 

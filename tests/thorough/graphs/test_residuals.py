@@ -11,7 +11,7 @@ import pgo_models as pgo
 from pgo_models import Chi2Convention, chi2
 from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.precisions import isotropic_information
+from pgo_models.graphs.pose_graph import isotropic_information
 from pgo_models.graphs.residuals import uncertain_edges
 
 

@@ -12,7 +12,8 @@ from hypothesis import given, strategies as st
 from pgo_models import PGOProblem, Poses, Weighting, chi2, chordal_start, multipliers
 from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import tangent_dimension
-from pgo_models.graphs.precisions import are_definite, isotropic_information
+from pgo_models.graphs.pose_graph import isotropic_information
+from pgo_models.graphs.precisions import are_definite
 from pgo_models.problem.costs import TangentCost
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from solvers import certify, polish

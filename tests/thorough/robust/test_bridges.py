@@ -7,8 +7,8 @@ from scipy.sparse.csgraph import connected_components
 from wrong_edges import joined_by
 
 import pgo_models as pgo
+from pgo_models.graphs.bridges import bridges, unchecked_bridges
 from pgo_models.graphs.pose_graph import edge_counts
-from solvers.robust.bridges import bridges, unchecked_bridges
 from solvers.robust.known import odometry
 
 
