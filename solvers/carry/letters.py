@@ -1,9 +1,9 @@
 """Letters: what robots of a team tell each other in a solve that a third one drives.
 
-An answer of a robot may have messages for other robots, by receiver. The robot sends
-them itself, and its answer carries tokens in their place. The page of the solve passes the tokens
-on, by sender, and the receiver puts what the letters say in their place. A letter that
-is lost is asked for again. What is for the robot that drives, or from it, needs no letter.
+An answer of a robot may have messages for other robots, by receiver. The robot sends them itself,
+and its answer carries tokens in their place. The robot that drives passes the tokens on, by sender,
+and the receiver puts what the letters say in their place. A letter that is lost is asked for again.
+What is for the robot that drives, or from it, needs no letter.
 """
 
 from __future__ import annotations

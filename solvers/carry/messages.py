@@ -31,13 +31,13 @@ class Worker(Protocol):
             Arrays of any shape, by name.
         """
 
-    def restore(self, snapshot: Snapshot) -> None:
-        """Continue from a snapshot.
+    def restore(self, record: Any) -> None:  # noqa: ANN401 - of the worker's own kind
+        """Continue from what a snapshot holds.
 
         Parameters
         ----------
-        snapshot : mapping of str to array
-            Arrays by name, of the shapes that `snapshot` returned.
+        record : object
+            What `deserialize` makes of the arrays that `snapshot` returned.
         """
 
 
@@ -75,9 +75,9 @@ def take_snapshot(worker: Worker, _: None) -> Snapshot:
 
 
 @order("worker.restore")
-def restore(worker: Worker, snapshot: Snapshot) -> None:
-    """Order: continue from a snapshot."""
-    worker.restore(snapshot)
+def restore(worker: Worker, record: object) -> None:
+    """Order: continue from the record of a snapshot."""
+    worker.restore(record)
 
 
 def snapshot_bytes(snapshots: Sequence[Snapshot]) -> int:

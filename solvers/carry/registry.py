@@ -8,6 +8,7 @@ the version goes up with every change of these.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
@@ -23,87 +24,78 @@ from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.low_rank import LiftedPoses
 
 VERSION = 10
-K = TypeVar("K", bound=type)
-F = TypeVar("F", bound=Callable[..., Any])
-# Records of a package that knows nothing of messages.
-_records: dict[str, type] = {
-    "BoundSource": BoundSource,
-    "Certificate": Certificate,
-    "Fit": Fit,
-    "HandednessTerms": HandednessTerms,
-    "LiftedPoses": LiftedPoses,
-    "LowerBound": LowerBound,
-    "ObjectiveRounding": ObjectiveRounding,
-    "Partition": Partition,
-    "PartitionMethod": PartitionMethod,
-    "Poses": Poses,
-    "Rows": Rows,
-    "Verdict": Verdict,
-    "Weighting": Weighting,
-    "WrittenDigits": WrittenDigits,
-}
-_name_of_record: dict[type, str] = {kind: name for name, kind in _records.items()}
-_orders: dict[str, Callable[..., Any]] = {}
-_name_of_order: dict[Callable[..., Any], str] = {}
+T = TypeVar("T")
 
 
-def record(name: str) -> Callable[[K], K]:
-    """Give a dataclass, a named tuple or an enum the name by which it is sent and written."""
+@dataclass(eq=False)
+class _Names:
+    """Names of orders, or of records, in both directions."""
 
-    def register(kind: K) -> K:
-        assert name not in _records, f"two records are called {name}"
-        _records[name] = kind
-        _name_of_record[kind] = name
-        return kind
+    what: str
+    known: dict[str, Any]
+    name_of: dict[object, str] = field(init=False)
 
-    return register
+    def __post_init__(self) -> None:
+        self.name_of = {named: name for name, named in self.known.items()}
 
+    def given(self, name: str) -> Callable[[T], T]:
+        """Give what is decorated the name by which it is sent and written."""
 
-def order(name: str) -> Callable[[F], F]:
-    """Give an order, a function of a worker and a request, the name by which it is sent."""
+        def register(named: T) -> T:
+            assert name not in self.known, f"two {self.what}s are called {name}"
+            self.known[name] = named
+            self.name_of[named] = name
+            return named
 
-    def register(function: F) -> F:
-        assert name not in _orders, f"two orders are called {name}"
-        _orders[name] = function
-        _name_of_order[function] = name
-        return function
+        return register
 
-    return register
+    def name(self, named: Any) -> str:  # noqa: ANN401 - a class or a function
+        """Name of a class or function; a TypeError if it has none."""
+        if named not in self.name_of:
+            raise TypeError(f"{named.__qualname__} is no {self.what} with a name")
+        return self.name_of[named]
 
-
-def name_of_record(kind: type) -> str:
-    """Name of a record; a TypeError for a class that is none."""
-    if kind not in _name_of_record:
-        raise TypeError(f"{kind.__name__} is no record with a name")
-    return _name_of_record[kind]
-
-
-def record_named(name: str) -> type:
-    """Record of this name; a ValueError if there is none."""
-    if name not in _records:
-        raise ValueError(f"{name!r:.80} is no record")
-    return _records[name]
+    def called(self, name: str) -> Any:  # noqa: ANN401 - a class or a function
+        """What has this name; a ValueError if nothing has."""
+        if name not in self.known:
+            raise ValueError(f"{name!r:.80} is no {self.what}")
+        return self.known[name]
 
 
-def name_of_order(function: Callable[..., Any]) -> str:
-    """Name of an order; a TypeError for a function that is none."""
-    if function not in _name_of_order:
-        raise TypeError(f"{function.__qualname__} is no order with a name")
-    return _name_of_order[function]
-
-
-def order_named(name: str) -> Callable[..., Any]:
-    """Order of this name; a ValueError if there is none."""
-    if name not in _orders:
-        raise ValueError(f"{name!r:.80} is no order")
-    return _orders[name]
+_records = _Names(
+    "record",
+    {  # of a package that knows nothing of messages
+        "BoundSource": BoundSource,
+        "Certificate": Certificate,
+        "Fit": Fit,
+        "HandednessTerms": HandednessTerms,
+        "LiftedPoses": LiftedPoses,
+        "LowerBound": LowerBound,
+        "ObjectiveRounding": ObjectiveRounding,
+        "Partition": Partition,
+        "PartitionMethod": PartitionMethod,
+        "Poses": Poses,
+        "Rows": Rows,
+        "Verdict": Verdict,
+        "Weighting": Weighting,
+        "WrittenDigits": WrittenDigits,
+    },
+)
+_orders = _Names("order", {})
+# Decorators of records (dataclasses, named tuples, enums), and of orders, functions of a worker and
+# a request.
+record = _records.given
+order = _orders.given
+name_of_record = _records.name
+record_named = _records.called
+name_of_order = _orders.name
+order_named = _orders.called
 
 
 def names_and_fields() -> dict[str, tuple[str, ...]]:
     """What `VERSION` stands for: all orders, and all records with their fields or members."""
-    described: dict[str, tuple[str, ...]] = dict.fromkeys(_orders, ())
-    for name, kind in _records.items():
-        members: Any = getattr(kind, "__members__", None)
-        members = members or getattr(kind, "_fields", None) or kind.__dataclass_fields__  # type: ignore[attr-defined]
-        described[f"record {name}"] = tuple(members)
+    described: dict[str, tuple[str, ...]] = dict.fromkeys(_orders.known, ())
+    for name, kind in _records.known.items():
+        members = getattr(kind, "__members__", None) or getattr(kind, "_fields", None)
+        described[f"record {name}"] = tuple(members or kind.__dataclass_fields__)
     return described

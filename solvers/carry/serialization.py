@@ -88,7 +88,7 @@ def _rebuild(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:  # noqa: ANN
     if "array" in tree:
         return np.array(arrays[str(tree["array"])])  # a copy, which may be written to
     if "enum" in tree:
-        return record_named(tree["enum"])[tree["member"]]  # type: ignore[index] # an enum's class
+        return record_named(tree["enum"])[tree["member"]]
     if "record" in tree:
         fields = {name: _rebuild(item, arrays) for name, item in tree["fields"].items()}
         return record_named(tree["record"])(**fields)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -18,7 +17,7 @@ from pgo_models.problem.cholesky import CholeskyBackend
 from solvers.carry.messages import Snapshot
 from solvers.carry.moments import Recall
 from solvers.carry.registry import order, record
-from solvers.carry.serialization import deserialize, serialize
+from solvers.carry.serialization import serialize
 from solvers.robots.part import Interior, InteriorState, interior_of
 from solvers.soc.copies import CopyLayout
 from solvers.soc.subgraph import Subgraph
@@ -181,11 +180,8 @@ class Agent:
         held = _states(Held(self.interior, self.copies))
         return serialize(AgentRecord(held, moments))
 
-    def restore(self, snapshot: Snapshot) -> None:
-        """Continue from a snapshot of this robot."""
-        # A process that has just begun knows the records of an algorithm once its file is imported.
-        import_module("solvers.robots.place")
-        record: AgentRecord = deserialize(snapshot)
+    def restore(self, record: AgentRecord) -> None:
+        """Continue from the record of a snapshot of this robot."""
         held = self._restored(record.held)
         self.interior = held.interior
         self.copies = held.copies

@@ -70,6 +70,7 @@ from solvers.carry.messages import Snapshot, restore, take_snapshot
 from solvers.carry.moments import Moment
 from solvers.carry.process import DEFAULT_MEMORY, WorkerPool
 from solvers.carry.registry import order, record
+from solvers.carry.serialization import deserialize
 from solvers.result import Measurement
 from solvers.robots import poses as pose_orders
 from solvers.robots.interface import Interface, InterfaceFactor, Separators
@@ -403,7 +404,8 @@ class Driver:
 
         The robots send again what they sent of the matrix of the translations.
         """
-        self.network.ask(restore, snapshots, Count.OFF)
+        records = [deserialize(snapshot) for snapshot in snapshots]
+        self.network.ask(restore, records, Count.OFF)
         self.current = state.current
         self.saved = state.saved
         self.network.ledger = state.ledger

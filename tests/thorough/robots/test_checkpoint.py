@@ -20,6 +20,7 @@ import solvers
 from pgo_models import partition
 from pgo_models.errors import FileFormatError, SettingError
 from solvers import Checkpoint, InProcess
+from solvers.carry.serialization import deserialize
 from solvers.riemannian.prefixes import GrowingStart
 from solvers.robots.checkpoint import Journal
 from solvers.soc.soc import WARM_START
@@ -83,11 +84,11 @@ def test_a_robot_in_a_new_process_goes_on_wherever_it_was(stage, tmp_path):
     solvers.solve(pgo.load("grid"), solvers.Pipeline(soc=soc), robots=robots, callback=callback)
     agent = engine.agents[0]
     path = tmp_path / "robot"
-    path.write_bytes(pickle.dumps((agent.subgraph, agent.snapshot())))
+    path.write_bytes(pickle.dumps((agent.subgraph, deserialize(agent.snapshot()))))
     code = (
         "import pickle, sys; from solvers.robots.agent import Agent\n"
-        "subgraph, snapshot = pickle.load(open(sys.argv[1], 'rb'))\n"
-        "agent = Agent(subgraph); agent.restore(snapshot)\n"
+        "subgraph, record = pickle.load(open(sys.argv[1], 'rb'))\n"
+        "agent = Agent(subgraph); agent.restore(record)\n"
         "print(agent.interior.poses.t.tolist(), type(agent.interior.state.session).__name__)"
     )
     ended = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)

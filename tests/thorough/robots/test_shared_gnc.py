@@ -82,7 +82,7 @@ def test_a_robot_that_is_started_again_has_its_weights(wrong) -> None:
     )
     order_interior(reweigh, agent, Reweigh(True, 0.01, 1.0, 1e-9, 1e-13))
     before = order_interior(pose_orders.evaluate, agent, None)
-    again.restore(agent.snapshot())
+    again.restore(deserialize(agent.snapshot()))
     after = order_interior(pose_orders.evaluate, again, None)
     assert before.objective == after.objective
     np.testing.assert_array_equal(before.force, after.force)

@@ -18,6 +18,7 @@ from pgo_models.relaxations.rotation_hull import matrices_at
 from solvers import Status, SweptScene, polish, run, solve
 from solvers.carry.counted_pool import Count
 from solvers.carry.messages import restore, take_snapshot
+from solvers.carry.serialization import deserialize
 from solvers.handedness.ascent import AscentState, HandednessAscent
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
 from solvers.loop import Outcome
@@ -188,6 +189,6 @@ def test_the_state_of_an_ascent_survives_a_snapshot() -> None:
     before = best_bound_by_robots(driver, 1e-6, handedness.return_to_best(driver))
     snapshots = driver.network.ask(take_snapshot, [None] * 3, Count.OFF)
     handedness.begin_without_terms(driver)
-    driver.network.ask(restore, snapshots, Count.OFF)
+    driver.network.ask(restore, [deserialize(each) for each in snapshots], Count.OFF)
     after = best_bound_by_robots(driver, 1e-6, handedness.return_to_best(driver))
     assert after.value == before.value
