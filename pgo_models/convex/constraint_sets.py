@@ -64,13 +64,6 @@ class ConstraintSet(ABC):
         """
         return 0.0
 
-    def tangent_basis(self, P: Array) -> Array:
-        """Orthonormal basis of the tangent space, one direction a column, entries column-major.
-
-        Known of orthonormal and of unit columns and rows alone.
-        """
-        raise NotImplementedError
-
     def distance(self, P: Array) -> float:
         """How far P is from satisfying the equations of the set; here from its projection."""
         return float(np.linalg.norm(P - self.project(P)))

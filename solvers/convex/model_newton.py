@@ -16,13 +16,14 @@ from scipy.sparse import block_diag as sparse_block_diag, csc_array, eye_array
 
 from pgo_models.convex.constraint_sets import Orthonormal, UnitColumns
 from pgo_models.convex.model_relaxation import closed_form_multipliers
-from pgo_models.convex.quadratic_form import QuadraticForm
+from pgo_models.convex.quadratic_form import Block, QuadraticForm
 from pgo_models.convex.set_equations import SetEquations
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import factorize
 
+_SMOOTH = Orthonormal | UnitColumns  # sets that have tangent spaces
 _MAX_STEPS = 50
 _HALVINGS = 30
 _SUFFICIENT = 1e-4  # Armijo's constant
@@ -45,7 +46,7 @@ class ModelNewton(ReadOnly):
     def is_possible(self) -> bool:
         """Whether every variable is in one set that has tangent spaces, and free or fixed."""
         for block in self.form.blocks:
-            has_one = len(block.sets) == 1 and isinstance(block.sets[0], Orthonormal | UnitColumns)
+            has_one = len(block.sets) == 1 and isinstance(block.sets[0], _SMOOTH)
             free = self.form.is_free[block.coordinates]
             if not has_one or (free.any() and not free.all()):
                 return False
@@ -117,7 +118,7 @@ class ModelNewton(ReadOnly):
             elif block.is_plane:
                 basis = np.array([[-x[1]], [x[0]]])
             else:
-                basis = block.sets[0].tangent_basis(block.value(x))
+                basis = _smooth_set(block).tangent_basis(block.value(x))
             bases.append(basis)
         kept = np.setdiff1d(form.free_others, form.grounded) - form.num_constrained
         others = eye_array(form.side - form.num_constrained, format="csc")[:, kept]
@@ -140,6 +141,13 @@ class ModelNewton(ReadOnly):
             if length * decrement <= noise:
                 break
         return None, J
+
+
+def _smooth_set(block: Block) -> Orthonormal | UnitColumns:
+    """The set of a constrained variable, where Newton is possible."""
+    (kind,) = block.sets
+    assert isinstance(kind, _SMOOTH)
+    return kind
 
 
 def _damped(convex: Array | csc_array, gradient: Array) -> Array:

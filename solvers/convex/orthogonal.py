@@ -176,7 +176,8 @@ class OrthogonalSOC:
         if start is None:
             start = problem.point([_identity(variable.shape) for variable in problem.variables])
         problem.check_point(start)
-        split = split_by(self.x_step, problem, self.solver)
+        matrices = _matrices_of_step(self, problem)
+        split = problem.split(self.solver) if matrices is None else matrices
         rho, others = self._first_penalty(split, start)
         X = problem.values(start.copies)
         B = tuple(normal / rho for normal in start.normals)
@@ -442,8 +443,10 @@ def solve_orthogonal(
     method = soc if soc is not None else OrthogonalSOC()
     if solver is not None:
         method = replace(method, solver=solver)
-    split = split_by(method.x_step, problem, method.solver)
-    prepared = replace(method, x_step=split) if isinstance(split, QuadraticSplit) else method
+    # Whether the model is quadratic is found once, and not at every start.
+    matrices = _matrices_of_step(method, problem)
+    x_step = XStep.CONVEX_SOLVER if matrices is None else matrices
+    prepared = replace(method, x_step=x_step)
     outcomes = list[Outcome[OrthogonalState]]()
     for _ in range(starts):
         outcomes.append(run(prepared, problem, problem.random_point(rng), verbose=verbose))
@@ -497,21 +500,23 @@ def _certified(
     )
 
 
-def split_by(
-    x_step: XStep | QuadraticSplit, problem: OrthogonalProblem, solver: ConvexSolver | str = COLD
-) -> SplitProblem | QuadraticSplit:
-    """Step (a) of a problem, made as it says; a SettingError where that cannot be."""
+def _matrices_of_step(method: OrthogonalSOC, problem: OrthogonalProblem) -> QuadraticSplit | None:
+    """Step (a) by matrices; None where a convex solver is to make it.
+
+    A NotQuadraticError where matrices are asked for and the model is not quadratic.
+    """
+    x_step = method.x_step
     if isinstance(x_step, QuadraticSplit):
         return x_step
-    is_asked_for = x_step is XStep.AUTOMATIC and solver is not COLD
-    if is_asked_for or x_step is XStep.CONVEX_SOLVER:
-        return problem.split(solver)
+    is_solver_named = x_step is XStep.AUTOMATIC and method.solver is not COLD
+    if is_solver_named or x_step is XStep.CONVEX_SOLVER:
+        return None
     try:
         return QuadraticSplit(problem, quadratic_form(problem))
     except NotQuadraticError:
         if x_step is XStep.FACTORIZED:
             raise
-        return problem.split(solver)
+        return None
 
 
 def _size_of(copies: Sequence[Array]) -> float:
