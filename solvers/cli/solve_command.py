@@ -263,7 +263,16 @@ def solve_command(
         estimate_noise,
     )
     stages = StageOptions(
-        method, start, r_step, gap, max_iterations, tolerance, time_limit, robust, known
+        method,
+        start,
+        r_step,
+        gap,
+        max_iterations,
+        tolerance,
+        time_limit,
+        robust,
+        known,
+        prove_outliers,
     )
     network = RobotOptions(robots, split, engine, address, resume, driver_memory)
     is_printed = any(map(is_standard_output, out or []))
@@ -282,15 +291,14 @@ def solve_command(
         loaded = with_times(source.loaded(), times)
     if network.has_no_driver and source.chosen_cost is None and not rotations:
         source = replace(source, cost=Cost.ISOTROPIC)
-    extras = SolveExtras(anchor, prove_outliers)
     if not all_components:
-        raise typer.Exit(_solve_graph(loaded, source, stages, network, outputs, display, extras))
+        raise typer.Exit(_solve_graph(loaded, source, stages, network, outputs, display, anchor))
     if largest_component:
         raise SettingError("--largest-component takes one component, and --all-components each")
     codes = []
     for number, component in enumerate(components_of(loaded), 1):
         named = outputs if number == 1 else outputs.numbered(number)
-        codes.append(_solve_graph(component, source, stages, network, named, display, extras))
+        codes.append(_solve_graph(component, source, stages, network, named, display, anchor))
     raise typer.Exit(max(codes))
 
 
@@ -307,6 +315,7 @@ class StageOptions:
     time_limit: float
     robust: Robust | None
     known: TakenForRight | None
+    prove_outliers: bool  # whether edges that are rejected are to be proven wrong
 
     @property
     def wrong_edges(self) -> "GNC | PCM | None":
@@ -532,14 +541,6 @@ class Outputs:
                 check_writable(other)
 
 
-@dataclass(frozen=True)
-class SolveExtras:
-    """The pose that the frame is held by, and whether rejected edges are to be proven wrong."""
-
-    anchor: int | None
-    prove_outliers: bool
-
-
 def _solve_graph(
     loaded: PoseGraph,
     source: GraphOptions,
@@ -547,7 +548,7 @@ def _solve_graph(
     network: RobotOptions,
     outputs: Outputs,
     display: Display,
-    extras: SolveExtras,
+    anchor: int | None,
 ) -> int:
     """Solve a graph that has been read, write and show the solution; the exit code."""
     problem = source.problem(loaded)
@@ -555,7 +556,6 @@ def _solve_graph(
     outputs.check_writable(problem.graph.num_robots)
     stages.check_robust()
     place = network.chosen_for(problem.graph, stages)
-    anchor = extras.anchor
     solution = solve(
         problem,
         stages.pipeline(place.method, place.partition, not network.has_no_driver),
@@ -567,7 +567,7 @@ def _solve_graph(
         verbose=display.verbose,
         progress=display.has_bar,
     )
-    if extras.prove_outliers:
+    if stages.prove_outliers:
         from solvers.robust_solves.outlier_proof import prove_outliers as with_proof
 
         solution = with_proof(solution, stages.time_limit)

@@ -23,11 +23,12 @@ from pgo_models.graphs.g2o_parser import read_lines
 from pgo_models.graphs.g2o_readings import ROTATION_FIRST, Reading
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import edge_residuals
+from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from pgo_models.summaries import Summarised
 from solvers.pipeline import solve
 from solvers.request import Pipeline
 from solvers.riemannian.newton import Newton
+from solvers.solution import Solution
 
 # Factors by which lengths, or angles of less than a turn, are made smaller.
 _SHRINKING = {
@@ -241,9 +242,7 @@ def compare_readings(
         graph = read(Reading.AS_WRITTEN)
     except FileFormatError as error:
         return _readings_of_invalid(error, read)
-    problem = PGOProblem(graph)
-    solution = solve(problem, _PLAIN)
-    residuals = edge_residuals(problem, solution.poses)
+    problem, solution, residuals = _solved(graph)
     written = ReadingFit(Reading.AS_WRITTEN, 0, solution.objective, residuals.overall, 0.0)
     has_large_angles = _has_large_angles(name_or_path, graph.d)
     trial = _Trial(graph, written, residuals.freedom, read, has_large_angles)
@@ -271,30 +270,51 @@ def _readings_of_invalid(
 
     Proposed are those of which the cost is what their matrices make expected, or nearly so.
     """
-    written = ReadingFit(Reading.AS_WRITTEN, 0)
-    fits: list[ReadingFit] = []
-    proposed: list[ReadingFit] = []
-    cost_name = "F"
-    for are_pairs in (False, True):
-        for reading in Reading:
-            if proposed or reading.is_pair is not are_pairs:
-                continue
-            with warnings.catch_warnings(action="ignore"):
-                try:
-                    problem = PGOProblem(read(reading))
-                    solution = solve(problem, _PLAIN)
-                    overall = edge_residuals(problem, solution.poses).overall
-                except (FileFormatError, *FAILURES):
-                    continue
-            cost_name = problem.cost_name
-            num_edges = problem.graph.num_edges
-            fits.append(ReadingFit(reading, num_edges, solution.objective, overall))
-        proposed = [fit for fit in fits if _log_misfit(fit) <= math.log(_MOST_MISFIT)]
+    with warnings.catch_warnings(action="ignore"):
+        fits, cost_name = _fits_of_readable(read, are_pairs=False)
+        proposed = _as_expected(fits)
+        if not proposed:
+            pairs, cost_of_pairs = _fits_of_readable(read, are_pairs=True)
+            fits += pairs
+            cost_name = cost_of_pairs or cost_name
+            proposed = _as_expected(pairs)
     if not fits:
         raise error
-    proposed.sort(key=_log_misfit)
+    written = ReadingFit(Reading.AS_WRITTEN, 0)
     invalid = error.problem.partition(";")[0]
-    return ReadingComparison(cost_name, written, tuple(fits), tuple(proposed), invalid)
+    return ReadingComparison(cost_name, written, tuple(fits), proposed, invalid)
+
+
+def _fits_of_readable(
+    read: Callable[[Reading], PoseGraph], are_pairs: bool
+) -> tuple[list[ReadingFit], str]:
+    """Fits under all readings, or pairs of them, that make a graph, and the name of their cost."""
+    fits = []
+    cost_name = ""
+    for reading in Reading:
+        if reading.is_pair is not are_pairs:
+            continue
+        try:
+            problem, solution, residuals = _solved(read(reading))
+        except (FileFormatError, *FAILURES):
+            continue
+        cost_name = problem.cost_name
+        num_edges = problem.graph.num_edges
+        fits.append(ReadingFit(reading, num_edges, solution.objective, residuals.overall))
+    return fits, cost_name
+
+
+def _solved(graph: PoseGraph) -> tuple[PGOProblem, Solution, EdgeResiduals]:
+    """A graph solved for its own cost by Newton's method alone, and how well its edges fit."""
+    problem = PGOProblem(graph)
+    solution = solve(problem, _PLAIN)
+    return problem, solution, edge_residuals(problem, solution.poses)
+
+
+def _as_expected(fits: list[ReadingFit]) -> tuple[ReadingFit, ...]:
+    """Fits whose cost is about what their matrices make expected, the best first."""
+    close = [fit for fit in fits if _log_misfit(fit) <= math.log(_MOST_MISFIT)]
+    return tuple(sorted(close, key=_log_misfit))
 
 
 def _log_misfit(fit: ReadingFit) -> float:
@@ -330,11 +350,10 @@ class _Trial:
         if num_changed == 0 or (changed.all() and reading in _OF_SOME_EDGES):
             return None
         try:
-            problem = PGOProblem(graph)
-            solution = solve(problem, _PLAIN)
-            overall = edge_residuals(problem, solution.poses).overall
+            _, solution, residuals = _solved(graph)
         except FAILURES:  # of linear algebra, with numbers that mean nothing
             return ReadingFit(reading, num_changed)
+        overall = residuals.overall
         evidence = self._evidence(reading, solution.objective, overall)
         return ReadingFit(reading, num_changed, solution.objective, overall, evidence)
 
