@@ -4,10 +4,15 @@ cvxpy states a convex quadratic model as
 
     minimise 1/2 z^T P z + c^T z + constant   subject to   A z = b,
 
-where z holds the model's variables and cvxpy's own ones, as the residuals of a sum of squares. Each
-of the latter that stands in one equality alone, with the factor 1 or -1, is what that equality
-says; written so, z = T w exactly, and w = (variables, 1). A rotation of the plane (a, -b; b, a) is
-two numbers, so that w = spread u with entries 0, 1 and -1. What remains is
+where z holds the model's variables, and numbers of cvxpy's own, such as the residuals r of a sum of
+squares, with the equality r = A x - b. Two steps, both exact, lead to fewer numbers:
+
+1. A number of cvxpy's own that stands in a single equality, with the factor 1 or -1, is what this
+   equality says of it. So z = T w, and w has the variables, the rest of cvxpy's own numbers, and 1.
+2. A rotation of the plane, (a, -b; b, a), has two different numbers. So w = spread u, where u has
+   every number once; the entries of `spread` are 0, 1 and -1.
+
+What remains is
 
     J = u^T Q u,   Q = spread^T T^T P T spread / 2 + sym(e (T spread)^T c) + constant e e^T,
 
