@@ -22,6 +22,7 @@
 # %%
 import heapq
 import itertools
+import time
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
@@ -94,6 +95,7 @@ def measure(robots, ten):
 # %% [markdown]
 # The network has a clock of its own, with 20 steps a second. A message is on its way for 10 to 50
 # milliseconds, overtakes others, and does not arrive if its sender or its receiver is out of reach.
+# Computing takes no time on this clock: it stands still while a robot computes, beside its calls.
 # Every second we note what each robot knows. Nothing here looks into a message: `receive` takes bytes
 # and `outbox` returns them.
 
@@ -130,6 +132,8 @@ def mission(robots, away, seconds=180, lost=0.0):
                 robots[message.to].receive(message.data, now)
         for name, robot in robots.items():
             robot.tick(now)
+            while robot.is_computing:
+                time.sleep(1e-4)
             for message in robot.outbox():
                 arrival = now + rng.uniform(0.01, 0.05)
                 heapq.heappush(in_the_air, (arrival, next(count), name, message))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,6 +62,8 @@ class Network:
         return len(terms) == 1 and all(robot.is_settled for robot in awake)
 
     def _send(self, name: str, robot: solvers.Robot) -> None:
+        while robot.is_computing:  # computing takes no time here
+            time.sleep(1e-5)
         for message in robot.outbox():
             copies = 1 + (self.rng.random() < self.repeated)
             for _ in range(copies):

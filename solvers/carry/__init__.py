@@ -8,5 +8,6 @@
 | `counted_pool`, `ledger` | workers whose messages are counted, and the account |
 | `faults` | messages that are lost or late, for study |
 | `registry`, `serialization` | names of orders and records with a version; records as arrays |
+| `field_types` | whether what arrives has the types that a record declares |
 | `wire`, `letters` | sealed bytes; what two robots tell each other while a third one drives |
 """

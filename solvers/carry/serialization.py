@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pgo_models.errors import PGOError
+from solvers.carry.field_types import check_fields
 from solvers.carry.messages import Messages
 from solvers.carry.registry import name_of_record, record_named
 
@@ -38,13 +40,15 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
 def deserialize(arrays: Mapping[str, NDArray[Any]]) -> Any:  # noqa: ANN401 - whatever was serialized
     """Record of which `serialize` made the arrays.
 
-    Only records that have a name (`solvers.carry.registry`) are ever constructed. Raises a
+    Only records that have a name (`solvers.carry.registry`) are ever constructed, of fields of the
+    types that they declare. An array that a record has twice is one array again. Raises a
     ValueError if the arrays are not those of `serialize`, or name no record.
     """
     try:
-        return _rebuild(json.loads(str(arrays[_TREE])), arrays)
-    except (KeyError, TypeError, IndexError) as error:
-        raise ValueError(f"arrays that were not serialized here: {error!r}") from error
+        tree = json.loads(str(arrays[_TREE]))
+        return _rebuild(tree, {name: np.array(array) for name, array in arrays.items()})
+    except (LookupError, TypeError, AttributeError, RecursionError, PGOError) as error:
+        raise ValueError(f"arrays that were not serialized here: {error!r:.200}") from error
 
 
 def _describe(value: object, arrays: _Arrays) -> object:
@@ -86,12 +90,14 @@ def _rebuild(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:  # noqa: ANN
     if not isinstance(tree, dict):
         return tree
     if "array" in tree:
-        return np.array(arrays[str(tree["array"])])  # a copy, which may be written to
+        return arrays[str(tree["array"])]
     if "enum" in tree:
         return record_named(tree["enum"])[tree["member"]]
     if "record" in tree:
         fields = {name: _rebuild(item, arrays) for name, item in tree["fields"].items()}
-        return record_named(tree["record"])(**fields)
+        kind = record_named(tree["record"])
+        check_fields(kind, fields)
+        return kind(**fields)
     if "keys" in tree:
         values = [_rebuild(item, arrays) for item in tree["values"]]
         items = dict(zip(tree["keys"], values, strict=True))

@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import hmac
 import json
+import math
 import zlib
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -29,8 +30,10 @@ _VERSION = VERSION.to_bytes(1, "big")
 _SEAL_BYTES = 32  # of HMAC-SHA256
 _LENGTH_BYTES = 4  # of the length of the description, which precedes it
 _LEVEL = 1  # of the compression: numbers hardly shrink, trees do
-# A message may not unpack to more: whoever has the key could else fill the memory of the others.
-MOST_BYTES = 1 << 30
+# A message may not unpack to more, nor its description, each byte of which may become an object:
+# whoever has the key could else fill the memory of the others.
+MOST_BYTES = 1 << 27
+_MOST_DESCRIBED = 1 << 20
 K = TypeVar("K")
 
 
@@ -67,9 +70,29 @@ class Order:
         return partial(function, *given) if given else function
 
 
+def as_bytes(message: object) -> bytes:
+    """Bytes of a message, compressed."""
+    return zlib.compress(packed(serialize(message)), _LEVEL)
+
+
+def from_bytes(data: bytes, kind: type[K]) -> K:
+    """The message that the bytes are, one of the given kinds; else a WireError."""
+    try:
+        unpacker = zlib.decompressobj()
+        plain = unpacker.decompress(data, MOST_BYTES)
+        if not unpacker.eof:
+            raise WireError("a message that is too long")
+        message = deserialize(unpacked(plain, _MOST_DESCRIBED))
+    except (zlib.error, ValueError) as error:
+        raise WireError(f"a message that cannot be read: {error}") from error
+    if not isinstance(message, kind):
+        raise WireError(f"a {type(message).__name__} is no message")
+    return message
+
+
 def sealed(key: bytes, message: object) -> bytes:
     """Bytes of a message, which only holders of the key can make."""
-    body = zlib.compress(packed(serialize(message)), _LEVEL)
+    body = as_bytes(message)
     return _MARK + _VERSION + hmac.digest(key, _MARK + _VERSION + body, hashlib.sha256) + body
 
 
@@ -88,17 +111,7 @@ def opened(key: bytes, data: bytes, kind: type[K]) -> K:
         )
     if not hmac.compare_digest(seal, hmac.digest(key, mark + version + body, hashlib.sha256)):
         raise WireError("a message that was not sealed with the key of the team")
-    try:
-        unpacker = zlib.decompressobj()
-        plain = unpacker.decompress(body, MOST_BYTES)
-        if not unpacker.eof:
-            raise WireError("a message that is too long")
-        message = deserialize(unpacked(plain))
-    except (zlib.error, ValueError) as error:
-        raise WireError(f"a message that cannot be read: {error}") from error
-    if not isinstance(message, kind):
-        raise WireError(f"a {type(message).__name__} is no message")
-    return message
+    return from_bytes(body, kind)
 
 
 def _cut(data: bytes, *lengths: int) -> list[bytes]:
@@ -129,9 +142,14 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     return len(described).to_bytes(_LENGTH_BYTES, "little") + described + b"".join(parts)
 
 
-def unpacked(data: bytes) -> dict[str, NDArray[Any]]:
-    """Arrays of which `packed` made the bytes; a ValueError for others."""
+def unpacked(data: bytes, most_described: float = math.inf) -> dict[str, NDArray[Any]]:
+    """Arrays of which `packed` made the bytes; a ValueError for others.
+
+    Neither their head nor a text among them may have more bytes than `most_described`.
+    """
     length = int.from_bytes(data[:_LENGTH_BYTES], "little")
+    if length > most_described:
+        raise ValueError(f"a head of {length} bytes")
     begins = _LENGTH_BYTES + length
     arrays = {}
     try:
@@ -140,12 +158,14 @@ def unpacked(data: bytes) -> dict[str, NDArray[Any]]:
             dtype = np.dtype("u1" if kind == "text" else kind)
             if dtype.kind not in "biuf":
                 raise ValueError(f"an array of {dtype}")
-            count = int(np.prod(shape, dtype=np.int64))
+            count = math.prod(shape)
+            if not 0 <= count <= len(data) or (kind == "text" and count > most_described):
+                raise ValueError(f"an array of {count} numbers")
             values = np.frombuffer(data, dtype, count, begins).reshape(shape)
             begins += values.nbytes
             if kind == "text":
                 values = np.array(values.tobytes().decode("utf-8"))
             arrays[name] = values
-    except (TypeError, KeyError) as error:
-        raise ValueError(f"no arrays: {error!r}") from error
+    except (TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise ValueError(f"no arrays: {error!r:.200}") from error
     return arrays

@@ -99,8 +99,8 @@ def robot_command(
 ) -> None:
     """Run `pgo robot`."""
     from solvers.team.robot import Robot
-    from solvers.team.sharing import Sharing  # greenlet and Zenoh are of an extra
-    from solvers.team.zenoh_link import ZenohLink, carry
+    from solvers.team.sharing import Sharing
+    from solvers.team.zenoh_link import ZenohLink, carry  # Zenoh is of an extra
 
     if out is not None:
         check_writable(out)

@@ -1,22 +1,23 @@
 """An engine whose robots are there already: those of a team, one of which drives a solve.
 
-A solve asks robots and waits. Here it runs in a coroutine of the package greenlet: where it would
-wait, it stops, and goes on when the last answer is there. So the robot that drives has neither
-threads nor sockets, and its solve is that of every other place.
+A solve asks robots and waits. Here it runs in a thread beside the robot that drives, which hands on
+what it asks, and the answers when the last one is there. So its solve is that of every other place.
 """
 
 from __future__ import annotations
 
+import queue
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from pgo_models.errors import PGOError, extra_module
+from pgo_models.errors import PGOError
 from solvers.carry.messages import Idle, Worker, obey, raise_first_error
 from solvers.carry.wire import Order
 from solvers.robots.agent import Agent
 from solvers.robots_solution import RobotsSolution
-from solvers.team.messages import Ask, Ended, Reply, Term, error_of_message
+from solvers.team.beside import Beside
+from solvers.team.messages import Ask, Ended, Hello, Reply, Term, error_of_message
 
 T = TypeVar("T")
 Q = TypeVar("Q")
@@ -31,21 +32,24 @@ class _AbandonedError(BaseException):
 class Drive:
     """A solve of the term by the robots `members`, the first of which is this one, with its agent.
 
-    `solve` is what is solved, with this engine. `waiting` are the asks without an answer, by robot,
-    `num_asked` says how many orders each has had (not all are for everybody), `outcome` is the
-    solution or error at the end.
+    `solve` is what is solved, with this engine, beside the robot. Of what it asks the robot is told
+    (`tell`), after which `waiting` are the asks without an answer, by robot; at the end `outcome`
+    is the solution or error. `call` and `num_asked`, how many orders each has had, as not all are
+    for everybody, belong to the thread of the solve.
     """
 
     term: Term
     members: tuple[str, ...]
     agent: Agent
     solve: Callable[[Drive], RobotsSolution]
+    beside: Beside
+    tell: Callable[[Drive], None]
     call: int = -1
     waiting: dict[str, Ask] = field(default_factory=dict)
     num_asked: dict[str, int] = field(default_factory=dict)
     outcome: RobotsSolution | PGOError | None = None
     _answers: list[Any] = field(default_factory=list)
-    _page: Any = None
+    _arrived: queue.SimpleQueue[list[Any] | None] = field(default_factory=queue.SimpleQueue)
 
     @property
     def needed(self) -> Sequence[str]:
@@ -56,17 +60,26 @@ class Drive:
         return list(self.waiting) if self.agent.own_lines.is_shared else self.members[1:]
 
     def begin(self) -> None:
-        """Run the solve until it waits for answers, or ends."""
-        self._page = extra_module("greenlet", "team").greenlet(self._run)
-        self._page.switch()
+        """Run the solve."""
+        self.beside.begin(self._run)
 
     def _run(self) -> None:
+        outcome: RobotsSolution | PGOError
         try:
-            self.outcome = self.solve(self)
+            outcome = self.solve(self)
         except PGOError as error:
-            self.outcome = error
+            outcome = error
         except _AbandonedError:
-            pass
+            return
+        except Exception as error:
+            outcome = PGOError(
+                f"an answer of another robot cannot be computed with: {error!r:.200}"
+            )
+        self.beside.hand_over(lambda: self._end(outcome))
+
+    def _end(self, outcome: RobotsSolution | PGOError) -> None:
+        self.outcome = outcome
+        self.tell(self)
 
     def take(self, robot: str, reply: Reply) -> None:
         """Take an answer; with the last one the solve goes on."""
@@ -78,13 +91,19 @@ class Drive:
         error = reply.error
         self._answers[place] = reply.answer if error is None else error_of_message(error, robot)
         if not self.waiting:
-            self._page.switch()
+            self.beside.count(1)
+            self._arrived.put(self._answers)
+
+    def is_computed(self, robot: str, hello: Hello) -> bool:
+        """Whether a robot computes what it was asked, as it says."""
+        ask = self.waiting.get(robot)
+        return ask is not None and (hello.term, hello.computing) == (self.term, ask.call)
 
     def abandon(self) -> None:
-        """Give the solve up."""
-        if self._page is not None and not self._page.dead:
-            self._page.throw(_AbandonedError)
-        self.waiting.clear()
+        """Give the solve up, where it asks next; nothing more is told of it."""
+        self.tell = lambda _: None
+        self.waiting = {}
+        self._arrived.put(None)
 
     def ended(self, absent: tuple[str, ...], revisions: Mapping[str, int]) -> Ended:
         """How the solve has ended, without `absent` robots, by members with these revisions."""
@@ -103,17 +122,29 @@ class Drive:
         """Give every robot an order with its request, and wait for all answers."""
         self.call += 1
         named = Order.of(order)
-        self._answers = [None] * len(requests)
+        asks = {}
         for place, (name, request) in enumerate(zip(self.members, requests, strict=True)):
             if place > 0 and request is not Idle.IDLE:
                 number = self.num_asked.get(name, 0)
                 self.num_asked[name] = number + 1
                 members = self.members if number == 0 else ()
-                self.waiting[name] = Ask(self.term, number, place, named, request, members)
-        self._answers[:1] = obey([self.agent], order, requests[:1])
-        if self.waiting:
-            self._page.parent.switch()
-        return raise_first_error(self._answers)
+                asks[name] = Ask(self.term, number, place, named, request, members)
+        if asks:
+            self.beside.hand_over(lambda: self._ask_others(asks))
+        answers = obey([self.agent], order, requests[:1])
+        if not asks:
+            return raise_first_error([*answers, *(None for _ in requests[1:])])
+        self.beside.count(-1)
+        arrived = self._arrived.get()
+        if arrived is None:
+            self.beside.count(1)
+            raise _AbandonedError
+        return raise_first_error([*answers, *arrived[1:]])
+
+    def _ask_others(self, asks: dict[str, Ask]) -> None:
+        self._answers = [None] * len(self.members)
+        self.waiting = asks
+        self.tell(self)
 
     def close(self) -> None:
         """Keep the robots: they outlive a solve."""

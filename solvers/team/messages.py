@@ -10,9 +10,10 @@ from typing import Any
 from pgo_models import errors
 from pgo_models.errors import PGOError
 from solvers.carry.registry import record
-from solvers.carry.wire import Order
+from solvers.carry.wire import Order, WireError
 from solvers.robots_solution import RobotsSolution
 
+_MOST = 1 << 62  # no number of a message is higher
 _PLAIN_ERRORS = {
     kind.__name__: kind
     for kind in (errors.GraphError, errors.NotPositiveDefiniteError, errors.SettingError)
@@ -38,10 +39,14 @@ class Term:
 @record("Hello")
 @dataclass(frozen=True)
 class Hello:
-    """A robot is there, with measurements of this revision; `term` is the latest that it knows."""
+    """A robot is there, with measurements of this revision; `term` is the latest that it knows.
+
+    `computing` is the order of the term that it computes the answer to, or -1.
+    """
 
     revision: int
     term: Term
+    computing: int = -1
 
 
 @record("Ask")
@@ -144,6 +149,22 @@ class Heard:
     """The outcome of this solve has arrived."""
 
     term: Term
+
+
+def check_message(message: object, team: tuple[str, ...]) -> None:
+    """Raise a WireError for names and numbers that no robot of the team sends."""
+    if not isinstance(message, Hello | Ask | Reply | Letter | LetterLost | Ended | Heard):
+        raise WireError(f"a {type(message).__name__} is no message")
+    numbers = [getattr(message, name, 0) for name in ("revision", "call", "place", "computing")]
+    names = [*getattr(message, "members", ()), *getattr(message, "revisions", ())]
+    names += getattr(message, "absent", ())
+    is_known = set(names) <= set(team) and message.term.driver in (*team, "")
+    if not is_known or not all(-1 <= number < _MOST for number in (*numbers, message.term.number)):
+        raise WireError(f"a {type(message).__name__} with names or numbers of nobody")
+    if isinstance(message, Ask) and message.members:
+        is_numbered = 0 < message.place < len(message.members)
+        if not is_numbered or message.members[0] != message.term.driver:
+            raise WireError("an order with other places than those of its robots")
 
 
 def error_as_message(error: PGOError) -> tuple[str, str]:

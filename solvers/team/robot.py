@@ -1,4 +1,4 @@
-"""A robot of a team that solves together: an object without sockets, threads or a clock.
+"""A robot of a team that solves together: an object without sockets or a clock.
 
 Whoever has a network gives the robot what arrives (`receive`) and the time (`tick`), and sends what
 it has to say (`outbox`). Every robot keeps its own measurements. The robot whose name comes first
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pgo_models.errors import SettingError, door, extra_module
+from pgo_models.errors import SettingError, door
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
@@ -82,13 +82,12 @@ class Robot:
     SettingError
         For a name that is not in the team, a name twice, a short key, times that are not positive,
         or known inliers of robots that do not share their measurements.
-    MissingExtraError
-        Without the package greenlet, which the extra `team` brings.
 
     Examples
     --------
     Two robots in one process, and a loop in place of a network:
 
+    >>> import time
     >>> import numpy as np
     >>> key = b"sixteen or more bytes"
     >>> robots = {name: Robot(name, ["a", "b"], key) for name in ("a", "b")}
@@ -99,12 +98,11 @@ class Robot:
     ...     robots[name].add_edge(first, first + 1, np.eye(2), ahead, kappa=100.0, tau=100.0)
     >>> robots["a"].add_edge(1, 2, np.eye(2), ahead, kappa=100.0, tau=100.0)
     >>> robots["b"].add_edge(3, 0, np.eye(2), np.array([-2.9, 0.0]), kappa=100.0, tau=100.0)
-    >>> for step in range(200):
-    ...     now = 0.1 * step
+    >>> while not all(robot.is_settled for robot in robots.values()):
     ...     for robot in robots.values():
-    ...         robot.tick(now)
+    ...         robot.tick(time.monotonic())
     ...         for message in robot.outbox():
-    ...             robots[message.to].receive(message.data, now)
+    ...             robots[message.to].receive(message.data, time.monotonic())
     >>> robots["b"].solution.verdict.name, robots["b"].covered
     ('CERTIFIED', ('a', 'b'))
     >>> sorted(robots["b"].poses)
@@ -127,7 +125,6 @@ class Robot:
     ) -> None:
         self.name = name
         self.team = tuple(sorted(team))
-        extra_module("greenlet", "team")  # which a solve needs
         _check_settings(name, self.team, key, patience, retry)
         has_known = robust is not None and not takes_odometry(robust.known)
         if has_known and sharing is not Sharing.MEASUREMENTS:
@@ -276,6 +273,11 @@ class Robot:
         return self._session.is_settled
 
     @property
+    def is_computing(self) -> bool:
+        """Whether it computes, in a thread beside the calls, which hand on what it has found."""
+        return self._session.is_computing
+
+    @property
     def outcome(self) -> Ended | None:
         """How the last solve that succeeded has ended: which one, of whom, and its `solution`."""
         return self._member.outcome
@@ -353,6 +355,7 @@ class Robot:
             "sent": dict(self.ledger.sent),
             "received": dict(self.ledger.received),
             "dropped": self.ledger.dropped,
+            "dropped_by": dict(self.ledger.dropped_by),
         }
 
     def write(self, path: Path | str) -> None:

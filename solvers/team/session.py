@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pgo_models.errors import EngineError, PGOError
 from solvers.carry.letters import LetterName, Letters
 from solvers.carry.registry import record
-from solvers.carry.wire import WireError, opened, sealed
+from solvers.carry.wire import WireError, as_bytes, from_bytes, opened, sealed
 from solvers.robots.agent import Agent
+from solvers.team.beside import Beside
 from solvers.team.driving import Drive
 from solvers.team.member import Member
 from solvers.team.messages import (
@@ -31,6 +33,7 @@ from solvers.team.messages import (
     Priority,
     Reply,
     Term,
+    check_message,
     error_as_message,
 )
 
@@ -54,13 +57,19 @@ class Message(NamedTuple):
 class TeamLedger:
     """Bytes that a robot has handed out for others and received from them, by robot.
 
-    `messages` counts those handed out, `dropped` those received that were none of the team.
+    `messages` counts those handed out, `dropped_by` those received that could not be read, by the
+    robot that sealed them, or "" where none of the team did.
     """
 
     sent: Mapping[str, int] = field(default_factory=dict)
     received: Mapping[str, int] = field(default_factory=dict)
     messages: int = 0
-    dropped: int = 0
+    dropped_by: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def dropped(self) -> int:
+        """How many messages were dropped."""
+        return sum(self.dropped_by.values())
 
     def after_sending(self, message: Message) -> TeamLedger:
         """Return the ledger after one more message."""
@@ -71,9 +80,9 @@ class TeamLedger:
         """Return the ledger after a message of another robot."""
         return replace(self, received=_with_more(self.received, robot, len(data)))
 
-    def after_dropping(self) -> TeamLedger:
-        """Return the ledger after bytes that were no message of the team."""
-        return replace(self, dropped=self.dropped + 1)
+    def after_dropping(self, robot: str) -> TeamLedger:
+        """Return the ledger after bytes that could not be read, which a robot has sealed, or ""."""
+        return replace(self, dropped_by=_with_more(self.dropped_by, robot, 1))
 
 
 def _with_more(counts: Mapping[str, int], name: str, more: int) -> Mapping[str, int]:
@@ -83,18 +92,29 @@ def _with_more(counts: Mapping[str, int], name: str, more: int) -> Mapping[str, 
 @record("Envelope")
 @dataclass(frozen=True)
 class Envelope:
-    """A message and who it is from and to."""
+    """A message as bytes, and who it is from and to."""
 
     sender: str
     receiver: str
-    message: object
+    content: NDArray[np.uint8]
+
+    @classmethod
+    def of(cls, sender: str, receiver: str, message: object) -> Envelope:
+        """Return a message with its addresses."""
+        return cls(sender, receiver, np.frombuffer(as_bytes(message), np.uint8))
+
+    @property
+    def message(self) -> Any:  # noqa: ANN401 - a message of any kind
+        """The message; a WireError for bytes that are none."""
+        return from_bytes(self.content.tobytes(), object)
 
 
 @dataclass(eq=False)
 class Following:
     """What a robot does in a solve: its agent obeys each order once. The last answer may be lost.
 
-    `waiting` is an order that waits for letters of other robots; `members` are all by their places.
+    `waiting` is an order that waits for letters of other robots, and `obeyed` one that the robot
+    computes the answer to; `members` are all by their places.
     """
 
     agent: Agent
@@ -104,6 +124,7 @@ class Following:
     call: int = -1
     reply: Reply | None = None
     waiting: Ask | None = None
+    obeyed: Ask | None = None
 
 
 @dataclass(eq=False)
@@ -192,6 +213,13 @@ class Session:
         self._tried: dict[str, int] | None = None  # revisions of the robots in the last solve
         self._unheard: dict[str, Ended] = {}  # robots that have not confirmed the outcome
         self._out: list[Message] = []
+        self._now = 0.0
+        self._beside = Beside()
+
+    @property
+    def is_computing(self) -> bool:
+        """Whether something is computed beside the calls."""
+        return self._beside.is_busy
 
     @property
     def is_settled(self) -> bool:
@@ -206,6 +234,7 @@ class Session:
 
     def outbox(self) -> list[Message]:
         """Hand out what is to be sent, what others wait for first."""
+        self._beside.act()
         messages = sorted(self._out, key=lambda message: message.priority)
         self._out = []
         for message in messages:
@@ -214,29 +243,39 @@ class Session:
 
     def receive(self, data: bytes, now: float) -> None:
         """Take what has arrived: in any order, and any number of times."""
+        self._now = now
+        self._beside.act()
         try:
             envelope = opened(self._key, data, Envelope)
-            if envelope.receiver != self.name:
-                raise WireError("a message for another robot")
-            if envelope.sender not in self.team or envelope.sender == self.name:
-                raise WireError("a message of nobody in the team")
         except WireError:
-            self.ledger = self.ledger.after_dropping()
+            self.ledger = self.ledger.after_dropping("")
             return
         sender = envelope.sender
+        if sender not in self.team or sender == self.name or envelope.receiver != self.name:
+            self.ledger = self.ledger.after_dropping("")
+            return
+        try:
+            message = envelope.message
+            check_message(message, self.team)
+        except WireError:
+            self.ledger = self.ledger.after_dropping(sender)
+            return
         self.ledger = self.ledger.after_receiving(sender, data)
         self._presence.last_heard[sender] = now
-        self._take(sender, envelope.message, now)
+        self._take(sender, message, now)
 
     def _take(self, sender: str, message: object, now: float) -> None:
         """Update what is known of the team by a message, or obey the order in it."""
         if isinstance(message, Hello):
             self._presence.learn_revision(sender, message.revision)
             self._learn_term(message.term)
+            if self._drive is not None and self._drive.is_computed(sender, message):
+                self._waits_since = now
+                self._sent_at[sender] = now
         elif isinstance(message, Ask):
             self._obey(sender, message)
         elif isinstance(message, Reply):
-            self._take_reply(sender, message, now)
+            self._take_reply(sender, message)
         elif isinstance(message, Letter):
             self._take_letter(message)
         elif isinstance(message, LetterLost):
@@ -250,6 +289,8 @@ class Session:
 
     def tick(self, now: float) -> None:
         """Do what is due: say hello, begin a solve, repeat what was not answered, give up."""
+        self._now = now
+        self._beside.act()
         presence = self._presence
         if presence.began is None:
             presence.began = now
@@ -259,15 +300,18 @@ class Session:
         if self._drive is not None:
             self._go_on_driving(now, awake)
         if self._drive is None and awake[0] == self.name and self._is_time(now, awake):
-            self._begin_drive(awake, now)
+            self._begin_drive(awake)
         self._unheard = {name: ended for name, ended in self._unheard.items() if name in awake}
         self._send_again(self._unheard, Priority.NORMAL, now)
 
     def _say_hello(self, to: str, priority: Priority) -> None:
-        self._send(to, Hello(self._member.revision, self.term), priority)
+        part = self._following
+        is_computing = part is not None and part.obeyed is not None
+        call = part.call + 1 if part is not None and is_computing else -1
+        self._send(to, Hello(self._member.revision, self.term, call), priority)
 
     def _send(self, to: str, message: object, priority: Priority) -> None:
-        data = sealed(self._key, Envelope(self.name, to, message))
+        data = sealed(self._key, Envelope.of(self.name, to, message))
         self._out.append(Message(to, data, priority))
 
     def _send_again(self, waiting: Mapping[str, object], priority: Priority, now: float) -> None:
@@ -303,7 +347,7 @@ class Session:
         is_new = min(revisions.values()) > 0 and revisions != self._tried
         return is_new and self._presence.is_complete(now, awake)
 
-    def _begin_drive(self, awake: tuple[str, ...], now: float) -> None:
+    def _begin_drive(self, awake: tuple[str, ...]) -> None:
         own_revision = self._member.revision
         self._tried = self._presence.revisions_of(awake, own_revision)
         self._unheard.clear()  # of the last outcome: there will be another one
@@ -312,9 +356,10 @@ class Session:
         assert agent is not None  # as it has measurements
         members = (self.name, *(name for name in awake if name != self.name))
         self._following = Following(agent, own_revision, Letters(0), members)
-        self._drive = Drive(self.term, members, agent, self._member.solve)
+        self._drive = Drive(
+            self.term, members, agent, self._member.solve, self._beside, self._after_step
+        )
         self._drive.begin()
-        self._after_step(now)
 
     def _go_on_driving(self, now: float, awake: tuple[str, ...]) -> None:
         """Ask again where no answer came, and give up where a robot has gone.
@@ -326,7 +371,7 @@ class Session:
         if not set(self._drive.needed) <= set(awake):
             self._give_up()
             return
-        if self._waits_since is None:  # a step may have taken longer than any patience
+        if self._waits_since is None or not self._drive.waiting:
             self._waits_since = now
         if now - self._waits_since > _MOST_PATIENCES * self._presence.patience:
             self._end_without_answers(now)
@@ -348,21 +393,16 @@ class Session:
             self._drive.take(
                 name, Reply(ask.term, ask.call, self._presence.revisions.get(name, 0), None, error)
             )
-        self._after_step(now)
 
-    def _take_reply(self, sender: str, reply: Reply, now: float) -> None:
+    def _take_reply(self, sender: str, reply: Reply) -> None:
         if self._drive is not None and reply.term == self._drive.term:
             if self._tried is not None:
                 self._tried[sender] = reply.revision
-            before = self._drive.call
             self._drive.take(sender, reply)
-            if self._drive.call != before or self._drive.outcome is not None:
-                self._after_step(now)
 
-    def _after_step(self, now: float) -> None:
-        """Send what the page of the solve asks for, or its outcome if it has ended."""
-        drive = self._drive
-        assert drive is not None
+    def _after_step(self, drive: Drive) -> None:
+        """Send what the solve asks for, or its outcome if it has ended."""
+        now = self._now
         self._waits_since = None
         self._sent_at.clear()
         self._send_again(drive.waiting, Priority.URGENT, now)
@@ -394,39 +434,69 @@ class Session:
                 return
             letters = Letters(ask.place)
             self._following = Following(agent, self._member.revision, letters, ask.members)
-        part = self._following
-        if ask.call == part.call + 1:
-            lost = self._answer(part, ask)
+        self._answer(self._following, ask)
+
+    def _answer(self, part: Following, ask: Ask) -> None:
+        """Begin to obey the next order, or send the last answer again."""
+        if part.obeyed is not None:
+            self._say_hello(ask.term.driver, Priority.URGENT)
+        elif ask.call == part.call + 1:
+            lost = self._begin_answer(part, ask)
             if part.waiting is not None:  # asked again: the letters should be here by now
                 for name in lost:
                     message = LetterLost(ask.term, name.call, part.letters.place)
                     self._send(part.members[name.other], message, Priority.URGENT)
             part.waiting = ask if lost else None
         elif ask.call == part.call and part.reply is not None:
-            self._send(sender, part.reply, Priority.URGENT)
+            self._send(ask.term.driver, part.reply, Priority.URGENT)
 
     def _have_all_begin_again(self, term: Term) -> None:
         """Tell the robot that drives that this one has begun anew and has lost its part."""
         self.term = Term(term.number + 1, self.name)
         self._say_hello(term.driver, Priority.URGENT)
 
-    def _answer(self, part: Following, ask: Ask) -> set[LetterName]:
-        """Obey an order and send the answer, and letters with it, unless letters are missing."""
-        request, missing = part.letters.put_in(ask.request)
-        if missing:
-            return missing
-        part.call = ask.call
+    def _begin_answer(self, part: Following, ask: Ask) -> set[LetterName]:
+        """Begin to obey an order, unless letters are missing."""
         try:
-            answer = ask.order.function()(part.agent, request)
-        except PGOError as error:
-            part.reply = Reply(ask.term, ask.call, part.revision, None, error_as_message(error))
-        else:
-            answer, letters = part.letters.take_out(ask.call, answer)
-            part.reply = Reply(ask.term, ask.call, part.revision, answer)
-            for name in letters:
-                self._send_letter(part, ask.term, name)
-        self._send(ask.term.driver, part.reply, Priority.URGENT)
+            request, missing = part.letters.put_in(ask.request)
+        except (LookupError, TypeError, PGOError) as error:
+            part.reply = Reply(ask.term, ask.call, part.revision, None, _as_error(error))
+            part.call = ask.call
+            self._send(ask.term.driver, part.reply, Priority.URGENT)
+            return set()
+        if missing:
+            return {name for name in missing if 0 <= name.other < len(part.members)}
+        part.obeyed = ask
+
+        def compute() -> None:
+            answer: Any = None
+            error = None
+            try:
+                answer = ask.order.function()(part.agent, request)
+            except Exception as reason:  # another robot may ask for anything
+                error = _as_error(reason)
+            self._beside.hand_over(lambda: self._end_answer(part, ask, answer, error))
+
+        self._beside.begin(compute)
         return missing
+
+    def _end_answer(
+        self,
+        part: Following,
+        ask: Ask,
+        answer: Any,  # noqa: ANN401 - the order chooses
+        error: tuple[str, str] | None,
+    ) -> None:
+        """Send an answer, and letters with it, unless the solve is given up."""
+        part.obeyed = None
+        part.call = ask.call
+        answer, letters = part.letters.take_out(ask.call, answer)
+        part.reply = Reply(ask.term, ask.call, part.revision, answer, error)
+        if part is not self._following:
+            return
+        for name in letters:
+            self._send_letter(part, ask.term, name)
+        self._send(ask.term.driver, part.reply, Priority.URGENT)
 
     def _send_letter(self, part: Following, term: Term, name: LetterName) -> None:
         letter = Letter(term, name.call, part.letters.place, part.letters.sent[name])
@@ -438,7 +508,9 @@ class Session:
         if part is None or letter.term != self.term:
             return
         part.letters.received[LetterName(letter.place, letter.call)] = letter.content
-        if part.waiting is not None and not self._answer(part, part.waiting):
+        if part.obeyed is not None or part.waiting is None:
+            return
+        if not self._begin_answer(part, part.waiting):
             part.waiting = None
 
     def _repeat_letter(self, lost: LetterLost) -> None:
@@ -464,3 +536,10 @@ class Session:
         """Remember how a solve has ended, and have the robot take what was found."""
         self.last = outcome
         self._member.end_with(outcome, None if self._following is None else self._following.agent)
+
+
+def _as_error(error: Exception) -> tuple[str, str]:
+    """An error as a message: what is no PGOError comes of what another robot has sent."""
+    if isinstance(error, PGOError):
+        return error_as_message(error)
+    return error_as_message(PGOError(f"it cannot compute what it was asked: {error!r:.200}"))

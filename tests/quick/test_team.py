@@ -7,8 +7,6 @@ from networks import KEY, Network, robots_of
 import pgo_models as pgo
 import solvers
 
-pytest.importorskip("greenlet")
-
 
 @pytest.fixture(scope="module")
 def graph() -> pgo.PoseGraph:

@@ -135,7 +135,6 @@ def test_the_only_edge_between_two_robots_is_told(tmp_path: Path) -> None:
 
 
 def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_path: Path) -> None:
-    pytest.importorskip("greenlet")
     graph = world(2, 2, "random", tmp_path)
     robots = robots_with_files(tmp_path, 3, robust=solvers.PCM(), retry=0.3)
     network = Network(robots, np.random.default_rng(0), lost=0.2)

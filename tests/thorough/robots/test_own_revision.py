@@ -94,7 +94,6 @@ def test_thresholds_follow_errors_that_are_smaller_than_the_matrices_claim(tmp_p
 
 
 def test_a_team_that_keeps_its_measurements_does_the_same(tmp_path: Path) -> None:
-    pytest.importorskip("greenlet")
     world_in_files(tmp_path, 0, 2, "random", 0.3)
     folder = solvers.solve_folder(tmp_path, robust=solvers.GNC(), trust_folder=True)
     robots = robots_with_files(tmp_path, 4, robust=solvers.GNC(), retry=0.3)

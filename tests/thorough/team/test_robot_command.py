@@ -19,7 +19,6 @@ import pgo_models as pgo
 import solvers
 from pgo_models.graphs.g2o import write_g2o_folder
 
-pytest.importorskip("greenlet")
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.slow
 

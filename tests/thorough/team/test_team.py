@@ -29,8 +29,6 @@ from solvers.soc.rounding import RowChange
 from solvers.team.messages import Ask, Ended, Heard, Letter, Reply
 from solvers.team.session import Envelope, TeamLedger
 
-pytest.importorskip("greenlet")
-
 PEERS = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.CONSENSUS, tolerance=5e-3))
 
 PAPER = solvers.Pipeline(soc=solvers.PaperSOC(max_iterations=100))
@@ -237,7 +235,7 @@ def test_a_robot_that_was_saved_with_the_outcome_does_not_ask_for_another() -> N
     assert before is not None
     loaded = solvers.Robot.load(network.robots["r2"].save(), KEY, patience=5.0, retry=0.3)
     network.robots["r2"] = loaded
-    loaded.receive(sealed(KEY, Envelope("r0", "r2", before)), network.now)  # its Heard was lost
+    loaded.receive(sealed(KEY, Envelope.of("r0", "r2", before)), network.now)  # its Heard was lost
     network.wait(20.0)
     assert network.robots["r0"].outcome is before
     assert loaded.poses

@@ -1,0 +1,52 @@
+"""Computations beside the calls of a robot, each in a thread of its own.
+
+A robot answers at once, also while it computes. What a computation has found waits in a queue until
+the robot is called again: so all that the robot knows is changed by the thread of its caller alone,
+and computations change nothing but what they were given. The one lock is that of a count.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+
+
+class Beside:
+    """Threads that compute, and what is to be done with their results."""
+
+    def __init__(self) -> None:
+        self._results: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._num_busy = 0
+        self._lock = threading.Lock()  # of the count
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a thread computes; one that waits for others does not."""
+        return self._num_busy > 0
+
+    def begin(self, compute: Callable[[], None]) -> None:
+        """Compute in a thread, which ends with the process at the latest."""
+        self.count(1)
+
+        def run() -> None:
+            try:
+                compute()
+            finally:
+                self.count(-1)
+
+        threading.Thread(target=run, daemon=True).start()
+
+    def count(self, more: int) -> None:
+        """Count threads that begin to compute, also after waiting, or cease to."""
+        with self._lock:
+            self._num_busy += more
+
+    def hand_over(self, act: Callable[[], None]) -> None:
+        """Have the caller of the robot act on a result, when it calls the next time."""
+        self._results.put(act)
+
+    def act(self) -> None:
+        """Act on all results that there are."""
+        while not self._results.empty():
+            self._results.get_nowait()()

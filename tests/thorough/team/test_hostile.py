@@ -1,0 +1,168 @@
+"""What robots with the key of the team send wrongly is dropped and counted, whatever it is."""
+
+from __future__ import annotations
+
+import hmac
+import json
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from budget import examples
+from networks import KEY, Network, robots_of
+
+import pgo_models as pgo
+import solvers
+from solvers.carry.registry import VERSION
+from solvers.carry.serialization import serialize
+from solvers.carry.wire import opened, packed, sealed, unpacked
+from solvers.team.messages import Hello, Term
+from solvers.team.session import Envelope
+
+HELLO = Hello(1, Term(0, ""))
+
+
+def with_content(packed_message: bytes) -> bytes:
+    """A message of r1 to r0 whose bytes are these."""
+    content = np.frombuffer(zlib.compress(packed_message), np.uint8)
+    return sealed(KEY, Envelope("r1", "r0", content))
+
+
+def with_tree(change: Callable[[Any], Any]) -> bytes:
+    """A hello of r1 whose description is changed."""
+    arrays = serialize(HELLO)
+    return with_content(
+        packed({"tree": np.array(json.dumps(change(json.loads(str(arrays["tree"])))))})
+    )
+
+
+def with_field(name: str, value: object) -> bytes:
+    return with_tree(lambda tree: {**tree, "fields": {**tree["fields"], name: value}})
+
+
+def raw(body: bytes) -> bytes:
+    """Any bytes, sealed."""
+    mark = b"PGO" + VERSION.to_bytes(1, "big")
+    return mark + hmac.digest(KEY, mark + body, "sha256") + body
+
+
+def many_arrays() -> bytes:
+    """A megabyte to which a small description refers a hundred thousand times."""
+    tree = {"items": [{"array": 0}] * 100_000}
+    return with_content(packed({"tree": np.array(json.dumps(tree)), "0": np.zeros(1 << 17)}))
+
+
+WRONG: dict[str, Callable[[], bytes]] = {
+    "text for a number": lambda: with_field("revision", "many"),
+    "a number that is none": lambda: with_field("revision", float("nan")),
+    "a number that is too high": lambda: with_field("revision", 1 << 80),
+    "nothing for a number": lambda: with_field("revision", None),
+    "a list for a term": lambda: with_field("term", {"items": [1, "r1"]}),
+    "a driver of nobody": lambda: with_field(
+        "term", {"record": "Term", "fields": {"number": 3, "driver": "zed"}}
+    ),
+    "a list as fields": lambda: with_tree(lambda tree: {**tree, "fields": [1, 2]}),
+    "a field that is none": lambda: with_field("more", 1),
+    "a record that is none": lambda: with_tree(lambda tree: {**tree, "record": "Path"}),
+    "a record in place of a message": lambda: with_tree(lambda tree: tree["fields"]["term"]),
+    "a list that does not end": lambda: with_content(
+        packed({"tree": np.array("[" * 20_000 + "]" * 20_000)})
+    ),
+    "items that do not end": lambda: with_content(
+        packed({"tree": np.array('{"items":[' * 20_000 + "]}" * 20_000)})
+    ),
+    "keys that are lists": lambda: with_tree(lambda tree: {"keys": [[1]], "values": [2]}),
+    "an array many times": many_arrays,
+    "too many bytes": lambda: with_content(bytes(1 << 28)),
+    "too long a text": lambda: with_content(
+        packed({"tree": np.array("[" + "1," * (1 << 20) + "1]")})
+    ),
+    "a negative length": lambda: with_content(_headed([["0", "<f8", [-1]]])),
+    "lengths whose product is small": lambda: with_content(_headed([["0", "<f8", [1 << 40, 0]]])),
+    "a kind of objects": lambda: with_content(_headed([["0", "O", [1]]])),
+    "a length that is a text": lambda: with_content(_headed([["0", "<f8", ["1"]]])),
+    "bytes that are not packed": lambda: sealed(
+        KEY, Envelope("r1", "r0", np.arange(9, dtype="u1"))
+    ),
+}
+
+
+def _headed(head: list[Any]) -> bytes:
+    described = json.dumps(head).encode()
+    return len(described).to_bytes(4, "little") + described
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_no_message_is_dropped_and_counted_with_the_name(what: str) -> None:
+    robot = solvers.Robot("r0", ["r0", "r1"], KEY)
+    robot.receive(WRONG[what](), 0.0)
+    assert robot.ledger.dropped_by == {"r1": 1}
+    assert robot.ledger.received == {}
+
+
+@pytest.mark.parametrize("body", [b"", b"x", zlib.compress(b""), zlib.compress(bytes(1 << 28))])
+def test_a_seal_around_anything_else_is_dropped(body: bytes) -> None:
+    robot = solvers.Robot("r0", ["r0", "r1"], KEY)
+    robot.receive(raw(body), 0.0)
+    assert robot.ledger.dropped == 1
+
+
+ODD = ["text", None, -1, 1 << 70, 0.5, float("nan"), True, [], {}, {"items": []}, {"array": 0}]
+
+
+def spoiled_tree(tree: Any, rng: np.random.Generator) -> Any:
+    """A description with one odd value somewhere in it."""
+    if not isinstance(tree, dict | list) or not tree or rng.random() < 0.15:
+        return ODD[rng.integers(len(ODD))]
+    if isinstance(tree, list):
+        k = int(rng.integers(len(tree)))
+        return [*tree[:k], spoiled_tree(tree[k], rng), *tree[k + 1 :]]
+    name = list(tree)[rng.integers(len(tree))]
+    return {**tree, name: spoiled_tree(tree[name], rng)}
+
+
+def spoiled_message(data: bytes, rng: np.random.Generator) -> bytes:
+    """A message of which something is another: a value in its description, or its numbers."""
+    envelope = opened(KEY, data, Envelope)
+    arrays = dict(unpacked(zlib.decompress(envelope.content.tobytes())))
+    numbers = [name for name, array in arrays.items() if array.dtype.kind in "if" and array.size]
+    if not numbers or rng.random() < 0.5:
+        tree = spoiled_tree(json.loads(str(arrays["tree"])), rng)
+        arrays["tree"] = np.array(json.dumps(tree))
+    else:
+        name = numbers[rng.integers(len(numbers))]
+        array = arrays[name]
+        odd = [array.ravel()[1:], array * 0 - 1, array[..., None], np.zeros(0)]
+        if array.dtype.kind == "f":
+            odd += [array * np.nan, array * np.inf, -array, 1e300 * array]
+        arrays[name] = odd[rng.integers(len(odd))]
+    content = np.frombuffer(zlib.compress(packed(arrays)), np.uint8)
+    return sealed(KEY, Envelope(envelope.sender, envelope.receiver, content))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of numbers that are none
+@pytest.mark.parametrize("seed", range(examples(12)))
+def test_one_wrong_message_of_a_solve_raises_nothing_and_blocks_nobody(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pipeline = solvers.Pipeline(
+        soc=solvers.SOC(coupling=solvers.Coupling.CONSENSUS, tolerance=5e-3)
+    )
+    graph = pgo.grid_world(1, 16, 3, d=2)
+    robots = robots_of(graph, 3, pipeline=pipeline if seed % 2 else None)
+    chosen = int(rng.integers(60))
+    count = 0
+
+    def spoil(sender: str, receiver: str, data: bytes) -> bool:
+        nonlocal count
+        count += 1
+        if count == chosen:
+            robots[receiver].receive(spoiled_message(data, rng), network.now)
+            return True
+        return False
+
+    network = Network(robots, np.random.default_rng(seed), is_lost=spoil)
+    network.run(200.0)
+    for robot in robots.values():
+        assert robot.last is not None
