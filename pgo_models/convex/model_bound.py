@@ -8,9 +8,10 @@ means that these are left out. With Z = u - u', which vanishes there, and G = S 
 
 if S_r is positive definite. This is the bound of a pose graph grounded at a pose
 (`pgo_models.certificates.lower_bound`), where the pose takes the place of the fixed coordinates;
-definiteness is proven by the same factorisation, and u' is moved by -S_r^-1 G_r as X' is there.
-Where S_r is not definite, S_r + eta I may be, I of the coordinates x. As columns have norm 1, that
-is nothing but other multipliers: eta less for each of the equations that say so.
+definiteness is proven by the same factorisation, and u' is moved by -S_r^-1 G_r as X' is there. The
+matrices P of products of hulls are proven definite, too. Where S_r is not definite, S_r + eta I may
+be, I of the coordinates x. As columns have norm 1, that is nothing but other multipliers: eta less
+for each of the equations that say so.
 """
 
 from dataclasses import dataclass
@@ -26,9 +27,10 @@ from pgo_models.certificates.definiteness import (
     smallest_eta,
 )
 from pgo_models.convex.quadratic_form import QuadraticForm
-from pgo_models.convex.set_equations import SetEquations
+from pgo_models.convex.set_equations import HullProduct, SetEquations
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import analyze
 from pgo_models.problem.floating_point import OUTWARD, exact_sum, gamma
 
@@ -52,12 +54,15 @@ class ModelBound(ReadOnly):
         u', which with l is the proof.
     rounding : float
         What was subtracted for rounding and for the G_r that is left.
+    products : tuple of HullProduct
+        Whose matrices P are among the multipliers.
     """
 
     value: float
     multipliers: Array
     u: Array
     rounding: float
+    products: tuple[HullProduct, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class _Lagrangian:
     @classmethod
     def of(cls, form: QuadraticForm, equations: SetEquations, multipliers: Array) -> "_Lagrangian":
         S = csc_array(form.Q - equations.combined(multipliers))
-        most = np.bincount(equations.i, minlength=form.side).max(initial=0) + 4.0
+        most = np.bincount(equations.i, minlength=form.side)[:-1].max(initial=0) + 4.0
         sizes = abs(form.Q) + equations.sizes(multipliers)
         S_error = csc_array(form.Q_error + gamma(float(most)) * sizes)
         is_free = form.is_free.copy()
@@ -82,7 +87,10 @@ class _Lagrangian:
         return cls(form, equations, multipliers, S, S_error, is_free)
 
     def prove(self) -> DefiniteProof | None:
-        """Proof that S_r is definite, or None."""
+        """Proof that S_r is definite, or None; also where a P is not proven definite."""
+        of_products = (each.matrix(self.multipliers) for each in self.equations.products)
+        if not all(_is_definite(P) for P in of_products):
+            return None
         stored_diagonal = np.where(self.is_free, self.S.diagonal(), 2.0)
         if not is_in_range(self.S.data, stored_diagonal):
             return None
@@ -96,8 +104,7 @@ class _Lagrangian:
         root = np.sqrt(diagonal)
         error = keep @ self.S_error @ keep
         entries = OUTWARD * (error @ (1.0 / root)) / root
-        columns = np.repeat(np.arange(self.form.side), np.diff(stored.indptr))
-        positions = np.flatnonzero(stored.indices == columns)
+        positions = _diagonal_positions(stored)
         fixed = np.flatnonzero(~self.is_free)
         matrix = StoredMatrix(stored, diagonal, fixed, entries, analyze(stored), positions)
         return prove_stored(matrix)
@@ -114,13 +121,32 @@ class _Lagrangian:
         G -= self.equations.combined(self.multipliers) @ u
         P_error = abs(form.P) @ z_error + count * size_of_P
         error = 0.5 * (abs(form.spread).T @ (abs(form.T).T @ (P_error + count * size_of_P)))
-        most = np.bincount(self.equations.i, minlength=form.side).max(initial=0) + 8.0
+        most = np.bincount(self.equations.i, minlength=form.side)[:-1].max(initial=0) + 8.0
         error += gamma(float(most)) * (self.equations.sizes(self.multipliers) @ abs(u) + abs(G))
         return np.where(self.is_free, G, 0.0), np.where(self.is_free, OUTWARD * error, 0.0)
 
     def value(self, u: Array) -> tuple[float, float]:
         """The Lagrangian at u, and a bound on its error."""
         return self.form.evaluated(u, -self.equations.terms(self.multipliers, u))
+
+
+def _is_definite(P: Array) -> bool:
+    """Whether a matrix of doubles is proven positive definite."""
+    diagonal = P.diagonal()
+    if not is_in_range(P, diagonal):
+        return False
+    stored = csc_array(P)
+    none = np.zeros(0, dtype=int)
+    entries = np.zeros(len(P))  # P is exactly what is stored
+    positions = _diagonal_positions(stored)
+    matrix = StoredMatrix(stored, diagonal, none, entries, analyze(stored), positions)
+    return prove_stored(matrix, first_margin=0.0) is not None
+
+
+def _diagonal_positions(matrix: csc_array) -> IntArray:
+    """Of the diagonal among the values stored, all of which it has."""
+    columns = np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+    return np.flatnonzero(matrix.indices == columns)
 
 
 def prove_model_bound(
@@ -152,7 +178,8 @@ def _bound_at(lagrangian: _Lagrangian, proof: DefiniteProof, u: Array) -> ModelB
     bound = np.nextafter(exact_sum([value, -error, -loss]), -np.inf)
     if lagrangian.form.is_sum_of_squares:
         bound = max(bound, 0.0)
-    return ModelBound(float(bound), lagrangian.multipliers, u, float(error + loss))
+    products = lagrangian.equations.products
+    return ModelBound(float(bound), lagrangian.multipliers, u, float(error + loss), products)
 
 
 def best_model_bound(

@@ -39,6 +39,10 @@ def write_model_proof(form: QuadraticForm, bound: ModelBound, path: Path | str) 
         "b": form.b.tolist(),
         "constant": form.constant,
         "variables": variables,
+        "products": [
+            {"of": product.of, "P": bound.multipliers[product.entries].tolist()}
+            for product in bound.products
+        ],
         "lower_bound": bound.value,
     }
     with replace_when_done(path) as temporary:

@@ -2,19 +2,20 @@
 
 The relaxation replaces u u^T by any positive semidefinite Z with the same equations; its dual is
 
-    maximise g   subject to   Q - sum_k l_k A_k - g e e^T positive semidefinite.
+    maximise g   subject to   Q - sum_k l_k A_k - g e e^T positive semidefinite,
 
-Its value has seven digits and may be above the minimum, and is no bound: what is proven is the
-bound of its multipliers (`pgo_models.convex.model_bound`). At a stationary point u* multipliers are
-moved to the nearest ones with S u* = 0 in all coordinates that are not fixed, so that the bound is
-J(u*) where S stays definite.
+and so are the matrices P of products of hulls, if there are any. Its value has seven digits and may
+be above the minimum, and is no bound: what is proven is the bound of its multipliers
+(`pgo_models.convex.model_bound`). At a stationary point u* multipliers are moved to the nearest
+ones with S u* = 0 in all coordinates that are not fixed, so that the bound is J(u*) where S stays
+definite. P stays positive semidefinite if P W(u*) = 0, as at the optimum.
 """
 
 from dataclasses import dataclass
 
 import cvxpy as cp
 import numpy as np
-from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse import block_diag, coo_array, csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
 from pgo_models.convex.convex_solver import COLD, ConvexSolver, solve_compiled
@@ -25,6 +26,8 @@ from pgo_models.geometry.rotations import Array
 
 LARGEST = 120  # coordinates of x up to which the relaxation is solved
 _PENALTY = 100.0  # of equalities, as a multiple of the largest entry of Q
+_ZERO = 1e-6  # eigenvalues of W(u*), whose others are of the order of the largest
+_DEFINITE = 1e-13  # what is added to P, as a share of its largest eigenvalue
 _DAMPING = 1e-14  # of the normal equations, as a share of their diagonal
 
 
@@ -37,13 +40,13 @@ def closed_form_multipliers(form: QuadraticForm, equations: SetEquations, u: Arr
     used = np.concatenate([np.arange(equations.num_basic), equations.of_equalities])
     residual = form.Q @ u
     free = form.is_free
-    products = equations.products(u)[free][:, used]
-    normal = csc_array(products.T @ products)
+    columns = equations.times(u)[free][:, used]
+    normal = csc_array(columns.T @ columns)
     normal = csc_array(normal + diags_array(_DAMPING * normal.diagonal() + 1e-300))
     multipliers = np.zeros(equations.number)
     for _ in range(2):  # the second is for the rounding of the first
         left = residual - equations.combined(multipliers) @ u
-        multipliers[used] += splu(normal).solve(products.T @ left[free])
+        multipliers[used] += splu(normal).solve(columns.T @ left[free])
     return multipliers + _PENALTY * _scale(form) * equations.penalty
 
 
@@ -51,10 +54,46 @@ def moved_multipliers(
     form: QuadraticForm, equations: SetEquations, multipliers: Array, u: Array
 ) -> Array:
     """The multipliers nearest to given ones with S u = 0, but for coordinates that are fixed."""
-    residual = form.Q @ u - equations.combined(multipliers) @ u
-    free = form.is_free
-    products = equations.products(u)[free].toarray()
-    return np.asarray(multipliers + np.linalg.lstsq(products, residual[free])[0])
+    first = multipliers.copy()
+    columns = equations.times(u)[form.is_free].toarray()
+    bases = [eye_array(equations.num_equations, format="csc")]
+    for product in equations.products:
+        N = _kernel(product.at(equations, u))
+        first[product.entries] = _triangle(N @ (N.T @ product.matrix(multipliers) @ N) @ N.T)
+        bases.append(csc_array(_congruence(N)))
+    basis = csc_array(block_diag(bases))
+    residual = form.Q @ u - equations.combined(first) @ u
+    moved = first + basis @ np.linalg.lstsq(columns @ basis, residual[form.is_free])[0]
+    return definite_multipliers(equations, moved)
+
+
+def definite_multipliers(equations: SetEquations, multipliers: Array) -> Array:
+    """The multipliers with every P moved to a definite one, which costs the bound little."""
+    definite = multipliers.copy()
+    for product in equations.products:
+        values, vectors = np.linalg.eigh(product.matrix(multipliers))
+        values = np.maximum(values, 0.0) + _DEFINITE * max(abs(values).max(), 1e-300)
+        definite[product.entries] = _triangle((vectors * values) @ vectors.T)
+    return definite
+
+
+def _triangle(P: Array) -> Array:
+    return P[np.triu_indices(len(P))]
+
+
+def _kernel(W: Array) -> Array:
+    """Basis of the directions in which W is zero."""
+    values, vectors = np.linalg.eigh(W)
+    return np.asarray(vectors[:, values < _ZERO * values[-1]])
+
+
+def _congruence(N: Array) -> Array:
+    """Matrix from the upper triangle of D to that of N D N^T."""
+    rows, columns = np.triu_indices(N.shape[1])
+    below, right = np.triu_indices(N.shape[0])
+    products = N[below][:, rows] * N[right][:, columns]
+    mirrored = N[below][:, columns] * N[right][:, rows]
+    return np.asarray(np.where(rows == columns, products, products + mirrored))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +155,11 @@ def solve_model_relaxation(
     corner[-1, -1] = 1.0
     M = Q - cp.reshape(C @ multipliers, (side, side), order="F") - g * corner
     is_semidefinite = M >> 0
-    model = cp.Problem(cp.Maximize(g), [is_semidefinite])
+    constraints = [is_semidefinite]
+    for product in equations.products:
+        P = _from_triangle(product.side) @ multipliers[product.entries]
+        constraints.append(cp.reshape(P, (product.side, product.side), order="F") >> 0)
+    model = cp.Problem(cp.Maximize(g), constraints)
     solve_compiled(
         model, "relaxation", tolerance=1e-10, solver=solver, accepted=cp.OPTIMAL_INACCURATE
     )
@@ -134,6 +177,16 @@ def _reduction(form: QuadraticForm) -> Array:
     D[free, np.arange(len(free))] = 1.0
     D[:, -1] = np.where(form.is_free, 0.0, form.fixed)
     return D
+
+
+def _from_triangle(side: int) -> csc_array:
+    """Matrix from the upper triangle of P to all of P."""
+    rows, columns = np.triu_indices(side)
+    k = np.arange(len(rows))
+    off = rows != columns
+    entries = np.concatenate([rows + side * columns, (columns + side * rows)[off]])
+    of = np.concatenate([k, k[off]])
+    return csc_array((np.ones(len(entries)), (entries, of)), shape=(side**2, len(k)))
 
 
 def _scale(form: QuadraticForm) -> float:

@@ -6,7 +6,9 @@ product of the two others, which is linear beside quadratic and tells rotations 
 = 1 is left to say. An equality E_r u = 0 holds times every coordinate of u.
 
 Multipliers l of these equations make the Lagrangian u^T S u, S = Q - sum_k l_k A_k, which is J
-wherever the equations hold.
+wherever the equations hold. Products of hulls (`pgo_models.convex.hulls`) bring inequalities
+<P, W(u)> >= 0, with P positive semidefinite: their multipliers are the entries of P, and u^T S u is
+at most J on the sets.
 """
 
 from collections.abc import Sequence
@@ -22,8 +24,50 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 
 # An equation of one block: terms (a, b, value) of value u_a u_b; -1 stands for the last of u.
-_Terms = list[tuple[int, int, float]]
-_ONE = -1
+Terms = list[tuple[int, int, float]]
+ONE = -1
+
+
+@dataclass(frozen=True)
+class HullProduct:
+    """A matrix W, linear in u u^T, that is positive semidefinite on the sets.
+
+    Parameters
+    ----------
+    of : pair of (int, int)
+        Of both hulls, the position of the variable and its column or row.
+    start : int
+        The k of the first entry of P. Those of its upper triangle follow, row by row, and the
+        other triangle is counted with them.
+    side : int
+        Of P and W.
+    """
+
+    of: tuple[tuple[int, int], tuple[int, int]]
+    start: int
+    side: int
+
+    @property
+    def entries(self) -> slice:
+        """The k of the entries of P."""
+        return slice(self.start, self.start + self.side * (self.side + 1) // 2)
+
+    def matrix(self, multipliers: Array) -> Array:
+        """P, which is in the multipliers."""
+        P = np.zeros((self.side, self.side))
+        P[np.triu_indices(self.side)] = multipliers[self.entries]
+        return P + np.triu(P, 1).T
+
+    def at(self, equations: "SetEquations", u: Array) -> Array:
+        """W(u)."""
+        k = equations.k - self.start
+        is_own = (k >= 0) & (equations.k < self.entries.stop)
+        terms = (equations.entries * u[equations.i] * u[equations.j])[is_own]
+        upper = np.bincount(k[is_own], terms, self.entries.stop - self.start)
+        rows, columns = np.triu_indices(self.side)
+        W = np.zeros((self.side, self.side))
+        W[rows, columns] = np.where(rows == columns, upper, 0.5 * upper)
+        return W + np.triu(W, 1).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +91,8 @@ class SetEquations(ReadOnly):
     norms : (number,) array
         Multipliers l, 0 and 1, with sum l_k u^T A_k u = ||x||^2 less the number of columns (or
         rows) of norm 1.
+    products : tuple of HullProduct
+        Inequalities, whose A_k come last.
     """
 
     side: int
@@ -59,6 +105,12 @@ class SetEquations(ReadOnly):
     of_equalities: IntArray
     penalty: Array
     norms: Array
+    products: tuple[HullProduct, ...] = ()
+
+    @property
+    def num_equations(self) -> int:
+        """How many A_k are of equations, the first ones."""
+        return self.products[0].start if self.products else self.number
 
     def combined(self, multipliers: Array) -> csc_array:
         """The sum of l_k A_k, (N, N)."""
@@ -70,7 +122,7 @@ class SetEquations(ReadOnly):
         data = abs(multipliers[self.k] * self.entries)
         return csc_array(coo_array((data, (self.i, self.j)), shape=(self.side, self.side)))
 
-    def products(self, u: Array) -> csc_array:
+    def times(self, u: Array) -> csc_array:
         """The columns A_k u, (N, number)."""
         data = self.entries * u[self.j]
         return csc_array(coo_array((data, (self.i, self.k)), shape=(self.side, self.number)))
@@ -98,8 +150,8 @@ def set_equations(form: QuadraticForm) -> SetEquations:
     NotQuadraticError
         If a variable is in a set without such equations.
     """
-    basic: list[_Terms] = []
-    further: list[_Terms] = []
+    basic: list[Terms] = []
+    further: list[Terms] = []
     norms: list[bool] = []
     for block in form.blocks:
         first, others = equations_of_block(block)
@@ -107,7 +159,7 @@ def set_equations(form: QuadraticForm) -> SetEquations:
         further += others
         of_first_set = 1 if block.is_plane else len(_equations_of(block.sets[0], block.shape)[0])
         for position, terms in enumerate(first):
-            norms.append(position < of_first_set and (_ONE, _ONE, -1.0) in terms)
+            norms.append(position < of_first_set and (ONE, ONE, -1.0) in terms)
     last = form.side - 1
     of_equalities = []
     penalty = [0.0] * (len(basic) + len(further))
@@ -124,14 +176,14 @@ def set_equations(form: QuadraticForm) -> SetEquations:
         form.side,
         len(penalty),
         len(basic),
-        *_entries(form.side, basic + further),
+        *entries_of_terms(form.side, basic + further),
         np.array(of_equalities, dtype=int),
         np.array(penalty),
         is_norm,
     )
 
 
-def equations_of_block(block: Block) -> tuple[list[_Terms], list[_Terms]]:
+def equations_of_block(block: Block) -> tuple[list[Terms], list[Terms]]:
     """Basic and further equations of one variable; a NotQuadraticError if a set has none."""
     for each in block.sets:
         if not isinstance(each, Orthonormal | UnitColumns):
@@ -145,7 +197,7 @@ def equations_of_block(block: Block) -> tuple[list[_Terms], list[_Terms]]:
     return basic, further
 
 
-def _equations_of(kind: object, shape: tuple[int, ...]) -> tuple[list[_Terms], list[_Terms]]:
+def _equations_of(kind: object, shape: tuple[int, ...]) -> tuple[list[Terms], list[Terms]]:
     """Basic and further equations of one variable in one set."""
     n, p = shape if len(shape) == 2 else (shape[0], 1)
     columns = [[a + n * b for a in range(n)] for b in range(p)]
@@ -164,7 +216,7 @@ def _equations_of(kind: object, shape: tuple[int, ...]) -> tuple[list[_Terms], l
     return _orthonormal(columns), further
 
 
-def _orthonormal(vectors: Sequence[Sequence[int]]) -> list[_Terms]:
+def _orthonormal(vectors: Sequence[Sequence[int]]) -> list[Terms]:
     equations = []
     for b, second in enumerate(vectors):
         for first in vectors[: b + 1]:
@@ -172,33 +224,34 @@ def _orthonormal(vectors: Sequence[Sequence[int]]) -> list[_Terms]:
     return equations
 
 
-def _product(first: Sequence[int], second: Sequence[int], value: float) -> _Terms:
+def _product(first: Sequence[int], second: Sequence[int], value: float) -> Terms:
     """<first, second> = value."""
     terms = [(a, b, 1.0) for a, b in zip(first, second, strict=True)]
-    return [*terms, (_ONE, _ONE, -value)] if value else terms
+    return [*terms, (ONE, ONE, -value)] if value else terms
 
 
 def _cross_product(
     first: Sequence[int], second: Sequence[int], third: Sequence[int]
-) -> list[_Terms]:
+) -> list[Terms]:
     """Entries of first x second = third."""
     equations = []
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         plus = (first[b], second[c], 1.0)
         minus = (first[c], second[b], -1.0)
-        equations.append([plus, minus, (third[a], _ONE, -1.0)])
+        equations.append([plus, minus, (third[a], ONE, -1.0)])
     return equations
 
 
-def _shifted(terms: _Terms, start: int) -> _Terms:
+def _shifted(terms: Terms, start: int) -> Terms:
     return [
-        (a if a == _ONE else a + start, b if b == _ONE else b + start, value)
-        for a, b, value in terms
+        (a if a == ONE else a + start, b if b == ONE else b + start, value) for a, b, value in terms
     ]
 
 
-def _entries(side: int, equations: list[_Terms]) -> tuple[IntArray, IntArray, IntArray, Array]:
+def entries_of_terms(
+    side: int, equations: list[Terms]
+) -> tuple[IntArray, IntArray, IntArray, Array]:
     """All equations as one list of entries; a term of two coordinates is half above, half below."""
     k = np.repeat(np.arange(len(equations)), [len(terms) for terms in equations])
     flat = np.array([term for terms in equations for term in terms]).reshape(-1, 3)

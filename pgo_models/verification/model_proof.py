@@ -11,11 +11,13 @@ have orthonormal columns, are a rotation, or have unit columns or rows.
 entries of z. With any multipliers l_k of equations q_k that hold on the sets (columns and, of a
 square matrix, rows are orthonormal; in SO(3) a column is the cross product of the two others),
 
-    L(v) = objective - sum_k l_k q_k,
+    L(v) = objective - sum_k l_k q_k - sum_j <P_j, H_j x H'_j>,
 
-is a quadratic function of the entries v that are left, and equal to the objective on the sets. Its
-minimum over all v is a lower bound. The square is completed entry by entry: where all pivots are
-positive (or a whole row of zeros), the constant that remains is that minimum.
+is a quadratic function of the entries v that are left, and at most the objective on the sets. H and
+H' are matrices, affine in a variable, that are positive semidefinite on its set (`hull`), and so is
+their Kronecker product; P_j has to be, which is shown as the following is. The minimum of L over
+all v is a lower bound. The square is completed entry by entry: where all pivots are positive (or a
+whole row of zeros), the constant that remains is that minimum.
 
 All is done in rational numbers, without any rounding. Nothing outside `pgo_models.verification` is
 imported but `pgo_models.errors`.
@@ -114,21 +116,50 @@ def lagrangian(record: dict[str, Any]) -> tuple[Quadratic, str]:
     solved = solutions([*equalities(record), *plane_equations(variables)], constrained)
     if solved is None:
         return {}, "the equalities contradict each other"
-    L: Quadratic = {}
-    for i, j, value in record["P"]:  # the upper triangle
-        half = exact(float(value)) * (fmpq(1, 2) if i == j else 1)
-        add_product(L, affine(solved, int(i)), affine(solved, int(j)), half)
-    unit = {ONE: fmpq(1)}
-    for j, value in enumerate(record["c"]):
-        if value:
-            add_product(L, affine(solved, j), unit, exact(float(value)))
-    add_product(L, unit, unit, exact(float(record["constant"])))
+    L = objective(record, solved)
     for variable in variables:
         for multiplier, terms in equations(variable):
             for a, b, value in terms:
                 product = affine(solved, a), affine(solved, b)
                 add_product(L, *product, -exact(float(multiplier)) * value)
+    for product_of_hulls in record.get("products", []):
+        if not subtract_product(L, solved, variables, product_of_hulls):
+            return {}, "a matrix P of a product of hulls is not positive semidefinite"
     return L, ""
+
+
+def objective(record: dict[str, Any], solved: dict[int, Affine]) -> Quadratic:
+    """1/2 z^T P z + c^T z + constant in the entries that are left."""
+    J: Quadratic = {}
+    for i, j, value in record["P"]:  # the upper triangle
+        half = exact(float(value)) * (fmpq(1, 2) if i == j else 1)
+        add_product(J, affine(solved, int(i)), affine(solved, int(j)), half)
+    unit = {ONE: fmpq(1)}
+    for j, value in enumerate(record["c"]):
+        if value:
+            add_product(J, affine(solved, j), unit, exact(float(value)))
+    add_product(J, unit, unit, exact(float(record["constant"])))
+    return J
+
+
+def subtract_product(
+    L: Quadratic, solved: dict[int, Affine], variables: list[dict[str, Any]], record: dict[str, Any]
+) -> bool:
+    """Subtract <P, H x H'>, and say whether P is positive semidefinite."""
+    (first, part), (second, other_part) = record["of"]
+    side, H = hull(variables[first], part)
+    other_side, other_H = hull(variables[second], other_part)
+    entries = list(reversed(record["P"]))
+    P: Quadratic = {}
+    for row in range(side * other_side):
+        for column in range(row, side * other_side):
+            value = exact(float(entries.pop()))
+            P.setdefault(row, {})[column] = P.setdefault(column, {})[row] = value
+            of_first = H.get((row // other_side, column // other_side), {})
+            of_second = other_H.get((row % other_side, column % other_side), {})
+            factor = -value * (1 if row == column else 2)
+            add_product(L, substituted(solved, of_first), substituted(solved, of_second), factor)
+    return least_value(P) is not None
 
 
 def equalities(record: dict[str, Any]) -> Iterable[Affine]:
@@ -162,11 +193,7 @@ def solutions(rows: Iterable[Affine], constrained: set[int]) -> dict[int, Affine
     """Rows = 0 solved for entries of z, others than constrained ones if possible."""
     solved: dict[int, Affine] = {}
     for row in rows:
-        left: Affine = {}
-        for j, value in row.items():
-            for k, factor in affine(solved, j).items():
-                left[k] = left.get(k, fmpq(0)) + value * factor
-        left = {k: value for k, value in left.items() if value != 0}
+        left = {k: value for k, value in substituted(solved, row).items() if value != 0}
         pivots = sorted((k in constrained, k) for k in left if k != ONE)
         if not pivots:
             if left:
@@ -188,6 +215,15 @@ def solutions(rows: Iterable[Affine], constrained: set[int]) -> dict[int, Affine
 def affine(solved: dict[int, Affine], j: int) -> Affine:
     """Entry j of z in those that are left."""
     return solved.get(j, {j: fmpq(1)})
+
+
+def substituted(solved: dict[int, Affine], function: Affine) -> Affine:
+    """An affine function of z in the entries that are left."""
+    left: Affine = {}
+    for j, value in function.items():
+        for k, factor in affine(solved, j).items():
+            left[k] = left.get(k, fmpq(0)) + value * factor
+    return left
 
 
 def add_product(L: Quadratic, first: Affine, second: Affine, factor: fmpq) -> None:
@@ -251,6 +287,58 @@ def cross(first: list[int], second: list[int], third: list[int]) -> list[Terms]:
         plus = (first[b], second[c], fmpq(1))
         minus = (first[c], second[b], fmpq(-1))
         of_all.append([plus, minus, (third[a], ONE, fmpq(-1))])
+    return of_all
+
+
+def hull(variable: dict[str, Any], part: int) -> tuple[int, dict[tuple[int, int], Affine]]:
+    """Side and entries of a matrix that is positive semidefinite on the set of a variable.
+
+    Of the unit quaternion q = (w, x, y, z) of a rotation of space it is 4 q q^T; of a rotation of
+    the plane 2 h h^T, with h = (cos, sin) of half its angle; of X^T X = I it is (I, X; X^T, I),
+    and of one unit column or row x the same, (I, x; x^T, 1).
+    """
+    (kind,) = variable["sets"]
+    n, p = (int(size) for size in variable["shape"])
+    first = int(variable["first"])
+    x = [[first + a + n * b for b in range(p)] for a in range(n)]
+    if kind == "rotation" and n == 3:
+        return 4, quaternion_products(x)
+    if kind == "rotation" and n == 2:
+        plane = {(0, 0): {ONE: 1, x[0][0]: 1}, (1, 1): {ONE: 1, x[0][0]: -1}, (0, 1): {x[1][0]: 1}}
+        return 2, both_triangles(plane)
+    if kind == "unit columns":
+        x = [[x[a][range(p)[part]]] for a in range(n)]
+    elif kind == "unit rows":
+        x = [[entry] for entry in x[part]]
+    ball: dict[tuple[int, int], dict[int, int]] = {}
+    for a in range(len(x)):
+        for b in range(len(x[0])):
+            ball[a, len(x) + b] = {x[a][b]: 1}
+    side = len(x) + len(x[0])
+    return side, both_triangles(ball | {(a, a): {ONE: 1} for a in range(side)})
+
+
+def quaternion_products(x: list[list[int]]) -> dict[tuple[int, int], Affine]:
+    """4 q q^T in the entries of a rotation."""
+    entries: dict[tuple[int, int], dict[int, int]] = {}
+    for a in range(4):
+        # 4 w^2 = 1 + x_11 + x_22 + x_33, and 4 x^2 = 1 + x_11 - x_22 - x_33, ..
+        signs = [1 if a in (0, k + 1) else -1 for k in range(3)]
+        entries[a, a] = {ONE: 1} | {x[k][k]: signs[k] for k in range(3)}
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        entries[0, a + 1] = {x[c][b]: 1, x[b][c]: -1}
+        entries[min(b, c) + 1, max(b, c) + 1] = {x[b][c]: 1, x[c][b]: 1}
+    return both_triangles(entries)
+
+
+def both_triangles(
+    upper: dict[tuple[int, int], dict[int, int]],
+) -> dict[tuple[int, int], Affine]:
+    """A symmetric matrix of its upper triangle."""
+    of_all: dict[tuple[int, int], Affine] = {}
+    for (a, b), function in upper.items():
+        of_all[a, b] = of_all[b, a] = {k: fmpq(factor) for k, factor in function.items()}
     return of_all
 
 

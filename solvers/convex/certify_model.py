@@ -1,18 +1,22 @@
 """Certify values of a quadratic model: the bound of closed-form multipliers, or of the relaxation.
 
 The bound is proven at the stationary point beside the values. Where closed-form multipliers do not
-give the gap, the relaxation is solved, if the model is small. Its point, projected, is one more
-candidate, and its multipliers, moved to the best candidate, give the bound.
+give the gap, the relaxation is solved, if the model is small, and where that leaves a gap, the
+relaxation with products of hulls. Their points, projected, are more candidates, and their
+multipliers, moved to the best candidate, give the bound.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.convex.hulls import with_hull_products
 from pgo_models.convex.model_bound import ModelBound, best_model_bound, prove_model_bound
 from pgo_models.convex.model_certificate import ModelCertificate, judge_values
 from pgo_models.convex.model_relaxation import (
     LARGEST,
     closed_form_multipliers,
+    definite_multipliers,
     moved_multipliers,
     solve_model_relaxation,
 )
@@ -52,35 +56,53 @@ def best_bound(
 ) -> tuple[ModelBound | None, Array]:
     """The best bound that is found, and the best point: the stationary one beside u or another."""
     newton = ModelNewton(form, equations)
-    best = newton.polish(u) if newton.is_possible else u
-    closed = closed_form_multipliers(form, equations, best)
-    bounds = [prove_model_bound(form, equations, closed, best)]
-
-    def is_enough() -> bool:
-        bound = _largest(bounds)
-        return judge_values(form, equations, best, bound, gap).is_certified
-
-    if is_enough():
-        return _largest(bounds), best
-    if form.num_constrained > LARGEST:
-        bounds.append(best_model_bound(form, equations, closed, best))
-        return _largest(bounds), best
-    try:
-        relaxed = solve_model_relaxation(form, equations)
-    except PGOError:  # of the solver; closed-form multipliers are what is left
-        bounds.append(best_model_bound(form, equations, closed, best))
-        return _largest(bounds), best
-    if newton.is_possible:
-        other = newton.polish(newton.on_sets(relaxed.u))
-        best = min(best, other, key=form.objective)
-    moved = moved_multipliers(form, equations, relaxed.multipliers, best)
-    bounds.append(prove_model_bound(form, equations, moved, best))
-    for multipliers, at in ((relaxed.multipliers, relaxed.u), (moved, best)):
-        if not is_enough():
-            bounds.append(best_model_bound(form, equations, multipliers, at))
-    return _largest(bounds), best
+    search = _Search(newton, newton.polish(u) if newton.is_possible else u, gap)
+    closed = closed_form_multipliers(form, equations, search.best)
+    search.add(prove_model_bound(form, equations, closed, search.best))
+    if not search.is_done and form.num_constrained <= LARGEST:
+        search.relax(equations)
+        tighter = None if search.is_done else with_hull_products(form, equations)
+        if tighter is not None:
+            search.relax(tighter)
+    last = search.last_multipliers or [(equations, closed, search.best)]
+    for relaxation, multipliers, at in last:
+        if not search.is_done:
+            search.add(best_model_bound(form, relaxation, multipliers, at))
+    return search.bound, search.best
 
 
-def _largest(bounds: Sequence[ModelBound | None]) -> ModelBound | None:
-    known = [bound for bound in bounds if bound is not None]
-    return max(known, key=lambda bound: bound.value, default=None)
+@dataclass
+class _Search:
+    """The best point and the best bound so far."""
+
+    newton: ModelNewton
+    best: Array
+    gap: float
+    bound: ModelBound | None = None
+    # of the last relaxation: its equations, multipliers as solved and as moved, and their points
+    last_multipliers: list[tuple[SetEquations, Array, Array]] = field(default_factory=list)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the gap between the two is the one asked for."""
+        form, equations = self.newton.form, self.newton.equations
+        return judge_values(form, equations, self.best, self.bound, self.gap).is_certified
+
+    def add(self, bound: ModelBound | None) -> None:
+        if bound is not None and (self.bound is None or bound.value > self.bound.value):
+            self.bound = bound
+
+    def relax(self, equations: SetEquations) -> None:
+        """Solve a relaxation, whose point is one more candidate, and take its multipliers."""
+        form = self.newton.form
+        try:
+            relaxed = solve_model_relaxation(form, equations)
+        except PGOError:  # of the solver; the bounds that are known are what is left
+            return
+        if self.newton.is_possible:
+            other = self.newton.polish(self.newton.on_sets(relaxed.u))
+            self.best = min(self.best, other, key=form.objective)
+        moved = moved_multipliers(form, equations, relaxed.multipliers, self.best)
+        self.add(prove_model_bound(form, equations, moved, self.best))
+        given = definite_multipliers(equations, relaxed.multipliers)
+        self.last_multipliers = [(equations, given, relaxed.u), (equations, moved, self.best)]

@@ -35,6 +35,16 @@ def random_model(seed: int, kind: str, shape: tuple[int, int], count: int):
     return pgo.OrthogonalProblem(problem, **{kind: variables})
 
 
+def square_model(seed: int, kind: str, shape: tuple[int, int], count: int):
+    """A sum of as many squares as there are entries, far from any noise model."""
+    rng = np.random.default_rng(seed)
+    variables = [cp.Variable(shape) for _ in range(count)]
+    entries = cp.hstack([cp.vec(X, order="F") for X in variables])
+    A = rng.standard_normal((entries.size, entries.size))
+    squares = cp.sum_squares(A @ entries - rng.standard_normal(entries.size))
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(squares)), **{kind: variables})
+
+
 @pytest.mark.parametrize(("kind", "shape", "count"), SETS)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_bound_is_never_above_the_least_of_many_starts(seed, kind, shape, count) -> None:
@@ -53,6 +63,38 @@ def test_a_random_quadratic_of_one_rotation_is_certified(seed: int) -> None:
     solution = solvers.solve_orthogonal(random_model(seed, "rotations", (3, 3), 1), seed, starts=4)
     assert solution.verdict is Verdict.CERTIFIED
     assert solution.gap <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape", "count", "seed"),
+    [
+        ("rotations", (3, 3), 2, 0),
+        ("rotations", (2, 2), 3, 2),
+        ("orthogonal", (4, 2), 1, 3),
+        ("unit_columns", (3, 2), 2, 1),
+        ("unit_rows", (6, 3), 1, 4),
+    ],
+)
+def test_products_of_hulls_certify_what_equations_do_not(
+    kind, shape, count, seed, tmp_path
+) -> None:
+    pytest.importorskip("flint")
+    solution = solvers.solve_orthogonal(square_model(seed, kind, shape, count), 0)
+    assert solution.verdict is Verdict.CERTIFIED
+    assert solution.gap <= 1e-9
+    path = tmp_path / "proof.json"
+    solution.certificate.save_proof(path)
+    assert pgo.verify_model_proof(path).is_verified
+    record = json.loads(path.read_text())
+
+    def verified(**changes):
+        path.write_text(json.dumps({**record, **changes}))
+        return pgo.verify_model_proof(path)
+
+    assert not verified(products=[]).is_verified  # equations alone do not prove it
+    negative = json.loads(json.dumps(record["products"]))
+    negative[0]["P"][0] = -1.0
+    assert "P of a product" in verified(products=negative).failure
 
 
 def test_the_form_is_the_objective_with_the_best_free_variables() -> None:
