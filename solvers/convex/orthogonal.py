@@ -12,6 +12,7 @@ Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014, Algorithm 1.
 """
 
 import enum
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +36,7 @@ from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
 from solvers.convex.certify_model import best_bound, without_bound
+from solvers.convex.determinants import random_points, reflections, with_free_determinants
 from solvers.convex.model_newton import ModelNewton
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
@@ -51,6 +53,7 @@ _FAINT = 1e-6
 _BALANCE_EVERY = 5
 _BALANCE_UNTIL = 500
 _BALANCE_RATIO = 10.0
+_LOWER = 1e-6  # share of J by which a run from a reflected point has to end lower
 
 
 class XStep(enum.Enum):
@@ -395,7 +398,9 @@ def solve_orthogonal(
 ) -> OrthogonalSolution:
     """Run SOC from random starts, keep the best run, and prove how good it is.
 
-    Runs that converged come first, then the lowest J. Of a quadratic model with linear equalities
+    Runs that converged come first, then the lowest J. Starts take all signs of determinants of
+    variables in O(d) in turn; where there are more patterns of signs than starts, single variables
+    of the best point are reflected. Of a quadratic model with linear equalities
     (`pgo_models.convex.quadratic_form`) step (a) takes no convex solver, Newton moves the best run
     to a stationary point, and a lower bound on J at all points of the sets is proven; where the
     relaxation that gives the bound leads to a better point, that one is returned. Of other models
@@ -448,11 +453,13 @@ def solve_orthogonal(
     x_step = XStep.CONVEX_SOLVER if matrices is None else matrices
     prepared = replace(method, x_step=x_step)
     outcomes = list[Outcome[OrthogonalState]]()
-    for _ in range(starts):
-        outcomes.append(run(prepared, problem, problem.random_point(rng), verbose=verbose))
+    for start in itertools.islice(random_points(problem, rng), starts):
+        outcomes.append(run(prepared, problem, start, verbose=verbose))
         if outcomes[-1].status is Status.INTERRUPTED:
             break
-    best = min(outcomes, key=lambda outcome: (not outcome.status.is_success, outcome.objective))
+    best = min(outcomes, key=_rank)
+    if 2 ** len(with_free_determinants(problem)) > starts:
+        best = _lowered_by_reflections(prepared, problem, best, verbose=verbose)
     state = best.state
     ends = tuple(
         outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes
@@ -468,6 +475,34 @@ def solve_orthogonal(
     return OrthogonalSolution(
         problem, values, state.others, best.objective, kkt, best, ends, certificate
     )
+
+
+def _rank(outcome: Outcome[OrthogonalState]) -> tuple[bool, float]:
+    """Runs that converged come first, then the lowest J."""
+    return not outcome.status.is_success, outcome.objective
+
+
+def _lowered_by_reflections(
+    method: OrthogonalSOC,
+    problem: OrthogonalProblem,
+    best: Outcome[OrthogonalState],
+    *,
+    verbose: bool,
+) -> Outcome[OrthogonalState]:
+    """The best run, or one from its point with variables reflected that ends lower."""
+    is_lower = best.status is not Status.INTERRUPTED
+    while is_lower:
+        is_lower = False
+        for start in reflections(problem, problem.values(best.state.copies)):
+            outcome = run(method, problem, start, verbose=verbose)
+            if outcome.status is Status.INTERRUPTED:
+                return best
+            least = best.objective - _LOWER * abs(best.objective)
+            if _rank(outcome) < (not best.status.is_success, least):
+                best = outcome
+                is_lower = True
+                break
+    return best
 
 
 def _certified(

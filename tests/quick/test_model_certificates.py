@@ -193,6 +193,30 @@ def test_a_reflected_start_does_not_hide_the_minimum() -> None:
         assert solution.objective == pytest.approx(1.0, rel=1e-9)
 
 
+def nearest_orthogonal(targets: list[np.ndarray], *, is_quadratic: bool):
+    """The orthogonal matrices nearest to some, and their distances in closed form."""
+    variables = [cp.Variable(target.shape) for target in targets]
+    misfits = [X - target for X, target in zip(variables, targets, strict=True)]
+    squares = [np.sum((np.linalg.svd(target)[1] - 1.0) ** 2) for target in targets]
+    J = sum(cp.sum_squares(each) if is_quadratic else cp.norm(each, "fro") for each in misfits)
+    least = np.sum(squares if is_quadratic else np.sqrt(squares))
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J)), orthogonal=variables), least
+
+
+@pytest.mark.parametrize(("count", "is_quadratic"), [(1, True), (1, False), (6, True)])
+def test_starts_cover_the_signs_of_determinants(count: int, is_quadratic: bool) -> None:
+    rng = np.random.default_rng(count)
+    targets = list(rng.standard_normal((count, 3, 3)))
+    if count == 1:
+        targets = [np.diag([2.0, 1.0, -1.0])]
+    model, least = nearest_orthogonal(targets, is_quadratic=is_quadratic)
+    solution = solvers.solve_orthogonal(model, 0, starts=2)
+    assert solution.objective == pytest.approx(least, rel=1e-5)
+    if count == 1:
+        assert least == pytest.approx(1.0)
+        assert len(solution.objectives) == 2
+
+
 def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
     X = cp.Variable((3, 3), name="X")
     y = cp.Variable(name="y")
