@@ -124,12 +124,13 @@ def robot_command(
     with ZenohLink(robot, listen, connect or []) as link, _interrupt_noted() as interrupted:
         reporter.say(f"{name} listens at {listen}, and waits for {', '.join(robot.others)}")
         carry(robot, link, wait, reporter, interrupted.is_set)
-    if interrupted.is_set() and robot.outcome is None:
-        raise KeyboardInterrupt
-    writers = [(out, robot.write)] if out is not None and robot.poses else []
-    record = robot.as_json if as_json else None
-    text = wrapped("\n".join(f"{label:<12} {value}" for label, value in robot.facts()), _INDENT)
-    save_then_show(writers, lambda: typer.echo(text), record, quiet)
+        if interrupted.is_set() and robot.outcome is None:
+            raise KeyboardInterrupt
+        # Before the network is closed: others who have gone may keep it from that.
+        writers = [(out, robot.write)] if out is not None and robot.poses else []
+        record = robot.as_json if as_json else None
+        text = wrapped("\n".join(f"{label:<12} {value}" for label, value in robot.facts()), _INDENT)
+        save_then_show(writers, lambda: typer.echo(text), record, quiet)
     is_done = robot.is_certified and not interrupted.is_set()
     raise typer.Exit(DONE if is_done else NOT_CERTIFIED)
 

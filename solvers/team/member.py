@@ -7,6 +7,7 @@ measurements the robot that drives solves alone, with all options of `solve`.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -111,12 +112,21 @@ class Member:
         network.ask(take_answer, answers, Count.ROUND)
         return RobotsSolution.of(solution, network.ledger)
 
-    def end_with(self, ended: Ended, agent: Agent | None) -> None:
-        """Keep an outcome and the poses with it; where a solve has failed, those before it.
+    def has_more_than(self, revisions: Mapping[str, int]) -> bool:
+        """Whether what was certified holds for measurements of these revisions, and for more."""
+        outcome = self.outcome
+        if outcome is None or outcome.solution is None or not outcome.solution.is_certified:
+            return False
+        return outcome.revisions.items() > revisions.items()
 
-        The agent was its part in the solve.
+    def end_with(self, ended: Ended, agent: Agent | None) -> None:
+        """Keep an outcome and the poses with it, unless what was certified before holds for more.
+
+        Where a solve has failed, those before it stay. The agent was its part in the solve.
         """
         answer = None if agent is None else answer_of(agent)
+        if self.has_more_than(ended.revisions):
+            return
         if ended.solution is not None and answer is not None:
             self.outcome = ended
             self.known = answer

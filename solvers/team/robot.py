@@ -266,7 +266,7 @@ class Robot:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the last solve was of the whole team, and nobody waits for this robot.
+        """Whether a solve was of the whole team, and nobody waits for this robot.
 
         It was of all measurements that this robot has.
         """
@@ -279,7 +279,10 @@ class Robot:
 
     @property
     def outcome(self) -> Ended | None:
-        """How the last solve that succeeded has ended: which one, of whom, and its `solution`."""
+        """How the last solve that succeeded has ended: which one, of whom, and its `solution`.
+
+        A solve of fewer robots without new measurements does not replace one that is certified.
+        """
         return self._member.outcome
 
     @property
@@ -313,6 +316,8 @@ class Robot:
             facts += [("stages", ", ".join(_names_of_stages(solution)))]
             facts += [("rounds", str(solution.ledger.rounds))]
         facts.append(("absent", ", ".join(self.absent)))
+        if self.last is not None and self.last is not self.outcome and not self.failure:
+            facts.append(("last solve", self.last.text))
         sent = sum(self.ledger.sent.values())
         received = sum(self.ledger.received.values())
         traffic = f"{sent} sent, {received} received, {self.ledger.dropped} messages dropped"

@@ -223,12 +223,13 @@ class Session:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the last solve was of the whole team and all that this robot has measured.
+        """Whether a solve was of the whole team and all that this robot has measured.
 
         Nobody waits for this robot then.
         """
-        last = self.last
-        if last is None or last.absent or last.revisions.get(self.name) != self._member.revision:
+        ends = [ended for ended in (self.last, self._member.outcome) if ended is not None]
+        own = self._member.revision
+        if not any(not end.absent and end.revisions.get(self.name) == own for end in ends):
             return False
         return self._drive is None and not self._unheard and not self._out
 
@@ -341,10 +342,13 @@ class Session:
     def _is_time(self, now: float, awake: tuple[str, ...]) -> bool:
         """Whether a solve should begin: everybody is there or was waited for, and something is new.
 
-        Robots without measurements are waited for, too.
+        Robots without measurements are waited for, too. Where robots have gone and nothing is new,
+        a solve would find less than what is known.
         """
         revisions = self._presence.revisions_of(awake, self._member.revision)
         is_new = min(revisions.values()) > 0 and revisions != self._tried
+        if self._member.has_more_than(revisions):
+            return False
         return is_new and self._presence.is_complete(now, awake)
 
     def _begin_drive(self, awake: tuple[str, ...]) -> None:

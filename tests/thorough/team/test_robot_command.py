@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.slow
 PGO = [sys.executable, "-c", "from solvers.cli.app import main; main()", "robot"]
 NAMES = ("a", "b", "c")
 WORLD = pgo.grid_world(1, 300, 3)
+NUMBERS = itertools.count()
 
 
 @dataclass
@@ -119,7 +121,8 @@ def without_networks(tag: str) -> None:
 @pytest.fixture
 def fleet(tmp_path: Path) -> Iterator[Fleet]:
     """Three machines, each with a folder that has its own file and the key of the team alone."""
-    tag = f"p{os.getpid() % 10000}"
+    # A network that is deleted lingers for a while, with its names.
+    tag = f"p{os.getpid() % 10000}n{next(NUMBERS)}"
     world = WORLD.with_robots(pgo.partition(WORLD, 3).robot)
     write_g2o_folder(world, tmp_path / "all", world.truth)
     has_networks = own_networks(tag)
@@ -141,8 +144,7 @@ def fleet(tmp_path: Path) -> Iterator[Fleet]:
     for process in made.processes.values():
         process.kill()
         process.communicate()
-    if has_networks:
-        without_networks(tag)
+    without_networks(tag)
 
 
 def central() -> solvers.Solution:
@@ -211,6 +213,20 @@ def test_a_robot_that_is_cut_off_for_twenty_seconds_goes_on(fleet: Fleet) -> Non
         code, told = fleet.ended(name)
         assert code == 0, told
         assert told["covered"] == list(NAMES)
+
+
+def test_a_robot_that_leaves_after_the_verdict_takes_nothing_from_the_others(fleet: Fleet) -> None:
+    if not fleet.has_own_networks:
+        pytest.skip("network namespaces are not allowed here")
+    for name in NAMES:
+        fleet.start(name)
+    fleet.says("c", "CERTIFIED, for a, b, c")
+    fleet.cut("c", True)
+    for name in ("a", "b"):
+        code, told = fleet.ended(name)
+        assert code == 0, told
+        assert told["covered"] == list(NAMES)
+        assert (fleet.machines[name].folder / "solved.g2o").exists()
 
 
 def test_ctrl_c_keeps_what_is_known(fleet: Fleet) -> None:

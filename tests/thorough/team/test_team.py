@@ -241,6 +241,28 @@ def test_a_robot_that_was_saved_with_the_outcome_does_not_ask_for_another() -> N
     assert loaded.poses
 
 
+@pytest.mark.parametrize("gone", ["r0", "r2"])
+def test_a_joint_certificate_outlives_robots_that_leave_after_it(gone: str) -> None:
+    graph = world()
+    loses, _ = losing(Heard, range(10**9), sender="r2")  # the last word of r2 is lost
+    network = Network(robots_of(graph, 3), np.random.default_rng(0), is_lost=loses)
+    while network.robots["r2"].outcome is None:
+        network.wait(0.02)
+    network.wait(1.0)
+    network.asleep = {gone}
+    network.wait(20.0)
+    assert network.is_settled
+    assert_is_the_optimum(network.robots, graph)
+    for name in {"r0", "r1", "r2"} - {gone}:
+        assert network.robots[name].covered == ("r0", "r1", "r2")
+    robot = network.robots["r1"]
+    add = np.array([1.0, 0.0])  # something new: the others go on without the one that has gone
+    robot.add_edge(*sorted(robot.poses)[:2], np.eye(2), add, kappa=1e-3, tau=1e-3)
+    network.wait(20.0)
+    assert gone in robot.absent
+    assert robot.is_certified
+
+
 def message_in(data: bytes) -> object:
     """What sealed bytes say."""
     return opened(KEY, data, Envelope).message
