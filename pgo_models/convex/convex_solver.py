@@ -113,6 +113,13 @@ def check_terms(terms: Sequence[cp.Expression], constraints: Sequence[cp.Constra
             )
 
 
+def check_parameters(problem: cp.Problem) -> None:
+    """Raise a SettingError unless every Parameter of a problem has a value."""
+    for parameter in problem.parameters():
+        if parameter.value is None:
+            raise SettingError(f"the Parameter {parameter.name()} has no value; set it first")
+
+
 def check_variable(variable: cp.Variable, name: str) -> None:
     """Raise a SettingError unless `variable` is a continuous real cvxpy Variable."""
     if not isinstance(variable, cp.Variable):
@@ -269,6 +276,8 @@ def solve_compiled(
         except cp.SolverError as error:
             status = cp.SOLVER_ERROR
             why = str(error)
+        except ValueError as error:  # cvxpy's of nan and inf in the data
+            raise SettingError(f"the {name} has nan or inf; check the data: {error}") from error
         is_last = tolerance >= LOOSEST_TOLERANCE or solver.is_first_order
         if status == cp.OPTIMAL or (is_last and status == accepted):
             return

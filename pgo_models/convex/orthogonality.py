@@ -8,7 +8,8 @@ in solvers/convex/orthogonal.py.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import cvxpy as cp
@@ -23,10 +24,12 @@ from pgo_models.convex.constraint_sets import (
     UnitColumns,
     UnitRows,
 )
+from pgo_models.convex.convex_on_sets import minimised
 from pgo_models.convex.convex_solver import (
     COLD,
     ConvexSolver,
     HoldsModel,
+    check_parameters,
     check_variable,
     finite_array,
 )
@@ -161,10 +164,12 @@ class OrthogonalProblem(HoldsModel):
                 check_variable(variable, "a variable of the problem")
                 others.append(variable)
         _check_not_imposed_twice(self.problem.constraints, set(positions))
-        object.__setattr__(self, "J", _minimised(self.problem))
         object.__setattr__(self, "variables", tuple(variables))
         object.__setattr__(self, "others", tuple(others))
         object.__setattr__(self, "terms", tuple(terms))
+        sets = [(variable, self.terms_of(place)) for place, variable in enumerate(variables)]
+        object.__setattr__(self, "J", minimised(self.problem, sets))
+        convex_solver.check_terms((), self.problem.constraints)
 
     def _named_constraints(self) -> list[tuple[str, Any, ConstraintSet]]:
         """All constraints of the arguments: a name for messages, the variable, and the set."""
@@ -416,7 +421,7 @@ class OrthogonalProblem(HoldsModel):
         return float(np.linalg.norm(violations))
 
     def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
-        """Compile the convex subproblem of the split form, step (a).
+        """Return the convex subproblem of the split form, step (a), which is compiled once.
 
         Returns
         -------
@@ -426,8 +431,22 @@ class OrthogonalProblem(HoldsModel):
         Raises
         ------
         SettingError
-            If a Parameter of the problem is not used by cvxpy's rules of DPP.
+            If a Parameter of the problem has no value, or is not used by cvxpy's rules of DPP.
         """
+        check_parameters(self.problem)
+        return replace(self._compiled, solver=solver)
+
+    @cached_property
+    def minimisation(self) -> cp.Problem:
+        """Minimise J under the convex constraints, without the sets.
+
+        It is one problem, so that cvxpy compiles it once: where Parameters follow the rules of DPP,
+        new values of theirs are new numbers alone.
+        """
+        return cp.Problem(cp.Minimize(self.J), self.problem.constraints)
+
+    @cached_property
+    def _compiled(self) -> "SplitProblem":
         root = cp.Parameter(nonneg=True, name="root")
         shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)
         penalty: Any = 0
@@ -443,7 +462,7 @@ class OrthogonalProblem(HoldsModel):
                 "the problem uses a Parameter in a way that breaks the rules of disciplined "
                 "parametrized programming (DPP); see cvxpy's manual"
             )
-        return SplitProblem(problem, self.variables, self.others, self.terms, root, shifts, solver)
+        return SplitProblem(problem, self.variables, self.others, self.terms, root, shifts)
 
 
 class Split(Protocol):
@@ -583,19 +602,3 @@ def _check_not_imposed_twice(constraints: Sequence[cp.Constraint], in_sets: set[
                 f"constraints[{position}], {convex_solver.in_short(constraint)}, is not convex; if "
                 "it says that its variable is in the set, remove it: SOC imposes the set itself"
             )
-
-
-def _minimised(problem: cp.Problem) -> cp.Expression:
-    """The convex function that a problem minimises, or whose negative it maximises."""
-    maximises = isinstance(problem.objective, cp.Maximize)
-    expression = problem.objective.args[0]
-    if maximises and not expression.is_concave():
-        raise SettingError(
-            f"the problem maximises {expression}, which is {expression.curvature.lower()}; "
-            "only a concave function can be maximised: where X^T X = I, ||X||_F^2 is constant, and "
-            "c ||X||_F^2 may be subtracted to get one"
-        )
-    J = -expression if maximises else expression
-    convex_solver.check_convex(J, "the objective")
-    convex_solver.check_terms((), problem.constraints)
-    return J

@@ -32,6 +32,7 @@ from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_arr
 from scipy.sparse.linalg import splu
 
 from pgo_models.convex.constraint_sets import ConstraintSet, Rotations
+from pgo_models.convex.convex_solver import check_parameters
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import ReadOnly
@@ -460,14 +461,11 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
 
 def _canonical_data(problem: OrthogonalProblem) -> tuple[dict[str, Any], dict[int, int], float]:
     """What cvxpy hands to a solver, the first column of every variable, and the constant."""
-    for parameter in problem.problem.parameters():
-        if parameter.value is None:
-            raise SettingError(f"the Parameter {parameter.name()} has no value; set it first")
+    check_parameters(problem.problem)
     if not problem.J.is_qpwa():
         raise NotQuadraticError("the objective is not quadratic")
-    model = cp.Problem(cp.Minimize(problem.J), problem.problem.constraints)
     try:
-        data, _, inverse = model.get_problem_data(cp.CLARABEL)
+        data, _, inverse = problem.minimisation.get_problem_data(cp.CLARABEL)
     except ValueError as error:  # cvxpy's of nan and inf in the data
         raise SettingError(f"the model has nan or inf: {error}") from error
     if data["dims"].zero != data["A"].shape[0]:

@@ -16,8 +16,11 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 
+import cvxpy as cp
 import numpy as np
+from cvxpy.reductions.solution import Solution
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex import orthogonality
@@ -41,6 +44,7 @@ from solvers.convex.model_newton import ModelNewton
 from solvers.loop import run
 from solvers.result import Measurement, Outcome, Status
 from solvers.soc.anderson import over_relax
+from solvers.soc.penalty import PenaltyOrder, PenaltyRule
 
 # The first penalty is found with at most so many solves of step (a). It is right when the relative
 # distance of X from the start is between the two numbers: there the gradients at X and at the start
@@ -115,12 +119,14 @@ class OrthogonalSOC:
 
     Parameters
     ----------
-    penalty : float or None
-        rho, fixed, as in Algorithm 1. Unless given, rho starts at `safeguard` times the norm of the
-        gradient at the start and is adapted: residuals are balanced (Boyd et al. 2011, section
-        3.4.1, as in the paper), and rho is at least `safeguard` times the least penalty at which
-        the copies are fixed points of their projection, the largest eigenvalue of the multiplier
-        Lambda.
+    penalty : float, PenaltyRule or None
+        rho, fixed, as in Algorithm 1; or a rule as for `SOC`: `bounds` is given the norms of the
+        gradient at the start, one a term, over the largest of them, m, and the largest of the rho_i
+        is the first rho; `rescaling` moves it. Unless given, rho starts at `safeguard` times the
+        norm of the gradient at the start and is adapted: residuals are balanced (Boyd et al. 2011,
+        section 3.4.1, as in the paper), and rho is at least `safeguard` times the least penalty at
+        which the copies are fixed points of their projection, the largest eigenvalue of the
+        multiplier Lambda.
     alpha : float in (0, 2)
         Over-relaxation.
     safeguard : float above 1
@@ -156,7 +162,7 @@ class OrthogonalSOC:
     ('CONVERGED', [0.6, 0.8])
     """
 
-    penalty: float | None = None
+    penalty: float | PenaltyRule | None = None
     alpha: float = 1.0
     safeguard: float = 2.0
     tolerance: float = 1e-6
@@ -165,9 +171,12 @@ class OrthogonalSOC:
     x_step: XStep | QuadraticSplit = XStep.AUTOMATIC
 
     def __post_init__(self) -> None:
-        check_settings(
-            self, finite=["penalty", "safeguard", "tolerance"], not_negative=["max_iterations"]
-        )
+        finite = ["safeguard", "tolerance"]
+        penalty: object = self.penalty  # a number of any type, as 3
+        if isinstance(penalty, Real):
+            object.__setattr__(self, "penalty", float(penalty))
+            finite.insert(0, "penalty")
+        check_settings(self, finite=finite, not_negative=["max_iterations"])
         check_settings(self, above_one=["safeguard"], relaxation=["alpha"])
         as_solver(self.solver)  # raises unless it is installed
 
@@ -237,56 +246,41 @@ class OrthogonalSOC:
     ) -> tuple[float, tuple[Array, ...]]:
         """The first rho, and the other variables at the start.
 
-        rho is `penalty`, or `safeguard` times the norm of the gradient at the start. The gradient
-        is minus the multipliers of the start, if it has any.
+        rho is `penalty`, or `safeguard` times the norm of the gradient at the start, or what a rule
+        makes of it. The gradient is minus the multipliers of the start, if it has any.
         """
-        multiplier = max(_spectral_norm(normal) for normal in point.normals)
-        if self.penalty is None and multiplier == 0.0:
-            return self._probed_penalty(split, point)
-        rho = self.penalty if self.penalty is not None else self.safeguard * multiplier
-        V = [P - N / rho for P, N in zip(point.copies, point.normals, strict=True)]
-        _, others = split.solve(V, rho)
-        return rho, others
+        if isinstance(self.penalty, float):
+            return self.penalty, _others_at(split, point, self.penalty)
+        norms = np.array([_spectral_norm(normal) for normal in point.normals])
+        if norms.any():
+            rho = self._rho_of(norms)
+            return rho, _others_at(split, point, rho)
+        norms, others = _probed_gradient(split, point)
+        return self._rho_of(norms), others
 
-    def _probed_penalty(
-        self, split: SplitProblem | QuadraticSplit, point: OrthogonalPoint
-    ) -> tuple[float, tuple[Array, ...]]:
-        """The first rho of a start without multipliers, and the other variables at the start.
-
-        Step (a) gives the gradient at its solution X. rho is moved by tens until X is near the
-        start, where the gradients are alike, or comes no nearer.
-        """
-        rho = 1.0
-        size = _size_of(point.copies)
-        was_far = False
-        gradient = 0.0
-        distance = math.inf
-        for _ in range(_MAX_PROBES):
-            X, others = split.solve(point.copies, rho)
-            moves = [
-                P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)
-            ]
-            distance_before = distance
-            distance = norm_of_all(moves) / size
-            if was_far and distance > 0.5 * distance_before:
-                # Convex constraints, or J itself, hold X away from the start: begin with a low
-                # penalty and let the rule raise it.
-                break
-            gradient = rho * max(_spectral_norm(move) for move in moves)
-            is_far = distance > _NEAR
-            if not is_far and (was_far or distance >= _FAINT):
-                break
-            was_far = was_far or is_far
-            rho *= 10.0 if is_far else 1e-3
-        return (self.safeguard * gradient if gradient > 0.0 else 1.0), others
+    def _rho_of(self, norms: Array) -> float:
+        """The first rho, from the norms of the gradient, one a term; 1 where they are zero."""
+        largest = float(norms.max())
+        if largest == 0.0:
+            return 1.0
+        if self.penalty is None:
+            return self.safeguard * largest
+        assert not isinstance(self.penalty, float)
+        order = PenaltyOrder(*self.penalty.bounds(norms / largest))
+        return float(order.rho(norms, np.full(len(norms), largest)).max())
 
     def _with_due_penalty(
         self, problem: OrthogonalProblem, state: OrthogonalState
     ) -> OrthogonalState:
         """State with the penalty for the next step; usually unchanged."""
-        if self.penalty is not None:
+        if isinstance(self.penalty, float):
             return state
-        rho = self._adapted_penalty(problem, state)
+        if self.penalty is not None:
+            is_first = state.k == 0
+            residuals = state.primal_residual, state.dual_residual
+            rho = state.rho if is_first else state.rho * self.penalty.rescaling(*residuals)
+        else:
+            rho = self._adapted_penalty(problem, state)
         if rho == state.rho:
             return state
         B = tuple(state.rho / rho * B for B in state.B)
@@ -471,7 +465,7 @@ def solve_orthogonal(
     values = problem.values(state.copies)
     point = method.point(problem, state)
     kkt = orthogonality.kkt_residuals(problem, point, state.rho, method.solver)
-    problem.assign(values, state.others)
+    _tell_cvxpy(problem, values, state.others, best.status, certificate)
     return OrthogonalSolution(
         problem, values, state.others, best.objective, kkt, best, ends, certificate
     )
@@ -529,10 +523,29 @@ def _certified(
     kkt = orthogonality.kkt_residuals(problem, point, state.rho, split=split)
     values = tuple(form.values(u))
     others = split.others(u)
-    problem.assign(values, others)
+    _tell_cvxpy(problem, values, others, best.status, certificate)
     return OrthogonalSolution(
         problem, values, others, certificate.objective, kkt, best, ends, certificate
     )
+
+
+def _tell_cvxpy(
+    problem: OrthogonalProblem,
+    values: Sequence[Array],
+    others: Sequence[Array],
+    status: Status,
+    certificate: ModelCertificate,
+) -> None:
+    """Set the value and the status of the cvxpy problem, and the values of its variables."""
+    word = cp.USER_LIMIT
+    if certificate.is_certified:
+        word = cp.OPTIMAL
+    elif status.is_success:
+        word = cp.OPTIMAL_INACCURATE
+    variables = (*problem.variables, *problem.others)
+    all_values = zip(variables, (*values, *others), strict=True)
+    of_variables = {variable.id: value for variable, value in all_values}
+    problem.problem.unpack(Solution(word, certificate.objective, of_variables, {}, {}))
 
 
 def _matrices_of_step(method: OrthogonalSOC, problem: OrthogonalProblem) -> QuadraticSplit | None:
@@ -552,6 +565,45 @@ def _matrices_of_step(method: OrthogonalSOC, problem: OrthogonalProblem) -> Quad
         if x_step is XStep.FACTORIZED:
             raise
         return None
+
+
+def _others_at(
+    split: SplitProblem | QuadraticSplit, point: OrthogonalPoint, rho: float
+) -> tuple[Array, ...]:
+    """The other variables at a point with multipliers."""
+    V = [P - N / rho for P, N in zip(point.copies, point.normals, strict=True)]
+    return split.solve(V, rho)[1]
+
+
+def _probed_gradient(
+    split: SplitProblem | QuadraticSplit, point: OrthogonalPoint
+) -> tuple[Array, tuple[Array, ...]]:
+    """Norms of the gradient at a start without multipliers, one a term, and the other variables.
+
+    Step (a) gives the gradient at its solution X. rho is moved by tens until X is near the start,
+    where the gradients are alike, or comes no nearer.
+    """
+    rho = 1.0
+    size = _size_of(point.copies)
+    was_far = False
+    norms = np.zeros(len(point.copies))
+    distance = math.inf
+    for _ in range(_MAX_PROBES):
+        X, others = split.solve(point.copies, rho)
+        moves = [P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)]
+        distance_before = distance
+        distance = norm_of_all(moves) / size
+        if was_far and distance > 0.5 * distance_before:
+            # Convex constraints, or J itself, hold X away from the start: begin with a low penalty
+            # and let the rule raise it.
+            break
+        norms = rho * np.array([_spectral_norm(move) for move in moves])
+        is_far = distance > _NEAR
+        if not is_far and (was_far or distance >= _FAINT):
+            break
+        was_far = was_far or is_far
+        rho *= 10.0 if is_far else 1e-3
+    return norms, others
 
 
 def _size_of(copies: Sequence[Array]) -> float:

@@ -3,6 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from cvxpy.reductions.dcp2cone.cone_matrix_stuffing import ConeMatrixStuffing
 
 import pgo_models as pgo
 import solvers
@@ -76,3 +77,139 @@ def test_a_variable_that_is_not_in_the_model_is_refused():
     problem = cp.Problem(cp.Minimize(cp.sum_squares(x)))
     with pytest.raises(pgo.PGOError):
         pgo.OrthogonalProblem(problem, rotations=[y])
+
+
+def test_cvxpy_is_told_value_status_and_variables():
+    X, t = cp.Variable((3, 3)), cp.Variable(3)
+    squares = cp.sum_squares(X - np.diag([2.0, 1.0, -1.0])) + cp.sum_squares(t - 1.0)
+    minimum = cp.Problem(cp.Minimize(squares))
+    maximum = cp.Problem(cp.Maximize(1.0 - squares))
+    for problem, value in ((minimum, 5.0), (maximum, -4.0)):
+        model = pgo.OrthogonalProblem(problem, rotations=[X])
+        solution = solvers.solve_orthogonal(model, 0, starts=1)
+        assert solution.is_certified
+        assert (problem.status, problem.value) == ("optimal", pytest.approx(value, rel=1e-9))
+        np.testing.assert_array_equal(X.value, solution.values[0])
+        np.testing.assert_allclose(t.value, np.ones(3), rtol=0, atol=1e-9)
+    rough = cp.Problem(cp.Minimize(cp.norm1(X - np.diag([2.0, 1.0, -1.0]))))
+    model = pgo.OrthogonalProblem(rough, rotations=[X])
+    for iterations, status in ((1000, "optimal_inaccurate"), (1, "user_limit")):
+        soc = solvers.OrthogonalSOC(max_iterations=iterations, tolerance=1e-3)
+        solution = solvers.solve_orthogonal(model, 0, soc, starts=1)
+        assert (rough.status, rough.value) == (status, pytest.approx(solution.objective, rel=1e-6))
+
+
+class Rule:
+    """A rule of the penalty that counts."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def bounds(self, ratio):
+        assert ratio.max() == 1.0
+        return 2.0, 0.0, 0.0
+
+    def rescaling(self, primal_residual, dual_residual):
+        self.asked += 1
+        return 1.5 if self.asked == 3 else 1.0
+
+
+@pytest.mark.parametrize("x_step", solvers.XStep)
+def test_a_rule_of_ones_own_sets_the_penalty(x_step):
+    model, rule = nearest(np.diag([3.0, 2.0]), orthogonal=True), Rule()
+    soc = solvers.OrthogonalSOC(penalty=rule, x_step=x_step)
+    turned = np.array([[0.6, -0.8], [0.8, 0.6]])
+    outcome = solvers.run(soc, model, model.point([turned]))
+    assert outcome.status.is_success
+    # the gradient is 2 (X - B) at the start
+    gradient = 2.0 * np.linalg.norm(turned - np.diag([3.0, 2.0]), 2)
+    assert outcome.state.rho == pytest.approx(1.5 * 2.0 * gradient, rel=0.2)
+    assert outcome.objective == pytest.approx(5.0, rel=ACCURACY)
+
+
+@pytest.mark.parametrize("x_step", ["automatic", "convex_solver"])
+@pytest.mark.parametrize("cost", [cp.norm1, cp.sum_squares])
+def test_missing_and_broken_data_get_one_sentence(x_step, cost):
+    soc = solvers.OrthogonalSOC(x_step=x_step)
+    X, A = cp.Variable((2, 2)), cp.Parameter((2, 2), name="A")
+    unset = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(cost(A @ X))), orthogonal=[X])
+    with pytest.raises(pgo.PGOError, match=r"^the Parameter A has no value; set it first$"):
+        solvers.solve_orthogonal(unset, 0, soc, starts=1)
+    for broken in (cost(X - np.nan), cost(np.full((2, 2), np.nan) @ X)):
+        model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(broken)), orthogonal=[X])
+        with pytest.raises(pgo.PGOError, match="has nan or inf; check the data"):
+            solvers.solve_orthogonal(model, 0, soc, starts=1)
+
+
+@pytest.mark.parametrize("cost", [cp.norm1, cp.sum_squares])
+def test_new_values_of_parameters_compile_nothing(cost, monkeypatch):
+    compiled = []
+    compile_once = ConeMatrixStuffing.apply
+
+    def counted(self, problem):
+        compiled.append(problem)
+        return compile_once(self, problem)
+
+    monkeypatch.setattr(ConeMatrixStuffing, "apply", counted)
+    rng = np.random.default_rng(0)
+    X, B = cp.Variable((2, 2)), cp.Parameter((2, 2))
+    model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(cost(X - B))), rotations=[X])
+    B.value = rng.standard_normal((2, 2))
+    solvers.solve_orthogonal(model, 0, starts=2)
+    before = len(compiled)
+    for _ in range(3):
+        R = pgo.random_rotations(1, 2, rng)[0]
+        B.value = 2.0 * R
+        solution = solvers.solve_orthogonal(model, 0, starts=2)
+        if cost is cp.sum_squares:
+            np.testing.assert_allclose(solution.values[0], R, rtol=0, atol=ACCURACY)
+    assert 0 < before == len(compiled)
+
+
+A = np.diag([3.0, -1.0, -2.0])
+
+
+@pytest.mark.parametrize("maximises", [False, True])
+@pytest.mark.parametrize("written", ["trace", "quad_form", "two"])
+def test_an_indefinite_quadratic_is_told_the_constant_that_makes_it_convex(written, maximises):
+    X = cp.Variable(3 if written == "quad_form" else (3, 2), name="X")
+    Y = cp.Variable((3, 2), name="Y")
+    objective = {
+        "trace": lambda: cp.trace(X.T @ A @ X),
+        "quad_form": lambda: cp.quad_form(X, A),
+        "two": lambda: cp.trace(X.T @ A @ Y),
+    }[written]()
+    least, columns = {"trace": (-2.0, 2), "quad_form": (-2.0, 1), "two": (-1.5, 4)}[written]
+    largest = {"trace": 3.0, "quad_form": 3.0, "two": 1.5}[written]
+    name = "unit_columns" if written == "quad_form" else "orthogonal"
+    sets = {name: [X, Y] if written == "two" else [X]}
+    goal = cp.Maximize(objective) if maximises else cp.Minimize(objective)
+    with pytest.raises(pgo.PGOError) as refused:
+        pgo.OrthogonalProblem(cp.Problem(goal), **sets)
+    message = str(refused.value)
+    c = float(message.split("subtract " if maximises else ": add ")[1].split()[0])
+    assert (largest if maximises else -least) <= c <= 1.02 * abs(largest if maximises else least)
+    if written == "two":
+        return
+    sign = -1.0 if maximises else 1.0
+    L = np.sqrt(c * np.eye(3) + sign * A)
+    shifted = cp.Problem(cp.Minimize(cp.sum_squares(L @ X)))
+    solution = solvers.solve_orthogonal(pgo.OrthogonalProblem(shifted, **sets), 0)
+    eigenvalues = np.sort(sign * np.diag(A))
+    assert solution.objective - c * columns == pytest.approx(sum(eigenvalues[:columns]), abs=1e-6)
+
+
+def test_other_objectives_that_are_not_convex_get_a_way_in():
+    X, Y = cp.Variable((2, 2), name="X"), cp.Variable((2, 2), name="Y")
+    y = cp.Variable(2, name="y")
+    ways = {
+        "maximise its tangent at the last": cp.Maximize(cp.norm1(X)),
+        "minimise its tangent at the last": cp.Minimize(cp.sum(cp.sqrt(X + 2.0))),
+        "hold one as a cp.Parameter": cp.Minimize(cp.sum_squares(X @ y - 1.0)),
+        "multiplies Y with other unknowns": cp.Minimize(cp.trace(X @ Y)),
+        "in y, which no set bounds": cp.Minimize(cp.sum_squares(X) - cp.sum_squares(y)),
+        "which cvxpy does not see": cp.Minimize(cp.trace(X.T @ X)),
+    }
+    for way, objective in ways.items():
+        with pytest.raises(pgo.PGOError, match=way):
+            pgo.OrthogonalProblem(cp.Problem(objective), orthogonal=[X])
