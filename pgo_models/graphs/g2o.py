@@ -22,8 +22,13 @@ from pgo_models.graphs.g2o_folder import (
     LETTER_CODES,
     LETTER_SHIFT,
     LETTERS,
+    Rows,
     absent_ids,
+    are_reprinted,
     check_one_graph,
+    copies_within_printing,
+    edge_rows,
+    edges_as_first_printed,
     robot_letters,
 )
 from pgo_models.graphs.g2o_parser import G2OLines, read_lines
@@ -194,6 +199,13 @@ def graph_of_robots(
     if not trust_folder:
         check_one_graph(files)
     graph = graph_of_files(path, files, weights)
+    num_copies = sum(
+        int(are_reprinted(edge_rows(file), rows).sum())
+        for file, rows in zip(files, _as_first_printed(files), strict=True)
+    )
+    if num_copies:
+        message = f"{printable(str(path))}: {copies_within_printing(num_copies)}"
+        warnings.warn(message, GraphWarning, stacklevel=3)
     absent = absent_ids(files) if is_folder else np.zeros(0, dtype=np.int64)
     if not len(absent):
         return graph
@@ -674,8 +686,12 @@ def _are_same_measurements(d: int, edges: Array, others: Array) -> bool:
 
 
 def _rows_to_keep(files: list[G2OLines]) -> list[IntArray | slice]:
-    ids_and_rows = [(file.edge_ids, file.edges) for file in files]
+    ids_and_rows = [(rows.ids, rows.numbers) for rows in _as_first_printed(files)]
     return edge_rows_to_keep(ids_and_rows)
+
+
+def _as_first_printed(files: list[G2OLines]) -> list[Rows]:
+    return edges_as_first_printed(files[0].d, [edge_rows(file) for file in files])
 
 
 def _joined_edges(files: list[G2OLines]) -> tuple[IntArray, Array]:

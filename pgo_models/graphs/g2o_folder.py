@@ -8,16 +8,18 @@ the lines of files, or what robots with files of their own tell each other.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import FileFormatError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_parser import G2OLines
 from pgo_models.graphs.g2o_rows import poses_of
-from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, edge_counts
+from pgo_models.graphs.written_digits import WrittenDigits, within_printing
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
 LETTER_CODES = [ord(letter) for letter in LETTERS]
@@ -46,6 +48,7 @@ class Rows:
     ids: IntArray  # (n,) of VERTEX lines, (n, 2) of EDGE lines
     numbers: Array  # (n, k): as in `G2OLines`
     scale: float
+    digits: WrittenDigits  # of the file
 
     def some(self, chosen: IntArray | BoolArray | slice) -> Rows:
         """The chosen lines, by numbers, a mask or a slice."""
@@ -55,6 +58,7 @@ class Rows:
             self.ids[chosen],
             self.numbers[chosen],
             self.scale,
+            self.digits,
         )
 
 
@@ -66,6 +70,7 @@ class _Joined(NamedTuple):
     ids: IntArray
     numbers: Array
     scale: Array  # (n,)
+    units: Array  # (n, k): of the last digits of the numbers, 0 where they do not tell copies
 
     @classmethod
     def of(cls, files: Sequence[Rows]) -> _Joined:
@@ -76,6 +81,7 @@ class _Joined(NamedTuple):
             np.concatenate([rows.ids for rows in files]),
             np.concatenate([rows.numbers for rows in files]),
             np.repeat([rows.scale for rows in files], sizes),
+            np.concatenate([_units_of_copies(rows) for rows in files]),
         )
 
     def some(self, chosen: IntArray | BoolArray) -> _Joined:
@@ -85,7 +91,14 @@ class _Joined(NamedTuple):
             self.ids[chosen],
             self.numbers[chosen],
             self.scale[chosen],
+            self.units[chosen],
         )
+
+
+def _units_of_copies(rows: Rows) -> Array:
+    if rows.digits.tell_copies:
+        return rows.digits.units(rows.numbers)
+    return np.zeros_like(rows.numbers)
 
 
 def check_one_graph(files: Sequence[G2OLines]) -> None:
@@ -156,7 +169,9 @@ def placed_poses(file: G2OLines) -> Rows:
     extent = float(np.ptp(t, axis=0).max()) if len(t) else 0.0
     if extent == 0.0:
         extent = float(np.abs(t).max(initial=0.0))
-    rows = Rows(str(file.path), file.vertex_lines, file.vertex_ids, file.vertices, extent)
+    rows = Rows(
+        str(file.path), file.vertex_lines, file.vertex_ids, file.vertices, extent, file.digits
+    )
     letters, _ = robot_letters(file.vertex_ids)
     if len(letters) == 0 or not np.isin(letters, LETTER_CODES).all():
         return rows
@@ -164,18 +179,68 @@ def placed_poses(file: G2OLines) -> Rows:
     return rows.some(letters == own_letter)
 
 
+def edge_rows(file: G2OLines) -> Rows:
+    """EDGE lines of a file."""
+    is_measured = file.edge_ids[:, 0] != WORLD_ID
+    lengths = np.linalg.norm(file.edges[is_measured, : file.d], axis=1)
+    usual = float(np.median(lengths)) if len(lengths) else 0.0
+    return Rows(str(file.path), file.edge_lines, file.edge_ids, file.edges, usual, file.digits)
+
+
 def measured_edges(file: G2OLines) -> Rows:
     """EDGE lines of a file without priors: two fixes of one pose are two measurements."""
-    edges = np.flatnonzero(file.edge_ids[:, 0] != WORLD_ID)
-    lengths = np.linalg.norm(file.edges[edges, : file.d], axis=1)
-    usual = float(np.median(lengths)) if len(lengths) else 0.0
-    return Rows(
-        str(file.path),
-        file.edge_lines[edges],
-        file.edge_ids[edges],
-        file.edges[edges],
-        usual,
+    return edge_rows(file).some(file.edge_ids[:, 0] != WORLD_ID)
+
+
+def edges_as_first_printed(d: int, files: Sequence[Rows]) -> list[Rows]:
+    """The same edges, of which all that are one within printing have the numbers of the first.
+
+    Two lines are one edge within printing if they join the same poses, stand in different files,
+    and all their numbers are one within printing: see `pgo_models.graphs.written_digits`. A
+    quaternion may have the other sign, and an angle be another by 2 pi.
+    """
+    lines = _in_two_files(_Joined.of(files))
+    earlier, later = _pairs_of_rows(lines)
+    is_other_file = lines.file[earlier] != lines.file[later]
+    earlier = earlier[is_other_file]
+    later = later[is_other_file]
+    x = lines.numbers[earlier]
+    y = _as_written_beside(d, lines.numbers[later], x)
+    are_one = within_printing(x, y, lines.units[earlier], lines.units[later]).all(axis=1)
+    if (x == y).all(axis=1)[are_one].all():
+        return list(files)
+    one = edge_counts(earlier[are_one], later[are_one], len(lines.file))
+    _, label = connected_components(one, directed=False)
+    _, first = np.unique(label, return_index=True)
+    numbers = [rows.numbers.copy() for rows in files]
+    for line in np.flatnonzero(first[label] != np.arange(len(label))).tolist():
+        numbers[lines.file[line]][lines.row[line]] = lines.numbers[first[label[line]]]
+    return [replace(rows, numbers=of_file) for rows, of_file in zip(files, numbers, strict=True)]
+
+
+def are_reprinted(rows: Rows, as_first: Rows) -> BoolArray:
+    """Which edges have other digits than where they are first printed, (n,)."""
+    return np.asarray((rows.numbers != as_first.numbers).any(axis=1))
+
+
+def copies_within_printing(num_copies: int) -> str:
+    """What is said of the edges of a folder that are printed twice."""
+    return (
+        f"{num_copies} edges of two files differ in no more than the last printed digit: "
+        "each counts once, as first printed"
     )
+
+
+def _as_written_beside(d: int, numbers: Array, others: Array) -> Array:
+    """The numbers, with angles less than half a turn, and quaternions less than 90 degrees, off."""
+    numbers = numbers.copy()
+    if d == 2:
+        turns = np.rint((others[:, 2] - numbers[:, 2]) / (2.0 * np.pi))
+        numbers[:, 2] += 2.0 * np.pi * turns
+        return numbers
+    is_opposite = (numbers[:, 3:7] * others[:, 3:7]).sum(axis=1) < 0.0
+    numbers[is_opposite, 3:7] *= -1.0
+    return numbers
 
 
 def check_places(d: int, files: Sequence[Rows]) -> None:
@@ -208,8 +273,9 @@ def check_places(d: int, files: Sequence[Rows]) -> None:
 def check_measurements(d: int, files: Sequence[Rows]) -> None:
     """Raise a FileFormatError where two files measure the same edge with different numbers.
 
-    `files` are `measured_edges`, or some of each. Copies with the same numbers count once and are
-    no question; nor is an edge that one file measures several times. There is one
+    `files` are `measured_edges`, or some of each. Copies with the same numbers, within printing,
+    count once and are no question; nor is an edge that one file measures several times. There is
+    one
 
     - where numbers of two files are nearly equal: one has a copy of the other's edge, rounded or
       recomputed, which would count twice, or both measured it, and both count;
@@ -218,7 +284,7 @@ def check_measurements(d: int, files: Sequence[Rows]) -> None:
     - where most edges that two files measure are off by more than their own length, or by more than
       1 rad: one may be a wrong closure, and most are edges of another graph.
     """
-    lines = _in_two_files(_Joined.of(files))
+    lines = _in_two_files(_Joined.of(edges_as_first_printed(d, files)))
     lines, in_files = _distinct(lines, len(files))
     earlier, later = _pairs_of_rows(lines)
     # Two measurements that one file has, too, are measurements of their own.

@@ -12,6 +12,13 @@ is no larger than that of the most precise of them.
 
 A short number says nothing by itself: 1 and 0.5 may be exact. So nothing is taken from files whose
 numbers all have few digits, nor from those with all digits of doubles.
+
+Two written numbers x and y, with units u and v, are one number within printing if some number could
+have been written as either:
+
+    |x - y| <= (u + v) / 2.
+
+Numbers of one format may so differ by one in the last digit.
 """
 
 from collections.abc import Iterable
@@ -19,11 +26,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 
 # Single precision has so many. With fewer, noise may hide below the last digit, and no rounding of
 # doubles is in the way of a proof.
 FEWEST_DIGITS = 7
+# C and C++ print so many by default (%g, %f, <<). To fewer, measurements may agree by chance.
+_FEWEST_OF_COPIES = 6
 # Doubles that are not rounded for a file are no multiples of the last of so many decimals, nor of
 # the last of so many significant digits.
 MOST_DECIMALS = 13
@@ -42,8 +51,17 @@ class WrittenDigits(NamedTuple):
     @property
     def are_of_format(self) -> bool:
         """Whether they show a format that rounds, and finely enough to tell noise from rounding."""
-        is_rounded = self.decimals <= MOST_DECIMALS or self.significant <= MOST_SIGNIFICANT
-        return is_rounded and min(self) >= FEWEST_DIGITS
+        return self.are_rounded and min(self) >= FEWEST_DIGITS
+
+    @property
+    def are_rounded(self) -> bool:
+        """Whether they are fewer than those of doubles."""
+        return self.decimals <= MOST_DECIMALS or self.significant <= MOST_SIGNIFICANT
+
+    @property
+    def tell_copies(self) -> bool:
+        """Whether they round, and measurements that agree within printing are copies of one."""
+        return self.are_rounded and min(self) >= _FEWEST_OF_COPIES
 
     def units(self, numbers: Array) -> Array:
         """Unit of the last digit that each of some numbers of the file is written with."""
@@ -87,6 +105,15 @@ def most_digits(parts: Iterable[WrittenDigits]) -> WrittenDigits:
     """The digits of several files, or parts of one, together."""
     decimals, significant = zip(*parts, strict=True)
     return WrittenDigits(max(decimals), max(significant))
+
+
+def within_printing(x: Array, y: Array, x_units: Array, y_units: Array) -> BoolArray:
+    """Whether numbers may be one number as written, with these units of their last digits.
+
+    The rounding of doubles is allowed for.
+    """
+    rounding = _SAME * np.maximum(np.abs(x), np.abs(y))
+    return np.asarray(np.abs(x - y) <= 0.5 * (x_units + y_units) + rounding)
 
 
 def written_errors(measured: Array, digits: WrittenDigits) -> Array | None:

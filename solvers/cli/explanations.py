@@ -147,7 +147,8 @@ def reading_that_is_meant(fit: EdgeFit, source: GraphOptions) -> list[Advice]:
         return []
     from solvers.studies.readings import compare_readings
 
-    with suppress(PGOError):  # the file may have changed since it was read
+    # The reader has warned before, and the file may have changed since.
+    with warnings.catch_warnings(action="ignore"), suppress(PGOError):
         comparison = compare_readings(source.graph, trust_folder=source.trust_folder)
         if comparison.proposed:
             return [advice_on_reading(comparison, source.graph)]

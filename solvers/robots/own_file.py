@@ -24,8 +24,10 @@ from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o import edge_rows_to_keep, make_folder, write_g2o
 from pgo_models.graphs.g2o_folder import (
     Rows,
+    are_reprinted,
     check_measurements,
     check_places,
+    edges_as_first_printed,
     measured_edges,
     placed_poses,
 )
@@ -269,8 +271,13 @@ def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[NumberedLines]:
 
 
 @order("files.join_neighbours")
-def join_neighbours(agent: Agent, request: tuple[Messages[NumberedLines], bool]) -> Border:
+def join_neighbours(
+    agent: Agent, request: tuple[Messages[NumberedLines], bool]
+) -> tuple[Border, int]:
     """Make the graph of the robot: its own edges, and those that others have of its poses.
+
+    Return its border, and how many edges of its poses stand in another file with another last digit
+    (an edge between two robots counts with the first of them).
 
     FIX lines of its own poses count. The request is what others told the robot, and whether the
     folder is trusted, so that nothing is asked that `read_g2o` would ask.
@@ -282,7 +289,9 @@ def join_neighbours(agent: Agent, request: tuple[Messages[NumberedLines], bool])
     if not is_trusted:
         check_places(lines.d, [part.places for part in parts])
         check_measurements(lines.d, [part.edges for part in parts])
-    ids_of_ends, rows, numbers_of_ends, owners_of_ends = _joined_edges(parts)
+    ids_of_ends, rows, numbers_of_ends, owners_of_ends, num_copies = _joined_edges(
+        lines.d, parts, agent.robot
+    )
     if not len(rows):
         raise GraphError(
             f"{agent.own_lines.path}: no edge touches a pose of this robot; "
@@ -315,21 +324,30 @@ def join_neighbours(agent: Agent, request: tuple[Messages[NumberedLines], bool])
     holding = fixed[0] if len(fixed) else np.argmax(is_own)
     joined = OwnGraph(graph, numbers, owners, _given_pose(lines, ids[holding]))
     agent.record = joined
-    return border_of(agent.robot, joined)
+    return border_of(agent.robot, joined), num_copies
 
 
-def _joined_edges(files: Sequence[NumberedLines]) -> tuple[IntArray, Array, IntArray, IntArray]:
+def _joined_edges(
+    d: int, files: Sequence[NumberedLines], robot: int
+) -> tuple[IntArray, Array, IntArray, IntArray, int]:
     """Edges of several files as one, in which an edge of several files counts once.
 
-    They are the ids of the ends, rows as in `G2OLines`, and numbers and owners of the ends.
+    They are the ids of the ends, rows as in `G2OLines`, numbers and owners of the ends, and how
+    many edges, of which this robot owns the first end, are printed again.
     """
-    kept = edge_rows_to_keep([(file.edges.ids, file.edges.numbers) for file in files])
+    as_first = edges_as_first_printed(d, [file.edges for file in files])
+    num_copies = sum(
+        int((are_reprinted(file.edges, rows) & (file.owners.min(axis=1) == robot)).sum())
+        for file, rows in zip(files, as_first, strict=True)
+    )
+    kept = edge_rows_to_keep([(rows.ids, rows.numbers) for rows in as_first])
     parts = [file.some(chosen, slice(0)) for file, chosen in zip(files, kept, strict=True)]
     return (
         np.concatenate([part.edges.ids for part in parts]),
         np.concatenate([part.edges.numbers for part in parts]),
         np.concatenate([part.numbers for part in parts]),
         np.concatenate([part.owners for part in parts]),
+        num_copies,
     )
 
 

@@ -13,6 +13,7 @@ What robots do is in `solvers.robots.own_file`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,9 +23,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.errors import FileFormatError, GraphError
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning, printable
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.bridges import bridges
+from pgo_models.graphs.g2o_folder import copies_within_printing
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, least_tree
 from pgo_models.graphs.written_digits import most_digits
@@ -187,11 +189,16 @@ def open_files(
         num_poses = numbered.num_poses
         sent = network.ask(number_poses, numbered.runs, Count.PIGGYBACKED)
         received = [(lines, trust_folder) for lines in network.exchange(sent)]
-        borders = network.ask(join_neighbours, received, Count.PIGGYBACKED)
+        joined = network.ask(join_neighbours, received, Count.PIGGYBACKED)
+        borders = [border for border, _ in joined]
+        num_copies = sum(count for _, count in joined)
         has_indefinite = any(border.has_indefinite for border in borders)
         if weighting is Weighting.OWN:
             weighting = _own_weighting(borders)
         folder = files[0].path.parent
+        if num_copies:
+            message = f"{printable(str(folder))}: {copies_within_printing(num_copies)}"
+            warnings.warn(message, GraphWarning, stacklevel=2)
         scale = 1.0  # of the errors
         if isinstance(robust, GNC):
             scale = _error_scale(network, weighting, robust.quantile)

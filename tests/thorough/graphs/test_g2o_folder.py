@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 import pgo_models as pgo
+import solvers
 from pgo_models import random_geometric, read_g2o, write_g2o
 from pgo_models.errors import FileFormatError, GraphWarning
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import solve_folder
+from solvers.robots_solution import RobotsSolution
 
 ROBOTS = Path(pgo.__file__).parent.parent / "data" / "robots"
 DOORS: dict[str, Callable[[Path], object]] = {"whole": read_g2o, "own files": solve_folder}
@@ -129,7 +131,95 @@ def test_a_landmark_of_one_file_is_no_pose_of_another(tmp_path: Path) -> None:
 # Edges that would count twice
 
 
-@pytest.mark.parametrize("digits", [2, 3, 6])
+def reprinted(folder: Path, units: int) -> int:
+    """Write `data/robots` with six digits, and copies of edges up to so many units off.
+
+    A copy is in another file. Quaternions have the other sign there. Return the number of copies.
+    """
+    folder.mkdir()
+    seen: dict[tuple[str, ...], int] = {}
+    num_copies = 0
+    rng = np.random.default_rng(0)
+    for robot in range(4):
+        lines = []
+        for line in (ROBOTS / f"{robot}.g2o").read_text().splitlines():
+            words = line.split()
+            is_edge = words[0].startswith("EDGE")
+            is_copy = is_edge and seen.setdefault(tuple(words[1:3]), robot) != robot
+            first_number = 3 if is_edge else 2
+            for place in range(first_number, len(words)):
+                number = float(words[place])
+                if is_copy and 3 <= place < 10 and number != 0.0:
+                    unit = 10.0 ** (np.floor(np.log10(abs(float(f"{number:.6g}")))) - 5)
+                    number = float(f"{number:.6g}") + units * unit * rng.integers(2)
+                    number *= -1.0 if place >= 6 else 1.0
+                words[place] = f"{number:.6g}"
+            num_copies += is_copy
+            lines.append(" ".join(words))
+        (folder / f"{robot}.g2o").write_text("\n".join(lines) + "\n")
+    return num_copies
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_copies_that_differ_in_the_last_printed_digit_are_one_edge(
+    door: str, tmp_path: Path
+) -> None:
+    """With all files, and a robot that hears of the copies of its own edges alone."""
+    num_copies = reprinted(tmp_path / "in", units=1)
+    with pytest.warns(GraphWarning, match=f"{num_copies} edges of two files differ in no more tha"):
+        opened = DOORS[door](tmp_path / "in")
+    with pytest.warns(GraphWarning, match="each counts once"):
+        graph = read_g2o(tmp_path / "in", trust_folder=True)
+    assert graph.num_edges == read_g2o(ROBOTS).num_edges
+    if isinstance(opened, RobotsSolution):
+        assert opened.sizes[1].sum() == graph.num_edges
+        expected = solvers.solve(graph)
+        assert opened.objective == pytest.approx(expected.objective, rel=1e-9)
+    reprinted(tmp_path / "off", units=3)
+    with pytest.raises(FileFormatError, match="is nearly that at"):
+        DOORS[door](tmp_path / "off")
+
+
+def test_copies_with_other_matrices_or_few_digits_are_a_question(tmp_path: Path) -> None:
+    ends = (EDGE.format(0, 1, 1.23456, 0, 0), EDGE.format(2, 3, 1.23456, 0, 0))
+    places = [VERTEX.format(pose, pose, 0, 0) for pose in range(4)]
+    pairs = {
+        "matrix": ("EDGE_SE2 0 2 2.00001 0 0.123456 1 0 0 1 0 1\n",) * 2,
+        "digits": ("EDGE_SE2 0 2 2.01 0 0 1 0 0 1 0 1\n", "EDGE_SE2 0 2 2.02 0 0 1 0 0 1 0 1\n"),
+    }
+    first, second = pairs["matrix"]
+    pairs["matrix"] = (first, second.replace("2.00001", "2.00002").replace("0 1\n", "0 2\n"))
+    for name, (first, second) in pairs.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        own = (
+            ends if name == "matrix" else (EDGE.format(0, 1, 1.2, 0, 0), EDGE.format(2, 3, 1, 0, 0))
+        )
+        (folder / "0.g2o").write_text("".join(places[:2]) + own[0] + first)
+        (folder / "1.g2o").write_text("".join(places[2:]) + own[1] + second)
+        with pytest.raises(FileFormatError, match="the edge from 0 to 2 is nearly that at"):
+            read_g2o(folder)
+
+
+def test_what_one_file_measures_twice_within_printing_counts_twice(tmp_path: Path) -> None:
+    """An angle may be written below pi in one file and above -pi in another."""
+    tail = " 1 0 0 1 0 1\n"
+    measured = ("EDGE_SE2 0 2 2.00001 0 3.141593" + tail, "EDGE_SE2 0 2 2.00002 0 3.141592" + tail)
+    printed = "EDGE_SE2 0 2 2.00002 0 -3.141593" + tail
+    places = [VERTEX.format(pose, pose, 0, 0) for pose in range(4)]
+    (tmp_path / "0.g2o").write_text(
+        "".join(places[:2]) + EDGE.format(0, 1, 1.123456, 0, 0.123456) + "".join(measured)
+    )
+    (tmp_path / "1.g2o").write_text(
+        "".join(places[2:]) + EDGE.format(2, 3, 1.123456, 0, 0.123456) + printed
+    )
+    with pytest.warns(GraphWarning, match="1 edges of two files"):
+        graph = read_g2o(tmp_path)
+    assert graph.num_edges == 4
+    np.testing.assert_allclose(np.sort(graph.t_ij[:, 0])[-2:], [2.00001, 2.00002], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("digits", [2, 3])
 def test_a_whole_graph_with_other_digits_is_a_question(digits: int, tmp_path: Path) -> None:
     shutil.copytree(ROBOTS, tmp_path / "in")
     graph = read_g2o(ROBOTS)
