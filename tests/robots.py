@@ -117,9 +117,7 @@ RULES = st.sampled_from(
         BalancedPenalty(scale=30.0),
     ]
 )
-ACCELERATIONS = st.sampled_from(
-    [None, Anderson(), Anderson(memory=2, restart_ratio=1.01), Anderson(per_robot=True)]
-)
+ACCELERATIONS = st.sampled_from([None, Anderson(), Anderson(memory=2, restart_ratio=1.01)])
 
 
 def _number(graph: PoseGraph, seed: int) -> int:

@@ -44,10 +44,6 @@ class Anderson:
     restart_ratio : float above 1
         The differences are forgotten when the residual exceeds this many times the smallest one
         since they last were.
-    per_robot : bool
-        Whether every robot extrapolates its own rows with its own inner products, so that nothing
-        is summed over the robots. Otherwise each round has one all-reduce, of the products of the
-        newest difference with all others.
 
     Raises
     ------
@@ -71,7 +67,6 @@ class Anderson:
     memory: int = 60
     regularization: float = 1e-12
     restart_ratio: float = 2.0
-    per_robot: bool = False
 
     def __post_init__(self) -> None:
         check_settings(

@@ -32,7 +32,6 @@ from solvers.carry.moments import Moment
 from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.result import Measurement, Status
-from solvers.soc.anderson import Anderson
 from solvers.soc.consensus_robot import ConsensusRobot, CopiesState
 from solvers.soc.copies import (
     CopyLayout,
@@ -142,8 +141,7 @@ class Consensus:
     """The recursion by robots, from the poses that they begin at.
 
     An iteration takes one exchange between neighbours and one all-reduce. The all-reduce sums the
-    squared residuals of this iterate and the products of the acceleration for the next one. Where
-    every robot accelerates alone, only the merit is summed in place of the products.
+    squared residuals of this iterate and the products of the acceleration for the next one.
     """
 
     soc: SOCSettings  # its coupling and robots are not used
@@ -181,7 +179,7 @@ class Consensus:
         merit = math.sqrt(state.ahead[0])
         if not math.isfinite(merit):
             return state.broken()
-        gamma, anderson = state.sums.coefficients(self._common_acceleration, state.ahead)
+        gamma, anderson = state.sums.coefficients(self.soc.acceleration, state.ahead)
         sent_gamma: Array | ShortNumbers | None = gamma
         if gamma is not None and self.soc.bytes_per_number < WHOLE:
             sent_gamma = ShortNumbers.of(gamma)
@@ -211,12 +209,6 @@ class Consensus:
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
         """CONVERGED when both residuals of `measure` are within tolerance."""
         return self.soc.status_at(measurement)
-
-    @property
-    def _common_acceleration(self) -> Anderson | None:
-        """Settings of an acceleration that sums over all robots, if there is one."""
-        acceleration = self.soc.acceleration
-        return None if acceleration is None or acceleration.per_robot else acceleration
 
     def _with_due_penalty(self, robots: AskedRobots, state: ConsensusState) -> ConsensusState:
         """State with the penalty that the rule or the safeguard asks for; usually unchanged.

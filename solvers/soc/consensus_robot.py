@@ -29,7 +29,7 @@ from pgo_models.problem.stationarity import gradient_squares, rotation_squares
 from solvers.carry.messages import Messages
 from solvers.carry.registry import order, record
 from solvers.soc import copies
-from solvers.soc.anderson import AndersonShare, AndersonSums
+from solvers.soc.anderson import AndersonShare
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.r_step import RotationStep, prepare
 from solvers.soc.recursion_block import (
@@ -118,12 +118,10 @@ class CopiesState:
         The robot's rows of the recursion.
     origin : pair of (rows, d) arrays or None
         omega and s when the penalties were set.
-    sums : AndersonSums
-        Of a robot that accelerates alone.
     received : mapping from robots to ReceivedRows
-        copies.Rows of the neighbours, which are extrapolated here as there.
-    ahead : tuple or None
-        X, block and sums after the next step (a).
+        Rows of the neighbours, which are extrapolated here as there.
+    ahead : pair or None
+        X and block after the next step (a).
     waiting : Waiting or None
         Of an asynchronous run.
     """
@@ -138,9 +136,8 @@ class CopiesState:
     settings: StepSettings = field(default_factory=StepSettings)
     block: RecursionBlock | None = None
     origin: tuple[Array, Array] | None = None
-    sums: AndersonSums = field(default_factory=AndersonSums)
     received: Mapping[int, ReceivedRows] = field(default_factory=dict)
-    ahead: tuple[Array, RecursionBlock, AndersonSums] | None = None
+    ahead: tuple[Array, RecursionBlock] | None = None
     waiting: Waiting | None = None
 
     def robot(self, layout: copies.CopyLayout) -> ConsensusRobot:
@@ -265,7 +262,6 @@ class ConsensusRobot:
             rho=rho,
             block=block,
             origin=(omega, block.s),
-            sums=AndersonSums(),
             received={},
             ahead=None,
         )
@@ -279,11 +275,7 @@ class ConsensusRobot:
 
     @order("consensus.solve")
     def solve(self, _: None) -> tuple[ConsensusRobot, copies.SolveReply]:
-        """Step (a); return rows of s after it, and sums for the acceleration.
-
-        Where robots accelerate alone the rows are extrapolated already, and of the sums only the
-        merit is returned.
-        """
+        """Step (a); return rows of s after it, and sums for the acceleration."""
         before = self.block
         X, local = self._solved_after_local_passes()
         x = np.where(self.layout.held, X, 0.0)
@@ -294,17 +286,8 @@ class ConsensusRobot:
         shared = self.layout.shared
         step[shared] = image[shared] - before.s[shared]
         block, sums = before.after_map(x, step, image)
-        alone = block.settings.alone
-        own_sums = self.state.sums
-        if alone is not None:
-            gamma: Array | None = None
-            if np.isfinite(sums).all():
-                gamma, own_sums = own_sums.coefficients(alone, sums)
-            block = block.extrapolated(Agreement(gamma, is_best=False))
-            sums = sums[:1]
-            sent = Messages({**self._common_rows(block.s)})
         part = PartOfSums.of(sums, block.settings.bytes_per_number)
-        return self._with(ahead=(X, block, own_sums)), copies.SolveReply(part, sent)
+        return self._with(ahead=(X, block)), copies.SolveReply(part, sent)
 
     def _as_sent(
         self, X: Array, known: Array, bytes_per_number: int
@@ -353,13 +336,9 @@ class ConsensusRobot:
         """
         before = self.block
         assert self.state.ahead is not None
-        X, block, own_sums = self.state.ahead
-        if before.settings.alone is not None:
-            block = replace(block, best=before.s if agreement.is_best else before.best)
-            memory = 0
-        else:
-            block = block.extrapolated(agreement)
-            memory = before.settings.memory
+        X, block = self.state.ahead
+        block = block.extrapolated(agreement)
+        memory = before.settings.memory
         received = {}
         rows = {}
         for robot, message in messages.items():
@@ -369,7 +348,7 @@ class ConsensusRobot:
             share = known.share.after(np.zeros((0, 0)), _updated_rows(message, known.s), memory)
             rows[robot], share = share.extrapolated(agreement.gamma)
             received[robot] = ReceivedRows(rows[robot], share)
-        return self._with(X=X, block=block, sums=own_sums, received=received), rows
+        return self._with(X=X, block=block, received=received), rows
 
     @order("consensus.announce")
     def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
@@ -435,7 +414,7 @@ class ConsensusRobot:
             block = replace(block, omega=self._agreed_omega(order.rows))
         rho = order.factor * self.state.rho
         block = block.rescaled(self._rho_of_rows(rho, order.translation))
-        following = self._with(rho=rho, block=block, sums=AndersonSums(), received={}, ahead=None)
+        following = self._with(rho=rho, block=block, received={}, ahead=None)
         return following._prepared(), None
 
     # Answers.

@@ -23,7 +23,7 @@ from pgo_models.geometry.rotations import (
 )
 from pgo_models.problem.matrices import inner
 from solvers.carry.registry import record
-from solvers.soc.anderson import Anderson, AndersonShare, over_relax
+from solvers.soc.anderson import AndersonShare, over_relax
 from solvers.soc.rounding import WHOLE, ShortNumbers
 
 
@@ -48,7 +48,6 @@ class StepSettings:
     memory: int = 0  # differences that the acceleration keeps; 0 for no acceleration
     local_passes: int = 1
     bytes_per_number: int = WHOLE  # of the rows that robots send each other
-    alone: Anderson | None = None  # the acceleration, where every robot extrapolates on its own
     rotations: Rotations = Rotations.PROJECTED
 
 

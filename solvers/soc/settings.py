@@ -102,15 +102,8 @@ class SOCSettings:
     @property
     def step_settings(self) -> StepSettings:
         """The settings that every robot needs for its steps."""
-        acceleration = self.acceleration
-        if acceleration is None:
-            return StepSettings(self.alpha, 0, self.local_passes, self.bytes_per_number)
-        if acceleration.per_robot:
-            memory = acceleration.memory
-            return StepSettings(self.alpha, memory, self.local_passes, WHOLE, acceleration)
-        return StepSettings(
-            self.alpha, acceleration.memory, self.local_passes, self.bytes_per_number
-        )
+        memory = 0 if self.acceleration is None else self.acceleration.memory
+        return StepSettings(self.alpha, memory, self.local_passes, self.bytes_per_number)
 
     def penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:
         """Rule of rho, from ||Lambda_i||_2 / m_i of all poses, (n,)."""

@@ -60,8 +60,8 @@ class SOC(SOCSettings):
         Of CONSENSUS alone: of the rows that robots send each other. With 2, the default, a robot
         sends the change of its rows, a number of it as a whole multiple of a 32767th of the
         largest (with 1 of a 127th), forces at the start in two bytes, and for the acceleration sums
-        in four bytes and coefficients in two (`solvers.soc.rounding`); 8 is full precision. Where
-        each robot accelerates alone, or robots do not wait for each other, rows are sent in full.
+        in four bytes and coefficients in two (`solvers.soc.rounding`); 8 is full precision. Robots
+        that do not wait for each other send rows in full.
     translation_penalty : float or None
         Of CONSENSUS alone: penalty of the translations of separators, the poses that several robots
         hold, as a multiple of their diagonal in M, the matrix of the cost F = tr(X^T M X). The

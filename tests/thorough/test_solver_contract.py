@@ -51,7 +51,6 @@ from solvers.robots.newton import SubstructuredNewton
 from solvers.robots.reweigh import SharedGNC
 from solvers.robots.setup import open_driver
 from solvers.robots.soc import SubstructuredSOC
-from solvers.soc.anderson import Anderson
 
 Make = Callable[..., Any]
 
@@ -293,10 +292,7 @@ METHODS_OF_ROBOTS: dict[str, Begin] = {
     ),
     "consensus": lambda driver: (ConsensusSOC(), driver),
     "consensus_restless": lambda driver: (ConsensusSOC(SOC(penalty=RESTLESS)), driver),
-    "consensus_alone": lambda driver: (
-        ConsensusSOC(SOC(acceleration=Anderson(per_robot=True)), has_driver=False),
-        driver,
-    ),
+    "consensus_leaderless": lambda driver: (ConsensusSOC(has_driver=False), driver),
     "asynchronous": lambda driver: (
         AsynchronousSOC(faults=Faults(loss=0.3, max_delay=2)),
         driver,

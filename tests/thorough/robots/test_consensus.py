@@ -172,7 +172,7 @@ def test_a_state_that_is_not_finite_is_said_to_be_and_leaves_the_last_one_behind
     engine = Recording()
     driver = driver_at(problem, metis(problem.graph, 2), None, engine)
     start = driver.current.objective
-    for acceleration in (Anderson(), Anderson(per_robot=True), None):
+    for acceleration in (Anderson(), None):
         method = ConsensusSOC(SOC(acceleration=acceleration))
         state = method.init(driver, None)
         spoil(engine.agents[0], np.nan)

@@ -50,7 +50,6 @@ from solvers import (
 )
 from solvers.place import AUTO
 from solvers.result import Record
-from solvers.soc.anderson import Anderson
 from solvers.soc.soc import WARM_START
 
 pytestmark = pytest.mark.slow  # solves by robots from end to end
@@ -241,10 +240,6 @@ def test_a_run_that_is_cut_short_gives_poses_and_a_bound_that_holds(
 STAGES = {
     "substructured": (SOC(coupling=Coupling.SUBSTRUCTURED, max_iterations=4), None),
     "consensus": (SOC(max_iterations=4), None),
-    "consensus, each accelerates alone": (
-        SOC(max_iterations=4, acceleration=Anderson(per_robot=True)),
-        None,
-    ),
     "consensus, loss": (SOC(max_iterations=9), Faults(loss=0.3, seed=1)),
     "consensus, delay": (SOC(max_iterations=9), Faults(max_delay=4, seed=2)),
     "consensus, silence": (

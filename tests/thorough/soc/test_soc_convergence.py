@@ -253,16 +253,6 @@ def test_the_translation_penalty_falls_where_the_start_is_far_away(
     assert result.state.separators.translation < 0.5 * at_start
 
 
-@pytest.mark.parametrize("method", [PartitionMethod.METIS, PartitionMethod.CONTIGUOUS])
-def test_acceleration_per_robot_reaches_the_gap(
-    method: PartitionMethod, benchmark_problem: Callable[[str], PGOProblem]
-) -> None:
-    problem = benchmark_problem("smallGrid3D")
-    optimum = OPTIMUM["smallGrid3D"]
-    soc = SOC(robots=partition(problem.graph, 5, method), acceleration=Anderson(per_robot=True))
-    assert run(soc, problem, callback=until_gap(optimum)).status is Status.STOPPED
-
-
 @pytest.mark.parametrize("accelerated", [True, False])
 @pytest.mark.parametrize("rho", [0.01, 1.0, 30.0])
 def test_a_penalty_far_too_small_is_caught(
