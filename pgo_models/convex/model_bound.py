@@ -89,7 +89,7 @@ class _Lagrangian:
     def prove(self) -> DefiniteProof | None:
         """Proof that S_r is definite, or None; also where a P is not proven definite."""
         of_products = (each.matrix(self.multipliers) for each in self.equations.products)
-        if not all(_is_definite(P) for P in of_products):
+        if not all(is_proven_definite(P) for P in of_products):
             return None
         stored_diagonal = np.where(self.is_free, self.S.diagonal(), 2.0)
         if not is_in_range(self.S.data, stored_diagonal):
@@ -130,17 +130,23 @@ class _Lagrangian:
         return self.form.evaluated(u, -self.equations.terms(self.multipliers, u))
 
 
-def _is_definite(P: Array) -> bool:
+def is_proven_definite(P: Array) -> bool:
     """Whether a matrix of doubles is proven positive definite."""
+    return prove_matrix(P, np.zeros(P.shape), 0.0) is not None
+
+
+def prove_matrix(P: Array, error: Array, first_margin: float) -> DefiniteProof | None:
+    """Proof that a dense symmetric matrix is definite, whose entries have errors."""
     diagonal = P.diagonal()
     if not is_in_range(P, diagonal):
-        return False
+        return None
     stored = csc_array(P)
+    root = np.sqrt(diagonal)  # as in `_Lagrangian.prove`
+    shares = OUTWARD * (error @ (1.0 / root)) / root
     none = np.zeros(0, dtype=int)
-    entries = np.zeros(len(P))  # P is exactly what is stored
     positions = _diagonal_positions(stored)
-    matrix = StoredMatrix(stored, diagonal, none, entries, analyze(stored), positions)
-    return prove_stored(matrix, first_margin=0.0) is not None
+    matrix = StoredMatrix(stored, diagonal, none, shares, analyze(stored), positions)
+    return prove_stored(matrix, first_margin)
 
 
 def _diagonal_positions(matrix: csc_array) -> IntArray:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
+from pgo_models.convex.hull_bound import HullBound
 from pgo_models.convex.model_bound import ModelBound
 from pgo_models.convex.model_proof_file import write_model_proof
 from pgo_models.convex.quadratic_form import QuadraticForm
@@ -32,8 +33,8 @@ class ModelCertificate(ReadOnly):
     objective : float
         J of the values, projected onto the sets, with the best values of all other variables.
     objective_error : float
-        Bound on its rounding.
-    bound : ModelBound or None
+        Bound on its rounding; 0 of a model that is not quadratic, whose J is taken as computed.
+    bound : ModelBound, HullBound or None
         The proof; None where no bound was proven.
     is_exact : bool
         Whether J is a sum of squares whose residuals are all zero to rounding.
@@ -42,12 +43,12 @@ class ModelCertificate(ReadOnly):
     form : QuadraticForm or None
         The model; None where it is not quadratic.
     reason : str
-        Why there is no bound, if there is none.
+        Why there is no bound, or none but that of the hulls.
     """
 
     objective: float
     objective_error: float
-    bound: ModelBound | None
+    bound: ModelBound | HullBound | None
     is_exact: bool
     wanted_gap: float = DEFAULT_GAP
     form: QuadraticForm | None = None
@@ -105,8 +106,10 @@ class ModelCertificate(ReadOnly):
         PGOError
             When the file cannot be written.
         """
-        if self.bound is None or self.form is None:
+        if self.bound is None:
             raise SettingError("no proof to write: no bound was found")
+        if isinstance(self.bound, HullBound) or self.form is None:
+            raise SettingError("no proof to write: a bound by hulls has no file")
         write_model_proof(self.form, self.bound, path)
 
     def facts(self) -> list[tuple[str, str]]:
@@ -116,13 +119,19 @@ class ModelCertificate(ReadOnly):
         bound = rounded_down(self.lower_bound) if math.isfinite(self.lower_bound) else "none"
         rounding = ""
         if self.bound is not None:
-            rounding = f"   (proven, less {rounded_up(self.bound.rounding, 2)} for rounding)"
+            of_hulls = "least J over the sets' hulls, " if self.reason else ""
+            rounding = (
+                f"   ({of_hulls}proven, less {rounded_up(self.bound.rounding, 2)} for rounding)"
+            )
         gap = f"{rounded_up(self.gap, 3)}   (asked for: {self.wanted_gap:.3g})"
-        return [
+        facts = [
             ("lower bound", f"{bound}{rounding}"),
             ("gap", "0: every residual is zero to rounding" if self.is_exact else gap),
             ("verdict", f"{self.verdict.name}: {_SENTENCES[self.verdict]}"),
         ]
+        if self.reason and not self.is_certified:
+            facts.append(("no more, as", self.reason))
+        return facts
 
     def __str__(self) -> str:
         facts = [("J", f"{self.objective:.12g}"), *self.facts()]
@@ -139,6 +148,13 @@ _SENTENCES = {
     Verdict.NOT_CERTIFIED: Verdict.NOT_CERTIFIED.value,
     Verdict.TRIVIAL: "not shown to be optimal: no bound was found",
 }
+
+
+def judge_by_hulls(
+    objective: float, bound: HullBound | None, reason: str, gap: float = DEFAULT_GAP
+) -> ModelCertificate:
+    """Hold J of values against the bound by hulls; `reason` is why there is no other."""
+    return ModelCertificate(objective, 0.0, bound, False, gap, None, reason)
 
 
 def judge_values(

@@ -9,10 +9,18 @@ multipliers, moved to the best candidate, give the bound.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cvxpy as cp
+
 from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.convex.convex_solver import solve_compiled
+from pgo_models.convex.hull_bound import prove_hull_bound
 from pgo_models.convex.hulls import with_hull_products
 from pgo_models.convex.model_bound import ModelBound, best_model_bound, prove_model_bound
-from pgo_models.convex.model_certificate import ModelCertificate, judge_values
+from pgo_models.convex.model_certificate import (
+    ModelCertificate,
+    judge_by_hulls,
+    judge_values,
+)
 from pgo_models.convex.model_relaxation import (
     LARGEST,
     closed_form_multipliers,
@@ -37,18 +45,21 @@ def certify_model(
         form = quadratic_form(problem)
         equations = set_equations(form)
     except NotQuadraticError as error:
-        others = tuple(variable.value for variable in problem.others)
-        return without_bound(problem.objective(projected, others), error, gap)
+        objective = _least_objective(problem, projected)
+        return judge_by_hulls(objective, prove_hull_bound(problem), str(error), gap)
     u = form.u_of(projected)
     bound, _ = best_bound(form, equations, u, gap)
     return judge_values(form, equations, u, bound, gap)
 
 
-def without_bound(
-    objective: float, error: NotQuadraticError, gap: float = DEFAULT_GAP
-) -> ModelCertificate:
-    """The certificate of a model that has no bound, and why."""
-    return ModelCertificate(objective, 0.0, None, False, gap, None, str(error))
+def _least_objective(problem: OrthogonalProblem, values: Sequence[Array]) -> float:
+    """J of constrained variables with the best values of all others."""
+    if not problem.others and not problem.problem.constraints:
+        return problem.objective(values)
+    held = [X - value == 0 for X, value in zip(problem.variables, values, strict=True)]
+    model = cp.Problem(cp.Minimize(problem.J), [*problem.problem.constraints, *held])
+    solve_compiled(model, "model with its variables held", accepted=cp.OPTIMAL_INACCURATE)
+    return problem.objective(values, [variable.value for variable in problem.others])
 
 
 def best_bound(

@@ -25,7 +25,12 @@ from cvxpy.reductions.solution import Solution
 from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex import orthogonality
 from pgo_models.convex.convex_solver import COLD, ConvexSolver, as_solver
-from pgo_models.convex.model_certificate import ModelCertificate, judge_values
+from pgo_models.convex.hull_bound import prove_hull_bound
+from pgo_models.convex.model_certificate import (
+    ModelCertificate,
+    judge_by_hulls,
+    judge_values,
+)
 from pgo_models.convex.orthogonality import (
     OrthogonalPoint,
     OrthogonalProblem,
@@ -35,10 +40,10 @@ from pgo_models.convex.orthogonality import (
 from pgo_models.convex.quadratic_form import NotQuadraticError, quadratic_form
 from pgo_models.convex.quadratic_split import QuadraticSplit
 from pgo_models.convex.set_equations import set_equations
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import PGOError, SettingError, check_settings
 from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
-from solvers.convex.certify_model import best_bound, without_bound
+from solvers.convex.certify_model import best_bound
 from solvers.convex.determinants import random_points, reflections, with_free_determinants
 from solvers.convex.model_newton import ModelNewton
 from solvers.loop import run
@@ -398,7 +403,7 @@ def solve_orthogonal(
     (`pgo_models.convex.quadratic_form`) step (a) takes no convex solver, Newton moves the best run
     to a stationary point, and a lower bound on J at all points of the sets is proven; where the
     relaxation that gives the bound leads to a better point, that one is returned. Of other models
-    nothing proves that the best of the stationary points is the global minimum.
+    the bound is the least J over the convex hulls of the sets, and mostly leaves a gap.
 
     Parameters
     ----------
@@ -454,14 +459,35 @@ def solve_orthogonal(
     best = min(outcomes, key=_rank)
     if 2 ** len(with_free_determinants(problem)) > starts:
         best = _lowered_by_reflections(prepared, problem, best, verbose=verbose)
-    state = best.state
     ends = tuple(
         outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes
     )
     try:
         return _certified(problem, method, best, ends)
     except NotQuadraticError as error:
-        certificate = without_bound(best.objective, error)
+        return _bounded_by_hulls(prepared, problem, best, ends, str(error))
+
+
+def _bounded_by_hulls(
+    method: OrthogonalSOC,
+    problem: OrthogonalProblem,
+    best: Outcome[OrthogonalState],
+    ends: tuple[float, ...],
+    reason: str,
+) -> OrthogonalSolution:
+    """The best run, or one that starts beside the least J over the hulls, and the bound of these.
+
+    `reason` is why there is no better bound.
+    """
+    bound = prove_hull_bound(problem)
+    if bound is not None and best.status is not Status.INTERRUPTED:
+        try:
+            beside = run(method, problem, problem.point(bound.point))
+            best = min(best, beside, key=_rank)
+        except PGOError:  # step (a) of this start is beyond the solver; the others remain
+            pass
+    state = best.state
+    certificate = judge_by_hulls(best.objective, bound, reason)
     values = problem.values(state.copies)
     point = method.point(problem, state)
     kkt = orthogonality.kkt_residuals(problem, point, state.rho, method.solver)

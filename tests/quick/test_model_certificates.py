@@ -233,12 +233,54 @@ def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
         answer(squares + p * X[0, 0], rotations=[X])
     with pytest.raises(pgo.PGOError, match=r"nan or inf"):
         answer(cp.sum_squares(X - np.full((3, 3), np.nan)), rotations=[X])
-    loose = {
+    none = answer(squares, sparse=[(X, 3)])
+    assert none.lower_bound == -np.inf
+    assert "Sparse" in str(none)
+    assert none.verdict is Verdict.TRIVIAL
+    by_hulls = {
         "there are other constraints": answer(squares, [X[0, 0] <= 0.5], rotations=[X]),
-        "Sparse": answer(squares, sparse=[(X, 3)]),
         "is not quadratic": answer(cp.norm(X - 2.0), rotations=[X]),
     }
-    for reason, solution in loose.items():
-        assert solution.lower_bound == -np.inf
+    for reason, solution in by_hulls.items():
+        assert -np.inf < solution.lower_bound <= solution.objective
         assert reason in str(solution)
-        assert solution.verdict is Verdict.TRIVIAL
+        assert "hulls" in str(solution)
+
+
+def robust_model(seed: int, kind: str, shape: tuple[int, int], loss):
+    """Registration with noise, one point in five off, and a free translation."""
+    rng = np.random.default_rng(seed)
+    X = cp.Variable(shape)
+    t = cp.Variable((1, shape[0]))
+    points = rng.standard_normal((10, shape[1]))
+    scene = points @ np.linalg.qr(rng.standard_normal(shape))[0].T + 1.0
+    scene = scene + 0.1 * rng.standard_normal(scene.shape)
+    scene[:2] += rng.standard_normal((2, shape[0]))
+    misfits = points @ X.T + np.ones((10, 1)) @ t - scene
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(loss(misfits))), **{kind: [X]})
+
+
+LOSSES = {
+    "norms": lambda misfits: cp.sum(cp.norm(misfits, axis=1)),
+    "absolute": lambda misfits: cp.sum(cp.abs(misfits)),
+    "Huber": lambda misfits: cp.sum(cp.huber(misfits, 0.1)),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize(("kind", "shape", "count"), SETS)
+def test_hulls_bound_what_is_not_quadratic(loss, kind, shape, count) -> None:
+    model = robust_model(count, kind, shape, LOSSES[loss])
+    rng = np.random.default_rng(0)
+    points = [model.values(model.random_point(rng).copies) for _ in range(4)]
+    certificates = [solvers.certify(model, values) for values in points]
+    bound = certificates[0].lower_bound
+    assert 0.0 < bound <= min(certificate.objective for certificate in certificates)
+    assert certificates[1].lower_bound == bound  # it is not of the values
+
+
+def test_a_robust_registration_is_bounded_closely() -> None:
+    solution = solvers.solve_orthogonal(robust_model(0, "rotations", (2, 2), LOSSES["norms"]), 0)
+    assert 0.0 <= solution.gap <= 0.1
+    assert solution.verdict is Verdict.NOT_CERTIFIED
+    assert "hulls" in str(solution)
