@@ -107,12 +107,13 @@ class Known(NamedTuple):
     outcome: object  # of the last solve that succeeded
     failure: str  # why the last solve failed, if it did
     poses: dict
-    revision: int  # lines of measurements that it has
+    lines: int  # of measurements that it has
     sent: dict
 
 
 def knowledge_of(robot):
-    return Known(robot.outcome, robot.failure, robot.poses, robot.revision, robot.ledger.sent)
+    lines = robot.revision.num_lines
+    return Known(robot.outcome, robot.failure, robot.poses, lines, robot.ledger.sent)
 
 
 # %%
@@ -188,7 +189,7 @@ for second in range(10, 181, 10):
         print(
             f"{second:4}  {name:4}  {term.driver:6}  {proven.verdict.name}  {proven.lower_bound:7.3f}"
             f"  {proven.proven_gap:.1e}  {error_of(now, group):.2f} m  {sent / 1000:3.0f} kB"
-            f"  {known.revision - known.outcome.revisions[name]:3}  {', '.join(known.outcome.covered)}"
+            f"  {known.lines - known.outcome.revisions[name].num_lines:3}  {', '.join(known.outcome.covered)}"
         )
 
 # %% [markdown]
@@ -457,7 +458,7 @@ for second in (80, 83, 87, 140, 143):
     now = log[second - 1]
     for name in ("anna", "ben"):
         solved_lines = now[name].outcome.revisions.items()
-        pairs = (f"{n} {lines} of {now[n].revision}" for n, lines in solved_lines)
+        pairs = (f"{n} {solved.num_lines} of {now[n].lines}" for n, solved in solved_lines)
         failed = " (a later solve has failed)" if now[name].failure else ""
         print(f"{second:4}  {name:4}  {', '.join(pairs)}{failed}")
 
@@ -558,7 +559,7 @@ with NamedNumbers():
         known = log[second - 1]["ben"]
         assert "2 parts" in known.failure
         assert known.outcome.term == log[79]["ben"].outcome.term
-        assert known.revision - known.outcome.revisions["ben"] == num_new
+        assert known.lines - known.outcome.revisions["ben"].num_lines == num_new
     assert error_of(log[-1], names) < 0.2 < error_of(log[79], names)
     assert np.isclose(bound_of_others, one_machine.objective, rtol=1e-9)
     assert bound_of_others <= one_machine.objective
@@ -583,5 +584,5 @@ with NamedNumbers():
     assert with_stranger["dora"].covered == ("dora",)
     assert with_stranger["ben"].ledger.dropped > 100
     assert log[82]["ben"].outcome.covered == log[82]["anna"].outcome.covered == tuple(names)
-    assert log[82]["anna"].outcome.revisions["anna"] == 32
-    assert log[82]["anna"].revision == 38
+    assert log[82]["anna"].outcome.revisions["anna"].num_lines == 32
+    assert log[82]["anna"].lines == 38

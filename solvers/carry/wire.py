@@ -25,7 +25,7 @@ from pgo_models.errors import PGOError
 from solvers.carry.registry import VERSION, name_of_order, order_named, record
 from solvers.carry.serialization import deserialize, serialize
 
-_MARK = b"PGO"
+MARK = b"PGO"
 _VERSION = VERSION.to_bytes(1, "big")
 _SEAL_BYTES = 32  # of HMAC-SHA256
 _LENGTH_BYTES = 4  # of the length of the description, which precedes it
@@ -93,7 +93,7 @@ def from_bytes(data: bytes, kind: type[K]) -> K:
 def sealed(key: bytes, message: object) -> bytes:
     """Bytes of a message, which only holders of the key can make."""
     body = as_bytes(message)
-    return _MARK + _VERSION + hmac.digest(key, _MARK + _VERSION + body, hashlib.sha256) + body
+    return MARK + _VERSION + hmac.digest(key, MARK + _VERSION + body, hashlib.sha256) + body
 
 
 def opened(key: bytes, data: bytes, kind: type[K]) -> K:
@@ -101,8 +101,8 @@ def opened(key: bytes, data: bytes, kind: type[K]) -> K:
 
     A WireError for bytes of another version, key or kind, and for those that were changed.
     """
-    mark, version, seal, body = _cut(data, len(_MARK), len(_VERSION), _SEAL_BYTES)
-    if mark != _MARK:
+    mark, version, seal, body = _cut(data, len(MARK), len(_VERSION), _SEAL_BYTES)
+    if mark != MARK:
         raise WireError("bytes of another program")
     if version != _VERSION:
         raise WireError(

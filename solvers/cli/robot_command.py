@@ -131,7 +131,8 @@ def robot_command(
         record = robot.as_json if as_json else None
         text = wrapped("\n".join(f"{label:<12} {value}" for label, value in robot.facts()), _INDENT)
         save_then_show(writers, lambda: typer.echo(text), record, quiet)
-    is_done = robot.is_certified and not interrupted.is_set()
+    is_whole = not robot.absent and not robot.problems
+    is_done = robot.is_certified and is_whole and not interrupted.is_set()
     raise typer.Exit(DONE if is_done else NOT_CERTIFIED)
 
 
@@ -175,10 +176,14 @@ class _Reporter:
 
     def __call__(self, robot: "Robot") -> None:
         """Say what is new of a robot."""
-        for other in robot.ledger.received:
+        for other in robot.heard:
             if other not in self._said:
                 self._said.add(other)
                 self.say(f"{other} is there")
+        for problem in robot.problems:
+            if problem not in self._said:
+                self._said.add(problem)
+                self.say(problem)
         if robot.outcome is not self._outcome and robot.outcome is not None:
             self._outcome = robot.outcome
             self.say(robot.outcome.text)

@@ -259,6 +259,8 @@ def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[NumberedLines]:
     numbers = runs.number[run] + rows.ids - runs.first[run]
     owners = runs.owner[run]
     places = placed_poses(lines)
+    if agent.own_lines.text is not None:  # a robot of a team
+        _refuse_claims(agent, lines, runs)
     numbered = NumberedLines(rows, numbers, owners, places)
     owners_of_places = runs.owner[runs.of(places.ids)]
     messages: Messages[NumberedLines] = Messages()
@@ -268,6 +270,21 @@ def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[NumberedLines]:
     own_message = messages.pop(agent.robot, numbered.some(slice(0), slice(0)))
     agent.record = NumberedFile(replace(lines, digits=runs.digits), own_message)
     return messages
+
+
+def _refuse_claims(agent: Agent, lines: G2OLines, runs: OwnedRuns) -> None:
+    """Raise a GraphError where poses of the robot are said to be another's.
+
+    It would tell that one of edges that are not between the two.
+    """
+    owners = runs.owner[runs.of(lines.vertex_ids)]
+    claimed = np.unique(lines.vertex_ids[owners != agent.robot])
+    if len(claimed):
+        raise GraphError(
+            f"{agent.own_lines.path} has VERTEX lines of {len(claimed)} poses that are said to be "
+            f"another robot's, pose {claimed[0]} first; each pose is one robot's, and what is not "
+            "at the border of a robot is not told"
+        )
 
 
 @order("files.join_neighbours")

@@ -7,9 +7,15 @@ and computations change nothing but what they were given. The one lock is that o
 
 from __future__ import annotations
 
+import atexit
 import queue
 import threading
+import time
+import weakref
 from collections.abc import Callable
+
+_PAUSE = 0.01  # seconds
+_ALL: weakref.WeakSet[Beside] = weakref.WeakSet()
 
 
 class Beside:
@@ -19,6 +25,7 @@ class Beside:
         self._results: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._num_busy = 0
         self._lock = threading.Lock()  # of the count
+        _ALL.add(self)
 
     @property
     def is_busy(self) -> bool:
@@ -26,7 +33,7 @@ class Beside:
         return self._num_busy > 0
 
     def begin(self, compute: Callable[[], None]) -> None:
-        """Compute in a thread, which ends with the process at the latest."""
+        """Compute in a thread."""
         self.count(1)
 
         def run() -> None:
@@ -50,3 +57,10 @@ class Beside:
         """Act on all results that there are."""
         while not self._results.empty():
             self._results.get_nowait()()
+
+
+@atexit.register
+def _wait_for_all() -> None:
+    """Let computations end before the process does: what they call may not survive to be ended."""
+    while any(beside.is_busy for beside in _ALL):
+        time.sleep(_PAUSE)

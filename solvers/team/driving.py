@@ -17,6 +17,7 @@ from solvers.carry.wire import Order
 from solvers.robots.agent import Agent
 from solvers.robots_solution import RobotsSolution
 from solvers.team.beside import Beside
+from solvers.team.measurements import Revision
 from solvers.team.messages import Ask, Ended, Hello, Reply, Term, error_of_message
 
 T = TypeVar("T")
@@ -105,7 +106,7 @@ class Drive:
         self.waiting = {}
         self._arrived.put(None)
 
-    def ended(self, absent: tuple[str, ...], revisions: Mapping[str, int]) -> Ended:
+    def ended(self, absent: tuple[str, ...], revisions: Mapping[str, Revision]) -> Ended:
         """How the solve has ended, without `absent` robots, by members with these revisions."""
         outcome = self.outcome
         if isinstance(outcome, RobotsSolution):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,12 +19,25 @@ from pgo_models.graphs.g2o_tags import SKIPPED_TAGS
 from pgo_models.graphs.pose_graph import IntArray, isotropic_information
 from solvers.carry.registry import record
 
+_DIGITS_OF_HASH = 16  # of base 16: two different contents agree by chance once in 2^64
 _EDGE_TAGS = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 _VERTEX_TAGS = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 _LANDMARK_TAGS = {2: "VERTEX_XY", 3: "VERTEX_TRACKXYZ"}
 _ORIGIN = {2: "0 0 0", 3: "0 0 0 0 0 0 1"}
 # Tag of a pose without an estimate, whose line becomes a VERTEX line when the dimension is known.
 _WITHOUT_ESTIMATE = "POSE"
+
+
+@record("Revision")
+@dataclass(frozen=True)
+class Revision:
+    """Which measurements a robot has: how many lines, and a hash (SHA-256) of what they say."""
+
+    num_lines: int = 0
+    digest: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.num_lines} lines, {self.digest}"
 
 
 @record("Measurements")
@@ -41,6 +55,18 @@ class Measurements:
 
     lines: list[str] = field(default_factory=list)
     d: int | None = None
+
+    def __post_init__(self) -> None:
+        self._hash = hashlib.sha256()
+        self._num_hashed = 0
+
+    @property
+    def revision(self) -> Revision:
+        """Which measurements they are."""
+        for line in self.lines[self._num_hashed :]:
+            self._hash.update(line.encode("utf-8"))
+        self._num_hashed = len(self.lines)
+        return Revision(self._num_hashed, self._hash.hexdigest()[:_DIGITS_OF_HASH])
 
     def add_pose(self, pose_id: int, R: Array | None, t: Array | None, fixed: bool) -> None:
         """Add a pose, as `Robot.add_pose` has it."""

@@ -30,7 +30,7 @@ from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.solves.folder_solve import FilesOfRobots
 from solvers.team.driving import Drive
-from solvers.team.measurements import Measurements
+from solvers.team.measurements import Measurements, Revision
 from solvers.team.messages import Ended
 from solvers.team.sharing import (
     OwnAnswer,
@@ -59,9 +59,9 @@ class Member:
     known: OwnAnswer | None = None
 
     @property
-    def revision(self) -> int:
-        """How many lines its measurements are, so that others notice when it has more."""
-        return len(self.measurements.lines)
+    def revision(self) -> Revision:
+        """Which measurements it has, so that others notice when they change."""
+        return self.measurements.revision
 
     def new_agent(self, place: int) -> Agent | None:
         """Its part in a solve, with its measurements as they are now; None where it has none."""
@@ -112,7 +112,7 @@ class Member:
         network.ask(take_answer, answers, Count.ROUND)
         return RobotsSolution.of(solution, network.ledger)
 
-    def has_more_than(self, revisions: Mapping[str, int]) -> bool:
+    def has_more_than(self, revisions: Mapping[str, Revision]) -> bool:
         """Whether what was certified holds for measurements of these revisions, and for more."""
         outcome = self.outcome
         if outcome is None or outcome.solution is None or not outcome.solution.is_certified:

@@ -12,6 +12,7 @@ from pgo_models.errors import PGOError
 from solvers.carry.registry import record
 from solvers.carry.wire import Order, WireError
 from solvers.robots_solution import RobotsSolution
+from solvers.team.measurements import Revision
 
 _MOST = 1 << 62  # no number of a message is higher
 _PLAIN_ERRORS = {
@@ -41,12 +42,15 @@ class Term:
 class Hello:
     """A robot is there, with measurements of this revision; `term` is the latest that it knows.
 
-    `computing` is the order of the term that it computes the answer to, or -1.
+    `known` is that of the outcome that it has, `computing` the order of the term that it computes
+    the answer to, or -1; `twins` are names that two robots have.
     """
 
-    revision: int
+    revision: Revision
     term: Term
+    known: Term
     computing: int = -1
+    twins: tuple[str, ...] = ()
 
 
 @record("Ask")
@@ -75,7 +79,7 @@ class Reply:
 
     term: Term
     call: int
-    revision: int
+    revision: Revision
     answer: Any
     error: tuple[str, str] | None = None  # name and text of a PGOError
 
@@ -110,8 +114,8 @@ class Ended:
     ----------
     term : Term
         The solve.
-    revisions : dict of str to int
-        Robots that took part, with how many lines of measurements each.
+    revisions : dict of str to Revision
+        Robots that took part, each with the revision of its measurements.
     absent : tuple of str
         Robots of the team that were not heard of.
     solution : RobotsSolution, optional
@@ -121,7 +125,7 @@ class Ended:
     """
 
     term: Term
-    revisions: Mapping[str, int]
+    revisions: Mapping[str, Revision]
     absent: tuple[str, ...]
     solution: RobotsSolution | None
     failure: str = ""
@@ -155,9 +159,9 @@ def check_message(message: object, team: tuple[str, ...]) -> None:
     """Raise a WireError for names and numbers that no robot of the team sends."""
     if not isinstance(message, Hello | Ask | Reply | Letter | LetterLost | Ended | Heard):
         raise WireError(f"a {type(message).__name__} is no message")
-    numbers = [getattr(message, name, 0) for name in ("revision", "call", "place", "computing")]
+    numbers = [getattr(message, name, 0) for name in ("call", "place", "computing")]
     names = [*getattr(message, "members", ()), *getattr(message, "revisions", ())]
-    names += getattr(message, "absent", ())
+    names += [*getattr(message, "absent", ()), *getattr(message, "twins", ())]
     is_known = set(names) <= set(team) and message.term.driver in (*team, "")
     if not is_known or not all(-1 <= number < _MOST for number in (*numbers, message.term.number)):
         raise WireError(f"a {type(message).__name__} with names or numbers of nobody")

@@ -26,7 +26,7 @@ from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
-from solvers.team.measurements import Measurements
+from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Term
 from solvers.team.session import PATIENCE, RETRY, Message, Session, TeamLedger
@@ -212,8 +212,8 @@ class Robot:
         self._member.measurements.read(Path(path))
 
     @property
-    def revision(self) -> int:
-        """How many lines its measurements are, so that others notice when it has more."""
+    def revision(self) -> Revision:
+        """Which measurements it has: how many lines, and a hash of what they say."""
         return self._member.revision
 
     # Answers
@@ -265,6 +265,15 @@ class Robot:
         return "" if self.last is None else self.last.failure
 
     @property
+    def problems(self) -> list[str]:
+        """Sentences on what is wrong with the team: names, keys, versions; none where nothing is.
+
+        They are of messages that arrive: of two robots with one name, of a robot that is not in
+        the team, and of one with another key or version.
+        """
+        return self._session.problems
+
+    @property
     def is_settled(self) -> bool:
         """Whether a solve was of the whole team, and nobody waits for this robot.
 
@@ -304,6 +313,7 @@ class Robot:
             Pairs of a label and a text.
         """
         facts = [("robot", f"{self.name} of {', '.join(self.team)}")]
+        facts += [("problem", problem) for problem in self.problems]
         facts.append(("failure", self.failure))
         solution = self.solution
         if solution is None:
@@ -333,6 +343,7 @@ class Robot:
             Names, cost, bound, verdict, who is covered and absent, and bytes by robot.
         """
         solution = self.solution
+        revisions = {} if self.outcome is None else self.outcome.revisions
         known: dict[str, object] = {}
         if solution is not None:
             certificate = solution.certificate
@@ -353,7 +364,8 @@ class Robot:
             "stages": [] if solution is None else _names_of_stages(solution),
             "note": "" if solution is None else solution.note,
             "failure": self.failure,
-            "revisions": {} if self.outcome is None else dict(self.outcome.revisions),
+            "revisions": {name: str(revision) for name, revision in revisions.items()},
+            "problems": self.problems,
             "robust": "" if solution is None else solution.robust,
             "is_certified": self.is_certified,
             "rejected": [list(pair) for pair in self.rejected],
@@ -384,7 +396,7 @@ class Robot:
             temporary.write_text(text, encoding="utf-8")
 
     def __repr__(self) -> str:
-        size = f"{self.revision} lines"
+        size = f"{self.revision.num_lines} lines"
         solution = self.solution
         if solution is None:
             return f"Robot({self.name!r}, {size}, {self.failure or 'no outcome yet'})"
@@ -430,6 +442,11 @@ class Robot:
     def others(self) -> list[str]:
         """Names of the other robots."""
         return [name for name in self.team if name != self.name]
+
+    @property
+    def heard(self) -> tuple[str, ...]:
+        """Names of the other robots that have spoken to this one."""
+        return self._session.heard
 
     @property
     def retry(self) -> float:

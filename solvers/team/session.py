@@ -8,20 +8,19 @@ robot brings into a solve is its `Member`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pgo_models.errors import EngineError, PGOError
 from solvers.carry.letters import LetterName, Letters
-from solvers.carry.registry import record
-from solvers.carry.wire import WireError, as_bytes, from_bytes, opened, sealed
+from solvers.carry.wire import MARK, WireError, opened, sealed
 from solvers.robots.agent import Agent
 from solvers.team.beside import Beside
 from solvers.team.driving import Drive
+from solvers.team.measurements import Revision
 from solvers.team.member import Member
 from solvers.team.messages import (
     Ask,
@@ -36,11 +35,14 @@ from solvers.team.messages import (
     check_message,
     error_as_message,
 )
+from solvers.team.refusals import function_for_teams
+from solvers.team.speakers import Envelope, Speakers, Word
 
 PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
 RETRY = 1.0  # seconds after which a message without an answer is sent again
 # Patiences after which a robot that is there, and has not answered, is waited for no more.
 _MOST_PATIENCES = 10.0
+_MOST_STRANGERS = 8  # sentences on messages of nobody in the team
 # Share of its patience after which a robot says again that it is there.
 _SHARE_OF_PATIENCE = 0.25
 
@@ -89,26 +91,6 @@ def _with_more(counts: Mapping[str, int], name: str, more: int) -> Mapping[str, 
     return {**counts, name: counts.get(name, 0) + more}
 
 
-@record("Envelope")
-@dataclass(frozen=True)
-class Envelope:
-    """A message as bytes, and who it is from and to."""
-
-    sender: str
-    receiver: str
-    content: NDArray[np.uint8]
-
-    @classmethod
-    def of(cls, sender: str, receiver: str, message: object) -> Envelope:
-        """Return a message with its addresses."""
-        return cls(sender, receiver, np.frombuffer(as_bytes(message), np.uint8))
-
-    @property
-    def message(self) -> Any:  # noqa: ANN401 - a message of any kind
-        """The message; a WireError for bytes that are none."""
-        return from_bytes(self.content.tobytes(), object)
-
-
 @dataclass(eq=False)
 class Following:
     """What a robot does in a solve: its agent obeys each order once. The last answer may be lost.
@@ -118,7 +100,7 @@ class Following:
     """
 
     agent: Agent
-    revision: int
+    revision: Revision
     letters: Letters
     members: tuple[str, ...]
     call: int = -1
@@ -131,8 +113,9 @@ class Following:
 class Presence:
     """Who of the team is awake, with which measurements, and who is to be told hello.
 
-    `last_heard` is when each of the others was last heard of, and `revisions` those of their
-    measurements. `began` is the first moment that the robot itself was awake.
+    `last_heard` is when each of the others was last heard of, `revisions` those of their
+    measurements, and `known` the terms of the outcomes that they have. `began` is the first moment
+    that the robot itself was awake.
     """
 
     name: str
@@ -140,11 +123,12 @@ class Presence:
     patience: float
     retry: float
     last_heard: dict[str, float] = field(default_factory=dict)
-    revisions: dict[str, int] = field(default_factory=dict)
+    revisions: dict[str, Revision] = field(default_factory=dict)
+    known: dict[str, Term] = field(default_factory=dict)
     began: float | None = None
     _hello_at: float = -np.inf  # when hello was said to all, and to those that are not awake
     _sought_at: float = -np.inf
-    _said_revision: int = -1
+    _said_revision: Revision | None = None
 
     def awake(self, now: float) -> tuple[str, ...]:
         """Robots that were heard of lately, and this one, in the order of their names."""
@@ -155,21 +139,18 @@ class Presence:
                 awake.append(name)
         return tuple(awake)
 
-    def is_complete(self, now: float, awake: tuple[str, ...]) -> bool:
-        """Whether everybody is awake, or was waited for."""
+    def is_complete(self, now: float, members: Collection[str]) -> bool:
+        """Whether the whole team is among the members of a solve, or was waited for."""
         assert self.began is not None
-        return len(awake) == len(self.team) or now - self.began >= self.patience
+        return len(members) == len(self.team) or now - self.began >= self.patience
 
-    def revisions_of(self, awake: tuple[str, ...], own: int) -> dict[str, int]:
-        """Revisions of the measurements of robots that are awake; this one has `own`."""
-        others = {name: self.revisions.get(name, 0) for name in awake if name != self.name}
-        return {self.name: own, **others}
+    def revisions_of(self, awake: tuple[str, ...], own: Revision) -> dict[str, Revision]:
+        """Revisions of the measurements of robots that are awake and have any."""
+        revisions = {**self.revisions, self.name: own}
+        known = {name: revisions.get(name, Revision()) for name in awake}
+        return {name: revision for name, revision in known.items() if revision.num_lines}
 
-    def learn_revision(self, robot: str, revision: int) -> None:
-        """Take the revision of another robot, which a late message may have of before."""
-        self.revisions[robot] = max(revision, self.revisions.get(robot, 0))
-
-    def to_greet(self, now: float, awake: tuple[str, ...], revision: int) -> list[str]:
+    def to_greet(self, now: float, awake: tuple[str, ...], revision: Revision) -> list[str]:
         """Whom to say hello: often those not awake, now and then and with more lines all."""
         is_due = now - self._hello_at >= _SHARE_OF_PATIENCE * self.patience
         is_due |= self._said_revision != revision
@@ -210,16 +191,24 @@ class Session:
         self._waits_since: float | None = None  # for answers to the orders under way
         self._following: Following | None = None
         self._drive: Drive | None = None
-        self._tried: dict[str, int] | None = None  # revisions of the robots in the last solve
+        # Revisions and boots of the robots in the last solve.
+        self._tried: dict[str, tuple[Revision, str]] = {}
         self._unheard: dict[str, Ended] = {}  # robots that have not confirmed the outcome
         self._out: list[Message] = []
         self._now = 0.0
         self._beside = Beside()
+        self._speakers = Speakers(self.name, patience)
+        self._strangers: dict[str, None] = {}  # sentences on messages of nobody in the team
 
     @property
     def is_computing(self) -> bool:
         """Whether something is computed beside the calls."""
         return self._beside.is_busy
+
+    @property
+    def heard(self) -> tuple[str, ...]:
+        """Robots of the team that have spoken to this one."""
+        return tuple(self._presence.last_heard)
 
     @property
     def is_settled(self) -> bool:
@@ -248,27 +237,56 @@ class Session:
         self._beside.act()
         try:
             envelope = opened(self._key, data, Envelope)
-        except WireError:
-            self.ledger = self.ledger.after_dropping("")
+        except WireError as error:
+            self._drop("", "" if data[:3] != MARK else f"{error}; see whether all have the same")
             return
         sender = envelope.sender
-        if sender not in self.team or sender == self.name or envelope.receiver != self.name:
-            self.ledger = self.ledger.after_dropping("")
+        if envelope.receiver != self.name or sender == self.name:
+            self._drop("", "")
+            return
+        if sender not in self.team:
+            sentence = f"{sender!r:.80} has the key of the team, and is not in it; name it for all"
+            self._drop("", sentence)
             return
         try:
             message = envelope.message
             check_message(message, self.team)
         except WireError:
-            self.ledger = self.ledger.after_dropping(sender)
+            self._drop(sender, "")
+            return
+        word = self._speakers.word_of(envelope, now)
+        if word is Word.REPEATED:
+            self._drop(sender, "")
             return
         self.ledger = self.ledger.after_receiving(sender, data)
+        if word is Word.UNPROVEN:  # answered by a message that does name the boot of the other
+            self._send(sender, self._hello(), Priority.URGENT, envelope.boot)
+            return
         self._presence.last_heard[sender] = now
+        if word is Word.NEW and isinstance(message, Hello):
+            self._presence.revisions[sender] = message.revision
+            self._presence.known[sender] = message.known
         self._take(sender, message, now)
+
+    def _drop(self, sender: str, sentence: str) -> None:
+        """Count what is dropped, and remember a sentence on why."""
+        self.ledger = self.ledger.after_dropping(sender)
+        if sentence and len(self._strangers) < _MOST_STRANGERS:
+            self._strangers[sentence] = None
+
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong with names, keys or versions of the team, a sentence each."""
+        twins = [
+            f"two robots are called {name}; give each a name of its own"
+            for name in sorted(self._speakers.twins)
+        ]
+        return [*twins, *self._strangers]
 
     def _take(self, sender: str, message: object, now: float) -> None:
         """Update what is known of the team by a message, or obey the order in it."""
         if isinstance(message, Hello):
-            self._presence.learn_revision(sender, message.revision)
+            self._speakers.twins.update(message.twins)
             self._learn_term(message.term)
             if self._drive is not None and self._drive.is_computed(sender, message):
                 self._waits_since = now
@@ -300,19 +318,26 @@ class Session:
             self._say_hello(name, Priority.NORMAL)
         if self._drive is not None:
             self._go_on_driving(now, awake)
-        if self._drive is None and awake[0] == self.name and self._is_time(now, awake):
-            self._begin_drive(awake)
+        if self._drive is None:
+            self._begin_if_due(now, awake)
         self._unheard = {name: ended for name, ended in self._unheard.items() if name in awake}
         self._send_again(self._unheard, Priority.NORMAL, now)
 
     def _say_hello(self, to: str, priority: Priority) -> None:
+        self._send(to, self._hello(), priority)
+
+    def _hello(self) -> Hello:
         part = self._following
         is_computing = part is not None and part.obeyed is not None
         call = part.call + 1 if part is not None and is_computing else -1
-        self._send(to, Hello(self._member.revision, self.term, call), priority)
+        twins = tuple(sorted(self._speakers.twins))
+        outcome = self._member.outcome
+        known = Term(0, "") if outcome is None else outcome.term
+        return Hello(self._member.revision, self.term, known, call, twins)
 
-    def _send(self, to: str, message: object, priority: Priority) -> None:
-        data = sealed(self._key, Envelope.of(self.name, to, message))
+    def _send(self, to: str, message: object, priority: Priority, heard: str | None = None) -> None:
+        """Send a message to a robot, to its run `heard` where that is not the one heard last."""
+        data = sealed(self._key, self._speakers.addressed(to, message, heard))
         self._out.append(Message(to, data, priority))
 
     def _send_again(self, waiting: Mapping[str, object], priority: Priority, now: float) -> None:
@@ -327,7 +352,7 @@ class Session:
         if term > self.term:
             self.term = term
             self._following = None
-            self._tried = None
+            self._tried = {}
             self._unheard.clear()
             self._give_up()
 
@@ -335,30 +360,43 @@ class Session:
         if self._drive is not None:
             self._drive.abandon()
             self._drive = None
-            self._tried = None
+            self._tried = {}
 
     # Driving
 
-    def _is_time(self, now: float, awake: tuple[str, ...]) -> bool:
-        """Whether a solve should begin: everybody is there or was waited for, and something is new.
+    def _begin_if_due(self, now: float, awake: tuple[str, ...]) -> None:
+        """Begin a solve if this robot drives: it comes first of those that have measured anything.
 
-        Robots without measurements are waited for, too. Where robots have gone and nothing is new,
-        a solve would find less than what is known.
+        Everybody is there or was waited for, and something is new: measurements, or a robot that
+        has begun anew. Where robots have gone, a solve would find less than what is known.
         """
         revisions = self._presence.revisions_of(awake, self._member.revision)
-        is_new = min(revisions.values()) > 0 and revisions != self._tried
-        if self._member.has_more_than(revisions):
-            return False
-        return is_new and self._presence.is_complete(now, awake)
+        members = tuple(revisions)
+        if not members or members[0] != self.name:
+            return
+        tried = {}
+        lacks_map = False
+        for name, revision in revisions.items():
+            before = self._tried.get(name)
+            tried[name] = (revision, self._speakers.boot_of(name))
+            if before is not None and before[1] != tried[name][1]:  # it has begun anew
+                has_map = self.last is not None and self._presence.known.get(name) == self.last.term
+                tried[name] = (revision, before[1] if has_map else tried[name][1])
+                lacks_map |= not has_map
+        if self._member.has_more_than(revisions) and not lacks_map:
+            return
+        if tried != self._tried and self._presence.is_complete(now, members):
+            self._begin_drive(members, tried)
 
-    def _begin_drive(self, awake: tuple[str, ...]) -> None:
+    def _begin_drive(
+        self, members: tuple[str, ...], tried: dict[str, tuple[Revision, str]]
+    ) -> None:
         own_revision = self._member.revision
-        self._tried = self._presence.revisions_of(awake, own_revision)
+        self._tried = tried
         self._unheard.clear()  # of the last outcome: there will be another one
         self.term = Term(self.term.number + 1, self.name)
         agent = self._member.new_agent(0)
         assert agent is not None  # as it has measurements
-        members = (self.name, *(name for name in awake if name != self.name))
         self._following = Following(agent, own_revision, Letters(0), members)
         self._drive = Drive(
             self.term, members, agent, self._member.solve, self._beside, self._after_step
@@ -395,13 +433,15 @@ class Session:
         )
         for name, ask in list(self._drive.waiting.items()):
             self._drive.take(
-                name, Reply(ask.term, ask.call, self._presence.revisions.get(name, 0), None, error)
+                name,
+                Reply(
+                    ask.term, ask.call, self._presence.revisions.get(name, Revision()), None, error
+                ),
             )
 
     def _take_reply(self, sender: str, reply: Reply) -> None:
         if self._drive is not None and reply.term == self._drive.term:
-            if self._tried is not None:
-                self._tried[sender] = reply.revision
+            self._tried[sender] = (reply.revision, self._speakers.boot_of(sender))
             self._drive.take(sender, reply)
 
     def _after_step(self, drive: Drive) -> None:
@@ -414,8 +454,8 @@ class Session:
             return
         self._drive = None
         absent = tuple(name for name in self.team if name not in drive.members)
-        assert self._tried is not None
-        outcome = drive.ended(absent, self._tried)
+        revisions = {name: revision for name, (revision, _) in self._tried.items()}
+        outcome = drive.ended(absent, revisions)
         self._end_with(outcome)
         self._unheard = dict.fromkeys(drive.members[1:], outcome)
         self._send_again(self._unheard, Priority.NORMAL, now)
@@ -476,7 +516,7 @@ class Session:
             answer: Any = None
             error = None
             try:
-                answer = ask.order.function()(part.agent, request)
+                answer = function_for_teams(ask.order)(part.agent, request)
             except Exception as reason:  # another robot may ask for anything
                 error = _as_error(reason)
             self._beside.hand_over(lambda: self._end_answer(part, ask, answer, error))

@@ -63,8 +63,6 @@ class ZenohLink:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise EngineError(f"cannot listen at {listen}: {error}") from error
-        names = ",".join(robot.team).encode("utf-8")
-        self._prefix = f"pgo/{hashlib.sha256(names).hexdigest()[:16]}"
         self._arrived: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
         def keep(sample: object) -> None:
@@ -73,8 +71,11 @@ class ZenohLink:
         self._subscriber = self._session.declare_subscriber(self._expression(robot.name), keep)
 
     def _expression(self, name: str) -> str:
-        """Key expression of a robot: its name may have any characters."""
-        return f"{self._prefix}/{hashlib.sha256(name.encode('utf-8')).hexdigest()[:16]}"
+        """Key expression of a robot: its name may have any characters.
+
+        Other teams are heard, too, so that a robot can say who has another key or team.
+        """
+        return f"pgo/{hashlib.sha256(name.encode('utf-8')).hexdigest()[:16]}"
 
     def send(self, message: Message) -> None:
         """Send a message, or lose it if nobody is there: robots repeat what is not answered."""

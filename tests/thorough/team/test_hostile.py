@@ -6,6 +6,7 @@ import hmac
 import json
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,16 +19,17 @@ import solvers
 from solvers.carry.registry import VERSION
 from solvers.carry.serialization import serialize
 from solvers.carry.wire import opened, packed, sealed, unpacked
+from solvers.team.measurements import Revision
 from solvers.team.messages import Hello, Term
-from solvers.team.session import Envelope
+from solvers.team.speakers import Envelope
 
-HELLO = Hello(1, Term(0, ""))
+HELLO = Hello(Revision(1, "0"), Term(0, ""), Term(0, ""))
 
 
 def with_content(packed_message: bytes) -> bytes:
     """A message of r1 to r0 whose bytes are these."""
     content = np.frombuffer(zlib.compress(packed_message), np.uint8)
-    return sealed(KEY, Envelope("r1", "r0", content))
+    return sealed(KEY, Envelope("r1", "r0", "boot", "", 1, content))
 
 
 def with_tree(change: Callable[[Any], Any]) -> bytes:
@@ -55,10 +57,10 @@ def many_arrays() -> bytes:
 
 
 WRONG: dict[str, Callable[[], bytes]] = {
-    "text for a number": lambda: with_field("revision", "many"),
-    "a number that is none": lambda: with_field("revision", float("nan")),
-    "a number that is too high": lambda: with_field("revision", 1 << 80),
-    "nothing for a number": lambda: with_field("revision", None),
+    "text for a number": lambda: with_field("computing", "many"),
+    "a number that is none": lambda: with_field("computing", float("nan")),
+    "a number that is too high": lambda: with_field("computing", 1 << 80),
+    "nothing for a number": lambda: with_field("computing", None),
     "a list for a term": lambda: with_field("term", {"items": [1, "r1"]}),
     "a driver of nobody": lambda: with_field(
         "term", {"record": "Term", "fields": {"number": 3, "driver": "zed"}}
@@ -84,7 +86,7 @@ WRONG: dict[str, Callable[[], bytes]] = {
     "a kind of objects": lambda: with_content(_headed([["0", "O", [1]]])),
     "a length that is a text": lambda: with_content(_headed([["0", "<f8", ["1"]]])),
     "bytes that are not packed": lambda: sealed(
-        KEY, Envelope("r1", "r0", np.arange(9, dtype="u1"))
+        KEY, Envelope("r1", "r0", "boot", "", 1, np.arange(9, dtype="u1"))
     ),
 }
 
@@ -139,7 +141,7 @@ def spoiled_message(data: bytes, rng: np.random.Generator) -> bytes:
             odd += [array * np.nan, array * np.inf, -array, 1e300 * array]
         arrays[name] = odd[rng.integers(len(odd))]
     content = np.frombuffer(zlib.compress(packed(arrays)), np.uint8)
-    return sealed(KEY, Envelope(envelope.sender, envelope.receiver, content))
+    return sealed(KEY, replace(envelope, content=content))
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of numbers that are none

@@ -194,7 +194,8 @@ def test_a_late_robot_is_waited_for_and_one_that_never_comes_is_named(fleet: Fle
     fleet.start("b", "--wait", "9")
     for name in ("a", "b"):
         code, told = fleet.ended(name)
-        assert code == 0
+        assert code == 3  # a map of a part of the team
+        assert told["verdict"] == "CERTIFIED"
         assert told["covered"] == ["a", "b"]
         assert told["absent"] == ["c"]
 
@@ -238,6 +239,22 @@ def test_ctrl_c_keeps_what_is_known(fleet: Fleet) -> None:
     assert code != 0
     assert told["covered"] == ["a", "b"]
     assert (fleet.machines["a"].folder / "solved.g2o").exists()
+
+
+@pytest.mark.parametrize("words", [["--key", "other.key"], ["--team", "a,b"], ["--name", "b"]])
+def test_a_wrong_key_team_or_name_is_told_by_the_others(fleet: Fleet, words: list[str]) -> None:
+    sentences = {
+        "--key": "not sealed with the key of the team",
+        "--team": "'c' has the key of the team, and is not in it",
+        "--name": "two robots are called b",
+    }
+    (fleet.machines["c"].folder / "other.key").write_bytes(b"the secret of other robots")
+    for name in NAMES:
+        has_words = (name == "c") != (words[0] == "--team")
+        fleet.start(name, *(words if has_words else ()), "--wait", "15")
+    code, told = fleet.ended("a")
+    assert code == 3
+    assert any(sentences[words[0]] in problem for problem in told["problems"])  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

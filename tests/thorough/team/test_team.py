@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import re
+import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -22,12 +23,14 @@ from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import Sharing
 from solvers.carry.messages import Token
-from solvers.carry.wire import opened, sealed
+from solvers.carry.wire import Order, opened
 from solvers.robots.own_file import NumberedLines
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.messages import Ask, Ended, Heard, Letter, Reply
-from solvers.team.session import Envelope, TeamLedger
+from solvers.team.refusals import function_for_teams
+from solvers.team.session import TeamLedger
+from solvers.team.speakers import Envelope
 
 PEERS = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.CONSENSUS, tolerance=5e-3))
 
@@ -235,10 +238,110 @@ def test_a_robot_that_was_saved_with_the_outcome_does_not_ask_for_another() -> N
     assert before is not None
     loaded = solvers.Robot.load(network.robots["r2"].save(), KEY, patience=5.0, retry=0.3)
     network.robots["r2"] = loaded
-    loaded.receive(sealed(KEY, Envelope.of("r0", "r2", before)), network.now)  # its Heard was lost
     network.wait(20.0)
     assert network.robots["r0"].outcome is before
     assert loaded.poses
+
+
+def test_a_robot_that_begins_anew_from_an_older_save_gets_a_map_at_once() -> None:
+    graph = world()
+    network = Network(robots_of(graph, 3), np.random.default_rng(0))
+    saved = network.robots["r2"].save()
+    network.run(60.0)
+    before = network.robots["r0"].outcome
+    network.robots["r2"] = solvers.Robot.load(saved, KEY, patience=5.0, retry=0.3)
+    network.wait(3.0)
+    assert network.is_settled
+    assert network.robots["r0"].outcome is not before
+    assert_is_the_optimum(network.robots, graph)
+
+
+# Who speaks.
+
+
+def test_replays_of_an_earlier_mission_are_dropped_and_wake_nobody() -> None:
+    graph = world()
+    recorded: list[tuple[str, bytes]] = []
+
+    def record(sender: str, receiver: str, data: bytes) -> bool:
+        recorded.append((receiver, data))
+        return False
+
+    network = Network(robots_of(graph, 3), np.random.default_rng(0), is_lost=record)
+    network.run(60.0)
+    yesterday = list(recorded)
+    last = np.arange(graph.num_edges) >= graph.num_edges - 2
+    today = robots_of(graph.without_edges(last), 3)
+    network = Network(today, np.random.default_rng(1), asleep={"r2"})
+    for receiver, data in yesterday:
+        network.wait(0.02)
+        today[receiver].receive(data, network.now)
+    network.wait(12.0)
+    for name in ("r0", "r1"):
+        assert today[name].absent == ("r2",)
+        assert today[name].heard == tuple({"r0", "r1"} - {name})
+        assert today[name].problems == []
+    for receiver, data in yesterday:  # also of this mission nothing counts twice
+        today[receiver].receive(data, network.now)
+    assert today["r0"].covered == ("r0", "r1")
+
+
+def test_messages_of_a_run_that_is_over_are_dropped() -> None:
+    graph = world()
+    recorded: list[bytes] = []
+
+    def record(sender: str, receiver: str, data: bytes) -> bool:
+        recorded.extend([data] * ((sender, receiver) == ("r1", "r0")))
+        return False
+
+    network = Network(robots_of(graph, 2), np.random.default_rng(0), is_lost=record)
+    network.run(60.0)
+    robots = network.robots
+    network.asleep = {"r1"}
+    dropped = robots["r0"].ledger.dropped
+    num_recorded = len(recorded)
+    for data in recorded[:num_recorded]:
+        network.wait(0.1)
+        robots["r0"].receive(data, network.now)
+    assert robots["r0"].ledger.dropped_by == {"r1": dropped + num_recorded - 1}  # one greeting
+
+
+def test_names_that_are_wrong_are_told_in_a_sentence() -> None:
+    graph = world()
+    robots = robots_of(graph, 2)
+    network = Network(robots, np.random.default_rng(0))
+    network.run(60.0)
+    assert all(robot.problems == [] for robot in robots.values())
+    receiver = robots["r1"]
+    stranger = solvers.Robot("r0", ["r0", "r1"], b"another key of 16 bytes")
+    zed = solvers.Robot("zed", ["r0", "r1", "zed"], KEY)
+    for robot in (stranger, zed):
+        robot.tick(network.now)
+        for message in robot.outbox():
+            if message.to == "r1":
+                receiver.receive(message.data, network.now)
+    key, name = receiver.problems
+    assert "not sealed with the key of the team" in key
+    assert "'zed' has the key of the team, and is not in it" in name
+
+
+def test_two_robots_of_one_name_are_told_of_each_other() -> None:
+    graph = world()
+    robots = robots_of(graph, 2)
+    twin = robots_of(graph, 2)["r0"]
+    twins = [robots["r0"], twin]
+    now = 0.0
+    while now < 30.0:
+        now += 0.1
+        for robot in (*twins, robots["r1"]):
+            robot.tick(now)
+            while robot.is_computing:
+                time.sleep(1e-5)
+            for message in robot.outbox():
+                for other in twins if message.to == "r0" else [robots["r1"]]:
+                    other.receive(message.data, now)
+    for robot in (*twins, robots["r1"]):
+        assert robot.problems == ["two robots are called r0; give each a name of its own"]
 
 
 @pytest.mark.parametrize("gone", ["r0", "r2"])
@@ -475,6 +578,35 @@ def test_a_robot_that_shares_its_interface_alone_gives_away_nothing_else() -> No
         solvers.Robot("a", names, KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))
 
 
+def test_a_robot_gives_a_driver_that_claims_its_poses_nothing() -> None:
+    graph = world()
+    robots = robots_of(graph, 2)
+    owners = pgo.partition(graph, 2).robot
+    for pose in graph.pose_ids[owners == 1][1:].tolist():  # r0 claims all but one
+        robots["r0"].add_pose(pose)
+    heard: list[object] = []
+
+    def listen(sender: str, receiver: str, data: bytes) -> bool:
+        heard.append(message_in(data))
+        return False
+
+    network = Network(robots, np.random.default_rng(0), is_lost=listen)
+    network.run(30.0)
+    for robot in robots.values():
+        assert robot.outcome is None
+        assert "what is not at the border of a robot is not told" in robot.failure
+    assert NumberedLines not in {kind for message in heard for kind in kinds_in(message)}
+
+
+@pytest.mark.parametrize(
+    "name", ["worker.take_snapshot", "files.write_answer", "poses.result", "consensus.own_poses"]
+)
+def test_orders_that_give_too_much_away_are_refused(name: str) -> None:
+    for order in (Order(name), Order("robot.order_interior", (Order(name),))):
+        with pytest.raises(SettingError, match="it gives too much away"):
+            function_for_teams(order)
+
+
 def test_bytes_are_counted_where_they_are_handed_out_and_received() -> None:
     network = Network(robots_of(world(), 3), np.random.default_rng(0))
     network.run(60.0)
@@ -504,6 +636,7 @@ def test_messages_without_the_key_changed_ones_and_those_for_others_are_dropped(
     assert robots["r0"].ledger.dropped == 1
     receiver.receive(right.data, 0.0)
     assert receiver.ledger.received == {"r0": len(right.data)}
+    assert receiver.heard == ()  # it may be of another day: r0 has not heard r1
 
 
 def test_a_saved_robot_keeps_its_measurements_poses_and_outcome() -> None:
@@ -561,7 +694,8 @@ def test_a_robot_is_saved_before_its_lines_tell_the_dimension(d: int) -> None:
     again.add_pose(1)
     again.add_edge(0, 1, np.eye(d), np.ones(d), kappa=1.0, tau=2.0)
     once_more = solvers.Robot.load(again.save(), KEY)
-    assert once_more.revision == again.revision == 3
+    assert once_more.revision == again.revision
+    assert again.revision.num_lines == 3
     with pytest.raises(GraphError, match="always alike"):
         once_more.add_edge(0, 1, np.eye(5 - d), np.ones(5 - d), kappa=1.0, tau=2.0)
 

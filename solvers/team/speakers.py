@@ -1,0 +1,132 @@
+"""Who speaks: what a message proves beside the key that seals it, and what two runs of a robot are.
+
+The key says that a robot of the team made a message, not when. So every run of a robot draws a
+number, its boot, and a message names the boot of its sender and that of its receiver, as the sender
+has heard it. A message is of this mission if it names the boot of its receiver, which nobody could
+know before; one that does not is answered by a greeting, and believed in nothing. Messages of a run
+are numbered, and each number counts once.
+"""
+
+from __future__ import annotations
+
+import enum
+import secrets
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solvers.carry.registry import record
+from solvers.carry.wire import as_bytes, from_bytes
+
+_WINDOW = 4096  # a message that comes later than so many after it counts as repeated
+
+
+@record("Envelope")
+@dataclass(frozen=True)
+class Envelope:
+    """A message as bytes, and who it is from and to: names, boots, and its number in the run.
+
+    `heard` is the boot of the receiver, or "" before the sender has heard it.
+    """
+
+    sender: str
+    receiver: str
+    boot: str
+    heard: str
+    number: int
+    content: NDArray[np.uint8]
+
+    @property
+    def message(self) -> Any:  # noqa: ANN401 - a message of any kind
+        """The message; a WireError for bytes that are none."""
+        return from_bytes(self.content.tobytes(), object)
+
+
+class Word(enum.Enum):
+    """What a message is worth."""
+
+    NEW = "of this mission, and later than all before of its sender"
+    LATE = "of this mission, and overtaken by another"
+    REPEATED = "it has come before, or is of a run that another one has followed"
+    UNPROVEN = "it does not name the boot of this robot"
+
+
+@dataclass(eq=False)
+class _Run:
+    """A run of another robot: the highest number heard, and those within the window."""
+
+    boot: str
+    since: float
+    highest: int = -1
+    numbers: set[int] = field(default_factory=set)
+
+    def takes(self, number: int) -> bool:
+        """Whether a number has not come before; it has now."""
+        if number in self.numbers or number <= self.highest - _WINDOW:
+            return False
+        self.numbers.add(number)
+        self.highest = max(number, self.highest)
+        if len(self.numbers) > 2 * _WINDOW:
+            self.numbers = {each for each in self.numbers if each > self.highest - _WINDOW}
+        return True
+
+
+class Speakers:
+    """The boot of a robot, and the runs of the others that it hears.
+
+    `twins` are names that two robots have: one of its runs speaks on after another has begun, for
+    longer than `patience`. `claimed_since` is when others have first spoken to another robot of
+    this name.
+    """
+
+    def __init__(self, name: str, patience: float) -> None:
+        self.name = name
+        self.boot = secrets.token_hex(8)
+        self.twins: set[str] = set()
+        self.claimed_since: float | None = None
+        self._patience = patience
+        self._runs: dict[str, _Run] = {}
+        self._former: dict[str, dict[str, _Run]] = {}
+        self._num_sent = 0
+
+    def boot_of(self, robot: str) -> str:
+        """The boot of another robot, or "" before it was heard."""
+        return self._runs[robot].boot if robot in self._runs else ""
+
+    def addressed(self, receiver: str, message: object, heard: str | None = None) -> Envelope:
+        """A message to a robot, of the run `heard` of it, or of that heard last."""
+        heard = self.boot_of(receiver) if heard is None else heard
+        self._num_sent += 1
+        content = np.frombuffer(as_bytes(message), np.uint8)
+        return Envelope(self.name, receiver, self.boot, heard, self._num_sent, content)
+
+    def word_of(self, envelope: Envelope, now: float) -> Word:
+        """What a message is worth, which is remembered."""
+        if envelope.heard != self.boot:
+            self._note_claim(envelope, now)
+            return Word.UNPROVEN
+        self.claimed_since = None
+        run = self._runs.get(envelope.sender)
+        former = self._former.setdefault(envelope.sender, {})
+        if envelope.boot in former:
+            is_new = former[envelope.boot].takes(envelope.number)
+            if is_new and run is not None and now - run.since > self._patience:
+                self.twins.add(envelope.sender)
+            return Word.REPEATED
+        if run is None or envelope.boot != run.boot:
+            if run is not None:
+                former[run.boot] = run
+            run = self._runs[envelope.sender] = _Run(envelope.boot, now)
+        highest = run.highest
+        if not run.takes(envelope.number):
+            return Word.REPEATED
+        return Word.NEW if envelope.number > highest else Word.LATE
+
+    def _note_claim(self, envelope: Envelope, now: float) -> None:
+        """Note that another robot is spoken to by this name, by one that has heard this one."""
+        if envelope.heard and self.boot_of(envelope.sender) == envelope.boot:
+            self.claimed_since = now if self.claimed_since is None else self.claimed_since
+            if now - self.claimed_since > self._patience:
+                self.twins.add(self.name)
