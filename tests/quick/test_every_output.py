@@ -9,13 +9,13 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
 import pgo_models as pgo
 import solvers
 from pgo_models import PGOError
-from pgo_models.convex.huber import huber_change
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.files import replace_when_done
 from pgo_models.graphs.datasets import locate
@@ -113,11 +113,11 @@ def test_each_backend_solves_certifies_and_says_how_sure_it_is(backend, weightin
 
 
 def test_terms_of_ones_own_are_solved_to_the_end(planar):
-    graph = pgo.load(planar)
-    every_edge = huber_change(
-        np.arange(graph.num_edges), pgo.chi2_thresholds(pgo.PGOProblem(graph))
-    )
-    solution = solvers.solve(graph, solvers.Pipeline(soc=solvers.ExtendedSOC(changer=every_edge)))
+    def change(unknown):
+        return pgo.ModelChange(terms=[cp.norm(unknown.translation_residual(0))])
+
+    pipeline = solvers.Pipeline(soc=solvers.ExtendedSOC(changer=change))
+    solution = solvers.solve(pgo.load(planar), pipeline)
     assert solution.status.is_success
 
 

@@ -1,4 +1,4 @@
-"""Huber's loss by reweighting: its majorant, and its minimum by Newton, SOC and a cvxpy model."""
+"""Huber's loss by reweighting: its majorant, and its minimum by Newton and SOC."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from graphs import COSTS_OF_POSES
 from hypothesis import given, strategies as st
 
 from pgo_models import PGOProblem, PoseGraph, Weighting
-from pgo_models.convex.graph_subproblem import Neighbours, Unknowns, graph_qp, robot_qp
-from pgo_models.convex.huber import huber_change
 from pgo_models.errors import SettingError
 from pgo_models.graphs.partitioning import partition
 from pgo_models.graphs.scenes import random_geometric
 from pgo_models.problem.thresholds import chi2_thresholds
-from solvers import IRLS, SOC, ExtendedSOC, MultiplierPenalty, Status
+from solvers import IRLS, SOC, MultiplierPenalty, Status
 from solvers.loop import run
 from solvers.riemannian.polish import relative_decrement
 from solvers.robust.irls import huber
@@ -70,43 +68,18 @@ def test_without_large_residuals_it_is_least_squares() -> None:
     assert relative_decrement(problem, result.poses) < 1e-12
 
 
-def test_soc_and_a_cvxpy_model_find_the_same_minimum() -> None:
+def test_soc_finds_the_same_minimum() -> None:
     problem = PGOProblem(spoiled(3, 5))
     thresholds = chi2_thresholds(problem)
     newton = run(IRLS(tolerance=1e-14), problem).state.objective
     soc = SOC(penalty=MultiplierPenalty(max_refreshes=0), tolerance=1e-6)
     by_weights = run(IRLS(inner=soc, inner_steps=soc.max_iterations), problem)
-    every_edge = np.arange(problem.graph.num_edges)
-    model = run(ExtendedSOC(huber_change(every_edge, thresholds), soc=soc), problem)
-    for poses in (by_weights.poses, model.poses):
-        cost = float(huber(problem.edge_costs(poses), thresholds).sum())
-        assert cost == pytest.approx(float(newton), rel=1e-6)
-
-
-def test_the_model_keeps_the_squares_of_other_edges() -> None:
-    graph = spoiled(5)
-    problem = PGOProblem(graph)
-    edges = np.array([1, 4, 5])
-    thresholds = 0.1 * chi2_thresholds(problem)
-    rho = np.full(graph.num_poses, 3.0)
-    model = graph_qp(graph, rho, changer=huber_change(edges, thresholds))
-    poses = run(IRLS(), problem).poses
-    expected = problem.edge_costs(poses)
-    expected[edges] = huber(expected[edges], thresholds[edges])
-    assert model.cost(problem.at(poses).X) == pytest.approx(expected.sum(), rel=1e-9)
-    assert model.qp.problem.is_dcp(dpp=True)
+    cost = float(huber(problem.edge_costs(by_weights.poses), thresholds).sum())
+    assert cost == pytest.approx(float(newton), rel=1e-6)
 
 
 def test_refusals() -> None:
     graph = spoiled(2)
-    problem = PGOProblem(graph)
-    change = huber_change(np.arange(graph.num_edges), chi2_thresholds(problem))
-    rho = np.ones(graph.num_poses)
-    with pytest.raises(SettingError, match=r"Unknowns\.POSES"):
-        graph_qp(graph, rho, Unknowns.ROTATIONS, change)
-    shared = graph.with_robots(partition(graph, 2).robot)
-    with pytest.raises(SettingError, match="its own poses"):
-        robot_qp(shared, 0, rho, Neighbours.COPIES, Unknowns.POSES, change)
     with pytest.raises(SettingError, match="leave out the robots"):
         IRLS(inner=SOC(robots=partition(graph, 2)))
     with pytest.raises(SettingError, match="inner_steps"):
