@@ -160,13 +160,11 @@ class ComplexRelaxation:
         On the decrement.
     max_iterations : int
         Most steps.
-    max_inner_iterations : int
-        Most conjugate gradients of a step.
 
     Raises
     ------
     SettingError
-        If tolerance is not positive, or there are no columns, steps or inner iterations.
+        If tolerance is not positive, `max_iterations` is negative, or there are no columns.
 
     References
     ----------
@@ -184,11 +182,10 @@ class ComplexRelaxation:
     columns: int = 4
     tolerance: float = STATIONARY_DECREMENT
     max_iterations: int = 100
-    max_inner_iterations: int = 1000
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
-        check_settings(self, at_least_one=["columns", "max_inner_iterations"])
+        check_settings(self, at_least_one=["columns"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> ComplexState:
         """State 0: the rotations of a start, or of the chordal one, with further columns."""
@@ -207,13 +204,7 @@ class ComplexRelaxation:
     def step(self, problem: PGOProblem, state: ComplexState) -> ComplexState:
         """One iteration of the trust region."""
         point = state.point
-        precision = Precision.at(
-            point.value,
-            state.decrement,
-            self.tolerance,
-            state.rounding_level,
-            self.max_inner_iterations,
-        )
+        precision = Precision.at(point.value, state.decrement, self.tolerance, state.rounding_level)
         step = trust_region_step(state.cost, point, state.radius, precision)
         if step.point is None:
             return replace(

@@ -64,6 +64,7 @@ _ENOUGH = 1e-3
 _COARSEST = 1e-7
 _FINEST = 1e-11
 _MOST_STEPS = 30  # of the trust region, in an iteration
+_MOST_RANK = 14  # of Y; above it the least of the columns is left out
 _MOST_PRODUCTS = 60  # with the Hessian, in a step of it
 _MOST_CLIMBS = 2  # in an iteration
 _FALLEN = 0.75  # share of the last violation above which rho grows
@@ -217,9 +218,7 @@ class HullLagrangian:
     gap : float
         Relative gap between F of the rounded poses and the proven bound.
     rank : int
-        First rank r of Y, at least 4. It grows where that leads down.
-    most_rank : int
-        Rank above which the least of the columns is left out.
+        First rank r of Y, from 4 to 14. It grows where that leads down, up to 14.
     max_iterations : int
         Most updates of the multipliers.
 
@@ -239,16 +238,12 @@ class HullLagrangian:
     tolerance: float = 3e-5
     gap: float = DEFAULT_GAP
     rank: int = 9
-    most_rank: int = 14
     max_iterations: int = 40
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance", "gap"], not_negative=["max_iterations"])
-        if not 4 <= self.rank <= self.most_rank:
-            raise SettingError(
-                f"rank is {self.rank} and most_rank {self.most_rank}; "
-                "give a rank of at least 4 that is not above most_rank"
-            )
+        if not 4 <= self.rank <= _MOST_RANK:
+            raise SettingError(f"rank must be from 4 to {_MOST_RANK}, got {self.rank}")
 
     def init(self, problem: PGOProblem, start: Poses | HullState | None) -> HullState:
         """State 0: the state of an earlier run, or poses moved at random in more dimensions."""
@@ -331,7 +326,7 @@ class HullLagrangian:
     def _without_negligible_columns(self, Y: Array) -> Array:
         """Y turned so that its columns are orthogonal, without those that are about zero.
 
-        As many as `rank` stay, and at most `most_rank`.
+        As many as `rank` stay, and at most `_MOST_RANK`.
         """
         n, d, r = Y.shape
         if r <= self.rank:
@@ -339,7 +334,7 @@ class HullLagrangian:
         stacked = Y.reshape(n * d, r)
         squares, axes = np.linalg.eigh(stacked.T @ stacked)
         num_kept = int(np.count_nonzero(squares > _NEGLIGIBLE * n))
-        num_kept = min(max(num_kept, self.rank), self.most_rank)
+        num_kept = min(max(num_kept, self.rank), _MOST_RANK)
         turned = (stacked @ axes[:, -num_kept:]).reshape(n, d, num_kept)
         return retract(turned, np.zeros_like(turned))
 

@@ -28,6 +28,9 @@ from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.riemannian.polish import polish_step, start_polish
 
+_LEAST_GROWTH = 0.03  # share of new poses below which no shorter prefix is tried
+_MOST_STEPS = 10  # factorisations of a prefix
+
 
 @dataclass(frozen=True, eq=False)
 class EntryTree:
@@ -182,12 +185,8 @@ class GrowingStart:
         Poses of the first prefix, without landmarks.
     growth : float
         New poses of the next prefix, as a share of those that are solved.
-    least_growth : float
-        Share below which no shorter prefix is tried.
     tolerance : float
         Relative Newton decrement to which prefixes are solved.
-    newton_steps : int
-        Most factorisations of a prefix.
     max_iterations : int
         Most prefixes.
 
@@ -207,16 +206,14 @@ class GrowingStart:
 
     first_size: int = 60
     growth: float = 0.5
-    least_growth: float = 0.03
     tolerance: float = 1e-3
-    newton_steps: int = 10
     max_iterations: int = 200
 
     def __post_init__(self) -> None:
         check_settings(
             self,
-            positive=["growth", "least_growth", "tolerance"],
-            at_least_one=["first_size", "newton_steps"],
+            positive=["growth", "tolerance"],
+            at_least_one=["first_size"],
             not_negative=["max_iterations"],
         )
 
@@ -245,7 +242,7 @@ class GrowingStart:
         solved = self._solved(prefix, state.poses[members])
         is_at_minimum = _is_at_global_minimum(prefix, solved)
         smaller = 0.5 * state.share
-        can_retreat = state.num_solved > 0 and smaller >= self.least_growth
+        can_retreat = state.num_solved > 0 and smaller >= _LEAST_GROWTH
         if state.is_at_minimum and not is_at_minimum and can_retreat:
             size = _grown(state.num_solved, smaller, tree.num_ranks)
             return replace(state, k=state.k + 1, size=size, share=smaller)
@@ -282,7 +279,7 @@ class GrowingStart:
     def _solved(self, prefix: PGOProblem, poses: Poses) -> Poses:
         """Poses of a prefix after Newton steps."""
         state = start_polish(prefix, poses)
-        for _ in range(self.newton_steps):
+        for _ in range(_MOST_STEPS):
             state = polish_step(prefix, state)
             if state.decrement <= self.tolerance or not state.moved:
                 break

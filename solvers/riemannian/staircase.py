@@ -82,14 +82,11 @@ class Staircase:
         Relative gap between f and the bound that is proven at the end.
     max_iterations : int
         Most steps.
-    max_inner_iterations : int
-        Most conjugate gradients of a trust-region step.
 
     Raises
     ------
     SettingError
-        If tolerance or gap is not positive, `max_iterations` is negative, or there are no inner
-        iterations.
+        If tolerance or gap is not positive, or `max_iterations` is negative.
 
     References
     ----------
@@ -108,11 +105,9 @@ class Staircase:
     tolerance: float = STATIONARY_DECREMENT
     gap: float = DEFAULT_GAP
     max_iterations: int = 300
-    max_inner_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=["tolerance", "gap"])
-        check_settings(self, not_negative=["max_iterations"], at_least_one=["max_inner_iterations"])
+        check_settings(self, positive=["tolerance", "gap"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> StaircaseState:
         """State 0: rank d, at the rotations of `start`, or of the chordal relaxation."""
@@ -160,13 +155,7 @@ class Staircase:
     def _descend(self, problem: PGOProblem, state: StaircaseState) -> StaircaseState:
         """One iteration of the trust region."""
         point = state.point
-        precision = Precision.at(
-            point.value,
-            state.decrement,
-            self.tolerance,
-            state.rounding_level,
-            self.max_inner_iterations,
-        )
+        precision = Precision.at(point.value, state.decrement, self.tolerance, state.rounding_level)
         function = _LiftedCost(problem, state.preconditioner)
         step = trust_region_step(function, point, state.radius, precision)
         spent = state.inner_iterations + step.iterations

@@ -15,6 +15,7 @@ from solvers.riemannian.newton_step import ROUNDING
 from solvers.riemannian.truncated_cg import TruncatedStep, truncated_conjugate_gradients
 
 _FORCING = 0.1  # the largest share of the residual that conjugate gradients leave
+_MOST_ITERATIONS = 1000  # of conjugate gradients in a step
 _FLOOR = 0.01  # of the tolerance: conjugate gradients go no deeper
 _FIRST_RADIUS = 100.0  # times the preconditioned gradient, which soft directions outgrow
 # ratios of actual to promised decrease
@@ -79,7 +80,7 @@ class Precision:
         decrement: float,
         tolerance: float,
         rounding_level: float,
-        max_iterations: int,
+        max_iterations: int = _MOST_ITERATIONS,
     ) -> Precision:
         """Precision of a step from a point of some value: the finer, the smaller the decrement.
 

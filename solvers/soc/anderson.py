@@ -23,6 +23,7 @@ from solvers.carry.registry import record
 # Shares of at most so many numbers take the products with all differences in one call of numpy,
 # from a copy; above it the copy costs more than the calls.
 _MAX_SIZE_OF_COPY = 3000
+_REGULARIZATION = 1e-12  # relative Tikhonov term of the least-squares problem
 
 
 def over_relax(new: Array, old: Array, alpha: float) -> Array:
@@ -39,8 +40,6 @@ class Anderson:
     ----------
     memory : int, at least 1
         How many past differences are combined.
-    regularization : float
-        Relative Tikhonov term of the least-squares problem.
     restart_ratio : float above 1
         The differences are forgotten when the residual exceeds this many times the smallest one
         since they last were.
@@ -65,16 +64,10 @@ class Anderson:
     """
 
     memory: int = 60
-    regularization: float = 1e-12
     restart_ratio: float = 2.0
 
     def __post_init__(self) -> None:
-        check_settings(
-            self,
-            not_negative=["regularization"],
-            at_least_one=["memory"],
-            above_one=["restart_ratio"],
-        )
+        check_settings(self, at_least_one=["memory"], above_one=["restart_ratio"])
 
 
 @record("AndersonShare")
@@ -178,7 +171,7 @@ class AndersonSums:
         gram[-1, :-1] = products[:-1] - self.products[first_kept:]
         gram[:-1, -1] = gram[-1, :-1]
         gram[-1, -1] = sums[1]
-        damped = gram + settings.regularization * np.trace(gram) * np.eye(num_differences)
+        damped = gram + _REGULARIZATION * np.trace(gram) * np.eye(num_differences)
         gamma = np.linalg.lstsq(damped, products, rcond=None)[0]
         return gamma, AndersonSums(gram, products, smallest)
 

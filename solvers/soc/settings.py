@@ -20,8 +20,9 @@ from solvers.soc.recursion_block import StepSettings
 from solvers.soc.rounding import WHOLE
 from solvers.soc.safeguard import Steps
 
-# The default `separator_penalty` is this times the square root of the translation penalty, but no
-# more than the maximum. `SOC` says why.
+# Under a MultiplierPenalty rho_i of a separator's rotation is at least m_i times this times the
+# square root of the translation penalty, or m_i times the maximum where that is less. On graphs
+# with little noise the multipliers alone would hold the copies too loosely together.
 _SEPARATOR_PENALTY = 0.7
 _MAX_SEPARATOR_PENALTY = 0.3
 
@@ -50,7 +51,6 @@ class SOCSettings:
     local_passes: int = 10
     bytes_per_number: int = 2
     translation_penalty: float | None = None
-    separator_penalty: float | None = None
     tolerance: float = 1e-5
     max_iterations: int = 500
 
@@ -63,7 +63,7 @@ class SOCSettings:
         check_settings(self, relaxation=["alpha"], positive=["translation_penalty", "tolerance"])
         check_settings(
             self,
-            not_negative=["separator_penalty", "max_iterations"],
+            not_negative=["max_iterations"],
             at_least_one=["local_passes"],
         )
         if self.bytes_per_number not in (1, 2, WHOLE):
@@ -117,8 +117,6 @@ class SOCSettings:
 
     def separator_penalty_for(self, translation_penalty: float) -> float:
         """Least penalty of separator rotations over m_i, given that of their translations."""
-        if self.separator_penalty is not None:
-            return self.separator_penalty
         return min(_SEPARATOR_PENALTY * math.sqrt(translation_penalty), _MAX_SEPARATOR_PENALTY)
 
     @property

@@ -72,11 +72,6 @@ class SOC(SOCSettings):
         stays. The default is lowered when the penalties are chosen anew, if since they were last
         chosen the multipliers of these translations have changed little compared with the penalty
         times the distance that the translations have moved.
-    separator_penalty : float or None
-        Of CONSENSUS alone: lower bound, under a MultiplierPenalty, on the penalty rho_i of every
-        separator's rotation, as a multiple of m_i, the mean diagonal of M over the rows of R_i^T.
-        On graphs with little noise the multipliers alone would hold the copies too loosely
-        together. The default is 0.7 times the square root of the translation penalty, at most 0.3.
     tolerance : float
         Largest primal and dual residual, both relative, of a run that has converged.
     max_iterations : int

@@ -205,7 +205,7 @@ def test_limits_are_reported() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"columns": 0}, {"tolerance": 0.0}, {"max_iterations": -1}, {"max_inner_iterations": 0}],
+    [{"columns": 0}, {"tolerance": 0.0}, {"max_iterations": -1}],
 )
 def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(SettingError):

@@ -158,6 +158,6 @@ def test_states_are_left_alone_and_a_run_goes_on_from_one() -> None:
 
 
 def test_settings_are_checked() -> None:
-    for wrong in ({"tolerance": 0.0}, {"gap": -1.0}, {"rank": 3}, {"rank": 9, "most_rank": 8}):
+    for wrong in ({"tolerance": 0.0}, {"gap": -1.0}, {"rank": 3}, {"rank": 15}):
         with pytest.raises(SettingError):
             partial(HullLagrangian, **wrong)()

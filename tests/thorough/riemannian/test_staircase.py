@@ -150,7 +150,6 @@ def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:
     ("changes", "message"),
     [
         ({"gap": 0.0}, "gap must be positive, got 0.0"),
-        ({"max_inner_iterations": 0}, "max_inner_iterations must be at least 1, got 0"),
     ],
 )
 def test_settings_are_checked(changes: dict[str, float], message: str) -> None:

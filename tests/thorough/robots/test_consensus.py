@@ -115,7 +115,7 @@ def check_end(problem: PGOProblem, last: ConsensusState, driver: Driver) -> None
     alpha=st.sampled_from([1.0, 1.6]),
     acceleration=ACCELERATIONS,
     local_passes=st.sampled_from([1, 10]),
-    penalties=st.sampled_from([(None, None), (0.1, None), (None, 0.5), (0.02, 0.0)]),
+    translation_penalty=st.sampled_from([None, 0.1, 0.02]),
 )
 def test_the_iterates_are_those_of_one_place(
     split: Split,
@@ -123,10 +123,9 @@ def test_the_iterates_are_those_of_one_place(
     alpha: float,
     acceleration: Anderson | None,
     local_passes: int,
-    penalties: tuple[float | None, float | None],
+    translation_penalty: float | None,
 ) -> None:
     problem, parts, _ = split
-    translation_penalty, separator_penalty = penalties
     soc = SOC(
         robots=parts,
         coupling=Coupling.CONSENSUS,
@@ -135,7 +134,6 @@ def test_the_iterates_are_those_of_one_place(
         acceleration=acceleration,
         local_passes=local_passes,
         translation_penalty=translation_penalty,
-        separator_penalty=separator_penalty,
     )
     check(problem, parts, soc, 8)
 

@@ -42,7 +42,7 @@ def extrapolate(
     residuals = (*older, newest)
     images = (*older_images, image - memory.image)
     right_hand_side = np.array([inner(other, residual) for other in residuals])
-    damped = gram + settings.regularization * np.trace(gram) * np.eye(len(gram))
+    damped = gram + 1e-12 * np.trace(gram) * np.eye(len(gram))
     gamma = np.linalg.lstsq(damped, right_hand_side, rcond=None)[0]
     following = image.copy()
     for coefficient, difference in zip(gamma, images, strict=True):
@@ -82,7 +82,7 @@ def test_parties_take_the_steps_that_one_would_take(
     # Residuals without order, so that the memory fills, is emptied again and again, and fills
     # again.
     rng = np.random.default_rng(seed)
-    rule = Anderson(memory=memory, restart_ratio=3.0, regularization=1e-6)
+    rule = Anderson(memory=memory, restart_ratio=3.0)
     parties = Parties(rng, rows, number)
     alone = AndersonMemory()
     restarts = 0

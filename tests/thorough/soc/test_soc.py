@@ -248,7 +248,6 @@ def test_couplings_follow_from_the_robots() -> None:
         ({"local_passes": 0}, "local_passes must be at least 1, got 0"),
         ({"bytes_per_number": 4}, "bytes_per_number must be 1, 2 or 8, got 4"),
         ({"translation_penalty": 0.0}, "translation_penalty must be positive"),
-        ({"separator_penalty": -1.0}, "separator_penalty must not be negative"),
         ({"tolerance": 0.0}, "tolerance must be positive"),
         ({"tolerance": np.nan}, "tolerance must be positive"),
         ({"max_iterations": -1}, "max_iterations must not be negative"),
