@@ -24,14 +24,14 @@ def write_model_proof(form: QuadraticForm, bound: ModelBound, path: Path | str) 
     start = 0
     further = sum(len(equations_of_block(block)[0]) for block in form.blocks)
     variables = []
-    for block, first in zip(form.blocks, form.columns, strict=True):
+    for block, first in zip(form.blocks, form.first_entries, strict=True):
         basic, others = equations_of_block(block)
         of_basic = bound.multipliers[start : start + len(basic)]
         of_others = bound.multipliers[further : further + len(others)]
         start += len(basic)
         further += len(others)
         variables.append(_variable(block, first, of_basic, of_others))
-    record = {
+    record: dict[str, Any] = {
         "format": FORMAT,
         "P": _entries(coo_array(triu(form.P))),
         "c": form.c.tolist(),
@@ -45,6 +45,12 @@ def write_model_proof(form: QuadraticForm, bound: ModelBound, path: Path | str) 
         ],
         "lower_bound": bound.value,
     }
+    if form.gauge is not None:
+        record["held"] = {
+            "variable": form.gauge.block,
+            "turned": "from the left" if form.gauge.is_left else "from the right",
+            "entries": form.w_columns[form.gauge.entries].tolist(),
+        }
     with replace_when_done(path) as temporary:
         temporary.write_text(json.dumps(record, allow_nan=False) + "\n", encoding="utf-8")
 

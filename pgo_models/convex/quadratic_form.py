@@ -101,6 +101,36 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
+class Gauge(ReadOnly):
+    """A common rotation of all variables that leaves J as it is (`pgo_models.convex.gauge`).
+
+    Parameters
+    ----------
+    block : int
+        Position of the variable that is held at the identity.
+    is_left : bool
+        Whether variables are turned from the left, X -> Q X, or from the right, X -> X Q.
+    entries : (d, k) array of ints
+        The entries of w that are turned: every column of w[entries] is.
+    """
+
+    block: int
+    is_left: bool
+    entries: IntArray
+
+    def turned(self, form: "QuadraticForm", u: Array) -> Array:
+        """U turned so that the variable is the identity."""
+        block = form.blocks[self.block]
+        X = block.value(u[block.coordinates])
+        w = form.spread @ u
+        w[self.entries] = (X.T if self.is_left else X) @ w[self.entries]
+        # the first of the entries that are the same number
+        turned = w[form.spread.indices[form.spread.indptr[:-1]]]
+        turned[block.coordinates] = block.coordinates_of(np.eye(len(X)))
+        return np.asarray(turned)
+
+
+@dataclass(frozen=True, eq=False)
 class QuadraticForm(ReadOnly):
     """J = u^T Q u with u = (x_1, .., x_m, y, 1), subject to E u = 0.
 
@@ -125,8 +155,10 @@ class QuadraticForm(ReadOnly):
         One for every constrained variable.
     names : tuple of (int, str)
         First coordinate and name of every variable.
-    columns : tuple of ints
-        First entry in z of every constrained variable.
+    w_columns : array of ints
+        The entry of z that every entry of w is, but for the last, which is 1.
+    gauge : Gauge or None
+        Why a variable is held at the identity, where no equality does it.
     """
 
     P: csc_array
@@ -140,7 +172,14 @@ class QuadraticForm(ReadOnly):
     fixed: Array
     blocks: tuple[Block, ...]
     names: tuple[tuple[int, str], ...]
-    columns: tuple[int, ...]
+    w_columns: IntArray
+    gauge: Gauge | None = None
+
+    @property
+    def first_entries(self) -> list[int]:
+        """The first entry in z of every constrained variable."""
+        sizes = [int(np.prod(block.shape)) for block in self.blocks]
+        return [int(self.w_columns[start]) for start in np.cumsum([0, *sizes[:-1]])]
 
     @property
     def side(self) -> int:
@@ -243,6 +282,8 @@ class QuadraticForm(ReadOnly):
         u = np.where(self.is_free, 0.0, self.fixed)
         for block, value in zip(self.blocks, values, strict=True):
             u[block.coordinates] = block.coordinates_of(value)
+        if self.gauge is not None:
+            u = self.gauge.turned(self, u)
         return self.with_best_others(u)
 
     # Variables without a set.
@@ -435,6 +476,7 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     num_own = len(w_columns) - spread.shape[0]
     corners: list[list[Any]] = [[spread, None], [None, eye_array(num_own + 1)]]
     spread = csc_array(block_array(corners))
+    spread.sort_indices()
     in_w = csc_array(A)[rows_left][:, w_columns]
     equalities = block_array([[in_w, csc_array(-b[rows_left][:, None])]])
     E = csr_array(csr_array(equalities) @ spread)
@@ -453,7 +495,7 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
         fixed=fixed,
         blocks=tuple(blocks),
         names=tuple(names),
-        columns=tuple(columns[variable.id] for variable in problem.variables),
+        w_columns=w_columns,
     )
     form.with_best_others(np.cos(np.arange(form.side)))  # refuses what has no best ones
     return form

@@ -19,6 +19,9 @@ their Kronecker product; P_j has to be, which is shown as the following is. The 
 all v is a lower bound. The square is completed entry by entry: where all pivots are positive (or a
 whole row of zeros), the constant that remains is that minimum.
 
+**A variable that is held.** The objective and the sets may stay as they are when all variables are
+turned together. Then one of them may be taken to be the identity (`held_entries`).
+
 All is done in rational numbers, without any rounding. Nothing outside `pgo_models.verification` is
 imported but `pgo_models.errors`.
 """
@@ -113,7 +116,12 @@ def lagrangian(record: dict[str, Any]) -> tuple[Quadratic, str]:
     constrained = set()
     for variable in variables:
         constrained |= set(range(variable["first"], variable["first"] + entries_of(variable)))
-    solved = solutions([*equalities(record), *plane_equations(variables)], constrained)
+    rows = [*equalities(record), *plane_equations(variables)]
+    if "held" in record:
+        if not stays_when_turned(record, constrained):
+            return {}, "turning all variables may change the objective or leave a set"
+        rows += held_entries(record)
+    solved = solutions(rows, constrained)
     if solved is None:
         return {}, "the equalities contradict each other"
     L = objective(record, solved)
@@ -126,6 +134,84 @@ def lagrangian(record: dict[str, Any]) -> tuple[Quadratic, str]:
         if not subtract_product(L, solved, variables, product_of_hulls):
             return {}, "a matrix P of a product of hulls is not positive semidefinite"
     return L, ""
+
+
+def held_entries(record: dict[str, Any]) -> list[Affine]:
+    """X - I = 0 of the variable that is held; of a rotation of the plane, its first column."""
+    variable = record["variables"][record["held"]["variable"]]
+    side = int(variable["shape"][0])
+    first = int(variable["first"])
+    columns = 1 if is_plane(variable) else side
+    return [
+        {first + a + side * b: fmpq(1)} | ({ONE: fmpq(-1)} if a == b else {})
+        for b in range(columns)
+        for a in range(side)
+    ]
+
+
+def stays_when_turned(record: dict[str, Any], constrained: set[int]) -> bool:
+    """Whether turning all variables leaves the objective and the sets, and can make one I.
+
+    `entries` has d lists of entries of z: those in the same place of every list are turned
+    together, as a vector. The objective is a sum of the same form of every list, and every column
+    of a variable (every row, from the right) is such a vector.
+    """
+    held = record["held"]
+    lists = [[int(entry) for entry in entries] for entries in held["entries"]]
+    d = len(lists)
+    places: dict[int, tuple[int, int]] = {}
+    for a, entries in enumerate(lists):
+        places |= {entry: (a, place) for place, entry in enumerate(entries)}
+    if any(len(entries) * d != len(places) for entries in lists):
+        return False
+    variables = record["variables"]
+    is_left = {"from the left": True, "from the right": False}[held["turned"]]
+    if not all(is_turned_as_vectors(each, places, d, is_left=is_left) for each in variables):
+        return False
+    has_rotations = any("rotation" in variable["sets"] for variable in variables)
+    makes_identity = "rotation" if has_rotations else "orthonormal"
+    of_held = variables[held["variable"]]
+    if of_held["sets"] != [makes_identity] or of_held["shape"] != [d, d]:
+        return False
+    solved = solutions(equalities(record), constrained)
+    if solved is None or set(solved) & constrained:  # an equality of variables in sets alone
+        return False
+    return is_same_of_every_list(objective(record, solved), lists, places)
+
+
+def is_same_of_every_list(
+    J: Quadratic, lists: list[list[int]], places: dict[int, tuple[int, int]]
+) -> bool:
+    """Whether a quadratic function is a sum of the same form of every list of entries."""
+    for i, row in J.items():
+        for j, value in row.items():
+            if value == 0 or (i == ONE and j == ONE):
+                continue
+            if i not in places or j not in places or places[i][0] != places[j][0]:
+                return False
+            of_i, of_j = places[i][1], places[j][1]
+            if any(J.get(e[of_i], {}).get(e[of_j], fmpq(0)) != value for e in lists):
+                return False
+    return True
+
+
+def is_turned_as_vectors(
+    variable: dict[str, Any], places: dict[int, tuple[int, int]], d: int, *, is_left: bool
+) -> bool:
+    """Whether every column (row, from the right) of a variable is a vector of d lists."""
+    (kind,) = variable["sets"]
+    n, p = (int(size) for size in variable["shape"])
+    first = int(variable["first"])
+    if kind == ("unit rows" if is_left else "unit columns") or d != (n if is_left else p):
+        return False
+    x = [[first + a + n * b for b in range(p)] for a in range(n)]
+    vectors = [[x[a][b] for a in range(n)] for b in range(p)] if is_left else x
+    for vector in vectors:
+        where = [places.get(entry) for entry in vector]
+        place = where[0][1] if where[0] else 0
+        if where != [(a, place) for a in range(d)]:
+            return False
+    return True
 
 
 def objective(record: dict[str, Any], solved: dict[int, Affine]) -> Quadratic:
@@ -181,12 +267,20 @@ def entries_of(variable: dict[str, Any]) -> int:
 def plane_equations(variables: Iterable[dict[str, Any]]) -> list[Affine]:
     """x_11 - x_22 = 0 and x_12 + x_21 = 0 of rotations of the plane."""
     rows: list[Affine] = []
-    for variable in variables:
-        if variable["shape"] == [2, 2] and "rotation" in variable["sets"]:
-            k = int(variable["first"])
-            rows.append({k + 3: fmpq(1), k: fmpq(-1)})
-            rows.append({k + 2: fmpq(1), k + 1: fmpq(1)})
+    for k in planes(variables):
+        rows.append({k + 3: fmpq(1), k: fmpq(-1)})
+        rows.append({k + 2: fmpq(1), k + 1: fmpq(1)})
     return rows
+
+
+def is_plane(variable: dict[str, Any]) -> bool:
+    """Whether a variable is a rotation of the plane."""
+    return variable["shape"] == [2, 2] and "rotation" in variable["sets"]
+
+
+def planes(variables: Iterable[dict[str, Any]]) -> list[int]:
+    """The first entries of the rotations of the plane."""
+    return [int(variable["first"]) for variable in variables if is_plane(variable)]
 
 
 def solutions(rows: Iterable[Affine], constrained: set[int]) -> dict[int, Affine] | None:

@@ -13,6 +13,7 @@ import cvxpy as cp
 
 from pgo_models.certificates.certificate import DEFAULT_GAP
 from pgo_models.convex.convex_solver import solve_compiled
+from pgo_models.convex.gauge import with_gauge_held
 from pgo_models.convex.hull_bound import prove_hull_bound
 from pgo_models.convex.hulls import with_hull_products
 from pgo_models.convex.model_bound import ModelBound, best_model_bound, prove_model_bound
@@ -42,7 +43,7 @@ def certify_model(
     """Judge anybody's values of the constrained variables; `solvers.certify` is its door."""
     projected = problem.values(problem.near_point(values).copies)
     try:
-        form = quadratic_form(problem)
+        form = with_gauge_held(quadratic_form(problem))
         equations = set_equations(form)
     except NotQuadraticError as error:
         objective = _least_objective(problem, projected)

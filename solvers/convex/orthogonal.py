@@ -25,6 +25,7 @@ from cvxpy.reductions.solution import Solution
 from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex import orthogonality
 from pgo_models.convex.convex_solver import COLD, ConvexSolver, as_solver
+from pgo_models.convex.gauge import with_gauge_held
 from pgo_models.convex.hull_bound import prove_hull_bound
 from pgo_models.convex.model_certificate import (
     ModelCertificate,
@@ -539,7 +540,7 @@ def _certified(
     split = state.split
     if not isinstance(split, QuadraticSplit):
         split = QuadraticSplit(problem, quadratic_form(problem))
-    form = split.form
+    form = with_gauge_held(split.form)
     equations = set_equations(form)
     bound, u = best_bound(form, equations, form.u_of(problem.values(state.copies)), DEFAULT_GAP)
     certificate = judge_values(form, equations, u, bound)

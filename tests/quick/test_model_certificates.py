@@ -170,7 +170,42 @@ def test_a_pose_graph_written_in_cvxpy_is_certified_like_the_built_in_one(is_anc
     certificate = solvers.certify(model, list(R))
     assert certificate.is_certified
     assert certificate.objective == pytest.approx(built_in.certificate.objective, rel=1e-9)
-    assert certificate.lower_bound == pytest.approx(built_in.lower_bound, rel=1e-5)
+    assert certificate.lower_bound == pytest.approx(built_in.lower_bound, rel=1e-10)
+
+
+@pytest.mark.parametrize(("d", "side"), [(2, "left"), (2, "right"), (3, "left"), (3, "right")])
+def test_a_model_that_a_common_rotation_leaves_as_it_is_has_one_variable_held(
+    d, side, tmp_path
+) -> None:
+    pytest.importorskip("flint")
+    rng = np.random.default_rng(d)
+    R = [cp.Variable((d, d)) for _ in range(4)]
+    J = 0.0
+    for i, j in [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2)]:
+        R_ij = pgo.random_rotations(1, d, rng)[0]
+        J += cp.sum_squares(R[j] - (R[i] @ R_ij if side == "left" else R_ij @ R[i]))
+    solution = solvers.solve_orthogonal(
+        pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J)), rotations=R), 0
+    )
+    assert solution.gap <= 1e-12
+    path = tmp_path / "proof.json"
+    solution.certificate.save_proof(path)
+    assert pgo.verify_model_proof(path).is_verified
+    record = json.loads(path.read_text())
+    # neither may another objective be turned, nor entries in another order
+    record["P"][0][2] *= 1.0 + 1e-12
+    path.write_text(json.dumps(record))
+    assert "turning" in pgo.verify_model_proof(path).failure
+    record["P"][0][2] = record["P"][1][2]
+    record["held"]["entries"][0].reverse()
+    path.write_text(json.dumps(record))
+    assert "turning" in pgo.verify_model_proof(path).failure
+    # a term for one rotation holds all of them
+    anchored = cp.Problem(cp.Minimize(J + cp.sum_squares(R[0] - np.eye(d))))
+    values = solution.values
+    certificate = solvers.certify(pgo.OrthogonalProblem(anchored, rotations=R), values)
+    assert certificate.form.gauge is None
+    assert certificate.is_certified
 
 
 def test_exact_data_give_exact_values() -> None:
@@ -239,7 +274,7 @@ def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
     assert none.verdict is Verdict.TRIVIAL
     by_hulls = {
         "there are other constraints": answer(squares, [X[0, 0] <= 0.5], rotations=[X]),
-        "is not quadratic": answer(cp.norm(X - 2.0), rotations=[X]),
+        "is not quadratic": answer(cp.norm(X - 2.0 * np.eye(3)[::-1]), rotations=[X]),
     }
     for reason, solution in by_hulls.items():
         assert -np.inf < solution.lower_bound <= solution.objective
