@@ -5,6 +5,7 @@ projection onto orthonormal columns is Theorem 1 of Lai & Osher 2014 and step (b
 Algorithm 1.
 """
 
+import functools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from pgo_models.convex.prox import project_sparse, project_stiefel, project_unit_columns
 from pgo_models.errors import SettingError, check_settings
+from pgo_models.geometry.arrays import read_only
 from pgo_models.geometry.rotations import Array, project_by_svd
 
 
@@ -123,16 +125,21 @@ class Orthonormal(ConstraintSet):
         It is P Omega + P_perp K with Omega skew.
         """
         n, p = P.shape
-        complete = np.concatenate([P, np.linalg.qr(P, mode="complete")[0][:, p:]], axis=1)
-        above = np.triu_indices(p, 1)
-        directions = np.zeros((len(above[0]) + (n - p) * p, p, n))
-        skew = np.arange(len(above[0]))
-        directions[skew, above[1], above[0]] = np.sqrt(0.5)
-        directions[skew, above[0], above[1]] = -np.sqrt(0.5)
-        outside = directions[len(skew) :].reshape(p, n - p, p, n)
-        for a in range(p):
-            outside[a, np.arange(n - p), a, np.arange(p, n)] = 1.0
-        return np.asarray((directions @ complete.T).reshape(len(directions), n * p).T)
+        skew = (_skew_basis(p) @ P.T).reshape(-1, n * p)
+        if n == p:
+            return np.asarray(skew.T)
+        P_perp = np.linalg.qr(P, mode="complete")[0][:, p:]
+        outside = np.kron(np.eye(p), P_perp.T)
+        return np.concatenate([skew, outside]).T
+
+    def times_multiplier(self, P: Array, G: Array, directions: Array) -> Array:
+        """V Lambda for all directions V, the columns of an (n p, k) array, Lambda = sym(P^T G).
+
+        The Hessian of the Lagrangian along V is that of J less this.
+        """
+        Lambda = _symmetric(P.T @ G)
+        by_column = directions.reshape(P.shape[1], -1)
+        return np.asarray((Lambda @ by_column).reshape(directions.shape))
 
     def distance(self, P: Array) -> float:
         """||P^T P - I||_F."""
@@ -200,6 +207,12 @@ class UnitColumns(ConstraintSet):
         Lambda = self._products(P, N)
         return max(0.0, float(-np.min(Lambda)))
 
+    def times_multiplier(self, P: Array, G: Array, directions: Array) -> Array:
+        """As `Orthonormal.times_multiplier`, with Lambda = diag(<p_j, g_j>)."""
+        Lambda = np.broadcast_to(self._products(P, G), self._columns(P).shape)
+        weights = self._columns(Lambda).reshape(-1, order="F")
+        return np.asarray(weights[:, None] * directions)
+
     def tangent_basis(self, P: Array) -> Array:
         """As `Orthonormal.tangent_basis`: what is orthogonal to each of the vectors."""
         counted = np.arange(float(P.size)).reshape(P.shape, order="F")
@@ -263,3 +276,14 @@ class Sparse(ConstraintSet):
 
 def _symmetric(A: Array) -> Array:
     return 0.5 * (A + A.T)
+
+
+@functools.cache
+def _skew_basis(p: int) -> Array:
+    """Orthonormal basis of the transposed skew (p, p) matrices, (p (p - 1) / 2, p, p)."""
+    above = np.triu_indices(p, 1)
+    basis = np.zeros((len(above[0]), p, p))
+    number = np.arange(len(above[0]))
+    basis[number, above[1], above[0]] = np.sqrt(0.5)
+    basis[number, above[0], above[1]] = -np.sqrt(0.5)
+    return read_only(basis)

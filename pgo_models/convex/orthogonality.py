@@ -7,6 +7,7 @@ The split form is step (a) of the paper's Algorithm 1 for any J (Lai & Osher 201
 in solvers/convex/orthogonal.py.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -417,8 +418,9 @@ class OrthogonalProblem(HoldsModel):
         violations = []
         for term, copy in zip(self.terms, copies, strict=True):
             violations.append(term.constraint.distance(copy))
-            violations.append(float(np.linalg.norm(copy - values[term.variable])))
-        return float(np.linalg.norm(violations))
+            if copy is not values[term.variable]:
+                violations.append(norm_of_all([copy - values[term.variable]]))
+        return math.hypot(*violations)
 
     def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
         """Return the convex subproblem of the split form, step (a), which is compiled once.
@@ -581,8 +583,7 @@ def kkt_residuals(
 
 def norm_of_all(arrays: Sequence[Array]) -> float:
     """Norm of all entries of several arrays."""
-    sums_of_squares = [float(np.sum(array**2)) for array in arrays]
-    return float(np.sqrt(sum(sums_of_squares)))
+    return math.sqrt(sum(float(np.vdot(array, array)) for array in arrays))
 
 
 def _real_arrays(arrays: Sequence[Array], name: str) -> tuple[Array, ...]:

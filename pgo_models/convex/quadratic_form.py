@@ -19,6 +19,7 @@ What remains is
 with e the last unit vector, equalities E u = 0, and coordinates of u that equalities fix.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -46,7 +47,7 @@ _DAMPING = 1e-9
 _REFINEMENTS = 4
 _INCONSISTENT = 1e-6
 _MOST_FLAT = 8  # directions in which J may be constant
-_LARGEST_DENSE = 300  # side up to which y is found by one dense matrix
+_LARGEST_DENSE = 600  # side up to which y is found by one dense matrix
 _FLAT = 1e-3  # share of a random direction that is left where J is constant
 
 
@@ -81,7 +82,7 @@ class Block:
     @property
     def size(self) -> int:
         """Number of its coordinates."""
-        return 2 if self.is_plane else int(np.prod(self.shape))
+        return 2 if self.is_plane else math.prod(self.shape)
 
     @property
     def coordinates(self) -> slice:
@@ -186,13 +187,13 @@ class QuadraticForm(ReadOnly):
         """N, the number of coordinates of u."""
         return len(self.fixed)
 
-    @property
+    @cached_property
     def num_constrained(self) -> int:
         """Number of coordinates of x."""
         last = self.blocks[-1]
         return last.start + last.size
 
-    @property
+    @cached_property
     def is_free(self) -> BoolArray:
         """Which coordinates are not fixed, (N,)."""
         return np.isnan(self.fixed)
@@ -234,7 +235,7 @@ class QuadraticForm(ReadOnly):
 
     def objective(self, u: Array) -> float:
         """J at u, from the residuals rather than from Q."""
-        z = self.T @ (self.spread @ u)
+        z = self.from_u @ u
         return float(0.5 * z @ (self.P @ z) + self.c @ z + self.constant)
 
     def residuals(self, u: Array) -> tuple[Array, Array]:
@@ -279,12 +280,26 @@ class QuadraticForm(ReadOnly):
 
     def u_of(self, values: Sequence[Array]) -> Array:
         """The u of constrained variables, with the best values of all others."""
-        u = np.where(self.is_free, 0.0, self.fixed)
-        for block, value in zip(self.blocks, values, strict=True):
-            u[block.coordinates] = block.coordinates_of(value)
+        pairs = zip(self.blocks, values, strict=True)
+        x = np.concatenate([block.coordinates_of(value) for block, value in pairs])
         if self.gauge is not None:
-            u = self.gauge.turned(self, u)
+            u = np.where(self.is_free, 0.0, self.fixed)
+            u[: len(x)] = x
+            x = self.gauge.turned(self, u)[: len(x)]
+        return self.u_of_entries(x)
+
+    def u_of_entries(self, x: Array) -> Array:
+        """The u of the coordinates of x, with the best values of all others."""
+        if self.reduction is not None:
+            return np.asarray(self.reduction[:, :-1] @ x[self.free_x] + self.reduction[:, -1])
+        u = np.where(self.is_free, 0.0, self.fixed)
+        u[: len(x)] = x
         return self.with_best_others(u)
+
+    @cached_property
+    def free_x(self) -> IntArray:
+        """Coordinates of x that are not fixed."""
+        return np.flatnonzero(self.is_free[: self.num_constrained])
 
     # Variables without a set.
 
@@ -367,7 +382,7 @@ class QuadraticForm(ReadOnly):
         """
         if self.side > _LARGEST_DENSE:
             return None
-        constrained = np.flatnonzero(self.is_free[: self.num_constrained])
+        constrained = self.free_x
         D = np.zeros((self.side, len(constrained) + 1))
         D[constrained, np.arange(len(constrained))] = 1.0
         D[:, -1] = np.where(self.is_free, 0.0, self.fixed)

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array
 
 from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, Term
 from pgo_models.convex.quadratic_form import QuadraticForm
@@ -57,7 +57,7 @@ class QuadraticSplit(ReadOnly):
         for term, V_term in zip(self.terms, V, strict=True):
             sums[term.variable] += V_term
         entries = np.concatenate([total.reshape(-1, order="F") for total in sums])
-        pull = rho * (self._entries_of_x.T @ entries)
+        pull = rho * (self._x_of_entries @ entries)
         u = self._solved_dense(pull, rho) if form.reduction is not None else self._solved(pull, rho)
         return tuple(form.values(u)), self.others(u)
 
@@ -107,6 +107,11 @@ class QuadraticSplit(ReadOnly):
         return csc_array(self.form.spread[:num_entries, : self.form.num_constrained])
 
     @cached_property
+    def _x_of_entries(self) -> csr_array:
+        """Its transpose."""
+        return csr_array(self._entries_of_x.T)
+
+    @cached_property
     def _weights(self) -> Array:
         """What rho is multiplied by in the Hessian of the penalty, a diagonal."""
         squares = abs(self._entries_of_x).sum(axis=0)
@@ -130,9 +135,9 @@ class QuadraticSplit(ReadOnly):
         D = self.form.reduction
         assert D is not None
         values, vectors, linear = self._diagonal
-        right = pull[self.form.is_free[: self.form.num_constrained]] - linear
+        right = pull[self.form.free_x] - linear
         x = vectors @ ((vectors.T @ right) / (np.maximum(values, 0.0) + rho))
-        return np.asarray(D @ np.append(x, 1.0))
+        return np.asarray(D[:, :-1] @ x + D[:, -1])
 
     def _solved(self, pull: Array, rho: float) -> Array:
         form = self.form

@@ -2,8 +2,9 @@
 
 The Hessian in coordinates of the tangent spaces is N^T S N, where S is the matrix of the Lagrangian
 with closed-form multipliers (Absil et al. 2008, section 6.5), N the bases of the tangent spaces and
-the identity for variables without a set. Where it is not positive definite, N^T Q N takes its
-place, which is never indefinite, with damping (Levenberg and Marquardt).
+the identity for variables without a set, which small models hold at their best instead. Where it is
+not positive definite, absolute eigenvalues take its place, or N^T Q N, which is never indefinite,
+with damping (Levenberg and Marquardt).
 """
 
 from dataclasses import dataclass
@@ -11,16 +12,17 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
+from scipy.linalg.lapack import dposv
 from scipy.sparse import block_diag as sparse_block_diag, csc_array, eye_array
 
 from pgo_models.convex.constraint_sets import Orthonormal, UnitColumns
 from pgo_models.convex.model_relaxation import closed_form_multipliers
 from pgo_models.convex.quadratic_form import Block, QuadraticForm
-from pgo_models.convex.set_equations import SetEquations
+from pgo_models.convex.set_equations import SetEquations, set_equations
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import factorize
 
 _SMOOTH = Orthonormal | UnitColumns  # sets that have tangent spaces
@@ -29,7 +31,7 @@ _HALVINGS = 30
 _SUFFICIENT = 1e-4  # Armijo's constant
 _ROUNDING = 4e-16  # share of J that is not told apart from zero
 _SMALL = 1e-9  # decrement, as a share of J, that a Newton step squares
-_LARGEST_DENSE = 150  # side up to which matrices are dense
+_SMALLEST_CURVATURE = 1e-3  # of absolute eigenvalues, as a share of the largest
 _FIRST_DAMPING = 1e-3
 _DAMPING_GROWTH = 10.0
 _LARGEST_DAMPING = 1e6
@@ -37,10 +39,15 @@ _LARGEST_DAMPING = 1e6
 
 @dataclass(frozen=True, eq=False)
 class ModelNewton(ReadOnly):
-    """Newton for one model."""
+    """Newton for one model; the equations of its sets are made where they are not given."""
 
     form: QuadraticForm
-    equations: SetEquations
+    given_equations: SetEquations | None = None
+
+    @cached_property
+    def equations(self) -> SetEquations:
+        """The equations of the sets, which large models need."""
+        return self.given_equations or set_equations(self.form)
 
     @property
     def is_possible(self) -> bool:
@@ -57,17 +64,19 @@ class ModelNewton(ReadOnly):
         J = self.form.objective(u)
         last = np.inf
         for _ in range(_MAX_STEPS):
-            N = self._tangent_bases(u)
-            S = self._lagrangian(u)
-            gradient = N.T @ (S @ u)
-            step = _solved(N.T @ (S @ N), gradient)
+            model = self._dense_model(u) if self._halves is not None else self._sparse_model(u)
+            if not len(model.gradient):
+                break  # isolated points, as -1 and 1
+            step = _solved(model.hessian, model.gradient)
             is_newton = step is not None
             if step is None:
-                step = _damped(N.T @ (self._Q @ N), gradient)
-            decrement = float(-gradient @ step)
+                step = _downhill(model)
+            decrement = float(-model.gradient @ step)
             if is_newton and decrement > 0.1 * last and last < _SMALL * abs(J):
                 break  # a Newton step squares what is left; this is rounding
-            moved, moved_J = self._backtracked(u, J, N @ step, decrement)
+            move = np.zeros(self.form.side)
+            move[model.moved] = model.basis @ step
+            moved, moved_J = self._backtracked(u, J, move, decrement)
             if moved is None:
                 break
             u = moved
@@ -77,54 +86,60 @@ class ModelNewton(ReadOnly):
 
     def on_sets(self, u: Array) -> Array:
         """U with x projected onto the sets, and y at its best."""
-        projected = []
-        for block, value in zip(self.form.blocks, self.form.values(u), strict=True):
-            projected.append(block.sets[0].projected(value))
-        return self.form.u_of(projected)
+        x = u[: self.form.num_constrained].copy()
+        for block in self.form.blocks:
+            if self.form.is_free[block.start]:
+                value = block.sets[0].projected(block.value(x[block.coordinates]))
+                x[block.coordinates] = block.coordinates_of(value)
+        return self.form.u_of_entries(x)
 
     @cached_property
-    def _is_dense(self) -> bool:
-        return self.form.side <= _LARGEST_DENSE
+    def _halves(self) -> tuple[Array, Array] | None:
+        """H / 2 and g / 2 of J = x^T H x / 2 + g^T x + .. in free x with the best y, if small."""
+        D = self.form.reduction
+        if D is None:
+            return None
+        Q = D.T @ (self.form.Q @ D)
+        return Q[:-1, :-1], Q[:-1, -1]
 
-    @cached_property
-    def _Q(self) -> Any:  # noqa: ANN401 - dense or sparse
-        return self.form.Q.toarray() if self._is_dense else self.form.Q
+    def _dense_model(self, u: Array) -> "_TangentModel":
+        """The model in free x; y is at its best."""
+        assert self._halves is not None
+        H, g = self._halves
+        gradient = H @ u[self.form.free_x] + g
+        blocks = [block for block in self.form.blocks if self.form.is_free[block.start]]
+        bases = [_tangent_basis(block, u[block.coordinates]) for block in blocks]
+        N = np.zeros((len(g), sum(basis.shape[1] for basis in bases)))
+        N_Lambda = np.zeros(N.shape)
+        row = 0
+        column = 0
+        for block, basis in zip(blocks, bases, strict=True):
+            place = np.s_[row : row + block.size, column : column + basis.shape[1]]
+            N[place] = basis
+            x = u[block.coordinates]
+            N_Lambda[place] = _times_multiplier(block, x, gradient[place[0]], basis)
+            row += block.size
+            column += basis.shape[1]
+        return _TangentModel(self.form.free_x, N, N.T @ gradient, N.T @ (H @ N - N_Lambda))
 
-    def _lagrangian(self, u: Array) -> Any:  # noqa: ANN401 - dense or sparse
-        """S with the multipliers of u."""
-        equations = self.equations
-        if not self._is_dense or len(equations.of_equalities):
-            return self._Q - equations.combined(closed_form_multipliers(self.form, equations, u))
-        number = equations.num_basic
-        is_basic = equations.k < number
-        k, i, j = (each[is_basic] for each in (equations.k, equations.i, equations.j))
-        entries = equations.entries[is_basic]
-        side = self.form.side
-        products = np.bincount(i * number + k, entries * u[j], side * number)
-        products = products.reshape(side, number)[: self.form.num_constrained]
-        residual = (self._Q @ u)[: self.form.num_constrained]
-        multipliers = np.linalg.solve(products.T @ products, products.T @ residual)
-        combined = np.bincount(i * side + j, multipliers[k] * entries, side**2)
-        return self._Q - combined.reshape(side, side)
-
-    def _tangent_bases(self, u: Array) -> Any:  # noqa: ANN401 - dense or sparse
-        """N, (N, dimension)."""
+    def _sparse_model(self, u: Array) -> "_TangentModel":
+        """The model in x and y, sparse."""
         form = self.form
+        equations = self.equations
+        S = form.Q - equations.combined(closed_form_multipliers(form, equations, u))
         bases = []
         for block in form.blocks:
-            x = u[block.coordinates]
-            if not form.is_free[block.start]:
-                basis = np.zeros((block.size, 0))
-            elif block.is_plane:
-                basis = np.array([[-x[1]], [x[0]]])
-            else:
-                basis = _smooth_set(block).tangent_basis(block.value(x))
+            is_free = form.is_free[block.start]
+            basis = np.zeros((block.size, 0))
+            if is_free:
+                basis = _tangent_basis(block, u[block.coordinates])
             bases.append(basis)
         kept = np.setdiff1d(form.free_others, form.grounded) - form.num_constrained
         others = eye_array(form.side - form.num_constrained, format="csc")[:, kept]
-        if self._is_dense:
-            return block_diag(*bases, others.toarray())
-        return csc_array(sparse_block_diag([*bases, others], format="csc"))
+        N = csc_array(sparse_block_diag([*bases, others], format="csc"))
+        everywhere = np.arange(form.side)
+        convex = N.T @ (form.Q @ N)
+        return _TangentModel(everywhere, N, N.T @ (S @ u), N.T @ (S @ N), convex)
 
     def _backtracked(
         self, u: Array, J: float, move: Array, decrement: float
@@ -143,6 +158,32 @@ class ModelNewton(ReadOnly):
         return None, J
 
 
+@dataclass(frozen=True)
+class _TangentModel:
+    """Half of the second-order model of J along tangent directions at u, dense or sparse."""
+
+    moved: IntArray  # coordinates of u
+    basis: Any  # directions in them, one a column
+    gradient: Array
+    hessian: Any
+    convex_part: csc_array | None = None  # of a sparse Hessian, without the curvature of the sets
+
+
+def _tangent_basis(block: Block, x: Array) -> Array:
+    """Orthonormal basis of the tangent space at x, one direction a column."""
+    if block.is_plane:
+        return np.array([[-x[1]], [x[0]]])
+    return _smooth_set(block).tangent_basis(block.value(x))
+
+
+def _times_multiplier(block: Block, x: Array, gradient: Array, directions: Array) -> Array:
+    """What the Lagrangian subtracts from the Hessian along directions."""
+    if block.is_plane:
+        return float(x @ gradient) * directions
+    value, slope = block.value(x), block.value(gradient)
+    return _smooth_set(block).times_multiplier(value, slope, directions)
+
+
 def _smooth_set(block: Block) -> Orthonormal | UnitColumns:
     """The set of a constrained variable, where Newton is possible."""
     (kind,) = block.sets
@@ -150,27 +191,36 @@ def _smooth_set(block: Block) -> Orthonormal | UnitColumns:
     return kind
 
 
-def _damped(convex: Array | csc_array, gradient: Array) -> Array:
-    """The step of the convex part with the least damping that makes it definite."""
-    scale = convex.diagonal().max(initial=0.0) or 1.0
-    identity = np.eye(len(gradient)) if isinstance(convex, np.ndarray) else eye_array(len(gradient))
+def _downhill(model: _TangentModel) -> Array:
+    """A step where the Hessian is not positive definite.
+
+    Of a dense model it is Newton's with the absolute eigenvalues (Nocedal & Wright 2006, section
+    3.4), which leaves saddle points; of a sparse one it is that of the convex part with the least
+    damping that makes it definite.
+    """
+    if model.convex_part is None:
+        eigenvalues, vectors = np.linalg.eigh(model.hessian)
+        sizes = abs(eigenvalues)
+        sizes = np.maximum(sizes, _SMALLEST_CURVATURE * sizes.max() or 1.0)
+        return -np.asarray(vectors @ ((vectors.T @ model.gradient) / sizes))
+    scale = model.convex_part.diagonal().max(initial=0.0) or 1.0
+    identity = eye_array(len(model.gradient))
     damping = _FIRST_DAMPING
     while damping <= _LARGEST_DAMPING:
-        damped: Any = convex + damping * scale * identity
-        step = _solved(damped, gradient)
+        step = _solved(model.convex_part + damping * scale * identity, model.gradient)
         if step is not None:
             return step
         damping *= _DAMPING_GROWTH
-    return -gradient / scale
+    return -model.gradient / scale
 
 
 def _solved(matrix: Array | csc_array, gradient: Array) -> Array | None:
     """-matrix^-1 gradient, or None where the matrix is not positive definite."""
+    if isinstance(matrix, np.ndarray):
+        _, step, failure = dposv(matrix, gradient)
+        return None if failure or not np.isfinite(step).all() else -step
     try:
-        if isinstance(matrix, np.ndarray):
-            step = cho_solve(cho_factor(matrix, check_finite=False), gradient, check_finite=False)
-        else:
-            step = factorize(csc_array(matrix + 0.0 * eye_array(len(gradient)))).solve(gradient)
-    except (LinAlgError, NotPositiveDefiniteError):
+        step = factorize(csc_array(matrix + 0.0 * eye_array(len(gradient)))).solve(gradient)
+    except NotPositiveDefiniteError:
         return None
     return -step if np.isfinite(step).all() else None

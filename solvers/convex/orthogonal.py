@@ -46,8 +46,9 @@ from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
 from solvers.convex.certify_model import best_bound
 from solvers.convex.determinants import random_points, reflections, with_free_determinants
+from solvers.convex.hand_over import SOCWithNewton
 from solvers.convex.model_newton import ModelNewton
-from solvers.loop import run
+from solvers.loop import Method, run
 from solvers.result import Measurement, Outcome, Status
 from solvers.soc.anderson import over_relax
 from solvers.soc.penalty import PenaltyOrder, PenaltyRule
@@ -401,10 +402,16 @@ def solve_orthogonal(
     Runs that converged come first, then the lowest J. Starts take all signs of determinants of
     variables in O(d) in turn; where there are more patterns of signs than starts, single variables
     of the best point are reflected. Of a quadratic model with linear equalities
-    (`pgo_models.convex.quadratic_form`) step (a) takes no convex solver, Newton moves the best run
-    to a stationary point, and a lower bound on J at all points of the sets is proven; where the
-    relaxation that gives the bound leads to a better point, that one is returned. Of other models
-    the bound is the least J over the convex hulls of the sets, and mostly leaves a gap.
+    (`pgo_models.convex.quadratic_form`) step (a) takes no convex solver, Newton moves an early
+    iterate of every run to a stationary point, and a lower bound on J at all points of the sets is
+    proven; where the relaxation that gives the bound leads to a better point, that one is returned.
+    Of other models the bound is the least J over the convex hulls of the sets, and mostly leaves a
+    gap.
+
+    The cvxpy problem has its `value` and `status` afterwards, and its variables theirs. The status
+    is "optimal" where that is certified, else "optimal_inaccurate", or "user_limit" where the best
+    run did not converge. Where a Parameter has a new value, and the rules of DPP are kept, the
+    model is not compiled again.
 
     Parameters
     ----------
@@ -452,14 +459,16 @@ def solve_orthogonal(
     matrices = _matrices_of_step(method, problem)
     x_step = XStep.CONVEX_SOLVER if matrices is None else matrices
     prepared = replace(method, x_step=x_step)
+    runner = _with_newton(prepared)
     outcomes = list[Outcome[OrthogonalState]]()
     for start in itertools.islice(random_points(problem, rng), starts):
-        outcomes.append(run(prepared, problem, start, verbose=verbose))
+        outcomes.append(run(runner, problem, start, verbose=verbose))
         if outcomes[-1].status is Status.INTERRUPTED:
             break
     best = min(outcomes, key=_rank)
     if 2 ** len(with_free_determinants(problem)) > starts:
-        best = _lowered_by_reflections(prepared, problem, best, verbose=verbose)
+        best = _lowered_by_reflections(runner, problem, best, verbose=verbose)
+    best = replace(best, name=type(method).__name__, method=prepared)
     ends = tuple(
         outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes
     )
@@ -498,13 +507,24 @@ def _bounded_by_hulls(
     )
 
 
+def _with_newton(
+    method: OrthogonalSOC,
+) -> Method[OrthogonalProblem, OrthogonalPoint, OrthogonalState]:
+    """The method, with Newton where it has a quadratic model without equalities that allows it."""
+    split = method.x_step
+    if not isinstance(split, QuadraticSplit) or split.form.E.shape[0]:
+        return method
+    newton = ModelNewton(split.form)
+    return SOCWithNewton(method, split, newton) if newton.is_possible else method
+
+
 def _rank(outcome: Outcome[OrthogonalState]) -> tuple[bool, float]:
     """Runs that converged come first, then the lowest J."""
     return not outcome.status.is_success, outcome.objective
 
 
 def _lowered_by_reflections(
-    method: OrthogonalSOC,
+    method: Method[OrthogonalProblem, OrthogonalPoint, OrthogonalState],
     problem: OrthogonalProblem,
     best: Outcome[OrthogonalState],
     *,
