@@ -51,7 +51,11 @@ class PenaltyOrder:
 
 
 class PenaltyRule(Protocol):
-    """A rule of the penalty: one of those below, or a user's own, for `SOC(penalty=..)`."""
+    """A rule of the penalty: one of those below, or a user's own, for `SOC(penalty=..)`.
+
+    A rule of one's own has both methods, or has this class as its base: the penalties then stay
+    where `bounds` puts them, but for the safeguard.
+    """
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """Return the first penalties, from ||Lambda_i||_2 / m_i.
@@ -87,14 +91,16 @@ class PenaltyRule(Protocol):
         float
             1 where the penalties stay.
         """
-
-
-class _FirstPenalty:
-    """Base of rules whose penalties stay where they are, but for a safeguard or a refresh."""
-
-    def rescaling(self, primal_residual: float, dual_residual: float) -> float:
-        """1: the residuals do not move the penalties."""
         return 1.0
+
+
+def _balancing(imbalance: float, growth: float, primal: float, dual: float) -> float:
+    """`growth` where primal > imbalance dual, 1 / growth where dual > imbalance primal."""
+    if primal > imbalance * dual:
+        return growth
+    if dual > imbalance * primal:
+        return 1.0 / growth
+    return 1.0
 
 
 def first_penalties(rule: PenaltyRule, problem: PGOProblem, poses: Poses) -> Array:
@@ -106,7 +112,7 @@ def first_penalties(rule: PenaltyRule, problem: PGOProblem, poses: Poses) -> Arr
 
 @record("MultiplierPenalty")
 @dataclass(frozen=True)
-class MultiplierPenalty(_FirstPenalty):
+class MultiplierPenalty(PenaltyRule):
     """A penalty of every pose from its multiplier: rho_i = factor max(||Lambda_i||_2, q m_i).
 
     m_i is the mean diagonal of M over the rotation rows of pose i, and q a quantile of
@@ -155,18 +161,7 @@ class MultiplierPenalty(_FirstPenalty):
             raise SettingError(f"stall_window must be at least 1 and stall_ratio in (0, 1), {got}")
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """Return the numbers of a `PenaltyOrder` from ||Lambda_i||_2 / m_i.
-
-        Parameters
-        ----------
-        ratio : (n,) array
-            ||Lambda_i||_2 / m_i of all poses.
-
-        Returns
-        -------
-        tuple of three floats
-            (factor, factor q, 0).
-        """
+        """(factor, factor q, 0), with q the quantile of ||Lambda_i||_2 / m_i."""
         # Where the multipliers are zero but for rounding (measurements without noise), any penalty
         # works that M + D/2 does not lose to rounding.
         q = max(float(np.quantile(ratio, self.quantile)), _SMALLEST_RATIO)
@@ -175,7 +170,7 @@ class MultiplierPenalty(_FirstPenalty):
 
 @record("FixedPenalty")
 @dataclass(frozen=True)
-class FixedPenalty(_FirstPenalty):
+class FixedPenalty(PenaltyRule):
     """The same penalty for all poses, rho_i = rho, unless the safeguard raises it.
 
     Parameters
@@ -200,34 +195,13 @@ class FixedPenalty(_FirstPenalty):
         check_settings(self, positive=["rho"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """Return the numbers of a `PenaltyOrder`, which do not depend on the multipliers.
-
-        Parameters
-        ----------
-        ratio : (n,) array
-            ||Lambda_i||_2 / m_i of all poses.
-
-        Returns
-        -------
-        tuple of three floats
-            (0, 0, rho).
-        """
+        """(0, 0, rho), whatever the multipliers are."""
         return 0.0, 0.0, self.rho
-
-
-class _ScaledRule:
-    """A rule that begins at `scale` times m_i, and balances the residuals from there."""
-
-    scale: float
-
-    def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """(0, scale, 0), whatever the multipliers are."""
-        return 0.0, self.scale, 0.0
 
 
 @record("BalancedPenalty")
 @dataclass(frozen=True)
-class BalancedPenalty(_ScaledRule):
+class BalancedPenalty(PenaltyRule):
     """A penalty that balances the relative residuals, after OSQP (Stellato et al. 2020).
 
     It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. The
@@ -264,32 +238,19 @@ class BalancedPenalty(_ScaledRule):
     def __post_init__(self) -> None:
         check_settings(self, positive=["scale"], above_one=["refactor_ratio"])
 
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(0, scale, 0), whatever the multipliers are."""
+        return 0.0, self.scale, 0.0
+
     def rescaling(self, primal_residual: float, dual_residual: float) -> float:
-        """Return the factor by which rho moves now.
-
-        Parameters
-        ----------
-        primal_residual : float
-            ||R - omega||, relative.
-        dual_residual : float
-            ||omega - omega_last||, relative.
-
-        Returns
-        -------
-        float
-            `refactor_ratio`, its inverse, or 1 where rho stays.
-        """
-        imbalance = self.refactor_ratio**2
-        if primal_residual > 0 and primal_residual >= imbalance * dual_residual:
-            return self.refactor_ratio
-        if dual_residual > 0 and dual_residual >= imbalance * primal_residual:
-            return 1.0 / self.refactor_ratio
-        return 1.0
+        """`refactor_ratio`, its inverse, or 1 where rho stays."""
+        ratio = self.refactor_ratio
+        return _balancing(ratio**2, ratio, primal_residual, dual_residual)
 
 
 @record("BoydPenalty")
 @dataclass(frozen=True)
-class BoydPenalty(_ScaledRule):
+class BoydPenalty(PenaltyRule):
     """One penalty for all poses that balances residuals as Boyd et al. 2011, (3.13); for PaperSOC.
 
     rho <- growth rho where ||r|| > imbalance ||s||, and rho / growth where ||s|| > imbalance ||r||,
@@ -323,23 +284,10 @@ class BoydPenalty(_ScaledRule):
     def __post_init__(self) -> None:
         check_settings(self, positive=["scale"], above_one=["imbalance", "growth"])
 
+    def bounds(self, ratio: Array) -> tuple[float, float, float]:
+        """(0, scale, 0), whatever the multipliers are."""
+        return 0.0, self.scale, 0.0
+
     def rescaling(self, primal_residual: float, dual_residual: float) -> float:
-        """Return the factor by which rho moves now.
-
-        Parameters
-        ----------
-        primal_residual : float
-            ||r||.
-        dual_residual : float
-            ||s||.
-
-        Returns
-        -------
-        float
-            `growth`, its inverse, or 1 where rho stays.
-        """
-        if primal_residual > self.imbalance * dual_residual:
-            return self.growth
-        if dual_residual > self.imbalance * primal_residual:
-            return 1.0 / self.growth
-        return 1.0
+        """`growth`, its inverse, or 1 where rho stays, from ||r|| and ||s||."""
+        return _balancing(self.imbalance, self.growth, primal_residual, dual_residual)
