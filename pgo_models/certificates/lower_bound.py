@@ -250,18 +250,26 @@ def prove_at(
 
 
 def best_bound(
-    problem: PGOProblem, Lambda: Array, poses: Poses | None, gap: float, objective: float
+    problem: PGOProblem,
+    Lambda: Array,
+    poses: Poses | None,
+    gap: float,
+    objective: float,
+    is_complex: bool = False,
 ) -> LowerBound:
     """Best bound from multipliers: the one grounded at a pose with eta = 0 if it is above zero.
 
-    Otherwise it is the better of both forms, each with the smallest eta found.
+    Otherwise it is the better of both forms, each with the smallest eta found. Without poses only
+    the form with eta alone is tried, in complex numbers only the grounded one. The smallest eta
+    that is tried follows from gap and objective.
 
     The problem has to be quadratic: for chi2 the caller passes the tangent at the poses. The poses
     are taken as they are; the bound is sharpest if the caller has given them their best
-    translations. Without poses only the form with eta alone is tried. The smallest eta that is
-    tried follows from gap and objective.
+    translations. In complex numbers only the traces of Lambda count.
     """
     Lambda = _symmetric(problem, Lambda)
+    if is_complex:
+        Lambda = scalar_multipliers(Lambda)
     count = problem.num_poses * problem.d
     smallest = smallest_shift(gap, objective, count)
     trace = _trace(Lambda)
@@ -270,8 +278,8 @@ def best_bound(
         return _prove(problem, Lambda, eta, None)
 
     if poses is None:
-        return search_forms(prove_with_eta, None, smallest, trace, count)
-    ground = _grounded_at(problem, poses)
+        return search_forms([prove_with_eta], smallest, trace, count)
+    ground = _grounded_at(problem, poses, is_complex)
 
     def prove_grounded(eta: float) -> LowerBound | None:
         return _prove(problem, Lambda, eta, ground)
@@ -279,31 +287,10 @@ def best_bound(
     without_shift = prove_grounded(0.0)
     if without_shift is not None and without_shift.value > 0.0:
         return without_shift
-    best = search_forms(prove_with_eta, prove_grounded, smallest, trace, count)
+    forms = [prove_grounded] if is_complex else [prove_with_eta, prove_grounded]
+    best = search_forms(forms, smallest, trace, count)
     is_definite = ground.unknowns.is_definite_in_doubles(Lambda)
     return replace(best, is_definite=is_definite)
-
-
-def best_complex_bound(
-    problem: PGOProblem, Lambda: Array, poses: Poses, gap: float, objective: float
-) -> LowerBound:
-    """`best_bound` grounded at a pose, with the rotations of the plane as complex numbers.
-
-    Only the traces of Lambda count.
-    """
-    Lambda = scalar_multipliers(_symmetric(problem, Lambda))
-    count = problem.num_poses * problem.d
-    ground = _grounded_at(problem, poses, is_complex=True)
-
-    def prove_grounded(eta: float) -> LowerBound | None:
-        return _prove(problem, Lambda, eta, ground)
-
-    without_shift = prove_grounded(0.0)
-    if without_shift is not None and without_shift.value > 0.0:
-        return without_shift
-    smallest = smallest_shift(gap, objective, count)
-    best = search_bound(prove_grounded, smallest, _trace(Lambda), count)
-    return replace(best, is_definite=ground.unknowns.is_definite_in_doubles(Lambda))
 
 
 def best_bound_with_terms(
@@ -327,33 +314,25 @@ def best_bound_with_terms(
 
 
 def search_forms(
-    prove_with_eta: Callable[[float], LowerBound | None],
-    prove_grounded: Callable[[float], LowerBound | None] | None,
+    forms: Sequence[Callable[[float], LowerBound | None]],
     smallest: float,
     trace: float,
     count: int,
 ) -> LowerBound:
-    """Return the better of both forms, each with the smallest eta found (`search_bound`).
+    """Return the best bound of the given forms, each with the smallest eta found.
 
-    `NO_BOUND` where neither gives one above zero. Each takes an eta to a bound, or to None where
-    the matrix cannot be shown to be positive definite with it; the grounded one may be missing.
+    A form takes an eta to a bound, or to None where the matrix cannot be shown to be positive
+    definite with it. The search begins with the eta `smallest`; trace and count are tr(Lambda) and
+    n d. `NO_BOUND` where no form gives a bound above zero, as where tr(Lambda) - eta n d is not.
     """
-    bounds = [NO_BOUND, search_bound(prove_with_eta, smallest, trace, count)]
-    if prove_grounded is not None:
-        bounds.append(search_bound(prove_grounded, smallest, trace, count))
-    return max(bounds, key=lambda bound: bound.value)
+    bounds = [_search_bound(prove, smallest, trace, count) for prove in forms]
+    return max([NO_BOUND, *bounds], key=lambda bound: bound.value)
 
 
-def search_bound(
+def _search_bound(
     prove: Callable[[float], LowerBound | None], smallest: float, trace: float, count: int
 ) -> LowerBound:
-    """Bound that `prove` gives with the smallest eta found.
-
-    It is `NO_BOUND` when tr(Lambda) - eta n d would not be above 0.
-
-    The search begins with the eta `smallest` (`smallest_eta`); trace and count are tr(Lambda) and n
-    d.
-    """
+    """Bound of one form of `search_forms`."""
     # At F = 0 the smallest eta is zero and would never grow.
     least_eta = UNIT_ROUNDOFF * trace / count
     first = max(smallest, least_eta)

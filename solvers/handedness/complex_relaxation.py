@@ -27,7 +27,7 @@ from pgo_models.certificates.certificate import (
     certify_with,
 )
 from pgo_models.certificates.definiteness import smallest_eta
-from pgo_models.certificates.lower_bound import best_complex_bound, pose_rows
+from pgo_models.certificates.lower_bound import best_bound, pose_rows
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.certificates.unknowns import ComplexUnknowns
 from pgo_models.errors import NotPositiveDefiniteError, check_settings
@@ -274,7 +274,7 @@ def certificates_of_relaxation(
     """
     point = state.point
     ground = state.ground
-    bound = best_complex_bound(state.cost.problem, point.Lambda, ground, gap, point.value)
+    bound = best_bound(state.cost.problem, point.Lambda, ground, gap, point.value, is_complex=True)
     relaxed = certify_with(problem, ground, point.Lambda, gap, math.nan, BoundSource.COMPLEX, bound)
     rounded = polish(problem, method.poses(problem, state))
     return relaxed, certify_at(problem, rounded, gap)

@@ -133,8 +133,10 @@ def _search_forms(
     smallest = central.smallest_shift(gap, driver.current.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     return central.search_forms(
-        partial(prove_with_eta, driver, less_terms=less_terms),
-        partial(prove_grounded, driver, less_terms=less_terms),
+        [
+            partial(prove_with_eta, driver, less_terms=less_terms),
+            partial(prove_grounded, driver, less_terms=less_terms),
+        ],
         smallest,
         driver.current.objective if most_lost is None else most_lost,
         count,

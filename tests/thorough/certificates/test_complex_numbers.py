@@ -40,7 +40,6 @@ from pgo_models.certificates.definiteness import DefiniteProof
 from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
 from pgo_models.certificates.lower_bound import (
     best_bound,
-    best_complex_bound,
     pose_rows,
     prove_at,
     prove_bound,
@@ -247,7 +246,8 @@ def test_no_bound_is_above_F(
                 bound = prove_bound(problem, Lambda, shift, at, is_complex=True)
                 assert bound is None or bound <= F
         at_poses = multipliers(problem, poses)
-        assert best_complex_bound(problem, at_poses, poses, 1e-6, float(F)).value <= F
+        found = best_bound(problem, at_poses, poses, 1e-6, float(F), is_complex=True)
+        assert found.value <= F
         assert certify_at(problem, poses).lower_bound <= F
 
 
@@ -335,7 +335,7 @@ def test_no_bound_on_chi2_is_above_it(
         at = problem.at_best_translations(poses)
         tangent = problem.tangent_at(at)
         Lambda = multipliers(problem, at)
-        found = best_complex_bound(tangent, Lambda, at, 1e-6, problem.objective(at))
+        found = best_bound(tangent, Lambda, at, 1e-6, problem.objective(at), is_complex=True)
         assert found.value <= least
         assert certify(problem, poses).lower_bound <= least
 

@@ -17,7 +17,12 @@ from pgo_models import PGOProblem
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import bound_from, squared_distances
+from pgo_models.certificates.lower_bound import (
+    bound_from,
+    pose_rows,
+    prove_at,
+    squared_distances,
+)
 from pgo_models.certificates.rounding_errors import (
     evaluate_certificate,
     evaluate_edges,
@@ -27,6 +32,7 @@ from pgo_models.certificates.rounding_errors import (
     rounding_level,
 )
 from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
+from pgo_models.graphs.pose_graph import middle_pose
 from pgo_models.problem.cholesky import CholeskyBackend, analyze
 from pgo_models.problem.floating_point import (
     UNIT_ROUNDOFF as u,
@@ -312,14 +318,17 @@ def test_the_error_of_S_X_is_taken_off(d: int, monkeypatch: pytest.MonkeyPatch) 
         found = evaluate(*args)  # type: ignore[arg-type]
         return replace(found, product_error=found.product_error + size)
 
-    point = lower_bound._grounded_at(problem, problem.with_best_translations(poses.R))
-    known = lower_bound._prove(problem, Lambda, 0.0, point)
+    at = problem.with_best_translations(poses.R)
+    known = prove_at(problem, Lambda, at)
     monkeypatch.setattr(lower_bound, "evaluate_certificate", less_known)
-    found = lower_bound._prove(problem, Lambda, 0.0, point)
+    found = prove_at(problem, Lambda, at)
     assert known is not None
     assert found is not None
     # the slack is a share of less
-    diagonal = np.delete(problem.M.diagonal(), point.rows) + np.abs(Lambda).max()
+    diagonal = (
+        np.delete(problem.M.diagonal(), pose_rows(middle_pose(problem.graph), 8, d))
+        + np.abs(Lambda).max()
+    )
     least = d * np.sum(size**2 / diagonal)
     assert known.rounding < 1e-3 * least < least <= found.rounding
 

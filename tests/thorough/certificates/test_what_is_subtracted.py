@@ -16,7 +16,7 @@ from pgo_models.certificates.certificate import certify_at, judge
 from pgo_models.certificates.definiteness import FIRST_MARGIN, prove_definite, shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
-from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models.certificates.lower_bound import prove_at, prove_bound
 from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.errors import ProofError
 from pgo_models.geometry.rotations import Array, random_rotations
@@ -129,13 +129,8 @@ def test_weights_near_the_ends_of_the_doubles_prove_nothing(exponent: int) -> No
     problem = scaled_problem(exponent)
     Lambda = np.zeros((8, 3, 3))
     poses = Poses(np.broadcast_to(np.eye(3), (8, 3, 3)), np.zeros((8, 3)))
+    assert prove_at(problem, Lambda, poses, eta=2.0**exponent) is None
     for at in (None, poses):
-        assert (
-            lower_bound._prove(
-                problem, Lambda, 2.0**exponent, lower_bound._grounded_at(problem, poses)
-            )
-            is None
-        )
         assert prove_bound(problem, Lambda, 2.0**exponent, at) is None
 
 
