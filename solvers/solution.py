@@ -23,6 +23,7 @@ from pgo_models.problem.marginals import Marginals, with_infinite_variances
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
 from solvers.carry.ledger import Ledger
+from solvers.reporting.edge_fit import fit_row
 from solvers.reporting.json_records import certificate_json, network_json, stage_json, write_json
 from solvers.reporting.notes import verdict_suffix
 from solvers.reporting.result_files import (
@@ -140,6 +141,25 @@ class Solution:
     def edge_residuals(self) -> EdgeResiduals:
         """How well every edge fits the poses, in the cost that was solved, and whether it may."""
         return edge_residuals(self.problem, self.poses)
+
+    @property
+    def fit_ratio(self) -> float:
+        """The cost over what the weights lead one to expect, about 1 where they are right.
+
+        0 where no measurement checks another. See `EdgeResiduals.overall`.
+        """
+        return self.edge_residuals.overall
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether edges fit worse than their weights allow, one by one or together.
+
+        Of a robust solve, whether nothing supports the edges kept, or something speaks against
+        them. The certificate does not ask: it is on the cost of the measurements as they are.
+        """
+        if self.robust is not None:
+            return self.robust.support is not Support.CHECKED
+        return self.edge_residuals.is_doubtful
 
     def before(self) -> tuple[Poses, str]:
         """Return the poses before the solve, to compare with.
@@ -328,6 +348,8 @@ class Solution:
             **both_costs(self.problem, self.poses),
             **certificate_json(self.certificate),
             "verdict": self.verdict.name,
+            "fit_ratio": self.fit_ratio or None,
+            "is_doubtful": self.is_doubtful,
             **({} if self.robust is None else self.robust.as_json()),
             "note": self.note,
             "frame": self.frame,
@@ -347,6 +369,8 @@ class Solution:
         cost = f"{self.certificate.cost}={self.certificate.cost_text}"
         gap = rounded_up(self.certificate.printed_gap, 3)
         verdict += verdict_suffix(len(self.problem.graph.absent))
+        if self.robust is None and self.is_doubtful:
+            verdict += f", fit={self.fit_ratio:.3g}: DOUBTFUL"
         return f"Solution({name!r}, {cost}, gap={gap}, {verdict})"
 
     def __str__(self) -> str:
@@ -395,6 +419,8 @@ class Solution:
             ("gap", certificate.gap_text),
             ("verdict", self._verdict_text()),
         ]
+        if self._fit_text():
+            facts.append(("fit", self._fit_text()))
         if self.robust is not None:
             facts += self.robust.facts()
         if self.note:
@@ -407,7 +433,15 @@ class Solution:
 
     def _verdict_text(self) -> str:
         text = self.certificate.verdict_text if self.robust is None else self.robust.headline
+        if self.robust is None and self.is_certified and self.is_doubtful:
+            text += ", of measurements that do not fit"
         return text + verdict_suffix(len(self.problem.graph.absent))
+
+    def _fit_text(self) -> str:
+        """How the edges fit; empty where the verdict or a robust solve says so."""
+        if self.robust is not None or self.certificate.fit.is_exact:
+            return ""
+        return fit_row(self.edge_residuals)
 
     def _network_facts(self) -> Facts:
         """What is printed of robots and of what they sent."""

@@ -2,7 +2,12 @@
 
 import typer
 
-from solvers.cli.explanations import advice_on_reading, explained_by_its_graph, show_advice
+from solvers.cli.explanations import (
+    advice_on_reading,
+    advice_on_wrong_edges,
+    explained_by_its_graph,
+    show_advice,
+)
 from solvers.cli.options import (
     GraphArgument,
     SkipUnknownOption,
@@ -31,6 +36,8 @@ def doctor_command(
         typer.echo(str(comparison))
         if comparison.proposed:
             show_advice([advice_on_reading(comparison, graph)])
+        elif comparison.is_misfit:
+            show_advice([advice_on_wrong_edges(comparison, graph)])
         else:
             typer.echo(f"\n{wrapped(comparison.sentence())}")
 

@@ -117,6 +117,12 @@ def advice_on_reading(comparison: "ReadingComparison", graph: str) -> Advice:
     return Advice(comparison.sentence(), shlex.join(command))
 
 
+def advice_on_wrong_edges(comparison: "ReadingComparison", graph: str) -> Advice:
+    """What to do about a file that means what it says, and whose edges do not fit together."""
+    text = f"{comparison.sentence()} Wrong edges are likelier: look for them."
+    return Advice(text, shlex.join(["pgo", "solve", graph, "--robust", "gnc"]))
+
+
 def advice_on_file(fit: EdgeFit, graph: PoseGraph, source: GraphOptions) -> list[Advice]:
     """Advice where the cost is far from what is expected: what the file may mean instead.
 

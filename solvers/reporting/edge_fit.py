@@ -219,12 +219,7 @@ def _for_own_cost(solve: str) -> str:
 
 def fit_sentence(residuals: EdgeResiduals, cost: str) -> str:
     """Return the result of the chi-square tests of the edges, one by one and together."""
-    count = int(residuals.is_misfit.sum())
-    if count > 1:
-        text = f"{count} edges fit worse than their information matrices allow"
-    else:
-        subject = "1 edge fits" if count == 1 else "No edge fits"
-        text = f"{subject} worse than its information matrix allows"
+    text = _count_of_misfits(residuals)
     if residuals.scale > 1.0:
         text += f", with {residuals.scale:.3g} times the cost allowed, as the median edge needs"
     overall = residuals.overall
@@ -236,6 +231,34 @@ def fit_sentence(residuals: EdgeResiduals, cost: str) -> str:
         smaller = f"{overall**-0.5:.3g} times smaller than the matrices say"
         text += f"; the errors are {smaller}, which can hide wrong edges"
     return text + "."
+
+
+def _count_of_misfits(residuals: EdgeResiduals) -> str:
+    """How many edges fail the test of a single edge."""
+    count = int(residuals.is_misfit.sum())
+    if count > 1:
+        return f"{count} edges fit worse than their information matrices allow"
+    subject = "1 edge fits" if count == 1 else "No edge fits"
+    return f"{subject} worse than its information matrix allows"
+
+
+def fit_row(residuals: EdgeResiduals) -> str:
+    """Return how the cost compares with what the information matrices lead one to expect.
+
+    It stands under the verdict: a certificate says that no other poses are better, and not that the
+    measurements agree. Empty where there is no redundancy, and thus nothing to compare.
+    """
+    if residuals.overall == 0.0:
+        return ""
+    ratio = f"{residuals.overall:.3g} times what is expected"
+    reasons = []
+    if residuals.is_overall_misfit:
+        reasons.append(f"chance allows {residuals.overall_allowed:.3g}")
+    if residuals.is_misfit.any():
+        reasons.append(_count_of_misfits(residuals))
+    if not reasons:
+        return ratio
+    return f"{ratio}: DOUBTFUL, {' and '.join(reasons)}; try --robust gnc, or pgo doctor"
 
 
 def _times_expected(overall: float) -> str:

@@ -153,6 +153,8 @@ class ReadingComparison(Summarised):
         they say, and where nothing can be told.
     invalid : str
         Why the file cannot be read as written; "" where it can.
+    is_misfit : bool
+        Whether the edges as written cost more together than chance allows.
     """
 
     cost_name: str
@@ -160,6 +162,7 @@ class ReadingComparison(Summarised):
     others: tuple[ReadingFit, ...]
     proposed: tuple[ReadingFit, ...]
     invalid: str = ""
+    is_misfit: bool = False
 
     def sentence(self) -> str:
         """Return the costs as written and as proposed, and the question that they raise."""
@@ -254,7 +257,8 @@ def compare_readings(
             pairs = trial.fits([reading for reading in Reading if reading.is_pair])
             others += pairs
             proposed = _proposed(pairs, best) or proposed
-    return ReadingComparison(problem.cost_name, written, others, proposed)
+    is_misfit = residuals.is_overall_misfit
+    return ReadingComparison(problem.cost_name, written, others, proposed, is_misfit=is_misfit)
 
 
 def _may_be_pair(best: ReadingFit) -> bool:

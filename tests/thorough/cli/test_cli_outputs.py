@@ -225,7 +225,7 @@ def test_nothing_is_certified_for_robots_that_are_absent(pgo_command, tmp_path):
     assert "in, only robots with a file here: " in out.splitlines()[0]
     text = " ".join(out.split())
     assert f"edges name {num_absent} poses of robots without a file here" in text
-    assert "asked for; this is of the files here alone, without absent robots note" in text
+    assert "asked for; this is of the files here alone, without absent robots fit" in text
     record = printed_json(pgo_command("solve", folder, "--json")[1])
     assert len(record["graph"]["absent"]) == num_absent
     assert "only robots with a file here" in record["graph"]["name"]
