@@ -194,6 +194,13 @@ class EdgeCost(EdgeArrays):
             self, tau=share * self.tau, W=share_of_W * self.W, W_error=share * self.W_error
         )
 
+    def split_by_convexity(self) -> tuple[Self, Array]:
+        """The cost with zero for every W that has a negative eigenvalue, and these W, (m, d, d)."""
+        W = self.W_matrices
+        is_indefinite = np.asarray(np.linalg.eigvalsh(W)[:, 0] < 0.0)
+        indefinite_W = np.where(is_indefinite[:, None, None], W, 0.0)
+        return replace(self, W=W - indefinite_W), indefinite_W
+
     def minorant(self, point: EdgePoint) -> "EdgeCost":
         """A quadratic cost that is at most this one everywhere and equal to it at a point.
 

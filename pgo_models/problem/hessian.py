@@ -10,7 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.geometry.rotations import Array, hat, tangent_dimension
+from pgo_models.geometry.rotations import (
+    Array,
+    hat,
+    quaternions_from_rotations,
+    tangent_dimension,
+)
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.matrices import (
@@ -86,7 +91,8 @@ def tangent_order(problem: PGOProblem) -> IntArray:
 def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
     """Hessian of F(R Exp(hat(w)), t + v) in (v, w), (side, side).
 
-    `Lambda`, (n, d, d), is theta Lambda; without it the result is the Gauss-Newton matrix.
+    `Lambda`, (n, d, d), is theta Lambda; without it the result is the Gauss-Newton matrix, which is
+    positive semidefinite.
 
     The pattern depends on the graph alone. A rigid motion of all poses is in the null space at
     stationary points: ground a pose before factoring (`ground_pose`).
@@ -96,11 +102,16 @@ def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
     graph = problem.graph
     incidence = problem.incidence
     d = problem.d
+    layout = TangentLayout(problem.num_poses, d)
     R_i = poses.R.take(graph.i, axis=0)
     R_j = poses.R.take(graph.j, axis=0)
     # Blocks of M. For the Hessian of chi2 they are those of its tangent; the Gauss-Newton matrix of
     # the excess is added below in either case.
     weights = problem.weights if Lambda is None else here.minorant
+    relative_R = np.swapaxes(R_i, 1, 2) @ R_j
+    indefinite_W = np.zeros((0, d, d))
+    if Lambda is None and not weights.is_convex:
+        weights, indefinite_W = weights.split_by_convexity()
     coupling_t, diagonal_i, coupling_R, diagonal_j = weights.matrix_blocks(graph.R_ij, graph.t_ij)
     S_ii = incidence.at_both(diagonal_i, diagonal_j)
     if Lambda is not None:
@@ -110,11 +121,13 @@ def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
     tau_sums = incidence.at_both(tau[:, None], tau[:, None])[:, 0]
     coupling_vw = 2.0 * R_i @ translation_generator(coupling_t)
     coupling_vw_sums = incidence.at_beginning(coupling_vw).reshape(-1, *coupling_vw.shape[1:])
-    relative_R = np.swapaxes(R_i, 1, 2) @ R_j
     coupling_ww = -2.0 * double_cross(relative_R, coupling_R)
     diagonal_ww = curvature_of_rotations(S_ii)
+    if len(indefinite_W):
+        between, at_poses = _squares_of_rotations(here, relative_R, indefinite_W)
+        coupling_ww = coupling_ww + between
+        diagonal_ww = diagonal_ww + at_poses
     # Rows and columns: of the poses, then of the two ends of every edge.
-    layout = TangentLayout(problem.num_poses, d)
     every_pose = short(np.arange(problem.num_poses))
     i = short(graph.i)
     j = short(graph.j)
@@ -142,8 +155,9 @@ def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
         (*block_entries(w_j, w_i), np.swapaxes(coupling_ww, 1, 2)),
         (*block_entries(w, w), diagonal_ww),
     ]
-    difference = poses.t[graph.j] - poses.t[graph.i]
-    for curvature in problem.weights.added_curvatures(R_i, R_j, difference):
+    for curvature in problem.weights.added_curvatures(
+        R_i, R_j, poses.t[graph.j] - poses.t[graph.i]
+    ):
         blocks += _curvature_blocks(incidence, layout, curvature)
     return assemble(blocks, layout.side)
 
@@ -192,6 +206,24 @@ def _curvature_blocks(
         (*block_entries(columns_i, columns_j), between),
         (*block_entries(columns_j, columns_i), np.swapaxes(between, 1, 2)),
     ]
+
+
+def _squares_of_rotations(here: EvaluatedPoses, relative_R: Array, W: Array) -> tuple[Array, Array]:
+    """Gauss-Newton matrices in w of rho^T I_rr rho, rho = 2 sin(theta/2) a, of every edge.
+
+    The term of W is no sum of squares where W is indefinite, and this one, which is equal on
+    rotations, is. Half of rho is the vector part q of the quaternion of E, which a move
+    E Exp(hat(w)) changes by (q_w w + q x w) / 2. Returned are the blocks between the ends of the
+    edges, (m, 3, 3), and their sums at the poses, (n, 3, 3).
+    """
+    E = np.swapaxes(here.problem.graph.R_ij, 1, 2) @ relative_R
+    quaternions = quaternions_from_rotations(E)
+    scalar_part = quaternions[:, 3, None, None]
+    doubled = scalar_part * np.eye(3) + hat(quaternions[:, :3])
+    of_j = np.swapaxes(doubled, 1, 2) @ curvature_of_rotations(W) @ doubled
+    between = -relative_R @ of_j
+    of_i = -between @ np.swapaxes(relative_R, 1, 2)
+    return between, here.problem.incidence.at_both(of_i, of_j)
 
 
 def double_cross(A: Array, B: Array) -> Array:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from graphs import (
@@ -12,7 +14,7 @@ from graphs import (
 )
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem, Poses, chordal_start, exp_map, multipliers
+from pgo_models import PGOProblem, Poses, Weighting, chordal_start, exp_map, multipliers
 from pgo_models.geometry.rotations import Array, hat, tangent_dimension
 from pgo_models.problem.hessian import TangentLayout, double_cross, riemannian_hessian
 from solvers import polish
@@ -103,3 +105,24 @@ def test_double_cross_is_its_definition_in_space(seed: int, n: int) -> None:
     np.testing.assert_allclose(
         double_cross(A, A), 2 * cofactors, rtol=0, atol=1e-9 * (1 + np.abs(cofactors).max())
     )
+
+
+@given(seed=SEEDS, n=SIZES)
+def test_gauss_newton_of_yaw_alone_is_semidefinite_and_promises_no_more_than_chi2(
+    seed: int, n: int
+) -> None:
+    # I_rr of yaw alone has an indefinite W.
+    graph = varied_graph(seed, n, 3)
+    yaw = np.diag([1.0, 2.0, 0.0, 0.0, 0.0, 3.0])
+    information = np.repeat(yaw[None], graph.num_edges, axis=0)
+    problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+    here = problem.at(random_poses(n, 3, seed))
+    H = riemannian_hessian(here, None).toarray()
+    values, axes = np.linalg.eigh(H)
+    rounding = 1e-9 * values[-1]
+    assert values[0] >= -rounding
+    along = axes.T @ TangentLayout(n, 3).join(*here.riemannian_gradient)
+    is_seen = values > rounding
+    assert np.abs(along[~is_seen]).max(initial=0.0) <= 1e-6 * np.linalg.norm(along)
+    promised = 0.5 * (along[is_seen] ** 2 / values[is_seen]).sum()
+    assert promised <= here.value * (1.0 + 1e-9)
