@@ -132,6 +132,15 @@ class Orthonormal(ConstraintSet):
         outside = np.kron(np.eye(p), P_perp.T)
         return np.concatenate([skew, outside]).T
 
+    def tangent_part(self, P: Array, basis: Array, M: Array) -> Array:
+        """basis^T M for the tangent basis at P, and M of any number of columns."""
+        n, p = P.shape
+        if n > p:
+            return np.asarray(basis.T @ M)
+        products = P.T @ M.reshape(p, n, -1)  # of column i of P and of column j of M at j, i
+        first, second = np.triu_indices(p, 1)
+        return np.asarray(np.sqrt(0.5) * (products[second, first] - products[first, second]))
+
     def times_multiplier(self, P: Array, G: Array, directions: Array) -> Array:
         """V Lambda for all directions V, the columns of an (n p, k) array, Lambda = sym(P^T G).
 
@@ -206,6 +215,10 @@ class UnitColumns(ConstraintSet):
         """Largest -Lambda_j, with N = P diag(Lambda)."""
         Lambda = self._products(P, N)
         return max(0.0, float(-np.min(Lambda)))
+
+    def tangent_part(self, P: Array, basis: Array, M: Array) -> Array:
+        """As `Orthonormal.tangent_part`."""
+        return np.asarray(basis.T @ M)
 
     def times_multiplier(self, P: Array, G: Array, directions: Array) -> Array:
         """As `Orthonormal.times_multiplier`, with Lambda = diag(<p_j, g_j>)."""

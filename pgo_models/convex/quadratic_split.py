@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import eigh
 from scipy.sparse import csc_array, csr_array, diags_array
 
 from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, Term
@@ -128,7 +127,9 @@ class QuadraticSplit(ReadOnly):
         assert D is not None
         H = 2.0 * (D.T @ (self.form.Q @ D))
         free = self.form.is_free[: self.form.num_constrained]
-        values, vectors = eigh(H[:-1, :-1], np.diag(self._weights[free]))
+        scale = np.sqrt(self._weights[free])
+        values, scaled = np.linalg.eigh(H[:-1, :-1] / scale / scale[:, None])
+        vectors = scaled / scale[:, None]
         return values, vectors, H[:-1, -1]
 
     def _solved_dense(self, pull: Array, rho: float) -> Array:

@@ -111,16 +111,26 @@ class ModelNewton(ReadOnly):
         bases = [_tangent_basis(block, u[block.coordinates]) for block in blocks]
         N = np.zeros((len(g), sum(basis.shape[1] for basis in bases)))
         N_Lambda = np.zeros(N.shape)
+        rows = []
         row = 0
         column = 0
         for block, basis in zip(blocks, bases, strict=True):
-            place = np.s_[row : row + block.size, column : column + basis.shape[1]]
+            rows.append(slice(row, row + block.size))
+            place = rows[-1], slice(column, column + basis.shape[1])
             N[place] = basis
             x = u[block.coordinates]
-            N_Lambda[place] = _times_multiplier(block, x, gradient[place[0]], basis)
+            N_Lambda[place] = _times_multiplier(block, x, gradient[rows[-1]], basis)
             row += block.size
             column += basis.shape[1]
-        return _TangentModel(self.form.free_x, N, N.T @ gradient, N.T @ (H @ N - N_Lambda))
+
+        def tangent_part(M: Array) -> Array:
+            parts = []
+            for block, basis, its_rows in zip(blocks, bases, rows, strict=True):
+                parts.append(_tangent_part(block, u[block.coordinates], basis, M[its_rows]))
+            return np.concatenate(parts)
+
+        hessian = tangent_part(tangent_part(H).T - N_Lambda)
+        return _TangentModel(self.form.free_x, N, N.T @ gradient, hessian)
 
     def _sparse_model(self, u: Array) -> "_TangentModel":
         """The model in x and y, sparse."""
@@ -174,6 +184,13 @@ def _tangent_basis(block: Block, x: Array) -> Array:
     if block.is_plane:
         return np.array([[-x[1]], [x[0]]])
     return _smooth_set(block).tangent_basis(block.value(x))
+
+
+def _tangent_part(block: Block, x: Array, basis: Array, M: Array) -> Array:
+    """basis^T M."""
+    if block.is_plane:
+        return np.asarray(basis.T @ M)
+    return _smooth_set(block).tangent_part(block.value(x), basis, M)
 
 
 def _times_multiplier(block: Block, x: Array, gradient: Array, directions: Array) -> Array:

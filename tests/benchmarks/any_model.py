@@ -1,19 +1,41 @@
-"""Random quadratic models over rotations: the share certified, the other gaps, and CPU seconds.
+"""Quadratic models over rotations in cvxpy: the share certified, the other gaps, and CPU seconds.
 
-    python tests/benchmarks/any_model.py [share of the models, 1 unless given]
+    python tests/benchmarks/any_model.py random [share of the models, 1 unless given]
+    python tests/benchmarks/any_model.py registration [draws of each size and noise, 5 unless given]
+    python tests/benchmarks/any_model.py hand-eye [draws, 5 unless given]
+    python tests/benchmarks/any_model.py speed
 
-A model is a sum of 9 m squares, of affine functions of m matrices with N(0, 1) entries: far from
-any noise model. `above` counts bounds above the least J of many starts, which have to be none.
+A random model is a sum of 9 m squares, of affine functions of m matrices with N(0, 1) entries: far
+from any noise model. `above` counts bounds above the least J of many starts, which have to be none.
+
+`registration` fits points to planes with a rotation and a translation, the noise in parts of the
+scene's size; `hand-eye` finds X of A X = X B from motions A and B of the hand and the eye.
+
+`speed` runs five starts of five models by SOC with Newton, and by pymanopt's trust regions with the
+same starts, with the same matrix for the gradient and the Hessian, to the same gradient. pymanopt
+is needed for this alone.
 """
 
 import sys
 import time
+import warnings
+from collections.abc import Callable
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
 import pgo_models as pgo
 import solvers
+from pgo_models.convex.orthogonality_examples import procrustes
+from pgo_models.convex.quadratic_split import QuadraticSplit
+from solvers.convex.hand_over import SOCWithNewton
+from solvers.convex.model_newton import ModelNewton
+
+try:
+    import pymanopt
+except ImportError:  # `speed` says so
+    pymanopt = None
 
 # kind of set, shape, number of variables, number of models, starts to compare with
 FAMILIES = [
@@ -27,6 +49,7 @@ FAMILIES = [
     ("unit_rows", (6, 3), 1, 50, 40),
 ]
 STARTS = 5
+GRADIENT = 1e-8  # at which pymanopt stops; Newton ends at rounding
 COMPARED = 3  # models of a family that are solved with a convex solver in step (a), too
 
 
@@ -49,9 +72,8 @@ def cpu_seconds(
     return time.process_time() - begun, solution
 
 
-def main() -> None:
+def random_models(share: float = 1.0) -> None:
     """Print a row a family."""
-    share = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
     print("| sets | models | certified | other gaps: median, largest | above | CPU s | Clarabel |")
     print("|---|---|---|---|---|---|---|")
     by_solver = solvers.OrthogonalSOC(x_step=solvers.XStep.CONVEX_SOLVER)
@@ -75,6 +97,168 @@ def main() -> None:
         sets = f"{kind} {shape[0]} x {shape[1]}, {count}"
         times = f"{np.median(seconds):.2g} | {np.median(seconds_of_solver):.2g}"
         print(f"| {sets} | {len(gaps)} | {certified} | {wide} | {above} | {times} |", flush=True)
+
+
+SIZES = (3, 4, 5, 7, 10, 30, 100, 1000)
+NOISES = (0.01, 0.03, 0.1, 0.3, 1.0)
+MOTIONS = (3, 5, 10, 20, 50)
+DEGREES = (1.0, 5.0, 20.0, 60.0)
+
+
+def registration(num_points: int, noise: float, seed: int) -> pgo.OrthogonalProblem:
+    """Points to planes: sum over the points of (n_i^T (R p_i + t - q_i))^2."""
+    rng = np.random.default_rng(seed)
+    points, shifts = rng.standard_normal((2, num_points, 3))
+    normals = rng.standard_normal((num_points, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    seen = points @ pgo.random_rotations(1, 3, rng)[0].T + noise * shifts
+    R, t = cp.Variable((3, 3), name="R"), cp.Variable(3, name="t")
+    by_entry = np.einsum("ki,kj->kji", normals, points).reshape(num_points, 9)
+    residuals = by_entry @ cp.vec(R, order="F") + normals @ t - np.sum(normals * seen, axis=1)
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum_squares(residuals))), rotations=[R])
+
+
+def hand_eye(num_motions: int, degrees: float, seed: int) -> pgo.OrthogonalProblem:
+    """A X = X B: rotations R_A R = R R_B, translations R_A t + t_A = R t_B + t."""
+    rng = np.random.default_rng(seed)
+    X = pgo.random_rotations(1, 3, rng)[0]
+    R_B = pgo.random_rotations(num_motions, 3, rng)
+    t_X, t_B = rng.standard_normal(3), rng.standard_normal((num_motions, 3))
+    R_A = pgo.project_to_rotations(
+        X @ R_B @ X.T + np.radians(degrees) * rng.standard_normal(R_B.shape)
+    )
+    t_A = t_B @ X.T + t_X - R_A @ t_X
+    t_A += np.radians(degrees) * rng.standard_normal(t_A.shape)
+    R, t = cp.Variable((3, 3), name="R"), cp.Variable(3, name="t")
+    terms = []
+    for k in range(num_motions):
+        terms.append(cp.vec(R_A[k] @ R - R @ R_B[k], order="F"))
+        terms.append((R_A[k] - np.eye(3)) @ t + t_A[k] - R @ t_B[k])
+    squares = cp.sum_squares(cp.hstack(terms))
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(squares)), rotations=[R])
+
+
+def certified_shares(
+    model: Callable[[int, float, int], pgo.OrthogonalProblem],
+    sizes: tuple[int, ...],
+    noises: tuple[float, ...],
+    draws: int,
+) -> None:
+    """Print a row a size: of how many draws with each noise the answer is certified."""
+    print("| | " + " | ".join(f"{noise:g}" for noise in noises) + " | CPU s |")
+    print("|---" * (len(noises) + 2) + "|")
+    exceptions = []
+    for size in sizes:
+        cells = []
+        seconds = []
+        for noise in noises:
+            certified = 0
+            for seed in range(draws):
+                problem = model(size, noise, seed)
+                taken, solution = cpu_seconds(problem, None)
+                seconds.append(taken)
+                certified += solution.is_certified
+                if not solution.is_certified:
+                    exceptions.append(f"{size}, {noise:g}, seed {seed}: gap {solution.gap:.2g}")
+            cells.append(f"{certified} of {draws}")
+        print(f"| {size} | {' | '.join(cells)} | {np.median(seconds):.2g} |", flush=True)
+    print("exceptions:", "; ".join(exceptions) or "none")
+
+
+def compared_models() -> dict[str, pgo.OrthogonalProblem]:
+    """The five models of `speed`."""
+    rng = np.random.default_rng(0)
+    draw = rng.standard_normal
+    models = {
+        "Procrustes 5 x 5": procrustes(draw((5, 5)), draw((5, 5))),
+        "unbalanced Procrustes 8 x 3": procrustes(draw((10, 8)), draw((10, 3))),
+    }
+    A, B = draw((2, 6, 6))
+    X = cp.Variable((6, 6))
+    assignment = cp.sum_squares((A + A.T) @ X - X @ (B + B.T))
+    models["orthogonal QAP 6 x 6"] = pgo.OrthogonalProblem(
+        cp.Problem(cp.Minimize(assignment)), orthogonal=[X]
+    )
+    X = cp.Variable((30, 4))
+    trace = cp.sum_squares(draw((30, 30)) / 30**0.5 @ X @ np.diag(np.arange(1.0, 5.0) ** 0.5))
+    models["Brockett 30 x 4"] = pgo.OrthogonalProblem(
+        cp.Problem(cp.Minimize(trace)), orthogonal=[X]
+    )
+    models["Procrustes 20 x 20"] = procrustes(draw((20, 20)), draw((20, 20)))
+    return models
+
+
+def pymanopt_problem(model: pgo.OrthogonalProblem, form: pgo.QuadraticForm) -> Any:
+    """The model for pymanopt, with its gradient and Hessian as one matrix."""
+    H = 2.0 * form.Q.toarray()
+    shape = model.variables[0].shape
+    manifold = pymanopt.manifolds.Stiefel(*shape)
+
+    @pymanopt.function.numpy(manifold)
+    def cost(X):
+        x = X.reshape(-1, order="F")
+        return 0.5 * x @ (H[:-1, :-1] @ x) + H[:-1, -1] @ x + 0.5 * H[-1, -1]
+
+    @pymanopt.function.numpy(manifold)
+    def gradient(X):
+        return (H[:-1, :-1] @ X.reshape(-1, order="F") + H[:-1, -1]).reshape(shape, order="F")
+
+    @pymanopt.function.numpy(manifold)
+    def hessian(X, V):
+        return (H[:-1, :-1] @ V.reshape(-1, order="F")).reshape(shape, order="F")
+
+    return pymanopt.Problem(manifold, cost, euclidean_gradient=gradient, euclidean_hessian=hessian)
+
+
+def speed() -> None:
+    """Print CPU seconds of five starts, as found by both, and of a whole solve."""
+    if pymanopt is None:
+        sys.exit("any_model.py speed needs pymanopt: pip install pymanopt")
+    print("| | SOC with Newton | pymanopt | least J | pymanopt's | with the certificate | gap |")
+    print("|---|---|---|---|---|---|---|")
+    solvers.solve_orthogonal(random_model(0, "orthogonal", (2, 2), 1))  # imports what it needs
+    for name, model in compared_models().items():
+        pgo.quadratic_form(model)  # compiles
+        rng = np.random.default_rng(1)
+        starts = [model.random_point(rng) for _ in range(STARTS)]
+        begun = time.process_time()
+        split = QuadraticSplit(model, pgo.quadratic_form(model))
+        soc = solvers.OrthogonalSOC(x_step=split)
+        method = SOCWithNewton(soc, split, ModelNewton(split.form))
+        outcomes = [solvers.run(method, model, start) for start in starts]
+        ours = time.process_time() - begun
+
+        problem = pymanopt_problem(model, split.form)
+        optimizer = pymanopt.optimizers.TrustRegions(verbosity=0, min_gradient_norm=GRADIENT)
+        begun = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # pymanopt's at its own limits of rounding
+            theirs = [optimizer.run(problem, initial_point=start.copies[0]) for start in starts]
+        seconds = time.process_time() - begun
+        least = min(outcome.objective for outcome in outcomes)
+        least_of_theirs = min(result.cost for result in theirs)
+        taken, solution = cpu_seconds(model, None)
+        print(
+            f"| {name} | {ours:.3f} | {seconds:.3f} | {least:.9g} | {least_of_theirs:.9g} "
+            f"| {taken:.2g} | {solution.gap:.2g} |",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Print the tables that are asked for."""
+    what = sys.argv[1] if len(sys.argv) > 1 else "random"
+    number = sys.argv[2] if len(sys.argv) > 2 else None
+    if what == "random":
+        random_models(float(number or 1.0))
+    elif what == "registration":
+        certified_shares(registration, SIZES, NOISES, int(number or 5))
+    elif what == "hand-eye":
+        certified_shares(hand_eye, MOTIONS, DEGREES, int(number or 5))
+    elif what == "speed":
+        speed()
+    else:
+        sys.exit(f"any_model.py: {what!r} is none of random, registration, hand-eye, speed")
 
 
 if __name__ == "__main__":
