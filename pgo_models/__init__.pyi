@@ -89,7 +89,6 @@ from pgo_models.relaxations.solve_sdp import (
     RelaxationForm as RelaxationForm,
     solve_relaxation as solve_relaxation,
 )
-from pgo_models.verification.model_proof import verify_model_proof as verify_model_proof
 from pgo_models.verification.verify import (
     verify_proof as verify_proof,
 )
@@ -116,7 +115,7 @@ __all__ += ["PGOProblem", "Weighting"]
 __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]
 __all__ += ["Certificate", "Verdict", "certificate_matrix", "certify_at"]
 __all__ += ["multipliers", "prove_bound"]
-__all__ += ["save_proof", "verify_model_proof", "verify_proof"]
+__all__ += ["save_proof", "verify_proof"]
 __all__ += ["BregmanProblem", "ConstraintSet", "ConvexSolver", "ModelChange"]
 __all__ += ["ModelCertificate", "OrthogonalProblem", "QuadraticForm", "quadratic_form"]
 __all__ += ["graph_qp", "solve_relaxation"]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import solvers
 from pgo_models import Certificate, PGOProblem, PoseGraph, Weighting, read_g2o, write_g2o
-from pgo_models.verification.verify import Verification
+from pgo_models.verification.verification import Verification
 
 PLANE = "EDGE_SE2 0 1 1 0 0.1 4 0 0 4 0 9\nEDGE_SE2 1 2 1 0.2 0.3 4 1 0 5 0 9\n"
 Q = "0 0.1 0 1"

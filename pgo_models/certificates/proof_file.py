@@ -75,7 +75,11 @@ def save_proof(problem: PGOProblem, certificate: Certificate, path: Path | str) 
     >>> found.is_verified, bool(found.bound >= certificate.lower_bound)
     (True, True)
     """
-    record = proof_json(problem, certificate)
+    write_proof(proof_json(problem, certificate), path)
+
+
+def write_proof(record: dict[str, object], path: Path | str) -> None:
+    """Write the record of a proof as JSON; the file is written whole or not at all."""
     with replace_when_done(path) as temporary:
         temporary.write_text(json.dumps(record, allow_nan=False) + "\n", encoding="utf-8")
 

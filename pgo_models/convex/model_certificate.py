@@ -92,7 +92,7 @@ class ModelCertificate(ReadOnly):
         return self.verdict in (Verdict.CERTIFIED, Verdict.EXACT)
 
     def save_proof(self, path: Path | str) -> None:
-        """Write what proves the bound, as JSON; `verify_model_proof` checks it exactly.
+        """Write what proves the bound, as JSON; `verify_proof` checks it exactly.
 
         Parameters
         ----------

@@ -1,24 +1,23 @@
 """Write the proof of a model's lower bound: the model's numbers, its sets, and the multipliers."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from scipy.sparse import coo_array, triu
 
+from pgo_models.certificates.proof_file import write_proof
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, UnitRows
 from pgo_models.convex.model_bound import ModelBound
 from pgo_models.convex.quadratic_form import Block, QuadraticForm
 from pgo_models.convex.set_equations import equations_of_block
 from pgo_models.errors import SettingError
-from pgo_models.files import replace_when_done
 from pgo_models.geometry.rotations import Array
 
 FORMAT = "pgo-splitting model proof 1"
 
 
 def write_model_proof(form: QuadraticForm, bound: ModelBound, path: Path | str) -> None:
-    """Write a proof that `verify_model_proof` checks; the file is written whole or not at all."""
+    """Write a proof that `verify_proof` checks; the file is written whole or not at all."""
     if any(len(block.sets) > 1 for block in form.blocks):
         raise SettingError("no proof to write: a variable is in several sets")
     start = 0
@@ -51,8 +50,7 @@ def write_model_proof(form: QuadraticForm, bound: ModelBound, path: Path | str) 
             "turned": "from the left" if form.gauge.is_left else "from the right",
             "entries": form.w_columns[form.gauge.entries].tolist(),
         }
-    with replace_when_done(path) as temporary:
-        temporary.write_text(json.dumps(record, allow_nan=False) + "\n", encoding="utf-8")
+    write_proof(record, path)
 
 
 def _variable(block: Block, first: int, basic: Array, others: Array) -> dict[str, Any]:

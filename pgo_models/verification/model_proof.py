@@ -26,88 +26,48 @@ All is done in rational numbers, without any rounding. Nothing outside `pgo_mode
 imported but `pgo_models.errors`.
 """
 
-import json
 from collections.abc import Iterable
-from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from pgo_models.errors import FileFormatError
-from pgo_models.verification.balls import exact, fmpq
-from pgo_models.verification.measurements import read_text
+from pgo_models.verification.balls import arb, ctx, exact, fmpq
+from pgo_models.verification.proof import MODEL_FORMAT, read_record
+from pgo_models.verification.verification import MODEL, Verification
 
-FORMAT = "pgo-splitting model proof 1"
+BITS = 128  # of the ball that the bound, a rational number, is printed as
 ONE = -1  # stands for the constant among the entries of z
 Affine = dict[int, fmpq]
 Quadratic = dict[int, dict[int, fmpq]]
 
 
-@dataclass(frozen=True)
-class ModelVerification:
-    """What a proof proves of a model.
-
-    Parameters
-    ----------
-    claim : float
-        The lower bound that is claimed.
-    bound : Fraction, optional
-        The lower bound that is proven, exactly.
-    failure : str
-        Why the proof fails; empty where it is verified.
-    """
-
-    claim: float
-    bound: Fraction | None = None
-    failure: str = ""
-
-    @property
-    def is_verified(self) -> bool:
-        """Whether the bound that is claimed is proven."""
-        return not self.failure
-
-
-def verify_model_proof(proof: Path | str) -> ModelVerification:
-    """Check the proof of a lower bound on a model, as `ModelCertificate.save_proof` writes it.
-
-    Whether the numbers are those of a model is for its owner to say: cvxpy gives them by
-    `problem.get_problem_data(cvxpy.CLARABEL)`.
-
-    Parameters
-    ----------
-    proof : Path or str
-        The file, JSON.
-
-    Returns
-    -------
-    ModelVerification
-        The bound, a rational number, and why the proof fails if it does.
-
-    Raises
-    ------
-    FileFormatError
-        When the file cannot be read, or is not what it has to be.
-    MissingExtraError
-        When python-flint is not installed, which the extra `verify` brings.
-    """
-    path = Path(proof)
+def verify_model(path: Path) -> Verification:
+    """What the proof of a model proves; `pgo_models.verify_proof` is its door."""
+    record = read_record(path, MODEL_FORMAT)
     try:
-        record = json.loads(read_text(path))
-        if record["format"] != FORMAT:
-            raise FileFormatError(path, None, f"its format is not {FORMAT!r}")
         claim = float(record["lower_bound"])
+        variables = record["variables"]
+        name = f"{path}: {len(variables)} variables in sets, {len(record['c'])} numbers"
         L, failure = lagrangian(record)
         bound = None if failure else least_value(L)
+        if claim <= 0.0 and is_sum_of_squares(record):  # whatever the multipliers prove
+            bound = max(bound or fmpq(0), fmpq(0))
+            failure = ""
     except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
         raise FileFormatError(path, None, f"not a proof of a model: {error!r:.80}") from error
-    if failure:
-        return ModelVerification(claim, None, failure)
-    if bound is None:
-        return ModelVerification(claim, None, "a pivot of the Lagrangian is not positive")
-    proven = Fraction(int(bound.p), int(bound.q))
-    if not Fraction(claim) <= proven:
-        return ModelVerification(claim, proven, "the bound that is claimed is above the proven one")
-    return ModelVerification(claim, proven)
+    if not failure and bound is None:
+        failure = "the minimum: a pivot of the Lagrangian is not positive"
+    if bound is not None and not exact(claim) <= bound:
+        failure = "the claim: the lower bound that is claimed is above the proven one"
+    with ctx.workprec(BITS):
+        ball = None if bound is None else arb(bound)
+    return Verification(name, MODEL, bound=ball, failure=failure)
+
+
+def is_sum_of_squares(record: dict[str, Any]) -> bool:
+    """Whether the objective is a sum of squares of entries of z and a constant, not negative."""
+    is_diagonal = all(i == j and value >= 0.0 for i, j, value in record["P"])
+    return is_diagonal and not any(record["c"]) and record["constant"] >= 0.0
 
 
 def lagrangian(record: dict[str, Any]) -> tuple[Quadratic, str]:
@@ -119,11 +79,14 @@ def lagrangian(record: dict[str, Any]) -> tuple[Quadratic, str]:
     rows = [*equalities(record), *plane_equations(variables)]
     if "held" in record:
         if not stays_when_turned(record, constrained):
-            return {}, "turning all variables may change the objective or leave a set"
+            return (
+                {},
+                "the variable held: turning all may change the objective or leave a set",
+            )
         rows += held_entries(record)
     solved = solutions(rows, constrained)
     if solved is None:
-        return {}, "the equalities contradict each other"
+        return {}, "the equalities, which contradict each other"
     L = objective(record, solved)
     for variable in variables:
         for multiplier, terms in equations(variable):
@@ -132,7 +95,7 @@ def lagrangian(record: dict[str, Any]) -> tuple[Quadratic, str]:
                 add_product(L, *product, -exact(float(multiplier)) * value)
     for product_of_hulls in record.get("products", []):
         if not subtract_product(L, solved, variables, product_of_hulls):
-            return {}, "a matrix P of a product of hulls is not positive semidefinite"
+            return {}, "the products: a matrix P of a product of hulls is not positive semidefinite"
     return L, ""
 
 

@@ -10,6 +10,7 @@ from pgo_models.errors import FileFormatError
 from pgo_models.verification.measurements import WORLD, read_text
 
 FORMAT = "pgo-splitting proof 1"
+MODEL_FORMAT = "pgo-splitting model proof 1"
 COSTS = {
     "F": "F, two precisions an edge, as in SE-Sync",
     "unit": "F with kappa = tau = 1, as in the paper",
@@ -21,6 +22,10 @@ COSTS = {
 ROTATION_COSTS = ("rotations", "unit rotations")
 UNIT_COSTS = ("unit", "unit rotations")
 WAY_OUT = "give a file of pgo solve --proof, as it was written"
+_WAYS_OUT = {
+    FORMAT: "it is the proof of a graph, which is verified with the graph: give both",
+    MODEL_FORMAT: "it is the proof of a model, which has the model's numbers: give it alone",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +68,7 @@ class Proof:
 
 def read_proof(path: Path, d: int) -> Proof:
     """Proof in a JSON file, shapes and numbers checked; a FileFormatError says what is wrong."""
-    try:
-        record = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(path, None, f"no JSON: {error}; {WAY_OUT}") from error
-    if entry(path, record, "format") != FORMAT:
-        raise FileFormatError(path, None, f"its format is not {FORMAT!r}; {WAY_OUT}")
+    record = read_record(path, FORMAT)
     cost = entry(path, record, "cost")
     if cost not in list(COSTS) or entry(path, record, "d") != d:
         problem = f"not the proof of {', '.join(COSTS)} in {d}D; give the proof of this graph"
@@ -102,6 +102,19 @@ def read_proof(path: Path, d: int) -> Proof:
         is_complex=read_is_complex(path, record, d),
         splits=read_splits(path, record, d),
     )
+
+
+def read_record(path: Path, wanted: str) -> dict[str, Any]:
+    """The JSON object of a proof file in a format; a FileFormatError says what is wrong."""
+    try:
+        record = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(path, None, f"no JSON: {error}; {WAY_OUT}") from error
+    given = entry(path, record, "format")
+    if given == wanted:
+        return dict(record)
+    other = _WAYS_OUT.get(given) if isinstance(given, str) else None
+    raise FileFormatError(path, None, f"its format is not {wanted!r}; {other or WAY_OUT}")
 
 
 def read_terms(path: Path, record: dict[str, Any], d: int) -> list[HandednessTerm]:

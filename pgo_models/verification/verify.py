@@ -102,23 +102,19 @@ more bits.
 Nothing outside `pgo_models.verification` is imported but `pgo_models.errors`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from heapq import heapify, heappop, heappush
 from pathlib import Path
-from typing import Any
 
 from pgo_models.errors import SettingError
 from pgo_models.verification.balls import (
-    Parts,
     above,
     arb,
     arb_mat,
-    ball_of_parts,
     beside,
     blocks_on_diagonal,
     ctx,
     exact,
-    exact_parts,
     first_bad_pivot,
     fmpq,
     identity,
@@ -136,8 +132,8 @@ from pgo_models.verification.costs import (
 )
 from pgo_models.verification.doubles import Resolution
 from pgo_models.verification.measurements import WORLD, Graph, read_graph
+from pgo_models.verification.model_proof import verify_model
 from pgo_models.verification.proof import (
-    COSTS,
     ROTATION_COSTS,
     HandednessTerm,
     Proof,
@@ -145,6 +141,7 @@ from pgo_models.verification.proof import (
     read_proof,
 )
 from pgo_models.verification.robot_logs import SUFFIX as LOG_SUFFIX, read_robot_log
+from pgo_models.verification.verification import DIGITS, Verification
 
 # Bits; the next where a ball is too wide to decide. With the last ones every pivot that is not zero
 # to 2,400 digits has a sign, and a proof that needs more is not one of doubles.
@@ -154,150 +151,27 @@ PRECISIONS = (128, 512, 2048, 8192)
 CLAIM_SLACK = 1e-9
 FARTHEST = 8  # the largest squared Frobenius norm of the difference of two rotations
 NO_ROTATION = 1e-6  # entries that far from those of the rotation made of them are a mistake
-DIGITS = 20  # of balls, as printed: more than doubles have
-
-
-@dataclass(frozen=True, eq=False)
-class Verification:
-    """What a proof proves of a graph: the cost of its poses and a bound on that of all, as balls.
-
-    Parameters
-    ----------
-    graph : str
-        The graph's file.
-    cost : str
-        Which cost this is, as the proof names it.
-    objective : arb, optional
-        The cost of the poses. Its upper end is an upper bound on the least cost.
-    bound : arb, optional
-        The lower end of this ball is a lower bound on the cost of all poses. It is exactly zero
-        where only the trivial bound is proven, as of a proof without eta.
-    gap : arb, optional
-        (objective - bound) / objective.
-    failure : str
-        The step that failed, and why; empty where the proof is verified.
-    num_raised : int
-        Number of information matrices that are semidefinite but for the rounding of their entries:
-        2^-45 of their diagonals is added to them, as everywhere in this project.
-    """
-
-    graph: str
-    cost: str
-    objective: arb | None = None
-    bound: arb | None = None
-    gap: arb | None = None
-    failure: str = ""
-    num_raised: int = 0
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the balls by their mantissas and exponents, which python-flint does not do."""
-        objective = exact_parts(self.objective)
-        bound = exact_parts(self.bound)
-        gap = exact_parts(self.gap)
-        rest = self.failure, self.num_raised
-        return _unpickled, (self.graph, self.cost, objective, bound, gap, *rest)
-
-    @property
-    def is_verified(self) -> bool:
-        """Whether the bound is proven, and cost and bound are what the proof claims."""
-        return not self.failure
-
-    @property
-    def cost_name(self) -> str:
-        """F or chi2, of rotations alone F(R)."""
-        if self.cost in ROTATION_COSTS:
-            return "F(R)"
-        return "chi2" if self.cost == "chi2" else "F"
-
-    @property
-    def verdict(self) -> str:
-        """VERIFIED, and what; or FAILED, at which step, and why."""
-        if self.failure:
-            return f"FAILED at {self.failure}"
-        if self.bound == 0:
-            trivial = f"VERIFIED, but only the trivial bound: {self.cost_name} is a sum of squares"
-            return f"{trivial}; no better bound is proven"
-        unknowns = "rotations" if self.cost in ROTATION_COSTS else "poses"
-        return f"VERIFIED: no {unknowns} have {self.cost_name} below this lower bound"
-
-    def facts(self) -> list[tuple[str, str]]:
-        """Return the facts as they are printed, balls to 20 digits.
-
-        Returns
-        -------
-        list of (str, str)
-            Pairs of a label and a text.
-        """
-        facts = [
-            ("graph", self.graph),
-            ("cost", f"{COSTS[self.cost]}; numbers as the file has them, in decimals"),
-        ]
-        if self.num_raised:
-            raised = f"{self.num_raised} information matrices are semidefinite but for rounding"
-            facts.append(("weights", f"{raised}; taken with 2^-45 of their diagonals added"))
-        balls = [(self.cost_name, self.objective), ("lower bound", self.bound), ("gap", self.gap)]
-        for label, ball in balls:
-            if ball is not None:
-                facts.append((label, ball.str(DIGITS)))
-        facts.append(("verdict", self.verdict))
-        return facts
-
-    def as_json(self) -> dict[str, object]:
-        """Return what `pgo verify --json` prints.
-
-        Returns
-        -------
-        dict
-            Balls are texts.
-        """
-        return {
-            "graph": self.graph,
-            "cost": self.cost,
-            "objective": _text(self.objective),
-            "lower_bound": _text(self.bound),
-            "gap": _text(self.gap),
-            "matrices_raised": self.num_raised,
-            "verified": self.is_verified,
-            "failure": self.failure,
-        }
-
-    def __str__(self) -> str:
-        return "\n".join(f"{label:<12} {text}" for label, text in self.facts())
-
-
-def _text(ball: arb | None) -> str | None:
-    """A ball as it is printed; None of none."""
-    return None if ball is None else ball.str(DIGITS)
-
-
-def _unpickled(
-    graph: str,
-    cost: str,
-    objective: Parts | None,
-    bound: Parts | None,
-    gap: Parts | None,
-    failure: str,
-    num_raised: int,
-) -> Verification:
-    """Verification that was pickled, its balls from `exact_parts`."""
-    balls = ball_of_parts(objective), ball_of_parts(bound), ball_of_parts(gap)
-    return Verification(graph, cost, *balls, failure, num_raised)
 
 
 def verify_proof(
     graph: Path | str,
-    proof: Path | str,
+    proof: Path | str | None = None,
     *,
     skip_unknown: bool = False,
 ) -> Verification:
     """Check the proof of a lower bound, as `save_proof` writes it, for the numbers of a file.
 
+    The proof of a cvxpy model has the numbers of the model, and is given alone. Whether these are
+    those of a model is for its owner to say: `problem.get_problem_data(cvxpy.CLARABEL)` has them.
+
     Parameters
     ----------
     graph : Path or str
-        The g2o file, or JSON robot log (JRL). Covariance matrices are inverted exactly.
-    proof : Path or str
-        The proof, JSON: cost, poses with their multipliers, the pose that is grounded, and eta.
+        The g2o file, or JSON robot log (JRL). Covariance matrices are inverted exactly. Or the
+        proof of a model.
+    proof : Path, str or None
+        The proof of a graph, JSON: cost, poses with their multipliers, the pose that is grounded,
+        and eta.
     skip_unknown : bool
         Whether lines with unknown tags are left out, as they were for the solve.
 
@@ -325,13 +199,16 @@ def verify_proof(
     >>> found.is_verified, found.bound.str(10, radius=False)
     (True, '97.01402085')
     """
-    for name, given_path in (("graph", graph), ("proof", proof)):
+    paths = {"graph": graph} if proof is None else {"graph": graph, "proof": proof}
+    for name, given_path in paths.items():
         # Not by `door`, which imports another room.
         if not isinstance(given_path, str | Path):
             raise SettingError(f"{name} is {given_path!r:.60}; give the path of a file")
     if not isinstance(skip_unknown, bool):
         raise SettingError(f"skip_unknown is {skip_unknown!r:.60}; give True or False")
     path = Path(graph)
+    if proof is None:
+        return verify_model(path)
     read = read_robot_log if path.suffix == LOG_SUFFIX else read_graph
     measured = read(path, skip_unknown)
     given = read_proof(Path(proof), measured.d)

@@ -15,9 +15,15 @@ _INDENT = 13  # columns of the labels of a verification
 
 def verify_command(
     graph: Annotated[
-        str, typer.Argument(help="The g2o file or robot log, or the name of a data set.")
+        str,
+        typer.Argument(
+            help="The g2o file or robot log, or the name of a data set; or the proof of a cvxpy "
+            "model alone."
+        ),
     ],
-    proof: Annotated[Path, typer.Argument(help="The proof, of pgo solve --proof.")],
+    proof: Annotated[
+        Path | None, typer.Argument(help="The proof of a graph, of pgo solve --proof.")
+    ] = None,
     skip_unknown: SkipUnknownOption = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -25,7 +31,8 @@ def verify_command(
     """Run `pgo verify`."""
     from pgo_models.verification.verify import verify_proof  # needs the extra `verify`
 
-    verification = verify_proof(locate(graph), proof, skip_unknown=skip_unknown)
+    path = Path(graph) if proof is None else locate(graph)
+    verification = verify_proof(path, proof, skip_unknown=skip_unknown)
     text = wrapped(str(verification), _INDENT)
     record = verification.as_json if as_json else None
     save_then_show([], lambda: typer.echo(text), record, quiet)

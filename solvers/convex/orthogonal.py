@@ -17,6 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
+from pathlib import Path
 
 import cvxpy as cp
 import numpy as np
@@ -360,6 +361,16 @@ class OrthogonalSolution(Summarised):
     def is_certified(self) -> bool:
         """Whether the values are proven to be globally optimal within the gap of the verdict."""
         return self.certificate.is_certified
+
+    def save_proof(self, path: Path | str) -> None:
+        """Write what proves the lower bound, for `pgo verify` and `verify_proof`.
+
+        Parameters
+        ----------
+        path : Path or str
+            The file, JSON; errors are those of `ModelCertificate.save_proof`.
+        """
+        self.certificate.save_proof(path)
 
     @property
     def status(self) -> Status:

@@ -97,7 +97,6 @@ OF_THEIR_OWN: dict[str, dict[str, str]] = {
     "solve_orthogonal": {"problem": "on_circle"},
     "exp_map": {"w": "t"},
     "verify_proof": {"graph": "path"},
-    "verify_model_proof": {"proof": "path"},
     "project_to_rotations": {"A": "R"},
     "read_kitti": {"path": "kitti"},
 }

@@ -84,12 +84,12 @@ def test_products_of_hulls_certify_what_equations_do_not(
     assert solution.gap <= 1e-9
     path = tmp_path / "proof.json"
     solution.certificate.save_proof(path)
-    assert pgo.verify_model_proof(path).is_verified
+    assert pgo.verify_proof(path).is_verified
     record = json.loads(path.read_text())
 
     def verified(**changes):
         path.write_text(json.dumps({**record, **changes}))
-        return pgo.verify_model_proof(path)
+        return pgo.verify_proof(path)
 
     assert not verified(products=[]).is_verified  # equations alone do not prove it
     negative = json.loads(json.dumps(record["products"]))
@@ -116,14 +116,14 @@ def test_proofs_are_verified_exactly_and_tampered_ones_rejected(kind, shape, cou
     path = tmp_path / "proof.json"
     certificate = solvers.solve_orthogonal(random_model(0, kind, shape, count), 0).certificate
     certificate.save_proof(path)
-    found = pgo.verify_model_proof(path)
+    found = pgo.verify_proof(path)
     assert found.is_verified, found.failure
     assert certificate.bound.value <= found.bound
     record = json.loads(path.read_text())
 
     def is_verified(**changes) -> bool:
         path.write_text(json.dumps({**record, **changes}))
-        return pgo.verify_model_proof(path).is_verified
+        return pgo.verify_proof(path).is_verified
 
     raised = float(found.bound) + 1e-9 * abs(float(found.bound))
     assert not is_verified(lower_bound=raised)
@@ -134,6 +134,8 @@ def test_proofs_are_verified_exactly_and_tampered_ones_rejected(kind, shape, cou
     assert not is_verified(variables=variables)
     with pytest.raises(pgo.PGOError, match="not a proof of a model"):
         is_verified(variables=3)
+    with pytest.raises(pgo.PGOError, match="give it alone"):
+        pgo.verify_proof("data/grid.g2o", path)
 
 
 def poses_of_graph(graph, *, is_anchored: bool):
@@ -190,16 +192,16 @@ def test_a_model_that_a_common_rotation_leaves_as_it_is_has_one_variable_held(
     assert solution.gap <= 1e-12
     path = tmp_path / "proof.json"
     solution.certificate.save_proof(path)
-    assert pgo.verify_model_proof(path).is_verified
+    assert pgo.verify_proof(path).is_verified
     record = json.loads(path.read_text())
     # neither may another objective be turned, nor entries in another order
     record["P"][0][2] *= 1.0 + 1e-12
     path.write_text(json.dumps(record))
-    assert "turning" in pgo.verify_model_proof(path).failure
+    assert "turning" in pgo.verify_proof(path).failure
     record["P"][0][2] = record["P"][1][2]
     record["held"]["entries"][0].reverse()
     path.write_text(json.dumps(record))
-    assert "turning" in pgo.verify_model_proof(path).failure
+    assert "turning" in pgo.verify_proof(path).failure
     # a term for one rotation holds all of them
     anchored = cp.Problem(cp.Minimize(J + cp.sum_squares(R[0] - np.eye(d))))
     values = solution.values
