@@ -96,6 +96,8 @@ def read_g2o(
     - BR, a point by bearing and range with their standard deviations, becomes a point with the
       covariance to first order, an approximation.
     - EDGE_SE3_PRIORQUAT, a rotation with its w first, has the information of a rotation vector.
+    - EDGE_SE3_PRIORVEC, a direction of the world and what the pose has measured of it, such as
+      gravity, measures the tilt of the pose.
     - Switchable edges hold always. Switches, robust kernels and data of sensors are not used.
     - EQUIV, which names edges that TORO may contract, is skipped.
     - An id of a pose that is a landmark's, too, names two things; a power of ten is added to the
@@ -108,7 +110,7 @@ def read_g2o(
     The robot of a pose is found in one of three ways:
 
     (a) Every id is a GTSAM symbol, which has a letter in its top byte. The letters in use, sorted,
-        number the robots.
+        number the robots. Landmarks whose letter is that of no pose belong to who sees them first.
     (b) Some id is no symbol, and the folder has several files. A pose belongs to the first file
         with a VERTEX line of it, or, if there is none, to the first file with an edge of it. The
         order of the files is 0, 1, .., 9, 10.
@@ -750,7 +752,7 @@ def _robots(
     ids: IntArray, files: list[G2OLines], letters_of_robots: Sequence[int]
 ) -> IntArray | None:
     """Robot of every pose by the cases (a) and (b) of `read_g2o`; None in case (c)."""
-    letters, _ = robot_letters(ids)
+    letters = _letters_of_owners(ids, files)
     if np.isin(letters, letters_of_robots).all():
         return _ranks(letters)
     if len(files) == 1:
@@ -766,6 +768,23 @@ def _robots(
             has_no_owner = owner[poses] < 0
             owner[poses[has_no_owner]] = robot
     return _ranks(owner)
+
+
+def _letters_of_owners(ids: IntArray, files: list[G2OLines]) -> IntArray:
+    """Codes of the letters of ids; a landmark that shares none with a pose has its observer's."""
+    letters, _ = robot_letters(ids)
+    is_landmark = np.isin(ids, np.concatenate([file.landmarks for file in files]))
+    of_poses = letters[~is_landmark]
+    nameless = np.flatnonzero(is_landmark & ~np.isin(letters, of_poses))
+    if not len(nameless) or not len(of_poses):
+        return letters
+    letters[nameless] = of_poses[0]
+    edges = np.concatenate([file.edge_ids for file in files])
+    edges = edges[np.isin(edges[:, 1], ids[nameless]) & (edges[:, 0] != WORLD_ID)]
+    seen, first_sight = np.unique(edges[:, 1], return_index=True)
+    observers = np.searchsorted(ids, edges[first_sight, 0])
+    letters[np.searchsorted(ids, seen)] = letters[observers]
+    return letters
 
 
 def _ranks(values: IntArray) -> IntArray:

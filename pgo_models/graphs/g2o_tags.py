@@ -15,7 +15,8 @@ hdl_graph_slam. Numbers are brought into the order of EDGE_SE2 and EDGE_SE3:QUAT
 - Vertigo (Suenderhauf & Protzel 2012): switches.
 - hdl_graph_slam (Koide et al. 2019): `edge_se3_priorquat.hpp`. Its error is the difference of the
   vector parts of two quaternions. To first order this is half the rotation vector, like the error
-  of EDGE_SE3:QUAT.
+  of EDGE_SE3:QUAT. `edge_se3_priorvec.hpp`: a direction of the world and what the pose has measured
+  of it, both of length one. Its error is their difference in the frame of the pose.
 """
 
 import enum
@@ -25,7 +26,13 @@ import numpy as np
 
 from pgo_models.files import LARGEST
 from pgo_models.geometry.arrays import triangle_places
-from pgo_models.geometry.rotations import Array, BoolArray, exp_map, quaternions_from_rotations
+from pgo_models.geometry.rotations import (
+    Array,
+    BoolArray,
+    exp_map,
+    hat,
+    quaternions_from_rotations,
+)
 from pgo_models.graphs.precisions import are_definite
 from pgo_models.graphs.weight_errors import (
     SINGULAR,
@@ -39,6 +46,8 @@ from pgo_models.graphs.weight_errors import (
 
 # Difference of two entries, beside the largest, by which a complete matrix is not symmetric.
 _ASYMMETRY = 1e-6
+# Of the squares and products of measured directions of length one, which are scaled to it.
+_DIRECTION_ERROR = 2.0**-44
 
 
 class Noise(enum.Enum):
@@ -58,7 +67,8 @@ class Tag:
     The noise is the upper triangle of an information matrix, row by row, unless `noise` says
     otherwise; with `is_complete` it is the whole matrix. A point has d numbers, or bearing and
     range with DEVIATIONS, and its matrix is d x d. A rotation in space is a quaternion, its w
-    first, and its matrix is 3 x 3. The ids of PARAMS_SE2OFFSET or PARAMS_SE3OFFSET lines,
+    first, and its matrix is 3 x 3. So is that of a direction, which is one of the world, then the
+    measured one. The ids of PARAMS_SE2OFFSET or PARAMS_SE3OFFSET lines,
     `num_offsets` of them, or those of switches, `num_switches`, may stand between ids and numbers.
     Poses of TORO in space have roll, pitch and yaw in place of a quaternion. The triangle of EDGE2
     is in another order, which `g2o_dialects` settles.
@@ -73,6 +83,7 @@ class Tag:
     num_switches: int = 0
     is_toro: bool = False
     is_rotation: bool = False
+    is_direction: bool = False
     is_complete: bool = False
     noise: Noise = Noise.INFORMATION
 
@@ -107,6 +118,9 @@ class Tag:
             is_wrong = np.asarray((numbers[:, 1:] <= 0.0).any(axis=1))
             problem = "range and standard deviations are not all positive; correct or remove it"
             return is_wrong, problem
+        if self.is_direction:
+            is_wrong = np.asarray(~numbers[:, :3].any(axis=1) | ~numbers[:, 3:6].any(axis=1))
+            return is_wrong, "a direction of length zero is none; correct or remove it"
         if self.noise is Noise.COVARIANCE:
             covariances = numbers[:, self.num_measured + triangle_places(self._side)]
             is_covariance = are_definite(covariances, SINGULAR)
@@ -122,8 +136,9 @@ class Tag:
 
         They are 0 where the lines have the information itself, and inf where rounding hides it.
         """
+        of_direction = np.full(len(numbers), _DIRECTION_ERROR if self.is_direction else 0.0)
         if not self.is_edge or self.noise in (Noise.INFORMATION, Noise.MISSING):
-            return np.zeros(len(numbers))
+            return of_direction
         places = triangle_places(self._side)
         information = self._with_information(numbers)[:, self.num_measured + places]
         if self.noise is Noise.COVARIANCE:
@@ -138,7 +153,7 @@ class Tag:
             largest = precisions[:, :, None] * np.eye(2)
             everywhere = np.ones((len(numbers), 2, 2))
             error = entry_error(information, congruence_error(everywhere, largest))
-        return both(error, precision_error(information, self.d))
+        return both(both(error, precision_error(information, self.d)), of_direction)
 
     def triangles_of_complete(self, numbers: Array) -> tuple[Array, BoolArray]:
         """Numbers with the upper triangle of a complete matrix, and whether that is symmetric."""
@@ -157,6 +172,8 @@ class Tag:
             return self._rows_of_points(numbers)
         if self.is_rotation:
             return _rows_of_rotations(numbers)
+        if self.is_direction:
+            return _rows_of_directions(numbers)
         if not self.is_toro:
             return numbers
         return _with_quaternions(numbers) if self.d == 3 else numbers
@@ -164,13 +181,16 @@ class Tag:
     @property
     def _side(self) -> int:
         """Rows of the information matrix."""
-        return self.d if self.is_point or self.is_rotation else 3 * self.d - 3
+        is_small = self.is_point or self.is_rotation or self.is_direction
+        return self.d if is_small else 3 * self.d - 3
 
     @property
     def num_measured(self) -> int:
         """How many numbers the measurement has."""
         if self.is_rotation:
             return 4
+        if self.is_direction:
+            return 6
         return 7 if self.has_quaternion else self._side
 
     @property
@@ -237,6 +257,31 @@ def _rows_of_rotations(numbers: Array) -> Array:
     return rows
 
 
+def _rows_of_directions(numbers: Array) -> Array:
+    """Directions n of the world, measured as b, as rows of poses, (k, 28).
+
+    The rotation of a row takes b to n along the shortest way. For R this rotation times
+    exp(hat(w)), R^T n - b is b x w to first order, so that I_rr = hat(b)^T I hat(b). Where I is a
+    multiple of the identity, chi2 of a rotation with this I_rr is that of the direction.
+    """
+    n = numbers[:, :3] / np.linalg.norm(numbers[:, :3], axis=1, keepdims=True)
+    b = numbers[:, 3:6] / np.linalg.norm(numbers[:, 3:6], axis=1, keepdims=True)
+    I = np.zeros((len(numbers), 3, 3))  # noqa: E741 - the name of information matrices
+    rows, columns = np.triu_indices(3)
+    I[:, rows, columns] = numbers[:, 6:]
+    I[:, columns, rows] = numbers[:, 6:]
+    across = hat(b)
+    information = across.mT @ I @ across
+    quaternions = np.concatenate([np.cross(b, n), 1.0 + np.sum(b * n, axis=1)[:, None]], axis=1)
+    # Opposite directions: half a turn about any axis across b.
+    is_opposite = np.linalg.norm(quaternions, axis=1) < 1e-7
+    axes = across[np.arange(len(b)), :, np.argmin(np.abs(b), axis=1)]
+    quaternions[is_opposite, :3] = axes[is_opposite]
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    triangle = information[:, rows, columns]
+    return _rows_of_rotations(np.concatenate([quaternions[:, [3, 0, 1, 2]], triangle], axis=1))
+
+
 def _cartesian(numbers: Array) -> Array:
     """Points (x, y) and the triangles of their information, (n, 5), of points in polar coordinates.
 
@@ -294,6 +339,7 @@ OTHER_TAGS = {
     "EDGE_SE2_SWITCHABLE": Tag(2, 2, num_switches=1),
     "EDGE_SE3_SWITCHABLE": Tag(3, 2, num_switches=1),
     "EDGE_SE3_PRIORQUAT": Tag(3, 1, is_rotation=True),
+    "EDGE_SE3_PRIORVEC": Tag(3, 1, is_direction=True),
 }
 _PLAIN_TAGS = {**G2O_TAGS, **OTHER_TAGS}
 
@@ -365,7 +411,6 @@ SKIPPED_TAGS = {
 REFUSED_TAGS = {
     "EDGE_RANGE": "a range without a bearing",
     "EDGE_SE3_PRIORXY": "a position without its height",
-    "EDGE_SE3_PRIORVEC": "a direction, such as that of gravity,",
     "EDGE_SE3_PLANE": "a plane",
 }
 

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 # Factors that become edges, and what stands on a line with such an edge. GPS measures the position
-# of a pose, a prior on a point that of a landmark.
+# of a pose, a prior on a point that of a landmark. Factors of rotations have no information on
+# positions.
 _FACTORS = {
     "BetweenFactorPose2": Tag(2, 2),
     "BetweenFactorPose3": Tag(3, 2),
@@ -50,6 +51,14 @@ _FACTORS = {
     "PoseTranslationPrior3D": Tag(3, 1, is_point=True),
     "PriorFactorPoint2": Tag(2, 1, is_point=True, to_landmark=True),
     "PriorFactorPoint3": Tag(3, 1, is_point=True, to_landmark=True),
+    "PoseRotationPrior2D": Tag(2, 1),
+    "PoseRotationPrior3D": Tag(3, 1),
+    "PriorFactorRot2": Tag(2, 1),
+    "PriorFactorRot3": Tag(3, 1),
+    "BetweenFactorRot2": Tag(2, 2),
+    "BetweenFactorRot3": Tag(3, 2),
+    "AttitudeFactorPose3": Tag(3, 1, is_direction=True),
+    "AttitudeFactorRot3": Tag(3, 1, is_direction=True),
     "BearingRangeFactor2D": Tag(2, 2, is_point=True, to_landmark=True, noise=Noise.DEVIATIONS),
 }
 _SOURCE = Path("factors of GTSAM")  # in messages, in place of a file
@@ -68,10 +77,12 @@ def from_gtsam(
 ) -> PoseGraph:
     """Make a PoseGraph of a factor graph of GTSAM, to solve it or to certify GTSAM's answer.
 
-    Read are between factors and priors of poses, GPS and other positions of poses, positions of
-    points, and bearing and range in the plane. Their noise models are Gaussian; a factor with a
-    constrained or robust one is no edge with an information matrix. Keys become the ids of the
-    poses, and a letter in a key names the robot.
+    Read are between factors and priors of poses and rotations, GPS and other positions of poses,
+    attitudes, positions of points, and bearing and range in the plane. Of a robust noise model its
+    Gaussian is read, with a warning. A pose whose only prior is a constrained one is an anchor: it
+    is where the prior has it. Other constrained factors are no edges with information matrices.
+    Keys become the ids of the poses, and a letter in the key of a pose names the robot. Slots
+    without a factor, as iSAM2 leaves them, are skipped.
 
     Parameters
     ----------
@@ -112,26 +123,21 @@ def from_gtsam(
         raise SettingError(f"factors are a {type(factors).__name__}; give a NonlinearFactorGraph")
     if values is not None and not isinstance(values, gtsam.Values):
         raise SettingError(f"values are a {type(values).__name__}; give gtsam.Values")
-    by_type: dict[str, Measurements] = {}
-    unreadable: dict[str, list[int]] = {}
-    for place in range(factors.size()):
-        factor = factors.at(place)
-        try:
-            name, ids, numbers = _measurement(gtsam, factor)
-        except _UnreadableFactorError as error:
-            unreadable.setdefault(str(error), []).append(place + 1)
-            continue
-        of_type = by_type.setdefault(name, Measurements(_FACTORS[name]))
-        of_type.places.append(place + 1)
-        of_type.ids.append(ids)
-        of_type.numbers.append(numbers)
+    by_type, unreadable, num_robust = _measurements(gtsam, factors)
     if unreadable:
         _report_unreadable(unreadable, skip_unknown)
+    if num_robust:
+        warnings.warn(
+            f"{num_robust} factors have robust noise models, of which the Gaussian is read; "
+            "solve(graph, robust=solvers.GNC()) finds wrong edges",
+            GraphWarning,
+            stacklevel=2,
+        )
     problems: list[Problem] = []
     d = common_dimension(_SOURCE, [by_type], problems)
     lines = lines_of_measurements(_SOURCE, d, by_type, problems)
     check_lines(_SOURCE, problems + problems_of(lines), "factors")
-    graph = graph_of_files(_SOURCE, [lines], weights, _letters(lines.edge_ids))
+    graph = graph_of_files(_SOURCE, [lines], weights, _letters(lines.edge_ids, lines.landmarks))
     graph = replace(graph, name="gtsam")
     if values is None:
         return graph
@@ -222,48 +228,128 @@ def poses_in_gtsam(gtsam: ModuleType, poses: Poses) -> list[Any]:
     return [gtsam.Pose2(t[0], t[1], angle) for t, angle in t_and_angles]
 
 
+def _measurements(
+    gtsam: ModuleType,
+    factors: Any,  # noqa: ANN401
+) -> tuple[dict[str, Measurements], dict[str, list[int]], int]:
+    """Measurements by the type of their factors, factors that are no edges, and robust ones."""
+    by_type: dict[str, Measurements] = {}
+    unreadable: dict[str, list[int]] = {}
+    num_robust = 0
+    num_priors = _num_priors(factors)
+    for place in range(factors.size()):
+        factor = factors.at(place)
+        if factor is None:
+            continue
+        try:
+            name, ids, numbers = _measurement(gtsam, factor, num_priors)
+        except _UnreadableFactorError as error:
+            unreadable.setdefault(str(error), []).append(place + 1)
+            continue
+        num_robust += isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
+        of_type = by_type.setdefault(name, Measurements(_FACTORS[name]))
+        of_type.places.append(place + 1)
+        of_type.ids.append(ids)
+        of_type.numbers.append(numbers)
+    return by_type, unreadable, num_robust
+
+
+def _num_priors(factors: Any) -> int:  # noqa: ANN401
+    """Number of factors that are priors."""
+    names = [type(factors.at(place)).__name__ for place in range(factors.size())]
+    return sum(name in _FACTORS and _FACTORS[name].num_ids == 1 for name in names)
+
+
 def _measurement(
     gtsam: ModuleType,
     factor: Any,  # noqa: ANN401
+    num_priors: int,
 ) -> tuple[str, list[int], list[float]]:
     """Type of a factor, its ids, and the numbers of its measurement and its noise."""
     name = type(factor).__name__
     if name not in _FACTORS:
         raise _UnreadableFactorError(name)
     kind = _FACTORS[name]
-    noise = factor.noiseModel()
-    is_gaussian = isinstance(noise, gtsam.noiseModel.Gaussian)
-    if not is_gaussian or noise.isConstrained():
-        raise _UnreadableFactorError(f"{name} with {type(noise).__name__} noise")
+    information = _information(gtsam, name, factor.noiseModel(), num_priors)
     keys = [int(key) for key in list(factor.keys())]
     ids = [WORLD_ID, *keys] if kind.num_ids == 1 else keys
     if kind.noise is Noise.DEVIATIONS:
-        information = noise.information()
         if information[0, 1] != 0.0:
             raise _UnreadableFactorError(f"{name} with correlated noise")
         value = factor.measured()
         deviations = np.diag(information) ** -0.5
         return name, ids, [value.bearing().theta(), value.range(), *deviations.tolist()]
+    if kind.is_direction:
+        return name, ids, _numbers_of_attitude(name, factor, information)
     if name == "GPSFactor":
         value = factor.measurementIn()
     else:
         value = factor.prior() if name.startswith("PriorFactor") else factor.measured()
-    information = noise.information()
-    if len(information) == 6:
+    numbers = _numbers_of(value)
+    if "Rot" in name:
+        information = _of_rotation_alone(information)
+        numbers = [0.0, 0.0, *numbers] if kind.d == 2 else [0.0, 0.0, 0.0, *numbers]
+    elif len(information) == 6:
         information = information[np.ix_(TRANSLATION_FIRST, TRANSLATION_FIRST)]
     triangle = information[np.triu_indices(len(information))]
-    return name, ids, [*_numbers_of(value), *triangle.tolist()]
+    return name, ids, [*numbers, *triangle.tolist()]
+
+
+def _information(
+    gtsam: ModuleType,
+    name: str,
+    noise: Any,  # noqa: ANN401
+    num_priors: int,
+) -> Array:
+    """Information matrix of a noise model; the identity for a constrained prior with no other."""
+    kind = type(noise).__name__
+    if isinstance(noise, gtsam.noiseModel.Robust):
+        noise = noise.noise()
+    is_gaussian = isinstance(noise, gtsam.noiseModel.Gaussian)
+    if not is_gaussian:
+        raise _UnreadableFactorError(f"{name} with {kind} noise")
+    if not noise.isConstrained():
+        return np.asarray(noise.information())
+    is_of_pose = name.startswith("PriorFactor") and not _FACTORS[name].to_landmark
+    if not is_of_pose or noise.sigmas().any():
+        raise _UnreadableFactorError(f"{name} with {kind} noise")
+    if num_priors > 1:
+        raise _UnreadableFactorError(f"{name} with {kind} noise beside other priors")
+    return np.eye(len(noise.sigmas()))
+
+
+def _numbers_of_attitude(name: str, factor: Any, information: Array) -> list[float]:  # noqa: ANN401
+    """Numbers of EDGE_SE3_PRIORVEC: nRef in the frame of the world, bMeasured in that of the pose.
+
+    Both errors, of two numbers in GTSAM and of three here, have the length of the difference of the
+    directions to first order.
+    """
+    weight = information[0, 0]
+    if (information != weight * np.eye(2)).any():
+        raise _UnreadableFactorError(f"{name} with noise that is not isotropic")
+    directions = [*factor.nRef().point3(), *factor.bMeasured().point3()]
+    return [*map(float, directions), weight, 0.0, 0.0, weight, 0.0, weight]
+
+
+def _of_rotation_alone(information: Array) -> Array:
+    """Information of a pose of which a rotation is known, with its information, (p, p)."""
+    p = len(information)
+    d = 3 if p == 3 else 2
+    whole = np.zeros((d + p, d + p))
+    whole[d:, d:] = information
+    return whole
 
 
 def _numbers_of(value: Any) -> list[float]:  # noqa: ANN401
-    """Numbers of a pose or point, as on a line of a g2o file."""
+    """Numbers of a pose, rotation or point, as on a line of a g2o file."""
     if isinstance(value, np.ndarray):
         return [float(number) for number in value]
     if hasattr(value, "theta"):
-        return [value.x(), value.y(), value.theta()]
-    quaternion = value.rotation().toQuaternion()
-    xyz = [quaternion.x(), quaternion.y(), quaternion.z()]
-    return [value.x(), value.y(), value.z(), *xyz, quaternion.w()]
+        return [value.x(), value.y(), value.theta()] if hasattr(value, "x") else [value.theta()]
+    if not hasattr(value, "rotation"):
+        quaternion = value.toQuaternion()
+        return [quaternion.x(), quaternion.y(), quaternion.z(), quaternion.w()]
+    return [value.x(), value.y(), value.z(), *_numbers_of(value.rotation())]
 
 
 def _report_unreadable(unreadable: dict[str, list[int]], skip_unknown: bool) -> None:
@@ -278,9 +364,9 @@ def _report_unreadable(unreadable: dict[str, list[int]], skip_unknown: bool) -> 
     warnings.warn(f"left out: {text}", GraphWarning, stacklevel=3)
 
 
-def _letters(ids: IntArray) -> list[int]:
-    """Codes of the letters in the top bytes of the keys. Each letter names a robot."""
-    named = ids[ids != WORLD_ID]
+def _letters(ids: IntArray, landmarks: IntArray) -> list[int]:
+    """Codes of the letters in the top bytes of the keys of poses. Each letter names a robot."""
+    named = ids[(ids != WORLD_ID) & ~np.isin(ids, landmarks)]
     codes = np.unique(named >> 56).tolist()
     return [int(code) for code in codes if code > 0]
 
@@ -297,6 +383,10 @@ def _poses_of_values(gtsam: ModuleType, values: Any, graph: PoseGraph) -> Poses:
             raise GraphError(f"the values have no pose {name}; give one for every key")
         if place in graph.landmarks:
             t[place] = values.atPoint2(key) if d == 2 else values.atPoint3(key)
+            continue
+        if not graph.has_translations:
+            rotation = values.atRot2(key) if d == 2 else values.atRot3(key)
+            R[place] = rotation.matrix()
             continue
         pose = values.atPose2(key) if d == 2 else values.atPose3(key)
         R[place] = pose.rotation().matrix()

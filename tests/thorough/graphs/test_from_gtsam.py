@@ -130,14 +130,20 @@ def test_landmarks_are_read_from_bearings_and_ranges() -> None:
         pgo.to_gtsam(graph)
 
 
-def test_factors_of_other_kinds_are_named_and_counted() -> None:
+def test_robust_noise_gives_its_gaussian_and_other_kinds_are_named_and_counted() -> None:
     factors, values = pose2_slam_example()
+    plain = pgo.from_gtsam(factors)
     huber = gtsam.noiseModel.mEstimator.Huber.Create(1.0)
     robust = gtsam.noiseModel.Robust.Create(huber, sigmas(0.2, 0.2, 0.1))
     factors.add(gtsam.BetweenFactorPose2(x(1), x(2), gtsam.Pose2(2, 0, 0), robust))
-    with pytest.raises(GraphError, match=r"1 BetweenFactorPose2 with Robust noise \(first: fac"):
+    with pytest.warns(GraphWarning, match="1 factors have robust noise .*robust=solvers.GNC"):
+        graph = pgo.from_gtsam(factors)
+    np.testing.assert_array_equal(graph.information[-1], plain.information[1])
+    factors.remove(6)  # iSAM2 leaves such slots
+    factors.add(gtsam.PriorFactorPoint2(x(4), np.zeros(2), gtsam.noiseModel.Constrained.All(2)))
+    with pytest.raises(GraphError, match=r"1 PriorFactorPoint2 with Constrained .*first: factor 8"):
         pgo.from_gtsam(factors)
-    with pytest.warns(GraphWarning, match="left out: .*Robust noise"):
+    with pytest.warns(GraphWarning, match="left out: .*Constrained noise"):
         graph = pgo.from_gtsam(factors, skip_unknown=True)
     assert graph.num_edges == 6
     values.erase(x(3))
@@ -146,6 +152,77 @@ def test_factors_of_other_kinds_are_named_and_counted() -> None:
         pytest.raises(GraphError, match="no pose x3; give one for every key"),
     ):
         pgo.from_gtsam(factors, values, skip_unknown=True)
+
+
+def test_a_constrained_prior_is_an_anchor_unless_others_place_the_map() -> None:
+    factors, _ = pose2_slam_example()
+    free = solvers.solve(pgo.from_gtsam(factors))
+    held_at = gtsam.Pose2(5, 6, 0.7)
+    factors.remove(0)
+    factors.add(gtsam.PriorFactorPose2(x(1), held_at, gtsam.noiseModel.Constrained.All(3)))
+    solution = solvers.solve(pgo.from_gtsam(factors))
+    assert solution.objective == pytest.approx(free.objective, rel=1e-9)
+    np.testing.assert_allclose(solution.poses.t[0], [5.0, 6.0], atol=1e-9, rtol=0)
+    factors.add(gtsam.PriorFactorPose2(x(2), gtsam.Pose2(), sigmas(0.1, 0.1, 0.1)))
+    with pytest.raises(GraphError, match="Constrained noise beside other priors"):
+        pgo.from_gtsam(factors)
+
+
+def turned_poses(rng: np.random.Generator, count: int) -> list[Any]:
+    turns = rng.normal(size=(count, 3))
+    places = 3.0 * rng.normal(size=(count, 3))
+    return [gtsam.Pose3(gtsam.Rot3.RzRyRx(*turn), t) for turn, t in zip(turns, places, strict=True)]
+
+
+def moved(rng: np.random.Generator, pose: Any) -> Any:
+    return pose.compose(gtsam.Pose3.Expmap(0.01 * rng.normal(size=6)))
+
+
+def test_attitudes_and_rotation_priors_cost_what_gtsam_says_to_second_order() -> None:
+    rng = np.random.default_rng(0)
+    poses = turned_poses(rng, 6)
+    factors = gtsam.NonlinearFactorGraph()
+    noise = sigmas(*[0.1] * 6)
+    for k in range(5):
+        step = moved(rng, poses[k].between(poses[k + 1]))
+        factors.add(gtsam.BetweenFactorPose3(x(k), x(k + 1), step, noise))
+    up = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
+    for k, pose in enumerate(poses):
+        measured = pose.rotation().unrotate(up.point3()) + 0.02 * rng.normal(size=3)
+        level = gtsam.noiseModel.Isotropic.Sigma(2, 0.03)
+        factors.add(gtsam.AttitudeFactorPose3(x(k), up, level, gtsam.Unit3(measured)))
+    turned = moved(rng, poses[3]).rotation()
+    factors.add(gtsam.PoseRotationPrior3D(x(3), turned, sigmas(0.05, 0.04, 0.02)))
+    factors.add(gtsam.GPSFactor(x(0), poses[0].translation(), sigmas(0.1, 0.2, 0.3)))
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(x(k), moved(rng, pose))
+    graph = pgo.from_gtsam(factors, optimised(factors, values))
+    problem = pgo.PGOProblem(graph)
+    twice_error = 2.0 * factors.error(optimised(factors, values))
+    assert problem.objective(graph.initial) == pytest.approx(twice_error, rel=1e-2)
+    assert solvers.solve(problem).is_certified
+
+
+def test_graphs_of_rotations_alone_are_read() -> None:
+    rng = np.random.default_rng(1)
+    rotations = [pose.rotation() for pose in turned_poses(rng, 6)]
+    factors = gtsam.NonlinearFactorGraph()
+    values = gtsam.Values()
+    for k, rotation in enumerate(rotations):
+        for step in (1, 2):
+            other = rotations[(k + step) % 6]
+            error = gtsam.Rot3.Expmap(0.02 * rng.normal(size=3))
+            measured = rotation.between(other).compose(error)
+            noise = sigmas(0.1, 0.1, 0.1)
+            factors.add(gtsam.BetweenFactorRot3(x(k), x((k + step) % 6), measured, noise))
+        values.insert(x(k), rotation)
+    factors.add(gtsam.PriorFactorRot3(x(0), rotations[0], gtsam.noiseModel.Constrained.All(3)))
+    graph = pgo.from_gtsam(factors, optimised(factors, values))
+    certificate = solvers.certify(graph, graph.initial, gap=1e-3)
+    assert certificate.is_certified
+    twice_error = 2.0 * factors.error(optimised(factors, values))
+    assert certificate.objective == pytest.approx(twice_error, rel=1e-2)
 
 
 def test_noise_that_no_matrix_of_an_edge_stands_for_is_named() -> None:

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from graphs import assert_says
 
-from pgo_models import PoseGraph, Reading, load, log_map, read_g2o, write_g2o
+from pgo_models import (
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Reading,
+    Weighting,
+    exp_map,
+    load,
+    log_map,
+    read_g2o,
+    write_g2o,
+)
 from pgo_models.errors import FileFormatError, GraphWarning, SettingError
 from pgo_models.graphs.g2o import read_g2o_poses
 from pgo_models.graphs.g2o_tags import COMPLETE_TAGS, TAGS
@@ -151,12 +162,34 @@ def test_a_prior_of_a_rotation_has_w_first(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.information, graph.information)
 
 
+@pytest.mark.parametrize("measured", [[0.1, 0.2, 0.9], [0.0, 0.0, -1.0], [0.0, 0.0, 4.0]])
+def test_chi2_of_a_direction_is_that_of_hdl_graph_slam(
+    tmp_path: Path, measured: list[float]
+) -> None:
+    words = " ".join(map(str, measured))
+    prior = f"EDGE_SE3_PRIORVEC 1 0 0 2 {words} 5 0 0 5 0 5"
+    fixes = [f"EDGE_SE3_PRIORXYZ {k} {k} 2 3 1 0 0 1 0 1" for k in range(2)]
+    graph = read(tmp_path, [EDGE_3D, prior, *fixes])
+    rng = np.random.default_rng(0)
+    poses = Poses(exp_map(rng.normal(size=(3, 3))), rng.normal(size=(3, 3)))
+    world, pose = poses.R[graph.i[1]], poses.R[graph.j[1]]
+    seen = pose.T @ world @ np.array([0.0, 0.0, 1.0])
+    difference = seen - np.array(measured) / np.linalg.norm(measured)
+    costs = PGOProblem(graph, weighting=Weighting.INFORMATION).edge_costs(poses)
+    assert costs[1] == pytest.approx(5.0 * difference @ difference, rel=1e-12)
+
+
+def test_a_direction_of_length_zero_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=":2: a direction of length zero"):
+        read(tmp_path, [EDGE_3D, "EDGE_SE3_PRIORVEC 1 0 0 0 0 0 1 5 0 0 5 0 5"])
+
+
 def test_positions_of_hdl_graph_slam_are_priors(tmp_path: Path) -> None:
     graph = read(tmp_path, [EDGE_3D, "EDGE_SE3_PRIORXYZ 1 3 4 5  2 0 0 2 0 2"])
     assert_same(graph, read(tmp_path, [EDGE_3D, "EDGE_SE3_XYZ_PRIOR 1 3 4 5 2 0 0 2 0 2"]))
 
 
-@pytest.mark.parametrize("tag", ["EDGE_SE3_PRIORXY", "EDGE_SE3_PRIORVEC", "EDGE_SE3_PLANE"])
+@pytest.mark.parametrize("tag", ["EDGE_SE3_PRIORXY", "EDGE_SE3_PLANE"])
 def test_what_is_no_edge_is_refused_with_the_reason(tmp_path: Path, tag: str) -> None:
     with pytest.raises(FileFormatError, match=f":2: {tag} measures a .*--skip-unknown"):
         read(tmp_path, [EDGE_3D, f"{tag} 1 2 3 4"])

@@ -51,8 +51,8 @@ LOADED = {
 REFUSED = {
     "T1_city10000_04.txt": "several hypotheses",
     "example_with_vertices.g2o": "no edges",
-    "goats_15.pyfg": "a range without a bearing",
-    "goats_16.pyfg": "a range without a bearing",
+    "goats_15.pyfg": "a factor graph of PyFG",
+    "goats_16.pyfg": "a factor graph of PyFG",
 }
 
 
