@@ -62,6 +62,18 @@ class Rows:
         )
 
 
+class Owners(NamedTuple):
+    """Ids of poses, ascending, and which robot owns each, (n,) both."""
+
+    ids: IntArray
+    robots: IntArray
+
+    def are_one(self, ends: IntArray) -> BoolArray:
+        """Whether one robot owns both ends of edges, (m, 2), (m,)."""
+        first, second = self.robots[np.searchsorted(self.ids, ends)].T
+        return np.asarray(first == second)
+
+
 class _Joined(NamedTuple):
     """Lines of several files, one file after the other."""
 
@@ -108,7 +120,17 @@ def check_one_graph(files: Sequence[G2OLines]) -> None:
     d = files[0].d
     _check_kinds(files)
     check_places(d, [placed_poses(file) for file in files])
-    check_measurements(d, [measured_edges(file) for file in files])
+    edges = [measured_edges(file) for file in files]
+    check_measurements(d, edges, _first_owners(files))
+
+
+def _first_owners(files: Sequence[G2OLines]) -> Owners:
+    """The first file with a VERTEX line of every pose, or else the first that names it."""
+    ids_of_files = [file.vertex_ids for file in files] + [file.edge_ids.ravel() for file in files]
+    number = np.tile(np.arange(len(files)), 2)
+    named_by = np.repeat(number, [len(ids) for ids in ids_of_files])
+    ids, first = np.unique(np.concatenate(ids_of_files), return_index=True)
+    return Owners(ids, named_by[first])
 
 
 def absent_ids(files: Sequence[G2OLines]) -> IntArray:
@@ -270,7 +292,7 @@ def check_places(d: int, files: Sequence[Rows]) -> None:
     _refuse(files, lines, first_one, problem)
 
 
-def check_measurements(d: int, files: Sequence[Rows]) -> None:
+def check_measurements(d: int, files: Sequence[Rows], owners: Owners) -> None:
     """Raise a FileFormatError where two files measure the same edge with different numbers.
 
     `files` are `measured_edges`, or some of each. Copies with the same numbers, within printing,
@@ -279,7 +301,7 @@ def check_measurements(d: int, files: Sequence[Rows]) -> None:
 
     - where numbers of two files are nearly equal: one has a copy of the other's edge, rounded or
       recomputed, which would count twice, or both measured it, and both count;
-    - where they differ on the step from an id to the next, which is the odometry of one robot: the
+    - where they differ on the step from an id to the next of one robot, which is its odometry: the
       ids are then of two graphs. Other edges may be measured by both robots that they join;
     - where most edges that two files measure are off by more than their own length, or by more than
       1 rad: one may be a wrong closure, and most are edges of another graph.
@@ -295,7 +317,8 @@ def check_measurements(d: int, files: Sequence[Rows]) -> None:
     lengths = np.linalg.norm(lines.numbers[:, :d], axis=1)
     scale = np.maximum(np.maximum(lengths, lines.scale)[earlier], lengths[later])
     is_copy = (apart <= _NEARLY * scale) & (turned <= _NEARLY)
-    is_step = np.abs(np.diff(lines.ids[later], axis=1)).ravel() == 1
+    is_next = np.abs(np.diff(lines.ids[later], axis=1)).ravel() == 1
+    is_step = is_next & owners.are_one(lines.ids[later])
     is_far = (apart > scale) | (turned > 1.0)
     contradicts = (is_step & ~is_copy) | (is_far & (2 * is_far.sum() > len(is_far)))
     if contradicts.sum() > is_copy.sum():

@@ -23,6 +23,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o import edge_rows_to_keep, make_folder, write_g2o
 from pgo_models.graphs.g2o_folder import (
+    Owners,
     Rows,
     are_reprinted,
     check_measurements,
@@ -305,7 +306,10 @@ def join_neighbours(
     parts = [part for _, part in sorted({**received, agent.robot: known.own}.items())]
     if not is_trusted:
         check_places(lines.d, [part.places for part in parts])
-        check_measurements(lines.d, [part.edges for part in parts])
+        ids = np.concatenate([part.edges.ids.ravel() for part in parts])
+        ids, first = np.unique(ids, return_index=True)
+        robots = np.concatenate([part.owners.ravel() for part in parts])[first]
+        check_measurements(lines.d, [part.edges for part in parts], Owners(ids, robots))
     ids_of_ends, rows, numbers_of_ends, owners_of_ends, num_copies = _joined_edges(
         lines.d, parts, agent.robot
     )

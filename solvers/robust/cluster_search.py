@@ -24,6 +24,7 @@ import scipy  # and scipy.special when it is used
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray, log_map
+from pgo_models.graphs.bridges import unchecked_bridges
 from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.initialization import chordal_start
@@ -403,10 +404,31 @@ class ClusterSearch:
             other = self._without_misfits(self._in_place_of_misfits(fit, run))
             if self.sets.is_better(other, fit):
                 return other
-        for other in self.aligned_anew(fit):
+        for other in itertools.chain(self._without_bridges(fit), self.aligned_anew(fit)):
             if self.sets.is_better(other, fit):
                 return other
         return None
+
+    def _without_bridges(self, fit: Fit) -> Iterator[Fit]:
+        """Fits with the largest rejected cluster between two parts in place of their only edge.
+
+        Nothing checks that edge, and other edges between the parts may be far from the map that it
+        makes: these fits begin at the chordal start.
+        """
+        graph = self.sets.problem.graph
+        is_bridge = unchecked_bridges(graph, self.sets.known, fit.kept)
+        for bridge in np.flatnonzero(is_bridge)[: self._most_failures].tolist():
+            kept = fit.kept.copy()
+            kept[bridge] = False
+            is_far = np.zeros(graph.num_poses, dtype=bool)
+            is_far[graph.components(kept)[0]] = True
+            groups = self.clusters.of_edges(~fit.kept & (is_far[graph.i] != is_far[graph.j]))
+            if not self.sets.has_time():
+                return
+            if groups.sizes.max(initial=0) > 1:
+                kept[groups[int(groups.sizes.argmax())]] = True
+                start = chordal_start(inlier_problem(self.sets.problem, kept))
+                yield self._within_thresholds(self.sets.settled(kept, start))
 
     def aligned_anew(self, fit: Fit) -> Iterator[Fit]:
         """Fits with fixes that agree, some of them rejected, in place of all fixes kept.

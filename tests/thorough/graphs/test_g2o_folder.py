@@ -278,20 +278,22 @@ def test_measurements_that_are_repeated_in_one_file_all_count(door: str, tmp_pat
 
 @pytest.mark.parametrize("door", DOORS)
 def test_robots_that_measure_each_other_both_count(door: str, tmp_path: Path) -> None:
-    """Not on steps from an id to the next: these one robot measures."""
+    """From an id to the next, too: only the steps between own poses are measured by one robot."""
     places = [VERTEX.format(pose, pose, 0, 0) for pose in range(4)]
     ends = (EDGE.format(0, 1, 1, 0, 0), EDGE.format(2, 3, 1, 0, 0))
-    for number, (first, second) in enumerate([(2.0, 2.4), (2.0, 2.04)]):
+    measured = [(0, 2.0, 2.4), (0, 2.0, 2.04), (1, 1.0, 1.2)]
+    for number, (i, first, second) in enumerate(measured):
         folder = tmp_path / str(number)
         folder.mkdir()
         (folder / "0.g2o").write_text(
-            "".join(places[:2]) + ends[0] + EDGE.format(0, 2, first, 0, 0)
+            "".join(places[:2]) + ends[0] + EDGE.format(i, 2, first, 0, 0)
         )
         (folder / "1.g2o").write_text(
-            "".join(places[2:]) + ends[1] + EDGE.format(0, 2, second, 0, 0)
+            "".join(places[2:]) + ends[1] + EDGE.format(i, 2, second, 0, 0)
         )
-    DOORS[door](tmp_path / "0")
-    assert read_g2o(tmp_path / "0").num_edges == 4
+    for number in ("0", "2"):
+        DOORS[door](tmp_path / number)
+        assert read_g2o(tmp_path / number).num_edges == 4
     with pytest.raises(FileFormatError, match="the edge from 0 to 2 is nearly that at"):
         DOORS[door](tmp_path / "1")
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.special
-from wrong_edges import ring_road, spoiled
+from wrong_edges import noisy_sphere, ring_road, spoiled
 
 import pgo_models as pgo
 import solvers
@@ -163,6 +163,22 @@ def test_a_wrong_run_that_is_kept_goes_as_a_whole_and_right_ones_take_its_place(
     kept = search.sets.known.copy()
     kept[np.flatnonzero(is_wrong)[:5]] = True
     poses = polish(inlier_problem(problem, kept), pgo.odometry_start(graph))
+    np.testing.assert_array_equal(search.improved(kept, poses).kept, ~is_wrong)
+
+
+def test_right_closures_take_the_place_of_a_wrong_edge_that_alone_joins_two_robots() -> None:
+    """No residual speaks against it, and from the map that it makes right ones are far."""
+    robots = np.repeat(np.arange(3), 60)
+    sphere = noisy_sphere(180, 18, NoiseModel(0.02, 0.02), 0).with_robots(robots)
+    graph, is_wrong = spoiled(sphere, 0.3, "random", 0)
+    problem = pgo.PGOProblem(graph)
+    search = search_of(problem)
+    first, second = np.sort([graph.robots[graph.i], graph.robots[graph.j]], axis=0)
+    kept = search.sets.known | (~is_wrong & (first == second))
+    kept[np.flatnonzero(is_wrong & (first == 0) & (second == 2))[0]] = True
+    kept[np.flatnonzero(is_wrong & (first == 0) & (second == 1))[0]] = True
+    inliers = inlier_problem(problem, kept)
+    poses = polish(inliers, pgo.chordal_start(inliers))
     np.testing.assert_array_equal(search.improved(kept, poses).kept, ~is_wrong)
 
 
