@@ -64,8 +64,8 @@ class RobotsSolution(Summarised):
     num_rejected : int, optional
         Number of edges that a robust solve has left out; None where none were judged.
     num_bridges : int
-        Number of edges kept that are the only ones between two parts of the team, so that nothing
-        checks them. That a robot's own odometry may have gaps is not looked at.
+        Number of edges that a robust solve has kept and that are the only ones between two parts of
+        the map, so that nothing checks them.
     """
 
     name: str

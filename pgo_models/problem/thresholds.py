@@ -6,6 +6,7 @@ They are made for either weighting, F or chi2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # and scipy.special when it is used
@@ -131,20 +132,38 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     scale = _median_ratio(cost, right_costs)
     quantile = 1.0 - FALSE_ALARM / max(graph.num_edges, 1)
     allowed = scale * right_costs.quantiles(quantile)
-    # All edges together: the sum is taken for a scaled chi^2 with the same mean and variance.
-    redundancy = _redundancy(graph, right_costs.rank, has_translations)
-    sum_w, sum_w2, _ = right_costs.sums.sum(axis=0)
-    mean = redundancy * sum_w
-    half_variance = redundancy * sum_w2
+    sums = right_costs.sums.sum(axis=0)[:2]
+    unknowns = _num_unknowns(graph, has_translations)
+    fit = overall_fit(float(cost.sum()), sums, unknowns, right_costs.rank)
+    return EdgeResiduals(translation, rotation, cost, allowed, scale, *fit)
+
+
+class OverallFit(NamedTuple):
+    """`overall`, `overall_allowed` and `freedom` of `EdgeResiduals`."""
+
+    overall: float
+    allowed: float
+    freedom: float
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether the sum of the costs exceeds its threshold."""
+        return self.overall > self.allowed
+
+
+def overall_fit(cost: float, sums: Array, unknowns: int, rank: int) -> OverallFit:
+    """How all edges fit together, by their cost, and sums of w and w^2 of `RightCosts`, (2,).
+
+    The cost is taken for a scaled chi^2 with the same mean and variance.
+    """
+    redundancy = 1.0 - unknowns / max(rank, 1)
+    mean, half_variance = redundancy * sums
     overall = 0.0
     dof = 1.0
     if mean > 0.0:
-        overall = float(cost.sum() / mean)
-        dof = mean**2 / half_variance
-    overall_allowed = float(scipy.special.chdtri(dof, FALSE_ALARM) / dof)
-    return EdgeResiduals(
-        translation, rotation, cost, allowed, scale, overall, overall_allowed, float(dof)
-    )
+        overall = float(cost / mean)
+        dof = float(mean**2 / half_variance)
+    return OverallFit(overall, float(scipy.special.chdtri(dof, FALSE_ALARM) / dof), dof)
 
 
 def _right_costs_of(problem: PGOProblem | PoseGraph) -> RightCosts:
@@ -164,15 +183,14 @@ def _median_ratio(cost: Array, right_costs: RightCosts) -> float:
     return max(1.0, float(np.median(ratios)))
 
 
-def _redundancy(graph: PoseGraph, rank: int, has_translations: bool) -> float:
-    """1 - u / rank for u unknowns."""
+def _num_unknowns(graph: PoseGraph, has_translations: bool) -> int:
+    """Numbers of all poses but one."""
     d = graph.d if has_translations else 0
     p = tangent_dimension(graph.d)
     num_points = len(graph.landmarks)
     num_other_poses = graph.num_poses - num_points
     # One pose is fixed.
-    unknowns = (d + p) * (num_other_poses - 1) + d * num_points
-    return 1.0 - unknowns / max(rank, 1)
+    return (d + p) * (num_other_poses - 1) + d * num_points
 
 
 def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:

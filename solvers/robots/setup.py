@@ -25,7 +25,6 @@ from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import FileFormatError, GraphError, GraphWarning, printable
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.bridges import bridges
 from pgo_models.graphs.g2o_folder import copies_within_printing
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, least_tree
@@ -127,19 +126,6 @@ class OpenedFiles:
     num_absent: int
     num_rejected: int = 0
     threshold_scale: float = 1.0
-
-    @property
-    def num_bridges(self) -> int:
-        """Number of edges between robots that are bridges of the graph of robots.
-
-        Nothing checks these. A robot is one node, whatever gaps its own odometry has.
-        """
-        owners = []
-        for robot, border in enumerate(self.borders):
-            is_first = border.owners.min(axis=1) == robot
-            owners.append(np.repeat(border.owners[is_first], border.num_edges[is_first], axis=0))
-        i, j = np.concatenate(owners).T
-        return len(bridges(i, j, np.ones(len(self.borders), dtype=bool)))
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
         """The same robots with other edges; `borders` are their borders with these.

@@ -149,8 +149,7 @@ class ClusterSearch:
         how many are expected below 1 at most. Of more than a hundred, a hundred are looked at.
         """
         [(number, deviation)] = self._numbers_between(fit, 1.0, _FAR)
-        p = self.sets.motion_dimension
-        return (number + 2.0 * deviation) / float(_FAR ** (0.5 * p) - 1.0)
+        return wrong_ones_within(number, deviation, self.sets.motion_dimension)
 
     def _numbers_between(self, fit: Fit, *multiples: float) -> list[tuple[float, float]]:
         """How many rejected edges lie between each two multiples of their thresholds.
@@ -493,3 +492,12 @@ class ClusterSearch:
     def _most_failures(self) -> int:
         """Clusters that are tried in a row without success, or for an exchange, at most."""
         return max(1, min(_MOST_FAILURES, _MOST_WORK // self.sets.problem.num_poses))
+
+
+def wrong_ones_within(number: float, deviation: float, p: int) -> float:
+    """Most wrong edges to expect within their thresholds, of so many within four times these.
+
+    `deviation` is the standard deviation of their number, p how many numbers a motion has; see
+    `ClusterSearch.expected_by_chance`.
+    """
+    return (number + 2.0 * deviation) / float(_FAR ** (0.5 * p) - 1.0)

@@ -23,6 +23,7 @@ from solvers.robust.rivals import Rival
 _NEAR = 4.0
 # Edges that are named in a row of the summary, at most.
 _MAX_NAMED = 5
+MISFIT = "the edges kept do not fit together"
 # Share of the closures kept that may be wrong by chance without a doubt; one closure always may.
 _TOLERATED_SHARE = 0.05
 
@@ -167,17 +168,15 @@ class Rejection(Summarised):
         if num_bridges:
             doubts.append(text_of_bridges(num_bridges))
         if self.is_misfit:
-            doubts.append("the edges kept do not fit together")
+            doubts.append(MISFIT)
         if self.rival is not None:
             doubts.append(self._text_of_rival(self.rival))
         num_fixes = int(self._suspected_fixes.sum())
         num_lost = int((self._suspected_fixes & self.rejected).sum())
         if 2 * num_lost > num_fixes:
             doubts.append(f"{num_lost} of {num_fixes} fixes are rejected")
-        if self.by_chance > max(1.0, _TOLERATED_SHARE * self.num_closures_kept):
-            number = rounded_up(self.by_chance, 2)
-            doubts.append(f"up to {number} wrong closures are expected to fit this map by chance")
-        return tuple(doubts)
+        by_chance = text_of_chance(self.by_chance, self.num_closures_kept)
+        return (*doubts, by_chance) if by_chance else tuple(doubts)
 
     @property
     def support(self) -> Support:
@@ -363,6 +362,13 @@ def text_of_bridges(number: int) -> str:
     """What is said of so many bridges, at least one."""
     subject = "one edge" if number == 1 else f"each of {number} edges"
     return f"{subject} is the only one between two parts of the map, and nothing checks it"
+
+
+def text_of_chance(number: float, num_kept: int) -> str:
+    """What is said of so many wrong closures that may fit by chance; empty where this is few."""
+    if number <= max(1.0, _TOLERATED_SHARE * num_kept):
+        return ""
+    return f"up to {rounded_up(number, 2)} wrong closures are expected to fit this map by chance"
 
 
 def _summary(attempt: Attempt) -> str:

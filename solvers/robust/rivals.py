@@ -21,7 +21,14 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
-from solvers.robust.chains import QUANTILE, Chains, Closures, cycle_distances, is_whole
+from solvers.robust.chains import (
+    QUANTILE,
+    Chains,
+    Closures,
+    Motions,
+    cycle_distances,
+    is_whole,
+)
 from solvers.robust.edge_sets import EdgeSets, with_edges
 from solvers.robust.revision import Fit, is_held, truncated_cost
 from solvers.robust.weighted_edges import held_together
@@ -31,7 +38,7 @@ from solvers.robust.weighted_edges import held_together
 _LIKELY = 0.05
 # A rival keeps more than this share of the closures kept, of edges that the map rejects and that
 # are beyond so many times their thresholds: one near its threshold makes no other map.
-_SHARE = 0.1
+LEAST_SHARE = 0.1
 _CLEAR = 4.0
 # Rejected closures and clusters that are looked at, at most: each is compared with all others.
 _MOST_SEEDS = 100
@@ -78,7 +85,7 @@ def rival_of(
     improbable = sets.scale * chi2_thresholds(sets.problem, 1.0 - FALSE_ALARM / num_known)
     is_clear = sets.problem.edge_costs(fit.poses) > _CLEAR * sets.allowed
     can_return = ~fit.kept & is_clear
-    least_others = _SHARE * int((fit.kept & ~sets.known).sum())
+    least_others = LEAST_SHARE * int((fit.kept & ~sets.known).sum())
     margin = _margin(sets)
     best: Rival | None = None
     for candidate in _candidates(sets, fit, improbable, attempts):
@@ -209,22 +216,10 @@ def _skipped(sets: EdgeSets, fit: Fit) -> Iterator[_Candidate]:
     poses = (fit.poses.R, fit.poses.t)
     closures = chains.closures(rejected, poses)
     kept_closures = chains.closures(kept, poses)
-    of_one_chain = chains.chain[closures.i] == chains.chain[closures.j]
-    covariance = chains.covariance_at(poses)
-    threshold = sets.scale * float(scipy.special.chdtri(sets.motion_dimension, 1.0 - QUANTILE))
-    against = _spans(kept_closures, chains)
-    votes = []
-    for seed in range(0, len(closures), len(closures) // _MOST_SEEDS + 1):
-        others = np.arange(len(closures))
-        distances = cycle_distances(closures, covariance, np.full(len(others), seed), others)
-        agree = of_one_chain & (distances <= threshold)
-        net = np.where(chains.step_to < 0, 0, _spans(closures[agree], chains) - against)
-        step = int(np.argmax(net))
-        if net[step] > 1:
-            votes.append((int(net[step]), step, seed, agree & _span(closures, step)))
-    votes.sort(key=lambda vote: -vote[0])
     steps: list[int] = []
-    for _, step, seed, agree in votes:
+    for _, step, seed, agree in votes_against_steps(
+        chains, closures, kept_closures, poses, sets.scale
+    ):
         if step in steps or len(steps) == _num_tried(sets):
             continue
         steps.append(step)
@@ -233,6 +228,31 @@ def _skipped(sets: EdgeSets, fit: Fit) -> Iterator[_Candidate]:
         edges[chains.step_to[step]] = False
         moved = _moved_from(fit.poses, chains, step, closures[np.array([seed])])
         yield _Candidate(edges, moved, int(chains.step_to[step]))
+
+
+def votes_against_steps(
+    chains: Chains, rejected: Closures, kept: Closures, poses: Motions, scale: float
+) -> list[tuple[int, int, int, BoolArray]]:
+    """Votes against steps of odometry at poses of a map, the most first.
+
+    By how many rejected closures that agree and span a step outnumber those kept that do, at least
+    two; the pose that the step leads to; one of them; and which of the rejected they are.
+    """
+    of_one_chain = chains.chain[rejected.i] == chains.chain[rejected.j]
+    covariance = chains.covariance_at(poses)
+    threshold = scale * float(scipy.special.chdtri(covariance.shape[1], 1.0 - QUANTILE))
+    against = _spans(kept, chains)
+    votes = []
+    for seed in range(0, len(rejected), len(rejected) // _MOST_SEEDS + 1):
+        others = np.arange(len(rejected))
+        distances = cycle_distances(rejected, covariance, np.full(len(others), seed), others)
+        agree = of_one_chain & (distances <= threshold)
+        net = np.where(chains.step_to < 0, 0, _spans(rejected[agree], chains) - against)
+        step = int(np.argmax(net))
+        if net[step] > 1:
+            votes.append((int(net[step]), step, seed, agree & _span(rejected, step)))
+    votes.sort(key=lambda vote: -vote[0])
+    return votes
 
 
 def _span(closures: Closures, step: int) -> BoolArray:

@@ -1,8 +1,8 @@
 """A robust solve by robots with own files: passes of graduated non-convexity, each from a map.
 
 `solvers.robots.revision` makes a pass, and `solvers.plan` solves for the edges that it keeps. No
-process has the graph, so that attempts, clusters and doubts of `solvers.robust_solves.robust_solve`
-are missing.
+process has the graph, so that attempts and clusters of `solvers.robust_solves.robust_solve` are
+missing.
 """
 
 from __future__ import annotations

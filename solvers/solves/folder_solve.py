@@ -37,11 +37,11 @@ from solvers.robots.paper import check_paper
 from solvers.robots.place import PlaceOfRobots
 from solvers.robots.settings import Robots
 from solvers.robots.setup import OpenedFiles, open_files
+from solvers.robots.support import EdgesKept, edges_kept
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
-from solvers.robust.rejection import text_of_bridges
 from solvers.robust_solves.passes import RobotsAnswer, answer_by_passes
 from solvers.soc.paper import PaperSOC
 from solvers.soc.r_step import RStep
@@ -89,8 +89,9 @@ def solve_folder(
         same, but that the distance of two closures depends a little on which comes first. With GNC
         the robots begin with the pairs of robots between which most closures agree, go on by
         graduated non-convexity on the edges near that map, or on all edges where it is not
-        certified, and take what it keeps where the truncated cost falls. The attempts, clusters and
-        doubts of `solve` take one process that has the graph.
+        certified, and take what it keeps where the truncated cost falls. The attempts and clusters
+        of `solve` take one process that has the graph. The solution is certified where nothing
+        speaks against the edges kept (`solvers.robots.support`).
     robots : Robots, optional
         Where the robots run, and the memory of their driver; who owns which poses is in the files.
     out : Path or str, optional
@@ -174,10 +175,10 @@ class FilesOfRobots:
             opened = answer.opened
             driver = opened.driver
             best, frame, F = answer.holder.move_to_frame(driver, answer.best)
+            kept = None if self.robust is None else edges_kept(opened, best.proof.objective)
             if out is not None:
                 nothing = [None] * len(self.files)
                 driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)
-        is_judged = self.robust is not None
         return RobotsSolution(
             name=name,
             certificate=best.proof,
@@ -189,24 +190,18 @@ class FilesOfRobots:
             F=F,
             note=_note(self.weighting, opened, answer.place.note(best)),
             num_absent=opened.num_absent,
-            robust=_text_of_rejected(opened, answer.rejected_by) if is_judged else "",
-            is_held=not is_judged,
-            num_rejected=opened.num_rejected if is_judged else None,
-            num_bridges=opened.num_bridges,
+            robust="" if kept is None else _text_of_rejected(opened, kept, answer.rejected_by),
+            is_held=kept is None or not kept.doubts,
+            num_rejected=None if kept is None else opened.num_rejected,
+            num_bridges=0 if kept is None else kept.num_bridges,
             seconds=time.perf_counter() - monitor.began,
         )
 
 
-def _text_of_rejected(opened: OpenedFiles, rejected_by: str) -> str:
+def _text_of_rejected(opened: OpenedFiles, kept: EdgesKept, rejected_by: str) -> str:
     """What was left out, and what that is worth."""
-    num_edges = int(opened.sizes[1].sum()) + opened.num_rejected
-    text = (
-        f"{opened.num_rejected} of {num_edges} edges left out, which {rejected_by}; "
-        "the answer is for those kept, and nobody has checked them"
-    )
-    if opened.num_bridges:
-        text += f"; {text_of_bridges(opened.num_bridges)}"
-    return text
+    num_edges = kept.num_edges + opened.num_rejected
+    return f"{opened.num_rejected} of {num_edges} edges left out, which {rejected_by}; {kept.held}"
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:

@@ -147,7 +147,7 @@ def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_pa
     for robot in robots.values():
         assert robot.solution is not None
         assert robot.solution.certificate.is_certified
-        assert not robot.is_certified  # nobody has checked the edges that are kept
+        assert robot.is_certified == robot.solution.is_held
         assert robot.solution.robust.startswith(f"{num_wrong} of {graph.num_edges} edges left out")
     with pytest.raises(SettingError, match=r"other known edges need sharing=Sharing\.MEASUREMENTS"):
         solvers.Robot("a", list(robots), KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))
