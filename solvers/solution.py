@@ -1,5 +1,6 @@
 """Solution: poses, cost, certificate and what each stage did; it prints and saves itself."""
 
+import textwrap
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +43,8 @@ from solvers.robust.rejection import Rejection, Support
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_WIDEST_NAME = 28  # characters of an attempt and of the name of a stage, in lines of 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,11 +380,14 @@ class Solution:
         rows = [f"{label:<12} {text}" for label, text in self._summary()]
         rows.append("")
         lines = self._stage_lines()
-        width = max(14, *(len(line[-5]) for line in lines))
+        longest = max(len(line[-5]) for line in lines)
         for *number, name, iterations, cost, seconds, ending in lines:
             attempt = "".join(f"{text:<8}" for text in number)
+            width = min(max(14, longest), _WIDEST_NAME - len(attempt))
             figures = f" {iterations:>10} {cost:>16} {seconds:>9}" if iterations else ""
-            rows.append(f"{attempt}{name:<{width}}{figures}  {ending}")
+            first, *others = textwrap.wrap(name, width, subsequent_indent="  ")
+            rows.append(f"{attempt}{first:<{width}}{figures}  {ending}")
+            rows += [" " * len(attempt) + other for other in others]
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:

@@ -279,7 +279,9 @@ class Certificate(ReadOnly):
             Pairs of a label and a figure.
         """
         measured = not math.isnan(self.stationarity)
-        stationary = f"   (stationary to {self.stationarity:.2g})" if measured else ""
+        stationary = (
+            f"   (a Newton step saves about {self.stationarity:.2g} of it)" if measured else ""
+        )
         facts = [
             (self.cost, f"{self.cost_text}{stationary}"),
             ("lower bound", f"{self.bound_text}   ({self.proof}; {self.source.value})"),

@@ -71,6 +71,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from pgo_models.certificates.definiteness import (
+    ETA_GROWTH,
     DefiniteProof,
     etas_of_rotations,
     prove_definite,
@@ -332,12 +333,24 @@ def search_forms(
 def _search_bound(
     prove: Callable[[float], LowerBound | None], smallest: float, trace: float, count: int
 ) -> LowerBound:
-    """Bound of one form of `search_forms`."""
+    """Bound of one form of `search_forms`.
+
+    Where the first eta fails, one proof with the eta that leaves no bound says whether any eta
+    between is worth a proof. Far from an optimum none is.
+    """
     # At F = 0 the smallest eta is zero and would never grow.
     least_eta = UNIT_ROUNDOFF * trace / count
     first = max(smallest, least_eta)
     useless_eta = trace / count
-    eta_and_bound = smallest_eta(prove, first, below=useless_eta)
+    if not first < useless_eta:
+        return NO_BOUND
+    bound = prove(first)
+    if bound is not None:
+        return bound if bound.value > 0.0 else NO_BOUND
+    if prove(useless_eta) is None:
+        return NO_BOUND
+    second = ETA_GROWTH * first
+    eta_and_bound = smallest_eta(prove, second, below=useless_eta, too_small=first)
     if eta_and_bound is None:
         return NO_BOUND
     _, bound = eta_and_bound

@@ -236,6 +236,9 @@ class Rejection(Summarised):
         condition = "that the rejected edges are wrong is not proven"
         if self.proof is not None:
             unproven = int((self.rejected & ~self.proof.proven_wrong).sum())
+            if not unproven:
+                proven = f"{rejected}, proven wrong on the condition that follows"
+                return f"{bound}; {proven}; that all others are right is not proven."
             condition = f"that {unproven} of these are wrong is not proven"
         return f"{bound}; {rejected}, and {condition}, nor that all others are right."
 

@@ -135,6 +135,8 @@ class Comparison(Summarised):
             "gaps are to the bound, over F",
             "rounds, all-reduces and MB: where they are counted; seconds a robot: side by side",
         ]
+        if graph.information is not None:
+            notes.append("F is what pgo solve minimises with --cost isotropic, and chi2 without")
         if not self.is_complete:
             notes.append("interrupted: the methods left out were not run")
         return tuple(notes)

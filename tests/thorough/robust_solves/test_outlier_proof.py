@@ -83,6 +83,7 @@ def test_wrong_closures_of_good_odometry_are_proven_wrong_and_right_ones_are_not
     assert proof.is_complete
     text = str(solution)
     assert "5 of 8 closures are proven wrong" in " ".join(text.split())
+    assert "rejected, proven wrong on the condition that follows" in " ".join(text.split())
     record = solution.as_json()["robust"]
     assert record["proven_wrong"] == np.flatnonzero(is_wrong).tolist()
     assert record["most_closures"] == 3
