@@ -114,15 +114,15 @@ class Certificate(ReadOnly):
         Half the squared Newton decrement of the given poses, over F: about the relative decrease of
         F down to the stationary point beside them.
     source : BoundSource
-        How the poses were come by that the bound was found at.
+        Where the poses come from at which the bound was proved.
     poses : Poses
-        The poses that the bound was found at.
+        The poses at which the bound was proved.
     poses_objective : float
         F of these, the best value known.
     Lambda : (n, d, d) array
-        Multipliers, which with eta and these poses are the proof: anyone can check it with
-        `prove_bound`, told whether `bound` is_complex. Those of `BoundSource.SOFTENED` are of the
-        smaller matrices.
+        Multipliers. With eta and these poses they are the proof, which `prove_bound` checks; its
+        `is_complex` is that of the bound. Those of `BoundSource.SOFTENED` belong to the smaller
+        matrices.
     wanted_gap : float
         The gap that was asked for.
     verdict : Verdict

@@ -271,11 +271,11 @@ def rounding_of(at: EvaluatedPoses) -> ObjectiveRounding:
 
 
 def rounding_level(problem: PGOProblem, poses: Poses) -> float:
-    """F of poses that a solve leaves, where nothing but rounding is left: what it stops at.
+    """F at which a solve stops, because its residuals may be nothing but rounding.
 
     It is sum tau e_t^2 + kappa e_R^2 with twice the largest ||t_i||, seen from the first pose, for
-    ||t_j - t_i||: a solve for all translations leaves every one with an error in proportion to the
-    last bits of the largest. No claim is made of it: whether poses are exact is asked of every edge
+    ||t_j - t_i||: after a solve for all translations the error of each is in proportion to the last
+    bits of the largest. No proof uses this number: whether poses are exact is asked of every edge
     (`fit_of`).
     """
     poses = problem.seen_poses(poses)

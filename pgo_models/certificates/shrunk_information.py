@@ -28,7 +28,7 @@ from pgo_models.graphs.precisions import (
 
 _SHOWN = 2.0**-45  # smallest eigenvalue of a matrix with ones on its diagonal that is not rounding
 _SHARE_ROUNDING = 2.0**-20  # taken off the share that the coupling leaves, as it is rounded
-_HALVINGS = 60  # of a share that rounding makes too large: nothing is left of the matrix then
+_HALVINGS = 60  # of a share that rounding makes too large; the matrix is then about zero
 # of the trace: above the rounding of a block, so that I' is below I all the same
 _MARGIN = 2.0**-40
 
@@ -40,9 +40,9 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
 
     Coupling blocks are removed first. With C = I_tt^-1/2 I_tr I_rr^-1/2 the rest keeps the share
     1 - ||C||, since I >= (1 - ||C||) blockdiag(I_tt, I_rr). Rounding may ask for a smaller share.
-    An edge whose coupled matrix is only semidefinite has a share of zero. It is left out, since it
-    costs zero or more, and so is a singular block. A GraphError if rounding hides the inequality
-    for every share, or what is left does not connect the graph.
+    An edge whose coupled matrix is only semidefinite has a share of zero. Such an edge costs zero
+    or more, and is removed; so is a singular block. A GraphError is raised if rounding hides the
+    inequality for every share, or if the other edges do not connect the graph.
     """
     information = without_singular_blocks(proper_information(graph), graph.d)
     d = graph.d

@@ -265,9 +265,9 @@ class _SuperLUFactor(CholeskyFactor):
         """`SymbolicCholesky.lower_factor` of the matrix."""
         root_pivots = np.sqrt(self._lu.U.diagonal())
         L = self._lu.L @ diags_array(root_pivots)
-        whole = L + self._analysis.tiny_factor()
+        with_all_entries = L + self._analysis.tiny_factor()
         # The conversion to rows and back sorts the rows of every column.
-        return whole.tocsr().tocsc(), self._rows
+        return with_all_entries.tocsr().tocsc(), self._rows
 
     def half_solve(self, right_hand_side: Array) -> Array:
         L = self._lu.L.tocsr()
@@ -466,9 +466,9 @@ class _Cholmod(SymbolicCholesky):
         super().__init__(pattern, most)
         self._order = order
         self._matrix, self._lower, self._is_diagonal = lower_triangle(pattern)
-        # Symbolic parts with the factor that uses each. No finaliser gives them back: Ctrl-C in one
-        # would be lost.
-        self._taken: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [
+        # Every capsule with the factor that uses it, or None. Unused ones are collected when one is
+        # needed: in a finaliser of the factor a Ctrl-C would be lost.
+        self._capsules: list[tuple[weakref.ref[_CholmodFactor] | None, _Capsule]] = [
             (None, self._analyze())
         ]
 
@@ -517,8 +517,8 @@ class _Cholmod(SymbolicCholesky):
         """
         capsule = self.fill(lower)
         factor = _CholmodFactor(capsule, self, lower)
-        # when it is gone, or overwritten, the next one may use the capsule
-        self._taken.append((weakref.ref(factor), capsule))
+        # A later factor may use the capsule when this one is deleted or overwritten.
+        self._capsules.append((weakref.ref(factor), capsule))
         return factor
 
     def fill(self, lower: Array) -> _Capsule:
@@ -526,38 +526,39 @@ class _Cholmod(SymbolicCholesky):
 
         A NotPositiveDefiniteError is raised when there is none.
         """
-        capsule = self._spare()
+        capsule = self._unused_capsule()
         try:
             check_pivots(self._fill(lower, capsule))
         except ArithmeticError as error:
-            # a failed factorisation leaves the symbolic part intact
-            self._taken.append((None, capsule))
+            # The symbolic part is intact after a failed factorisation, and after pivots that are
+            # not finite.
+            self._capsules.append((None, capsule))
             raise NotPositiveDefiniteError("the matrix has a pivot that is not positive") from error
         except NotPositiveDefiniteError:
-            self._taken.append((None, capsule))  # so does one with pivots that are not finite
+            self._capsules.append((None, capsule))
             raise
         return capsule
 
     def release_memory(self) -> None:
-        self._idle()
+        self._remove_unused_capsules()
 
-    def _spare(self) -> _Capsule:
-        """Take out a symbolic part that no factor uses, and let go of others like it."""
-        idle = self._idle()
-        return idle[-1] if idle else self._analyze()
+    def _unused_capsule(self) -> _Capsule:
+        """Remove all capsules that no factor uses; return one of them, or a new one."""
+        unused = self._remove_unused_capsules()
+        return unused[-1] if unused else self._analyze()
 
-    def _idle(self) -> list[_Capsule]:
-        """Take out all symbolic parts that no factor uses."""
+    def _remove_unused_capsules(self) -> list[_Capsule]:
+        """Remove and return all capsules that no factor uses."""
         used = []
-        idle = []
-        for user, numeric in self._taken:
+        unused = []
+        for user, capsule in self._capsules:
             factor = None if user is None else user()
             if factor is None or factor.is_overwritten:
-                idle.append(numeric)
+                unused.append(capsule)
             else:
-                used.append((user, numeric))
-        self._taken = used
-        return idle
+                used.append((user, capsule))
+        self._capsules = used
+        return unused
 
     def _fill(self, lower: Array, capsule: _Capsule) -> Array:
         """Fill the capsule with the factor of these values of the lower triangle.

@@ -34,9 +34,9 @@ def pose_order(graph: PoseGraph) -> IntArray:
 
 
 def order_of_pattern(lower: csc_array, d: int) -> IntArray:
-    """Order of elimination for the poses of a graph in d dimensions, coupled as this triangle says.
+    """Order of elimination, as that of `pose_order`, from the pattern of a matrix of the poses.
 
-    It is chosen as that of `pose_order`.
+    `lower` is the lower triangle of the pattern, d the dimension of the poses.
     """
     if not _is_dissected(lower.shape[0], d):
         return minimum_degree(lower)

@@ -17,13 +17,13 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from solvers.carry.registry import record
 
-# Decrement of a stationary point of chi2. What is left weighs more in its bound than in that of F,
+# Decrement of a stationary point of chi2. A decrement lowers the bound on chi2 more than that on F,
 # because the tangent is softer than chi2 itself.
 STATIONARY_FOR_TANGENTS = 1e-16
 SMALL_DECREMENT = 1e-9  # decrement that a Newton step squares
 ROUNDING = 1e-14  # relative change of F that is not told apart from none
 SUFFICIENT = 1e-4  # Armijo's constant
-HALVINGS = 40  # of a move, at most: what is left of it is then 2^-40
+HALVINGS = 40  # of a move, at most, to 2^-40 of it
 # damping, as a share of the diagonal: the least one, its growth, and the largest one
 DAMPING_START = 1e-8
 DAMPING_GROWTH = 10.0
@@ -152,7 +152,7 @@ class NewtonFigures:
 
     @property
     def is_stationary(self) -> bool:
-        """Whether nothing is left to gain above the rounding level."""
+        """Whether no further move can lower F by more than its rounding."""
         return self.decrement <= self.tolerance or self.is_at_rounding
 
 
@@ -164,10 +164,11 @@ def stationary_tolerance(is_quadratic: bool, share: float = 1.0) -> float:
 def newton_step(algebra: NewtonAlgebra[M, T], rules: StepRules) -> NewtonStep[M]:
     """Factor once, then move as long as the same factor serves; F rises by its rounding at most.
 
-    Further moves take the same factor, with the secants of those before (L-BFGS) or without (chord
-    steps), while each cuts the decrement to a tenth, or, with secants, by so much that those left
-    would bring it within tolerance. A NotPositiveDefiniteError where no damping or shift makes the
-    matrix positive definite, as with weights too far apart for doubles.
+    Further moves take the same factor, with the secants of earlier moves (L-BFGS) or without (chord
+    steps). They end where a move does not cut the decrement to a tenth; with secants a smaller cut
+    is enough if, repeated in the remaining moves, it brings the decrement within tolerance. A
+    NotPositiveDefiniteError is raised where no damping or shift makes the matrix positive definite,
+    as with weights too far apart for doubles.
     """
     model = factorize_definite(algebra, rules)
     decrement = decrement_of(model)
@@ -273,10 +274,10 @@ def decrement_of(model: NewtonModel) -> float:
 
 
 def scaled_decrement(square: float, objective: float, rounding_level: float) -> float:
-    """Compute (g^T H^-1 g / 2 - level) / F, what is left to gain as a share of F.
+    """Compute (g^T H^-1 g / 2 - level) / F, the decrease of F to be expected as a share of F.
 
-    It is 0 where what is left, or F, is not positive: F that comes out as zero, or chi2 below zero,
-    is nothing but rounding.
+    It is 0 where the expected decrease or F is not positive. A computed F of zero, or chi2 below
+    zero, is nothing but rounding.
     """
     decrease = 0.5 * square - rounding_level
     return decrease / objective if decrease > 0.0 and objective > 0.0 else 0.0

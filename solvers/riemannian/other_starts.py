@@ -1,8 +1,8 @@
 """Other starts of Newton, for a cost with several minima: cheap beside a relaxation.
 
-They are the estimate of the file, poses along a spanning tree and, on small graphs, random ones. Of
-the random starts half have all rotations drawn. The others are the best poses so far, of which all
-from some pose on are turned as a whole.
+They are the estimate of the file, poses along a spanning tree and, on small graphs, random ones.
+Half of the random starts have random rotations. The other half are the best poses so far, with all
+poses from a random one on turned by the same rotation.
 """
 
 import time
@@ -70,18 +70,18 @@ def best_of_starts(
     No start begins when the time is up.
     """
     began = time.perf_counter()
-    found = FoundStart("none is better", best, objective, 0)
+    cheapest = FoundStart("none is better", best, objective, 0)
     for name, start in starts:
         if time.perf_counter() - began > seconds_left:
             break
         poses = polish(problem, start, TRIAL_STEPS)
         cost = problem.objective(poses)
-        num_tried = found.num_tried + 1
-        if cost < found.objective * (1.0 - BETTER):
-            found = FoundStart(name, poses, cost, num_tried)
+        num_tried = cheapest.num_tried + 1
+        if cost < cheapest.objective * (1.0 - BETTER):
+            cheapest = FoundStart(name, poses, cost, num_tried)
         else:
-            found = replace(found, num_tried=num_tried)
-    return found
+            cheapest = replace(cheapest, num_tried=num_tried)
+    return cheapest
 
 
 def _random_rotations(num_poses: int, d: int, rng: np.random.Generator) -> Array:

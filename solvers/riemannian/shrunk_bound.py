@@ -36,7 +36,7 @@ BISECTIONS = 5  # of the range of log(cap), which is then known to 1/32 of that 
 
 @dataclass(frozen=True, eq=False)
 class ShrunkBound:
-    """A bound on chi2 by smaller information matrices, and where it was found."""
+    """A bound on chi2 by smaller information matrices, and the point at which it was proved."""
 
     bound: LowerBound
     poses: Poses  # the minimum of the smaller cost
@@ -96,7 +96,7 @@ def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Ce
     if shrunk.bound.value <= certificate.bound.value:
         return certificate
     by_smaller_cost = replace(certificate, Lambda=shrunk.Lambda, source=BoundSource.SOFTENED)
-    # Of the poses given, which need not be those that the bound was found at.
+    # Rounding is that of the given poses, at which the bound need not have been proved.
     rounding = ObjectiveRounding(
         certificate.rounding_level,
         certificate.objective_error,
@@ -110,6 +110,6 @@ def with_shrunk_information(problem: PGOProblem, certificate: Certificate) -> Ce
 
 
 def bound_is_tight(problem: PGOProblem, certificate: Certificate) -> bool:
-    """Whether the poses that the bound was found at have the gap asked for, but for rounding."""
+    """Whether the gap at the poses of the certificate is at most the wanted one, or rounding."""
     judged = judge(problem, certificate.poses, certificate)
     return judged.is_certified or judged.is_hidden_by_rounding

@@ -15,7 +15,7 @@ from pgo_models.problem.matrices import inner
 
 @dataclass(frozen=True, eq=False)
 class TruncatedStep:
-    """What `truncated_conjugate_gradients` found."""
+    """Result of `truncated_conjugate_gradients`."""
 
     step: Array  # of the shape of the gradient
     decrease: float  # what the model promises: -<g, s> - <s, H s> / 2, positive

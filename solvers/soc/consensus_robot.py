@@ -1,10 +1,10 @@
 """One robot of the CONSENSUS coupling: its own poses, copies of separators, and its part of SOC.
 
 An edge between two robots counts half with each. Two neighbours send each other rows of the poses
-that both hold, and the owner of a pose sends its penalty. A message to the neighbours is a mapping
-from the receiver's number. Most methods are orders. An order takes a request, and returns the robot
-after it with the answer; the robot before it does not change. `solvers.soc.consensus` calls the
-orders in turn.
+that both hold, and the owner of a pose sends the pose's penalty. Messages to the neighbours are a
+mapping from the receivers' numbers. Most methods are orders. An order takes a request and returns a
+new robot with its answer; the old robot does not change. `solvers.soc.consensus` calls the orders
+in turn.
 """
 
 from __future__ import annotations
@@ -292,10 +292,10 @@ class ConsensusRobot:
     def _as_sent(
         self, X: Array, known: Array, bytes_per_number: int
     ) -> tuple[Array, copies.RowMessages]:
-        """X, (rows, d), as the neighbours will have it, and the messages that tell them.
+        """X, (rows, d), as the neighbours will have it, and the messages to them.
 
-        What is sent is the change from `known`, which they have. X is sent whole where it is not
-        rounded, or not finite.
+        The messages have the change from `known`, which the neighbours have; without rounding, or
+        where X is not finite, they have X itself.
         """
         shared = self.layout.shared
         change = None

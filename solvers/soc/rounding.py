@@ -1,11 +1,12 @@
 """Messages of CONSENSUS in few bytes: steps of rows as small integers, and sums in few digits.
 
-Neighbours have a robot's rows of s, and it sends them the step of the fixed-point map from there,
-in whole multiples of a unit: the largest step divided by 127 (one byte a number) or 32767 (two).
-Sender and receivers add the same multiples to the same rows. So all continue from the same numbers,
-what was rounded off is part of the next step, and the unit shrinks as the recursion converges. Its
-fixed points are the same, and bounds are proved in full precision. (Where rho changes, all begin
-again at omega, which each robot has projected itself: the same numbers up to rounding.)
+A robot's neighbours have its rows of s. The robot sends them the step of the fixed-point map from
+there, in whole multiples of a unit: the largest step divided by 127 (one byte a number) or 32767
+(two). Sender and receivers add the same multiples to the same rows. So all continue from the same
+numbers, the error of rounding is part of the next step, and the unit shrinks as the recursion
+converges. The fixed points are those without rounding, and bounds are proved in full precision.
+Where rho changes, all begin again at omega. Each robot has projected omega itself, so that these
+numbers are the same up to rounding.
 
 To compress the difference from what the receiver has is known from gradients (Richtarik, Sokolov &
 Fatkhullin, EF21, 2021).

@@ -58,19 +58,19 @@ class SOC(SOCSettings):
         recursion.
     bytes_per_number : 1, 2 or 8
         Of CONSENSUS alone: of the rows that robots send each other. With 2, the default, a robot
-        sends the change of its rows, a number of it as a whole multiple of a 32767th of the
-        largest (with 1 of a 127th), forces at the start in two bytes, and for the acceleration sums
-        in four bytes and coefficients in two (`solvers.soc.rounding`); 8 is full precision. Robots
-        that do not wait for each other send rows in full.
+        sends the change of its rows. Each number of the change is a whole multiple of 1/32767 of
+        the largest one, and with 1 byte of 1/127 of it. So are forces at the start. Sums of the
+        acceleration have four bytes, its coefficients two (`solvers.soc.rounding`). 8 is full
+        precision, which robots that do not wait for each other always have.
     translation_penalty : float or None
         Of CONSENSUS alone: penalty of the translations of separators, the poses that several robots
         hold, as a multiple of their diagonal in M, the matrix of the cost F = tr(X^T M X). The
         default is 0.6 times the stiffness of the separators, the median over the robots. A robot's
-        stiffness is the inverse of its mean compliance: of how far a separator moves under a unit
-        force on its translation, in the scale of that diagonal, while rho holds the rotations and
-        common shifts are left out (`solvers.soc.separator_stiffness`). A penalty that is given
-        stays. The default is lowered when the penalties are chosen anew, if since they were last
-        chosen the multipliers of these translations have changed little compared with the penalty
+        stiffness is the inverse of its mean compliance. The compliance of a separator is how far it
+        moves under a unit force on its translation, in the scale of that diagonal, while rho holds
+        the rotations, and without common shifts (`solvers.soc.separator_stiffness`). A given
+        penalty stays. The default may fall when penalties are chosen anew: where the multipliers of
+        these translations have changed little since the last choice, compared with the penalty
         times the distance that the translations have moved.
     tolerance : float
         Largest primal and dual residual, both relative, of a run that has converged.
