@@ -12,6 +12,7 @@ from pgo_models.certificates.proof_file import save_proof as save_proof
 from pgo_models.convex.bregman import BregmanProblem as BregmanProblem
 from pgo_models.convex.constraint_sets import ConstraintSet as ConstraintSet
 from pgo_models.convex.convex_solver import ConvexSolver as ConvexSolver
+from pgo_models.convex.graph_model import graph_model as graph_model
 from pgo_models.convex.graph_subproblem import (
     GraphQP as GraphQP,
     ModelChange as ModelChange,
@@ -118,7 +119,7 @@ __all__ += ["multipliers", "prove_bound"]
 __all__ += ["save_proof", "verify_proof"]
 __all__ += ["BregmanProblem", "ConstraintSet", "ConvexSolver", "ModelChange"]
 __all__ += ["ModelCertificate", "OrthogonalProblem", "QuadraticForm", "quadratic_form"]
-__all__ += ["graph_qp", "solve_relaxation"]
+__all__ += ["graph_model", "graph_qp", "solve_relaxation"]
 __all__ += ["animate", "animate_poses", "compare_poses", "explore_graph", "plot_graph"]
 # Types in the signatures of the names above.
 __all__ += ["NoiseModel"]

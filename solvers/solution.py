@@ -11,6 +11,7 @@ from scipy.sparse import csc_array
 from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.proof_file import save_proof
+from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -256,13 +257,19 @@ class Solution:
         """Write what proves the lower bound, for `pgo verify` and `verify_proof`.
 
         Of a robust solve it is for the edges kept, which `save` writes as `.g2o`. Errors are those
-        of `pgo_models.save_proof`.
+        of `pgo_models.save_proof`, and a SettingError where terms of one's own are left.
 
         Parameters
         ----------
         path : Path or str
             A file, written as JSON.
         """
+        if any(stage.name == "ExtendedSOC" for stage in self.stages):
+            raise SettingError(
+                "no proof to write: the file of the graph has not the terms that are added; where "
+                "they are quadratic, solvers.certify(pgo_models.graph_model(problem, changer), "
+                "poses.R) has a proof"
+            )
         save_proof(self.problem, self.certificate, path)
 
     def report(self, path: Path | str) -> None:

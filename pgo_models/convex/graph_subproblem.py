@@ -54,15 +54,15 @@ class Stack:
         Their rows in terms of the t_i and R_i^T of the whole graph.
     columns : array of int
         Which of these t and R the program has.
-    X : cp.Variable
-        The variable of the program.
+    X : cp.Expression
+        The variable of the program, or what stands for it.
     side : int
         1 for vectors, d for matrices, which are transposed in X.
     """
 
     rows: csr_array
     columns: IntArray
-    X: cp.Variable
+    X: cp.Expression
     side: int
 
     def __getitem__(
@@ -107,7 +107,7 @@ class PoseVariables(HoldsModel):
         Whether translations are unknown too.
     poses : (n_a,) array
         Poses of the graph that are unknown, ascending.
-    X : cp.Variable
+    X : cp.Expression
         Rows t_i (not for ROTATIONS), then the rows of every R_i^T.
     t : Stack
         t_i, (d,), by pose.
@@ -122,7 +122,7 @@ class PoseVariables(HoldsModel):
     graph: PoseGraph
     unknowns: Unknowns
     poses: IntArray
-    X: cp.Variable
+    X: cp.Expression
     t: Stack
     R: Stack
     translation_residual: Stack
@@ -417,8 +417,9 @@ def _posed(
 
     A_of_graph = residual_matrix(graph)
     weights = isotropic_weights(graph).row_weights
-    variables = _variables(graph, unknowns, poses, columns, A_of_graph)
-    change = _checked_change(changer, variables)
+    X = cp.Variable((len(columns), graph.d), name="X")
+    variables = pose_variables(graph, unknowns, poses, columns, A_of_graph, X)
+    change = change_of(changer, variables)
     shares = shares.copy()
     shares[np.array(change.replaced_edges, dtype=int)] = 0.0
     shares_of_translations = shares if has_translations else np.zeros(m)
@@ -443,14 +444,21 @@ def _posed(
     return GraphQP(variables, qp, change, A, w, between)
 
 
-def _variables(
-    graph: PoseGraph, unknowns: Unknowns, poses: IntArray, columns: IntArray, A_of_graph: csr_array
+def pose_variables(
+    graph: PoseGraph,
+    unknowns: Unknowns,
+    poses: IntArray,
+    columns: IntArray,
+    A_of_graph: csr_array,
+    X: cp.Expression,
 ) -> PoseVariables:
-    """The unknowns, in the `columns` of the whole graph; `A_of_graph` gives the residuals."""
+    """The unknowns, in the `columns` of the whole graph, which the rows of X are.
+
+    `A_of_graph` gives the residuals.
+    """
     n = graph.num_poses
     m = graph.num_edges
     d = graph.d
-    X = cp.Variable((len(columns), d), name="X")
     identity = csr_array(eye_array(A_of_graph.shape[1]))
     return PoseVariables(
         graph,
@@ -464,7 +472,8 @@ def _variables(
     )
 
 
-def _checked_change(changer: Changer | None, variables: PoseVariables) -> ModelChange:
+def change_of(changer: Changer | None, variables: PoseVariables) -> ModelChange:
+    """What a changer returns, which has to be a ModelChange."""
     change = changer(variables) if changer is not None else ModelChange()
     if not isinstance(change, ModelChange):
         raise SettingError(

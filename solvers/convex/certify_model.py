@@ -53,6 +53,18 @@ def certify_model(
     return judge_values(form, equations, u, bound, gap)
 
 
+def certified_point(
+    form: QuadraticForm, values: Sequence[Array], gap: float = DEFAULT_GAP
+) -> tuple[ModelCertificate, Array]:
+    """The best point that is found, beside the values or elsewhere, and its certificate.
+
+    A NotQuadraticError where sets have no equations.
+    """
+    equations = set_equations(form)
+    bound, u = best_bound(form, equations, form.u_of(values), gap)
+    return judge_values(form, equations, u, bound, gap), u
+
+
 def _least_objective(problem: OrthogonalProblem, values: Sequence[Array]) -> float:
     """J of constrained variables with the best values of all others."""
     if not problem.others and not problem.problem.constraints:

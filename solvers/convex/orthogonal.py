@@ -23,7 +23,7 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.reductions.solution import Solution
 
-from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
+from pgo_models.certificates.certificate import Verdict
 from pgo_models.convex import orthogonality
 from pgo_models.convex.convex_solver import COLD, ConvexSolver, as_solver
 from pgo_models.convex.gauge import with_gauge_held
@@ -31,7 +31,6 @@ from pgo_models.convex.hull_bound import prove_hull_bound
 from pgo_models.convex.model_certificate import (
     ModelCertificate,
     judge_by_hulls,
-    judge_values,
 )
 from pgo_models.convex.orthogonality import (
     OrthogonalPoint,
@@ -45,7 +44,7 @@ from pgo_models.convex.set_equations import set_equations
 from pgo_models.errors import PGOError, SettingError, check_settings
 from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
-from solvers.convex.certify_model import best_bound
+from solvers.convex.certify_model import certified_point
 from solvers.convex.determinants import random_points, reflections, with_free_determinants
 from solvers.convex.hand_over import SOCWithNewton
 from solvers.convex.model_newton import ModelNewton
@@ -572,11 +571,9 @@ def _certified(
     if not isinstance(split, QuadraticSplit):
         split = QuadraticSplit(problem, quadratic_form(problem))
     form = with_gauge_held(split.form)
-    equations = set_equations(form)
-    bound, u = best_bound(form, equations, form.u_of(problem.values(state.copies)), DEFAULT_GAP)
-    certificate = judge_values(form, equations, u, bound)
+    certificate, u = certified_point(form, problem.values(state.copies))
     point = method.point(problem, state)
-    if ModelNewton(form, equations).is_possible and not form.E.shape[0]:
+    if ModelNewton(form, set_equations(form)).is_possible and not form.E.shape[0]:
         point = split.stationary_point(u)
     kkt = orthogonality.kkt_residuals(problem, point, state.rho, split=split)
     values = tuple(form.values(u))

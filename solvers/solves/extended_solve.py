@@ -10,15 +10,25 @@ from dataclasses import replace
 from typing import Any
 
 import cvxpy as cp
+import numpy as np
 
-from pgo_models.certificates.certificate import Certificate, relative_gap, verdict_of
+from pgo_models.certificates.certificate import (
+    BoundSource,
+    Certificate,
+    relative_gap,
+    verdict_of,
+)
 from pgo_models.certificates.fit import NO_FIT, fit_of
-from pgo_models.certificates.lower_bound import NO_BOUND
+from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound
+from pgo_models.convex.gauge import with_gauge_held
+from pgo_models.convex.graph_model import graph_model
 from pgo_models.convex.graph_subproblem import GraphQP, ModelChange
+from pgo_models.convex.quadratic_form import NotQuadraticError, quadratic_form
 from pgo_models.errors import SettingError
 from pgo_models.figures import gap_above, scaled_above, scaled_below
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
+from solvers.convex.certify_model import certified_point
 from solvers.convex.extended_soc import with_priors
 from solvers.reporting.notes import joined_notes, note_of_absence, note_of_coupling
 from solvers.request import SolveRequest
@@ -34,8 +44,10 @@ def solve_extended(
     Terms that are priors go into the graph, which `solution_for` solves. With priors alone that is
     the solution, of the graph with them, whose last pose is the world.
 
-    Else the poses are those of ExtendedSOC. The objective has all terms. The bound leaves out what
-    the note says: terms that are never negative, and constraints, which can only raise the optimum.
+    Else the poses are those of ExtendedSOC. The objective has all terms. Where they are quadratic,
+    the bound is that of the model (`pgo_models.convex.graph_model`), and the poses are its
+    stationary point. Else the bound leaves out what the note says: terms that are never negative,
+    and constraints, which can only raise the optimum.
     Where edges are replaced there is no bound.
 
     A SettingError where a term may be negative, and where robots or a robust solve are asked for,
@@ -78,18 +90,26 @@ def solve_extended(
         stage = Stage.of(with_terms)
         status = stage.status
         stages.append(replace(stage, objective=model.cost(poses.stacked())))
+    of_model = None
+    if status not in OUT_OF_TIME:
+        of_model = _certificate_of_model(request, poses, solution.certificate)
+    what_is_left_out = f"the bound leaves out {', '.join(left_out)}"
     certificate = _certificate_with_terms(
         solution.certificate, model, poses, with_known_priors, is_F=not other_terms
     )
+    if of_model is not None and of_model.lower_bound > certificate.lower_bound:
+        certificate = of_model
+    else:
+        of_model = None
     note = joined_notes(
         note_of_absence(len(problem.graph.absent)),
         note_of_coupling(problem),
-        f"the bound leaves out {', '.join(left_out)}",
+        "" if of_model else what_is_left_out,
     )
     return replace(
         solution,
         problem=problem,
-        poses=poses,
+        poses=poses if of_model is None else of_model.poses,
         objective=certificate.objective,
         certificate=certificate,
         status=status,
@@ -109,6 +129,42 @@ def _left_out(change: ModelChange, terms: list[cp.Expression]) -> list[str]:
         "replaced edges": len(change.replaced_edges),
     }
     return [f"{name} ({count})" for name, count in counts.items() if count]
+
+
+def _certificate_of_model(
+    request: SolveRequest, poses: Poses, certificate: Certificate
+) -> Certificate | None:
+    """Certificate of the stationary point beside the poses where all terms are quadratic.
+
+    It bounds the objective with all terms. None where they are not, or constraints are no
+    equalities that a model takes.
+    """
+    soc: Any = request.pipeline.soc
+    gap = certificate.wanted_gap
+    try:
+        model = graph_model(request.problem, soc.changer)
+        form = with_gauge_held(quadratic_form(model))
+        judged, u = certified_point(form, list(poses.R), gap)
+    except NotQuadraticError:
+        return None
+    if judged.bound is None:
+        return None
+    t = u[form.num_constrained :][: poses.t.size].reshape(poses.t.shape, order="F")
+    best = Poses(np.array(form.values(u)), t)
+    bound = LowerBound(judged.lower_bound, 0.0, True, judged.bound.rounding)
+    return replace(
+        certificate,
+        objective=judged.objective,
+        objective_error=judged.objective_error,
+        bound=bound,
+        gap=judged.gap,
+        source=BoundSource.POLISHED,
+        poses=best,
+        poses_objective=judged.objective,
+        verdict=judged.verdict,
+        fit=NO_FIT,
+        stationarity=math.nan,
+    )
 
 
 def _certificate_with_terms(

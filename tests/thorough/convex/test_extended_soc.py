@@ -19,9 +19,11 @@ from pgo_models import (
     Verdict,
     chordal_start,
     exp_map,
+    graph_model,
     graph_qp,
     log_map,
     partition,
+    random_rotations,
 )
 from pgo_models.convex.graph_subproblem import Changer, PoseVariables
 from pgo_models.errors import SettingError
@@ -35,6 +37,7 @@ from solvers import (
     Pipeline,
     RStep,
     Status,
+    certify,
     run,
     solve,
 )
@@ -289,6 +292,35 @@ def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(
     assert "ExtendedSOC" in page
     assert solution.note in page
     assert "What to try next" not in page  # commands that know nothing of these terms
+
+
+def test_quadratic_terms_are_certified_as_any_quadratic_model(tmp_path: Path) -> None:
+    heights = np.linspace(0.0, 1.0, N)
+
+    def change(unknown: PoseVariables) -> ModelChange:
+        level = cp.sum_squares(unknown.t[:][:, 0] - heights)
+        parallel = cp.sum_squares(unknown.R(1) - unknown.R(3))
+        return ModelChange(terms=[level, 0.1 * parallel])
+
+    method = ExtendedSOC(change, SETTINGS)
+    solution = solve(problem(), Pipeline(soc=method))
+    certificate = solution.certificate
+    assert solution.is_certified
+    assert "leaves out" not in solution.note
+    # the bound is on the objective with all terms, at poses that are stationary
+    cost = method.model(problem()).cost(solution.poses.stacked())
+    assert solution.objective == pytest.approx(cost, rel=1e-9)
+    assert solution.lower_bound == pytest.approx(cost, rel=1e-6)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        start = Poses(random_rotations(N, D, rng), rng.standard_normal((N, D)))
+        other = run(method, problem(), start)
+        assert solution.lower_bound <= method.cost(other.state, other.poses)
+    model = graph_model(problem(), change)
+    of_model = certify(model, list(solution.poses.R))
+    assert of_model.lower_bound == pytest.approx(certificate.lower_bound, rel=1e-9)
+    with pytest.raises(SettingError, match="graph_model"):
+        solution.save_proof(tmp_path / "proof.json")
 
 
 def test_a_position_alone_places_the_map_and_is_no_term_that_a_bound_leaves_out() -> None:
