@@ -258,6 +258,8 @@ def plot_graph(
                 label="95 % of x, y",
             )
             handles.append(axes.add_collection(ellipses))
+            outlined = np.concatenate([poses.t[shown], outlines.reshape(-1, graph.d)])
+            _frame(axes, outlined)  # no ellipse is cut off
         if handles:
             num_columns = 3 if graph.num_robots > 1 else 1
             figure.legend(handles=handles, loc="outside lower center", ncols=num_columns)

@@ -7,7 +7,7 @@ from scipy.special import chdtr, chdtri
 
 from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.plots.interactive_plots import lay_out
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, plotly
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 from pgo_models.problem.thresholds import FALSE_ALARM, EdgeResiduals
 from solvers.reporting.convergence_plots import LOGARITHMIC
 
@@ -24,9 +24,11 @@ _LEAST_SHOWN = 0.1  # edges, on the logarithmic axis
 def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
     """Plotly histogram of the errors sqrt(cost / allowed) of the edges, and the expected one.
 
-    The expected histogram is a line. For errors as the information matrices say, in d dimensions,
-    cost / allowed is chi^2_p divided by its quantile 1 - FALSE_ALARM / m, with p = 3 or 6: exactly
-    for chi2, and for F if its weights are equal. Edges without an allowed cost are left out.
+    The expected histogram is a dotted line, and what is allowed a vertical one. On a graph that
+    fits better than expected the bars are left of the dotted line, and the title says that no edge
+    is a misfit. For errors as the information matrices say, in d dimensions, cost / allowed is
+    chi^2_p divided by its quantile 1 - FALSE_ALARM / m, with p = 3 or 6: exactly for chi2, and for
+    F if its weights are equal. Edges without an allowed cost are left out.
     """
     is_counted = residuals.allowed > 0.0
     ratio = residuals.cost[is_counted] / residuals.allowed[is_counted]
@@ -52,10 +54,17 @@ def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
             figure.add_bar(x=middles, y=heights, name=name, marker={"color": colour})
     curve = [float(f"{value:.4g}") if value > _LEAST_SHOWN else None for value in expected]
     figure.add_scatter(
-        x=middles, y=curve, name="as the matrices say", mode="lines", line={"color": COLOURS[5]}
+        x=middles,
+        y=curve,
+        name="expected by the matrices",
+        mode="lines",
+        line={"color": QUIET_COLOUR, "dash": "dot"},
     )
-    lay_out(figure, "", legend_y=-0.25)
-    figure.update_layout(bargap=0.05, barmode="stack")
+    figure.add_vline(x=0.0, line={"color": QUIET_COLOUR, "width": 1})
+    num_misfits = int(count[is_misfit].sum())
+    share = f"{num_misfits} of {len(error)} edges cost" if num_misfits else "no edge costs"
+    lay_out(figure, f"{share} more than allowed", legend_y=-0.25)
+    figure.update_layout(bargap=0.05, barmode="stack", title_x=0.02)  # left of the tools
     powers = list(range(first, int(ends[-1]) + 1))
     figure.update_xaxes(
         tickvals=powers,

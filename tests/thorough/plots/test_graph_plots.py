@@ -178,6 +178,17 @@ def test_without_matplotlib_one_line_names_the_extra(monkeypatch):
         solution.plot()
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_no_ellipse_is_cut_off(d):
+    graph = pgo.grid_world(1, 30, np.random.default_rng(0), d=d)
+    covariances = solvers.solve(graph).marginals()
+    (axes,) = pgo.plot_graph(graph, graph.truth, covariances=covariances).axes
+    outlines = confidence_ellipses(graph.truth, covariances)
+    for letter, values in zip("xyz", outlines.reshape(-1, d).T, strict=False):
+        lowest, highest = getattr(axes, f"get_{letter}lim")()
+        assert lowest <= values.min() < values.max() <= highest
+
+
 @pytest.mark.parametrize(("d", "poses"), [(2, 30), (3, 240)])
 def test_ellipses_hold_what_their_covariance_says(d, poses):
     graph = pgo.random_geometric(poses, np.random.default_rng(0), d=d)

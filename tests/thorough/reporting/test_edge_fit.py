@@ -16,6 +16,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, Weighting
 from solvers.reporting.edge_fit import EdgeFit, fit_sentence, judge_edges
+from solvers.reporting.fit_plots import explore_fit
 from solvers.reporting.report import report_page
 
 Call = Callable[..., tuple[int, str, str]]
@@ -133,3 +134,18 @@ def test_the_page_of_MIT_says_that_its_edges_do_not_fit(benchmark_data: Path) ->
     assert "its minimum is at most 41.16" in page.text
     assert "pgo solve MIT" in page.text
     assert "No edge costs more" not in page.text
+
+
+def test_a_graph_without_errors_has_no_misfit_in_its_histogram() -> None:
+    pytest.importorskip("plotly")
+    noisy = pgo.grid_world(1, 40, 3, d=2)
+    truth = noisy.truth
+    assert truth is not None
+    turns = np.swapaxes(truth.R[noisy.i], 1, 2) @ truth.R[noisy.j]
+    moves = np.einsum("eba,eb->ea", truth.R[noisy.i], truth.t[noisy.j] - truth.t[noisy.i])
+    exact = replace(noisy, R_ij=turns, t_ij=moves)
+    wrong = exact.with_edges([5], [30], pgo.Poses(np.eye(2)[None], np.zeros((1, 2))), 10.0, 10.0)
+    for graph, title in ((exact, "no edge costs more than allowed"), (wrong, "1 of ")):
+        figure = explore_fit(solvers.solve(graph).edge_residuals, graph.d)
+        assert figure.layout.title.text.startswith(title)
+        assert ("misfits" in [trace.name for trace in figure.data]) == (graph is wrong)
