@@ -7,8 +7,9 @@
 # * **Prerequisites:** matrices, and the rotations among them; for the proof of the bound, what positive
 #   definite means
 # * **Time:** 20 minutes
-# * **Next:** [notebook 14](14_is_it_really_the_best.ipynb), which takes the lower bound apart for
-#   readers without optimisation
+# * **Next:** [notebook 2](02_bregman.ipynb), the iteration on which the paper's method is built. To see
+#   why a lower bound settles the question, without optimisation, begin with
+#   [notebook 14](14_is_it_really_the_best.ipynb)
 #
 # A robot measures its motion between poses, and it recognises places that it has seen before. Every
 # measurement has a small error, so the measurements contradict each other. *Pose graph

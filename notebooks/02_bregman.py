@@ -1,5 +1,5 @@
 # %% [markdown]
-# # 2. Why does adding the residual back make a penalty exact?
+# # 2. Bregman iteration: why does adding the residual back make a penalty exact?
 #
 # Open with `jupyter lab notebooks/02_bregman.ipynb`; `pip install -e '.[notebooks,fast]'` installs
 # it.

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # 3. What does it cost to minimise only a little before the multiplier moves?
+# # 3. ADMM is Bregman iteration: what does it cost to minimise only a little before the multiplier moves?
 #
 # Open with `jupyter lab notebooks/03_bregman_is_admm.ipynb`; `pip install -e '.[notebooks,fast]'`
 # installs it.

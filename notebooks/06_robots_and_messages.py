@@ -8,7 +8,8 @@
 # - **Prerequisites:** [notebook 4](04_splitting_orthogonality.ipynb), the three steps of SOC, the
 #   splitting of orthogonality constraints, and what a penalty rho is.
 # - **Time:** 30 minutes
-# - **Next:** [notebook 8](08_your_own_graph.ipynb), what to do with a graph of your own
+# - **Next:** [notebook 7](07_the_papers_tables.ipynb), where the last few percent of the paper's
+#   tables come from
 #
 # The paper's problem has several robots. Each has its own trajectory, and some of them have met.
 # No robot holds all measurements. This notebook divides a graph among robots, codes SOC as an

@@ -9,7 +9,10 @@
 #
 # **Time:** 30 minutes
 #
-# **Next:** [notebook 10](10_soc_beyond_robots.ipynb), what SOC does beyond robots
+# **For whom:** readers of the paper, and those who compare a method of their own with its tables. No
+# other notebook needs this one; if you have a graph to solve, go on to notebook 8.
+#
+# **Next:** [notebook 8](08_your_own_graph.ipynb), what to do with a graph of your own
 #
 # In the paper's tables 1 and 3 SOC ends a few percent above the certified optimum: 3.9 % on the
 # circle, 7.6 % on the grid, 6.0 % on the sphere (as a share of its own $F$). Is the reason too few

@@ -9,8 +9,7 @@
 #
 # **Time:** 40 minutes
 #
-# **Next:** [notebook 7](07_the_papers_tables.ipynb), where the last few percent of the paper's
-# tables come from
+# **Next:** [notebook 10](10_soc_beyond_robots.ipynb), what SOC does beyond robots
 #
 # If one place is taken for another that looks the same, a wrong loop closure enters the graph.
 # Least squares treats it like every other measurement. The certificate then proves that no poses

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # 11. How do machines agree on an answer when none shows its data?
+# # 11. ADMM across machines: how do machines agree on an answer when none shows its data?
 #
 # Open with `jupyter lab notebooks/11_admm_across_machines.ipynb`;
 # `pip install -e '.[notebooks,fast]'` installs it.

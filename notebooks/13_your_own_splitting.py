@@ -7,7 +7,7 @@
 # - **Prerequisites:** [notebook 4](04_splitting_orthogonality.ipynb), which derives the method SOC that
 #   is written anew here
 # - **Time:** 25 minutes
-# - **Next:** [notebook 15](15_rotation_averaging.ipynb), rotations without translations
+# - **Next:** [notebook 14](14_is_it_really_the_best.ipynb), whether an answer is really the best
 #
 # A splitting method is a recursion of a few lines. What surrounds it is the same for every method:
 # a loop, a clock, a table, a history, a test of convergence, limits, the best iterate. The library

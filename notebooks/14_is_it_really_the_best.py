@@ -7,7 +7,7 @@
 # * **Prerequisites:** a pose graph and an answer to it, and the first three sections of
 #   [notebook 1](01_quickstart.ipynb); no optimisation
 # * **Time:** 15 minutes
-# * **Next:** [notebook 2](02_bregman.ipynb), the iteration on which the paper's method is built
+# * **Next:** [notebook 15](15_rotation_averaging.ipynb), rotations without translations
 #
 # Some program has returned poses for your measurements, and it says that it has converged. Could
 # there be better poses? This notebook shows an answer that passes every test one can think of and
@@ -236,9 +236,9 @@ print(proof["poses"][30])
 
 # %% [markdown]
 # `pgo.verify_proof` reads the measurements and the proof, and computes the bound anew. It shares no code
-# with what found the proof, and it computes with intervals that contain every rounding error
-# ([notebook 5](05_sdp_and_certificates.ipynb) says how). The command line does the same:
-# `pgo verify town.g2o proof.json`.
+# with what found the proof. It reads every number as the rational number that its digits denote, and
+# completes the square pose by pose in *ball arithmetic*, where every number carries a bound on its
+# rounding error. The command line does the same: `pgo verify town.g2o proof.json`.
 
 # %%
 verified = pgo.verify_proof(folder / "town.g2o", folder / "proof.json")

@@ -7,8 +7,8 @@
 # * **Prerequisites:** matrices and eigenvectors; for the certificate
 #   [notebook 1](01_quickstart.ipynb) or [notebook 14](14_is_it_really_the_best.ipynb)
 # * **Time:** 20 minutes
-# * **Next:** [notebook 1](01_quickstart.ipynb), where poses have positions as well, if you
-#   began here; otherwise this was the last one
+# * **Next:** [notebook 16](16_beyond_the_relaxation.ipynb), what can be proven where the relaxation is
+#   loose
 #
 # Some devices measure rotations and nothing else: cameras that see the same things from different
 # sides, gyroscopes, particles in an electron microscope. The rotations are unknown, what is measured is how some of

@@ -6,15 +6,15 @@
 #
 # - **Prerequisites:** [notebook 5](05_sdp_and_certificates.ipynb), what a certificate is, and
 #   [notebook 6](06_robots_and_messages.ipynb), robots and the separators between them.
-# - **Time:** 30 minutes
-# - **Next:** [notebook 6](06_robots_and_messages.ipynb), the messages of a method, round by round
+# - **Time:** 25 minutes
+# - **Next:** [notebook 18](18_the_files_own_cost.ipynb), what information matrices change
 #
 # In notebook 6 the graph was there before the robots began to talk. Here it grows while they drive.
 # Four robots measure for three minutes, each keeps what it has measured, and messages travel between
 # them with a delay. For one minute the robot that organises the solves is out of reach. As soon as the
 # robots have met, each has a map and a certificate, and the certificate says which robots it *covers*.
-# This notebook simulates the mission, derives what such a certificate proves, counts the bytes on
-# every link, and ends with what no team can know.
+# This notebook simulates the mission, derives what such a certificate proves, and ends with what no
+# team can know.
 #
 # `solvers.Robot` is a robot without sockets, threads or a clock, so the network can be a loop of
 # twenty lines. What only draws is in [`drawings/a_mission.py`](drawings/a_mission.py).
@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from drawings.a_mission import draw_drivers, draw_links, draw_world, mission_film
+from drawings.a_mission import draw_drivers, draw_world, mission_film
 from drawings.checks import NamedNumbers
 
 import pgo_models as pgo
@@ -63,8 +63,9 @@ draw_world(world, names)
 # ## A team, and a network in twenty lines
 #
 # A `Robot` is made of its name, the names of the team, and a secret of the team. `Weighting.ISOTROPIC`
-# asks for the paper's cost $F$. Measurements are added in batches, every ten seconds, since new
-# measurements make a new solve begin.
+# asks for the paper's cost $F$. With `Sharing.INTERFACE` the edges inside a robot's part stay with it;
+# with `Sharing.MEASUREMENTS` the driver gets them all, and what a certificate says is the same.
+# Measurements are added in batches, every ten seconds, since new measurements make a new solve begin.
 
 # %%
 KEY = b"a secret of the whole team"
@@ -366,49 +367,6 @@ print(f"{len(separators)} separators; smallest eigenvalue of their matrix {least
 print(f"bound by hand {by_hand:.9f}, of the team {team_bound:.9f}")
 
 # %% [markdown]
-# ## What crosses which link
-#
-# With `Sharing.INTERFACE`, as above, a solve takes about 20 rounds of such matrices and vectors. With
-# `Sharing.MEASUREMENTS` every robot sends its measurements, compressed, to the driver, which solves
-# alone: two rounds. The same mission once more, in this way:
-
-# %%
-sharing_all = new_team(solvers.Sharing.MEASUREMENTS)
-log_of_sharing = mission(sharing_all, AWAY)
-tables = {
-    title: np.array([[r.ledger.sent.get(name, 0) / 1000 for name in names] for r in team.values()])
-    for title, team in (("interface", robots), ("measurements", sharing_all))
-}
-rounds = {}
-for title, entries in (("interface", log), ("measurements", log_of_sharing)):
-    outcome = entries[-1]["ben"].outcome
-    rounds[title] = outcome.solution.ledger.rounds
-    print(
-        f"{title:12} {tables[title].sum():5.0f} kB; solve {outcome.term.number}, the last one, "
-        f"took {outcome.solution.ledger.rounds} rounds; bound {outcome.solution.lower_bound:.9f}"
-    )
-draw_links(tables, names)
-
-# %% [markdown]
-# The two ways end with the same bound; here measurements are 40 % of the bytes. Which is less depends
-# on the graph. The matrices tell more than the totals:
-#
-# - Nearly everything goes to and from a driver. Carl and Dora, who never drive, send each other 27 kB in
-#   the right matrix. These are greetings, with which robots notice each other: one every 1.25 seconds, a
-#   quarter of `patience`, and one at once when a robot has new measurements. All twelve links have about
-#   as many or more, so greetings are more than half of the 553 kB in that matrix. In the left one they
-#   also tell each other, and nobody else, of the twelve edges between them: 2 to 3 kB.
-# - Ben's row and column are those of a driver, too, thanks to one minute without Anna.
-# - Dora has the most separators, and sends Anna the most in the left matrix. Sharing measurements
-#   depends on the edges of a robot, and sharing its interface on its separators.
-# - Every batch is solved once. There were 18, but the last solve has the number 20, for Anna began two
-#   more. At second 80 she asked the others for their parts, heard nothing, gave up, and began again
-#   alone. At second 140 she had not heard yet that they are back, began alone, and began again with them.
-#   (Ben counts his solves in the meantime from 9 as well. A solve is named by its number and its driver.)
-# - Bytes are counted when they are sent, also those that were sent to Anna in vain.
-#
-# Sharing the interface is not about bytes alone: the edges inside a robot's part stay with it.
-#
 # ## Where it fails
 #
 # **Parts without a common edge.** Until second 40 no solve succeeds, and for the others none does for a
@@ -457,6 +415,9 @@ for name in ("ben", "dora"):
 for second in (80, 83, 87, 140, 143):
     now = log[second - 1]
     for name in ("anna", "ben"):
+        if now[name].outcome is None:
+            print(f"{second:4}  {name:4}  no certificate yet")
+            continue
         solved_lines = now[name].outcome.revisions.items()
         pairs = (f"{n} {solved.num_lines} of {now[n].lines}" for n, solved in solved_lines)
         failed = " (a later solve has failed)" if now[name].failure else ""
@@ -569,14 +530,6 @@ with NamedNumbers():
     assert least > 0
     assert not S[np.ix_(rows_of(interiors[0]), rows_of(interiors[1]))].any()
     assert np.isclose(by_hand, team_bound, rtol=1e-9)
-    assert rounds["measurements"] == 2
-    assert 10 <= rounds["interface"] <= 30
-    assert tables["measurements"].sum() < 0.5 * tables["interface"].sum()
-    assert np.allclose(tables["interface"][2:, 2:], tables["measurements"][2:, 2:], rtol=0.15)
-    assert 1.0 < tables["interface"][2, 3] - tables["measurements"][2, 3] < 4.0
-    assert 12 * tables["measurements"][2, 3] > 0.5 * tables["measurements"].sum()
-    assert log[-1]["ben"].outcome.term == log_of_sharing[-1]["ben"].outcome.term
-    assert log[-1]["ben"].outcome.term.number == 20
     assert log[89]["ben"].outcome.term.driver == "anna"
     assert log[109]["ben"].outcome.term.driver == "ben"
     assert with_stranger["ben"].covered == ("anna", "ben", "carl")

@@ -96,25 +96,6 @@ def _driven(known: Known) -> str:
     return f"{known.outcome.term.driver} drove{later}"
 
 
-def draw_links(tables: Mapping[str, NDArray[np.float64]], names: Sequence[str]) -> None:
-    """Draw the kilobytes of every link, a matrix for each way to share."""
-    _, row = plt.subplots(1, len(tables), figsize=(3.1 * len(tables), 3.0), layout="constrained")
-    largest = max(float(table.max()) for table in tables.values())
-    for axes, (title, table) in zip(row, tables.items(), strict=True):
-        axes.imshow(table, cmap="Blues", vmin=0, vmax=largest)
-        for (sender, receiver), value in np.ndenumerate(table):
-            if sender != receiver:
-                colour = "white" if value > _DARK * largest else "black"
-                text = f"{value:.0f}"
-                axes.text(receiver, sender, text, ha="center", va="center", color=colour)
-        axes.set_xticks(range(len(names)), names, fontsize=8)
-        axes.set_yticks(range(len(names)), names, fontsize=8)
-        axes.set_xlabel("to", fontsize=8)
-        axes.set_ylabel("from", fontsize=8)
-        total = table.sum()
-        axes.set_title(f"{title}: {total:.0f} kB", fontsize=9)
-
-
 def mission_film(
     world: pgo.PoseGraph,
     log: Log,

@@ -1,4 +1,4 @@
-"""The checks at the end of a notebook: an assert that fails says which number moved."""
+"""The checks at the end of a notebook: one that fails says which number moved."""
 
 import ast
 import linecache
@@ -8,10 +8,12 @@ from types import TracebackType
 import numpy as np
 
 MOST_CHARACTERS = 200  # of a value that is shown
+# What a statement raises that is false, or whose numbers are not there after a change.
+FAILURES = (AssertionError, AttributeError, LookupError, TypeError, ValueError)
 
 
 class NamedNumbers:
-    """A block of asserts; one that fails is repeated with the values of what it compares."""
+    """A block of asserts; one that fails, or cannot be evaluated, is repeated with its values."""
 
     def __enter__(self) -> None:
         """Begin the block."""
@@ -23,9 +25,13 @@ class NamedNumbers:
         trace: TracebackType | None,
     ) -> None:
         """Raise an AssertionError with the statement and its numbers in place of a bare one."""
-        if isinstance(error, AssertionError) and trace is not None:
-            lines = "\n".join(["this statement no longer holds:", *_described(trace)])
-            raise AssertionError(f"{lines}\nif you changed a parameter, this may do so") from error
+        if not isinstance(error, FAILURES) or trace is None:
+            return
+        reason = "no longer holds"
+        if not isinstance(error, AssertionError):
+            reason = f"cannot be evaluated any more ({type(error).__name__}: {error})"
+        lines = "\n".join([f"this statement {reason}:", *_described(trace)])
+        raise AssertionError(f"{lines}\nif you changed a parameter, this may do so") from error
 
 
 def _described(trace: TracebackType) -> Iterator[str]:
@@ -42,9 +48,10 @@ def _described(trace: TracebackType) -> Iterator[str]:
         for expression in _compared(statement.test):
             try:
                 value = eval(expression, frame.f_globals, frame.f_locals)
-            except NameError:  # a variable of a comprehension
+            except (NameError, *FAILURES):  # a variable of a comprehension, or what has failed
                 continue
-            yield f"    {expression} is {_short(value)}"
+            if _short(value) != expression:
+                yield f"    {expression} is {_short(value)}"
 
 
 def _compared(test: ast.expr) -> list[str]:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 import pgo_models as pgo
-from pgo_models.certificates.certificate import Certificate
 from pgo_models.geometry.rotations import Array
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
@@ -22,106 +19,6 @@ SMALLEST = 1e-15  # of a share that is drawn: what is below it is rounding
 POWERS = (-12, -8, -4, 0)  # of ten, that the axis of shares names
 NUM_EIGENVALUES = 6
 LEGEND = {"x": 1.0, "xanchor": "right", "y": 1.0, "traceorder": "reversed"}
-
-
-def bounds_film(runs: Mapping[str, Sequence[Certificate]], optima: Mapping[str, float]) -> Figure:
-    """Film of what is proven in every iterate of some runs: an interval that holds the optimum."""
-    shares = {name: _shares(certificates, optima[name]) for name, certificates in runs.items()}
-    num_iterates = len(next(iter(runs.values())))
-    frames = []
-    labels = []
-    for k in range(num_iterates):
-        frames.append(
-            [
-                trace
-                for (name, (above, below)), colour in zip(shares.items(), COLOURS, strict=False)
-                for trace in _interval(name, above[: k + 1], below[: k + 1], colour)
-            ]
-        )
-        gaps = " and ".join(f"{certificates[k].gap:.0e}" for certificates in runs.values())
-        labels.append(f"iteration {k}: gaps {gaps}")
-    falls = "; ".join(
-        f"{name} from {certificates[0].gap:.0e} to {certificates[-1].gap:.0e}"
-        for name, certificates in runs.items()
-    )
-    description = (
-        f"For every iteration from 0 to {num_iterates - 1} of SOC, an upper curve with the cost of "
-        "the iterate and a lower one with the bound that is proven there, both relative to the "
-        f"optimum, on a logarithmic scale on either side of zero. The gap falls: {falls}."
-    )
-    return pgo.animate(
-        frames,
-        labels,
-        still=[_line_at_zero(num_iterates)],
-        layout=_axes_of_shares(num_iterates),
-        title="cost above, proven bound below the optimum",
-        description=description,
-    )
-
-
-def _shares(certificates: Sequence[Certificate], optimum: float) -> tuple[Array, Array]:
-    """How far costs are above the optimum and bounds below it, on the scale that is drawn."""
-    above = np.array([certificate.objective for certificate in certificates]) / optimum - 1.0
-    below = np.array([certificate.lower_bound for certificate in certificates]) / optimum - 1.0
-    return _scaled(above), _scaled(below)
-
-
-def _scaled(shares: Array) -> Array:
-    """Decades by which a share is above `SMALLEST`, with the sign of the share."""
-    decades = np.log10(np.maximum(np.abs(shares), SMALLEST) / SMALLEST)
-    return np.asarray(np.sign(shares) * decades).round(2)
-
-
-def _interval(name: str, above: Array, below: Array, colour: str) -> list[Trace]:
-    """Curve of the bound, and that of the cost with the area between them."""
-    iterations = list(range(len(above)))
-    line = {
-        "mode": "lines+markers",
-        "line": {"color": colour, "width": 2},
-        "marker": {"size": 4},
-        "hoverinfo": "skip",
-    }
-    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    area = {"fill": "tonexty", "fillcolor": f"rgba({red},{green},{blue},0.25)"}
-    lower = {"x": iterations, "y": below.tolist(), "showlegend": False, **line}
-    return [lower, {"x": iterations, "y": above.tolist(), "name": name, **line, **area}]
-
-
-def _line_at_zero(num_iterates: int) -> Trace:
-    return {
-        "x": [0, num_iterates - 1],
-        "y": [0.0, 0.0],
-        "mode": "lines",
-        "line": {"color": QUIET_COLOUR, "width": 1, "dash": "dot"},
-        "showlegend": False,
-        "hoverinfo": "skip",
-    }
-
-
-def _axes_of_shares(num_iterates: int) -> dict[str, object]:
-    """Axes of the iteration and of shares, whose ticks are powers of ten with a sign."""
-    heights = [power - np.log10(SMALLEST) for power in POWERS]
-    ticks = [(-height, f"-1e{power}") for height, power in zip(heights, POWERS, strict=True)]
-    ticks += [(height, f"1e{power}") for height, power in zip(heights, POWERS, strict=True)]
-    ticks.append((0.0, "optimum"))
-    highest = 1.1 * max(heights)
-    return {
-        "height": 470,
-        "margin": {"l": 66, "r": 12, "t": 40, "b": 20},
-        "xaxis": {
-            "range": [-0.3, num_iterates - 0.7],
-            "title": {"text": "iteration of SOC", "standoff": 5},
-            "zeroline": False,
-        },
-        "yaxis": {
-            "range": [-highest, highest],
-            "tickvals": [height for height, _ in ticks],
-            "ticktext": [text for _, text in ticks],
-            "gridcolor": "#eeeeee",
-            "zeroline": False,
-        },
-        "legend": LEGEND,
-    }
 
 
 def noise_film(levels: Sequence[Level], d: int) -> Figure:

@@ -7,12 +7,15 @@ script is Python.
 
 import ast
 import json
+import linecache
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pgo_models
@@ -23,17 +26,9 @@ SOURCES = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
 NAMES = [source.stem for source in SOURCES]
 LIBRARIES = {"cvxpy", "matplotlib", "numpy", "pandas", "scipy", "drawings"}
 ANSWER = re.compile(r"<details><summary>Answer</summary>\n\n(.*?)\n\n</details>", re.S)
+README = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
 FILM = "application/vnd.plotly.v1+json"
 MOST_BYTES = 400_000
-
-# What is run in place of parts of a notebook that take long: a sweep over three levels of the
-# noise, not six, with one graph at each, not three. The asserts of the notebook hold of it, too.
-SHORTENED = {
-    "16_beyond_the_relaxation": [
-        ("np.array([30.0, 40.0, 50.0, 60.0, 70.0, 80.0])", "np.array([30.0, 50.0, 80.0])"),
-        ("np.deg2rad(degrees), 3, np", "np.deg2rad(degrees), 1, np"),
-    ],
-}
 
 each_source = pytest.mark.parametrize("source", SOURCES, ids=NAMES)
 
@@ -69,11 +64,7 @@ def with_answers(source: Path) -> str:
             if kind == "code"
             else [code for answer in ANSWER.findall(text) for code in code_of(answer)]
         )
-    code = "\n\n".join(parts)
-    for whole, part in SHORTENED.get(source.stem, []):
-        assert code.count(whole) == 1
-        code = code.replace(whole, part)
-    return code
+    return "\n\n".join(parts)
 
 
 def code_of(answer: str) -> list[str]:
@@ -85,6 +76,17 @@ def test_there_is_a_notebook_for_every_topic():
     assert len(NAMES) >= 17
     assert [name[:2] for name in NAMES] == numbers
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
+
+
+def test_titles_next_and_the_readme_have_one_order():
+    rows = re.findall(r"^\| `(\w+)\.ipynb` \| (.+) \| (\d+) \|$", README, re.M)
+    assert [name for name, _, _ in rows] == NAMES
+    for k, (source, (_, question, minutes)) in enumerate(zip(SOURCES, rows, strict=True)):
+        head = cells(source)[0][1]
+        assert head.startswith(f"# {k + 1}. {question}\n")
+        assert f"**Time:** {minutes} minutes" in head
+        after = head[head.index("**Next:**") :].split("\n\n")[0]
+        assert source == SOURCES[-1] or f"]({NAMES[k + 1]}.ipynb)" in after, source.name
 
 
 @pytest.mark.slow
@@ -159,3 +161,32 @@ def test_a_source_uses_public_names_only(source):
                 assert node.attr in packages[node.value.id], (
                     f"{node.value.id}.{node.attr} is not public"
                 )
+
+
+CHECKS = runpy.run_path(str(FOLDER / "drawings" / "checks.py"))
+
+
+@pytest.mark.parametrize(
+    ("statement", "said"),
+    [
+        ("assert gap < 1e-6", ["assert gap < 1e-06", "gap is 0.25"]),
+        ("assert np.isclose(gap, 0.5)", ["gap is 0.25"]),
+        (
+            "assert outcome.covered == names",
+            ["'NoneType' object has no attribute", "names is ('a'"],
+        ),
+        ("assert bound <= gap", ["TypeError", "bound is None", "gap is 0.25"]),
+        ("(rejected,) = np.flatnonzero([gap, gap])", ["ValueError: too many values"]),
+    ],
+)
+def test_a_check_that_fails_says_which_number_moved(statement, said):
+    code = f"with NamedNumbers():\n    {statement}\n"
+    linecache.cache["<cell>"] = (len(code), None, code.splitlines(keepends=True), "<cell>")
+    names = {"NamedNumbers": CHECKS["NamedNumbers"], "np": np, "gap": 0.25}
+    with pytest.raises(AssertionError) as failed:
+        exec(
+            compile(code, "<cell>", "exec"),
+            names | {"outcome": None, "bound": None, "names": ("a", "b")},
+        )
+    for words in [*said, "if you changed a parameter, this may do so"]:
+        assert words in str(failed.value)
