@@ -16,6 +16,7 @@ import os
 import re
 import shutil
 import sys
+from html import unescape
 from pathlib import Path
 
 SITE = Path(__file__).parent
@@ -36,6 +37,9 @@ PAGES = {
 }
 FILM = "application/vnd.plotly.v1+json"  # a figure of plotly, in the output of a notebook's cell
 PLOTLY_SCRIPT = "../_static/plotly.min.js"  # of `conf.py`, seen from the pages of the notebooks
+FRONT_FILM = (
+    ROOT / "notebooks" / "14_is_it_really_the_best.ipynb"
+)  # whose first film opens the site
 # Files of the repository that are no page of the site, and the page that a link to them opens.
 INSTEAD = {"README.md": "index.md"}
 
@@ -181,11 +185,32 @@ def with_films(notebook: str) -> str:
     return json.dumps(content)
 
 
+def fill_front_pages(source: Path) -> None:
+    """Put films, thumbnails and links where comments of front page and indices ask for them."""
+    import pictures  # beside this file; needs plotly
+
+    film = json.dumps(pictures.outputs(FRONT_FILM, FILM)[0])
+    figure = extra_module("plotly.io", "docs").from_json(film)
+    html = figure_html(figure, PLOTLY_SCRIPT.removeprefix("../"), f"{figure.layout.height}px")
+    table = pictures.table_of_notebooks(source)
+    for page, mark, text in (
+        ("index.md", "<!-- film -->", pictures.raw_html(html)),
+        ("notebooks.md", "<!-- notebooks -->", table),
+    ):
+        path = source / page
+        content = path.read_text(encoding="utf-8")
+        path.write_text(content.replace(mark, text), encoding="utf-8")
+    gallery = source / "guide" / "gallery.md"
+    text = pictures.with_thumbnails(gallery.read_text(encoding="utf-8"))
+    gallery.write_text(text, encoding="utf-8")
+
+
 def assemble(source: Path) -> None:
     """Write all pages, notebooks and pictures to a folder."""
     shutil.copytree(
         SITE, source, ignore=shutil.ignore_patterns("_build", "*.py", "static", "__pycache__")
     )
+    fill_front_pages(source)
     (source / "notebooks").mkdir()
     notebooks = sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb"))
     for notebook in notebooks:
@@ -202,6 +227,27 @@ def assemble(source: Path) -> None:
         text = (ROOT / page).read_text(encoding="utf-8")
         (source / name).write_text(relinked(text, page), encoding="utf-8")
     write_reference(source / "reference")
+    import one_page  # beside this file; needs matplotlib
+
+    one_page.write_page(source / "method.pdf")
+
+
+def write_texts(html: Path) -> None:
+    """Write what the pages say, of which `excerpts.js` shows pieces under the results of a search.
+
+    A page that is opened from the disk may not read other pages, but it may load a script.
+    """
+    texts = {}
+    for page in sorted(
+        [*html.glob("*.html"), *html.glob("guide/*.html"), *html.glob("notebooks/*.html")]
+    ):
+        article = re.search(r"<article.*?</article>", page.read_text(encoding="utf-8"), re.S)
+        if article is not None:
+            shown = re.sub(r"<(script|style|svg)\b.*?</\1>|<[^>]+>", " ", article[0], flags=re.S)
+            name = page.relative_to(html).as_posix()
+            texts[name] = " ".join(unescape(shown).replace("#", " ").split())
+    script = f"const TEXTS = {json.dumps(texts)};\n"
+    (html / "_static" / "texts.js").write_text(script, encoding="utf-8")
 
 
 def main() -> int:
@@ -236,6 +282,7 @@ def main() -> int:
     ]
     options.append(str(out / "source"))
     code = build_main(["-b", "html", *options, str(out / "html")])
+    write_texts(out / "html")
     if code == 0 and arguments.links:
         code = build_main(["-b", "linkcheck", *options, str(out / "links")])
     if code == 0:

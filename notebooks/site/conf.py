@@ -52,7 +52,8 @@ html_css_files = ["site.css"]
 html_search_scorer = str(SITE / "static" / "scorer.js")
 html_copy_source = False
 html_show_sourcelink = False
-# Summaries need other files, which a browser does not read when pages are opened from the disk.
+# Sphinx's summaries need other files, which a browser does not read when pages are opened from the
+# disk; `excerpts.js` takes their place.
 html_show_search_summary = False
 html_context = {"default_mode": "auto"}
 html_theme_options = {
@@ -79,3 +80,11 @@ def setup(app: object) -> None:
     plotly = Path(find_spec("plotly").origin).parent
     app.config.html_static_path.append(f"{plotly}/package_data/plotly.min.js")
     docstrings.connect(app)
+    app.connect("html-page-context", add_excerpts)
+
+
+def add_excerpts(app: object, page: str, *_: object) -> None:
+    """Load the texts of the pages, which `build.py` writes, where a search shows its results."""
+    if page == "search":
+        app.add_js_file("texts.js")
+        app.add_js_file("excerpts.js")

@@ -25,10 +25,15 @@ BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.M | re.S)
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 
-def test_every_page_of_the_guide_is_in_its_table_of_contents():
+def test_every_page_of_the_guide_is_in_its_index_with_its_title_and_a_question():
     index = (SITE / "guide" / "index.md").read_text(encoding="utf-8")
-    pages = {page.stem for page in SITE.glob("guide/*.md")} - {"index"}
-    assert set(re.findall(r"^\w+$", index, re.M)) - {"Guide"} == pages
+    order = [name for name in re.findall(r"^\w+$", index, re.M) if name != "Guide"]
+    rows = re.findall(r"^\| \[(.+?)\]\((\w+)\.md\) \| .+\? \|$", index, re.M)
+    assert [name for _, name in rows] == order
+    assert set(order) == {page.stem for page in SITE.glob("guide/*.md")} - {"index"}
+    for title, name in rows:
+        page = (SITE / "guide" / f"{name}.md").read_text(encoding="utf-8")
+        assert page.startswith(f"# {title}\n")
 
 
 @pytest.mark.slow

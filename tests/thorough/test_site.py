@@ -227,6 +227,86 @@ def test_a_film_of_a_notebook_is_seen_and_moves_by_a_key(width, browser, site):
         opened_without_complaint(browser)
 
 
+# What of a page reaches beyond its column, and is not in a box that scrolls.
+TOO_WIDE = """
+(() => {
+  const column = document.querySelector('.bd-article');
+  const limit = column.getBoundingClientRect().right + 1;
+  const ends = (element) => element.getBoundingClientRect().right;
+  const scrolls = (element) => getComputedStyle(element).overflowX !== 'visible';
+  return [...column.querySelectorAll('*')].filter((element) => {
+    if (ends(element) <= limit || element.getBoundingClientRect().width === 0) { return false; }
+    for (let box = element.parentElement; box !== column.parentElement; box = box.parentElement) {
+      if (scrolls(box) && ends(box) <= limit) { return false; }
+    }
+    return true;
+  }).map((element) => `${element.tagName} ${element.textContent.slice(0, 60)}`);
+})()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 768, 1280, 1920])
+def test_nothing_on_a_page_is_wider_than_its_column(width, browser, site):
+    pages = [site / "index.html", site / "notebooks.html", site / "proved.html"]
+    wide = {}
+    with browser.showing(width, "light"):
+        for page in [*pages, *sorted(site.glob("guide/*.html")), *site.glob("notebooks/*.html")]:
+            browser.open(page)
+            count = browser.value("document.querySelectorAll('.math').length")
+            browser.wait_for(f"document.querySelectorAll('.math mjx-container').length >= {count}")
+            films = "[...document.querySelectorAll('.plotly-graph-div')]"
+            browser.wait_for(
+                f"{films}.every(f => f.querySelector('.main-svg')?.clientWidth === f.clientWidth)"
+            )
+            found = browser.value(TOO_WIDE)
+            if found or browser.value("document.documentElement.scrollWidth > innerWidth"):
+                wide[page.name] = found[:3]
+    assert wide == {}
+
+
+def test_the_front_page_opens_on_a_film_that_moves(browser, site):
+    browser.open(site / "index.html")
+    browser.wait_for(f"{FILM}?._fullLayout?.sliders !== undefined")
+    first = browser.value(PICTURE)
+    browser.value(f"{FILM}.focus()")
+    browser.press("End", "End", 35)
+    browser.wait_for(f"{PICTURE} !== {json.dumps(first)}")
+    opened_without_complaint(browser)
+
+
+def test_results_of_a_search_show_where_the_word_stands(browser, site):
+    browser.open(site / "index.html")
+    browser.value("setTimeout(() => { location.href = 'search.html?q=grounded' })")
+    item = "#search-results li:has(a[href*='proved.html'])"
+    browser.wait_for(f'document.querySelector("{item} .excerpt") !== null')
+    shown = browser.value(f'document.querySelector("{item} .excerpt").textContent')
+    assert "grounded" in shown.lower()
+    assert 50 < len(shown) < 400
+
+
+def test_pictures_lead_to_notebooks_and_to_lines_of_the_gallery(site):
+    index = (site / "notebooks.html").read_text(encoding="utf-8")
+    for notebook in (ROOT / "notebooks").glob("[0-9][0-9]_*.py"):
+        link = rf'<a [^>]*href="notebooks/{notebook.stem}\.html"[^>]*>(<span[^>]*>)?<img'
+        assert re.search(link, index), notebook.stem
+    gallery = (site / "guide" / "gallery.html").read_text(encoding="utf-8")
+    sections = re.findall(
+        r"^### ", (BUILD.parent / "guide" / "gallery.md").read_text("utf-8"), re.M
+    )
+    thumbnails = re.findall(r'<a [^>]*href="#[\w-]+"[^>]*><img', gallery)
+    assert len(thumbnails) == len(sections)
+    assert gallery.count("Used in") > 5
+
+
+def test_the_method_is_on_one_page_of_pdf(pages, site):
+    for page in ("index.html", "guide/teach.html"):
+        (link,) = [link for link in pages[site / page].links if link.endswith("method.pdf")]
+        content = ((site / page).parent / link).read_bytes()
+        assert content.startswith(b"%PDF")
+        assert content.count(b"/Type /Page\n") + content.count(b"/Type /Page ") == 1
+
+
 @pytest.mark.parametrize(
     "page",
     ["proved.html", "notebooks/01_quickstart.html", "reference/pgo_models.certificates.html"],
