@@ -120,6 +120,11 @@ def check_parameters(problem: cp.Problem) -> None:
             raise SettingError(f"the Parameter {parameter.name()} has no value; set it first")
 
 
+def has_attributes(variable: cp.Variable) -> bool:
+    """Whether a variable has attributes, as symmetric=True: solvers get another one for it."""
+    return any(value is not None and value is not False for value in variable.attributes.values())
+
+
 def check_variable(variable: cp.Variable, name: str) -> None:
     """Raise a SettingError unless `variable` is a continuous real cvxpy Variable."""
     if not isinstance(variable, cp.Variable):

@@ -24,6 +24,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 
 from pgo_models.convex.constraint_sets import ConstraintSet, Orthonormal, UnitColumns, UnitRows
+from pgo_models.convex.convex_solver import has_attributes
 from pgo_models.convex.hulls import hulls_of
 from pgo_models.convex.model_bound import is_proven_definite, prove_matrix
 from pgo_models.convex.orthogonality import OrthogonalProblem
@@ -62,11 +63,12 @@ class HullBound(ReadOnly):
 def prove_hull_bound(problem: OrthogonalProblem) -> HullBound | None:
     """The bound of a model; None where nothing is proven.
 
-    That is where a set has no hull here, the program has exponential cones, it is not strictly
-    feasible, or it leaves a direction of the variables without a set free.
+    That is where a set has no hull here, or a variable in a set has attributes, as nonneg=True;
+    where the program has exponential cones, is not strictly feasible, or leaves a direction of the
+    variables without a set free.
     """
     hulls = hull_constraints(problem)
-    if hulls is None:
+    if hulls is None or any(has_attributes(variable) for variable in problem.variables):
         return None
     model = cp.Problem(cp.Minimize(problem.J), [*problem.problem.constraints, *hulls])
     try:
@@ -114,7 +116,7 @@ def hull_constraints(problem: OrthogonalProblem) -> list[cp.Constraint] | None:
 
 def _hull_of(X: cp.Variable, kind: ConstraintSet) -> list[cp.Constraint]:
     if isinstance(kind, UnitRows):
-        return [cp.norm(X, axis=1) <= 1.0] if X.ndim == 2 else [abs(X) <= 1.0]
+        return [cp.norm(X, axis=1) <= 1.0] if X.ndim == 2 else [cp.abs(X) <= 1.0]
     if isinstance(kind, UnitColumns):
         return [cp.norm(X, axis=0) <= 1.0] if X.ndim == 2 else [cp.norm(X) <= 1.0]
     block = Block(0, X.shape, (kind,))

@@ -33,7 +33,7 @@ from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_arr
 from scipy.sparse.linalg import splu
 
 from pgo_models.convex.constraint_sets import ConstraintSet, Rotations
-from pgo_models.convex.convex_solver import check_parameters
+from pgo_models.convex.convex_solver import check_parameters, has_attributes
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import ReadOnly
@@ -529,7 +529,7 @@ def _canonical_data(problem: OrthogonalProblem) -> tuple[dict[str, Any], dict[in
         raise NotQuadraticError("there are other constraints than linear equalities")
     columns = data["param_prob"].var_id_to_col
     for variable in (*problem.variables, *problem.others):
-        if variable.id not in columns:
+        if has_attributes(variable):
             raise NotQuadraticError(f"{variable.name()} has attributes, which are constraints")
     return data, columns, float(inverse[-1]["offset"])
 

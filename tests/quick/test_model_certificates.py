@@ -284,6 +284,28 @@ def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
         assert "hulls" in str(solution)
 
 
+def test_variables_that_solvers_get_others_for_have_no_bound() -> None:
+    target = np.ones((3, 3))
+    for attribute in ("nonneg", "symmetric"):
+        X = cp.Variable((3, 3), **{attribute: True})
+        problem = cp.Problem(cp.Minimize(cp.sum_squares(X - target)))
+        solution = solvers.solve_orthogonal(
+            pgo.OrthogonalProblem(problem, orthogonal=[X]), 0, starts=1
+        )
+        assert solution.verdict is Verdict.TRIVIAL
+        assert solution.lower_bound == -np.inf
+
+
+@pytest.mark.parametrize("kind", ["unit_columns", "unit_rows"])
+def test_vectors_have_hulls(kind: str) -> None:
+    x = cp.Variable(3)
+    model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(cp.norm(x - 1.5))), **{kind: [x]})
+    solution = solvers.solve_orthogonal(model, 0)
+    nearest = np.ones(3) / np.sqrt(3.0) if kind == "unit_columns" else np.ones(3)
+    assert solution.objective == pytest.approx(np.linalg.norm(nearest - 1.5), rel=1e-5)
+    assert solution.lower_bound == pytest.approx(solution.objective, rel=1e-5)
+
+
 def robust_model(seed: int, kind: str, shape: tuple[int, int], loss):
     """Registration with noise, one point in five off, and a free translation."""
     rng = np.random.default_rng(seed)
