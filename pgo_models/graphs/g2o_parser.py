@@ -395,6 +395,12 @@ class _Assembly:
                 "EDGE_SE3_PRIORQUAT has w first, and its matrix is taken as that of a rotation "
                 "vector, as with EDGE_SE3:QUAT"
             )
+        of_cameras = [tag for tag in ("EDGE_SE3:EXPMAP", "EDGE_SIM3:EXPMAP") if parsed[tag]]
+        if of_cameras:
+            self.notes.append(
+                f"{' and '.join(of_cameras)}: matrices have the rotation first, and are taken as "
+                "those of the relative pose; g2o has such errors in the axes of the world"
+            )
         if parsed["BR"]:
             self.notes.append(
                 "BR measurements, bearing and range, are taken as points with the covariance to "

@@ -9,7 +9,6 @@ import enum
 import numpy as np
 
 from pgo_models.errors import SettingError
-from pgo_models.geometry.arrays import triangle_places
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
@@ -140,7 +139,7 @@ def noise_as(reading: Reading, tag: Tag) -> Noise:
 def numbers_as(reading: Reading, tag: Tag, numbers: Array) -> Array:
     """Numbers on lines of a tag, (n, num_numbers), with quaternions and angles as g2o has them."""
     if reading in ROTATION_FIRST and tag.has_matrix and not tag.is_toro:
-        numbers = _with_translation_first(tag, numbers)
+        numbers = tag.with_translation_first(numbers)
     if reading in _W_FIRST and tag.has_quaternion:
         w_last = [*range(3), 4, 5, 6, 3, *range(7, numbers.shape[1])]
         return np.asarray(numbers[:, w_last])
@@ -149,23 +148,6 @@ def numbers_as(reading: Reading, tag: Tag, numbers: Array) -> Array:
         numbers = numbers.copy()
         numbers[:, 2] = np.deg2rad(numbers[:, 2])
     return numbers
-
-
-def _with_translation_first(tag: Tag, numbers: Array) -> Array:
-    """Numbers on lines whose matrices have the rotation first, with the translation first.
-
-    Matrices of points and of rotations alone stay as they are.
-    """
-    side = 3 * tag.d - 3
-    places = triangle_places(side)
-    if numbers.shape[1] != tag.num_measured + side * (side + 1) // 2:
-        return numbers
-    first = side - tag.d  # where the translation stands in the line's matrix
-    order = [*range(first, side), *range(first)]
-    rows, columns = np.triu_indices(side)
-    moved = places[np.ix_(order, order)][rows, columns]
-    measured = numbers[:, : tag.num_measured]
-    return np.concatenate([measured, numbers[:, tag.num_measured + moved]], axis=1)
 
 
 def edges_as(

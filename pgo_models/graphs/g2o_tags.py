@@ -17,6 +17,9 @@ hdl_graph_slam. Numbers are brought into the order of EDGE_SE2 and EDGE_SE3:QUAT
   vector parts of two quaternions. To first order this is half the rotation vector, like the error
   of EDGE_SE3:QUAT. `edge_se3_priorvec.hpp`: a direction of the world and what the pose has measured
   of it, both of length one. Its error is their difference in the frame of the pose.
+- g2o, `edge_se3_expmap.cpp` and `types_seven_dof_expmap.cpp`: poses and measurements of a camera
+  are inverted in reading, so that files have poses from camera to world, as VERTEX_SE3:QUAT.
+  Errors are logarithms, the rotation first. Similarities have logarithms, and that of their scale.
 """
 
 import enum
@@ -68,7 +71,10 @@ class Tag:
     otherwise; with `is_complete` it is the whole matrix. A point has d numbers, or bearing and
     range with DEVIATIONS, and its matrix is d x d. A rotation in space is a quaternion, its w
     first, and its matrix is 3 x 3. So is that of a direction, which is one of the world, then the
-    measured one. The ids of PARAMS_SE2OFFSET or PARAMS_SE3OFFSET lines,
+    measured one. With `is_rotation_first` the rows of the rotation in the matrix are before
+    those of the translation. A similarity has rotation vector, translation and scale of a
+    logarithm, in this order in the matrix, too, and a vertex the four numbers of a camera. The ids
+    of PARAMS_SE2OFFSET or PARAMS_SE3OFFSET lines,
     `num_offsets` of them, or those of switches, `num_switches`, may stand between ids and numbers.
     Poses of TORO in space have roll, pitch and yaw in place of a quaternion. The triangle of EDGE2
     is in another order, which `g2o_dialects` settles.
@@ -84,6 +90,8 @@ class Tag:
     is_toro: bool = False
     is_rotation: bool = False
     is_direction: bool = False
+    is_rotation_first: bool = False
+    is_similarity: bool = False
     is_complete: bool = False
     noise: Noise = Noise.INFORMATION
 
@@ -121,6 +129,9 @@ class Tag:
         if self.is_direction:
             is_wrong = np.asarray(~numbers[:, :3].any(axis=1) | ~numbers[:, 3:6].any(axis=1))
             return is_wrong, "a direction of length zero is none; correct or remove it"
+        if self.is_similarity:
+            is_scaled = np.asarray(numbers[:, 6] != 0.0)
+            return is_scaled, "a similarity with a scale other than 1; give the poses without scale"
         if self.noise is Noise.COVARIANCE:
             covariances = numbers[:, self.num_measured + triangle_places(self._side)]
             is_covariance = are_definite(covariances, SINGULAR)
@@ -155,6 +166,16 @@ class Tag:
             error = entry_error(information, congruence_error(everywhere, largest))
         return both(both(error, precision_error(information, self.d)), of_direction)
 
+    def with_translation_first(self, numbers: Array) -> Array:
+        """Numbers on lines whose matrices have the rotation first, with the translation first.
+
+        Matrices of points and of rotations alone stay as they are.
+        """
+        side = 3 * self.d - 3
+        if numbers.shape[1] != self.num_measured + side * (side + 1) // 2:
+            return numbers
+        return with_translation_first(numbers, self.num_measured, side)
+
     def triangles_of_complete(self, numbers: Array) -> tuple[Array, BoolArray]:
         """Numbers with the upper triangle of a complete matrix, and whether that is symmetric."""
         side = self._side
@@ -168,6 +189,10 @@ class Tag:
     def rows(self, numbers: Array) -> Array:
         """Numbers of lines, (n, num_numbers), as rows of `G2OLines`."""
         numbers = self._with_information(numbers)
+        if self.is_similarity:
+            numbers = _with_poses(numbers, self.is_edge)
+        if self.is_rotation_first:
+            numbers = with_translation_first(numbers, 7, 6)
         if self.is_point:
             return self._rows_of_points(numbers)
         if self.is_rotation:
@@ -181,6 +206,8 @@ class Tag:
     @property
     def _side(self) -> int:
         """Rows of the information matrix."""
+        if self.is_similarity:
+            return 7
         is_small = self.is_point or self.is_rotation or self.is_direction
         return self.d if is_small else 3 * self.d - 3
 
@@ -191,6 +218,8 @@ class Tag:
             return 4
         if self.is_direction:
             return 6
+        if self.is_similarity:
+            return 7 if self.is_edge else 11
         return 7 if self.has_quaternion else self._side
 
     @property
@@ -232,6 +261,37 @@ class Tag:
         if self.is_edge:
             rows[:, num_measured + in_block] = numbers[:, d:]
         return rows
+
+
+def with_translation_first(numbers: Array, num_measured: int, side: int) -> Array:
+    """Numbers, (k, num_measured + side (side + 1) / 2), with the translation first in matrices."""
+    places = triangle_places(side)
+    num_turns = 1 if side == 3 else 3
+    order = [*range(num_turns, side), *range(num_turns)]
+    rows, columns = np.triu_indices(side)
+    moved = num_measured + places[np.ix_(order, order)][rows, columns]
+    return np.concatenate([numbers[:, :num_measured], numbers[:, moved]], axis=1)
+
+
+def _with_poses(numbers: Array, is_edge: bool) -> Array:
+    """Numbers of poses, (k, 7 or 28), for logarithms of similarities of scale 1.
+
+    The translation is V u of its logarithm u, V = I + (1 - cos a) / a^2 hat(w) + (a - sin a) / a^3
+    hat(w)^2 for the angle a of w. What the matrix says of the scale, which is known, is left out.
+    """
+    w, u = numbers[:, :3], numbers[:, 3:6]
+    angle = np.linalg.norm(w, axis=1)[:, None]
+    is_small = angle < 1e-4
+    safe = np.where(is_small, 1.0, angle)
+    first = np.where(is_small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(is_small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    once = np.cross(w, u)
+    t = u + first * once + second * np.cross(w, once)
+    poses = np.concatenate([t, quaternions_from_rotations(exp_map(w))], axis=1)
+    if not is_edge:
+        return poses
+    in_pose = triangle_places(7)[:6, :6][np.triu_indices(6)]
+    return np.concatenate([poses, numbers[:, 7 + in_pose]], axis=1)
 
 
 def _with_quaternions(numbers: Array) -> Array:
@@ -340,6 +400,9 @@ OTHER_TAGS = {
     "EDGE_SE3_SWITCHABLE": Tag(3, 2, num_switches=1),
     "EDGE_SE3_PRIORQUAT": Tag(3, 1, is_rotation=True),
     "EDGE_SE3_PRIORVEC": Tag(3, 1, is_direction=True),
+    "EDGE_SE3:EXPMAP": Tag(3, 2, is_rotation_first=True),
+    "VERTEX_SIM3:EXPMAP": Tag(3, 1, is_edge=False, is_similarity=True),
+    "EDGE_SIM3:EXPMAP": Tag(3, 2, is_similarity=True, is_rotation_first=True),
 }
 _PLAIN_TAGS = {**G2O_TAGS, **OTHER_TAGS}
 
@@ -368,6 +431,7 @@ ALIASES = {
     "LANDMARK2": "EDGE_SE2_XY",
     "VERTEX_SE3": "VERTEX_SE3:QUAT",
     "EDGE_SE3": "EDGE_SE3:QUAT",
+    "VERTEX_SE3:EXPMAP": "VERTEX_SE3:QUAT",
     "VERTEX_SE3:EULER": "VERTEX3",
     "EDGE_SE3:EULER": "EDGE3",
     "ONLINE_VERTEX_SE2": "VERTEX_SE2",

@@ -72,6 +72,7 @@ def test_an_estimate_needs_no_matrices(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*EDGE_SE3_PRIORQUAT has w first")
+@pytest.mark.filterwarnings("ignore:.*matrices have the rotation first")
 @pytest.mark.parametrize("tag", sorted(set(COMPLETE_TAGS) - {"EDGE3"}))
 def test_a_complete_matrix_is_that_of_its_triangle(tmp_path: Path, tag: str) -> None:
     kind = TAGS[tag]
@@ -81,6 +82,8 @@ def test_a_complete_matrix_is_that_of_its_triangle(tmp_path: Path, tag: str) -> 
     matrix = root @ root.T + np.eye(side)
     matrix = np.triu(matrix) + np.triu(matrix, 1).T
     measured = rng.standard_normal(kind.num_measured)
+    if kind.is_similarity:
+        measured[6] = 0.0  # the logarithm of the scale
     start = (
         f"{tag} {' '.join(map(str, range(kind.num_ids)))} {' '.join(map(repr, measured.tolist()))}"
     )
@@ -182,6 +185,56 @@ def test_chi2_of_a_direction_is_that_of_hdl_graph_slam(
 def test_a_direction_of_length_zero_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=":2: a direction of length zero"):
         read(tmp_path, [EDGE_3D, "EDGE_SE3_PRIORVEC 1 0 0 0 0 0 1 5 0 0 5 0 5"])
+
+
+CAMERAS = "matrices have the rotation first"
+UPPER = np.triu_indices(6)
+
+
+def rotation_first(triangle: np.ndarray) -> np.ndarray:
+    matrix = np.zeros((6, 6))
+    matrix[UPPER] = triangle
+    matrix = matrix + np.triu(matrix, 1).T
+    order = [3, 4, 5, 0, 1, 2]
+    return matrix[np.ix_(order, order)]
+
+
+def test_poses_of_cameras_are_those_of_g2o_with_the_rotation_first(tmp_path: Path) -> None:
+    triangle = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])[UPPER] + 0.1
+    turned = rotation_first(triangle)[UPPER]
+    pose = "1 2 3 0 0 0.6 0.8"
+    vertices = ["VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", f"VERTEX_SE3:QUAT 1 {pose}"]
+    plain = read(tmp_path, [*vertices, f"EDGE_SE3:QUAT 0 1 {pose} {' '.join(map(str, triangle))}"])
+    vertices = [line.replace("QUAT", "EXPMAP") for line in vertices]
+    with pytest.warns(GraphWarning, match=CAMERAS):
+        graph = read(
+            tmp_path, [*vertices, f"EDGE_SE3:EXPMAP 0 1 {pose} {' '.join(map(str, turned))}"]
+        )
+    assert_same(graph, plain)
+    np.testing.assert_array_equal(graph.initial.t, plain.initial.t)
+
+
+def test_similarities_are_read_where_their_scale_is_one(tmp_path: Path) -> None:
+    gtsam = pytest.importorskip("gtsam")
+    logarithm = np.array([0.3, -0.5, 0.7, 1.0, 2.0, 3.0])
+    pose = gtsam.Pose3.Expmap(logarithm)
+    words = " ".join(map(repr, logarithm.tolist()))
+    matrix = np.diag([4.0, 5.0, 6.0, 1.0, 2.0, 3.0, 9.0])[np.triu_indices(7)]
+    camera = "500 500 320 240"
+    lines = [
+        f"VERTEX_SIM3:EXPMAP 0 0 0 0 0 0 0 0 {camera}",
+        f"VERTEX_SIM3:EXPMAP 1 {words} 0 {camera}",
+        f"EDGE_SIM3:EXPMAP 0 1 {words} 0 {' '.join(map(str, matrix))}",
+    ]
+    with pytest.warns(GraphWarning, match=CAMERAS):
+        graph = read(tmp_path, lines)
+    np.testing.assert_allclose(graph.R_ij[0], pose.rotation().matrix(), atol=1e-15, rtol=0)
+    np.testing.assert_allclose(graph.t_ij[0], pose.translation(), atol=1e-14, rtol=0)
+    np.testing.assert_allclose(graph.initial.t[1], pose.translation(), atol=1e-14, rtol=0)
+    np.testing.assert_array_equal(graph.information[0], np.diag([1, 2, 3, 4, 5, 6]))
+    lines[2] = lines[2].replace(f"{words} 0", f"{words} 0.1")
+    with pytest.raises(FileFormatError, match=":3: a similarity with a scale other than 1"):
+        read(tmp_path, lines)
 
 
 def test_positions_of_hdl_graph_slam_are_priors(tmp_path: Path) -> None:
