@@ -14,7 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphWarning, printable
-from pgo_models.geometry.rotations import Array, project_to_rotations, quaternions_from_rotations
+from pgo_models.geometry.rotations import (
+    Array,
+    BoolArray,
+    project_to_rotations,
+    quaternions_from_rotations,
+)
 
 _VIEW_WORDS = 14  # i j, a rotation by rows, a translation
 _UNIT_ROTATION = " ".join(["0"] * 15 + ["1 0 0 1 0 1"])  # information of a rotation alone
@@ -104,6 +109,19 @@ def _of_open3d(path: Path, text: str) -> str:
             stacklevel=2,
         )
     return "\n".join(lines) + "\n"
+
+
+def certain_edges(path: Path) -> BoolArray | None:
+    """Whether Open3D calls an edge certain, (m,), in the order of a file; None of other files.
+
+    Uncertain edges, mostly loop closures, are the suspects of its own robust optimisation.
+    """
+    if not path.is_file() or path.suffix != ".json":
+        return None
+    record = json.loads(path.read_text())
+    if not isinstance(record, dict) or "edges" not in record:
+        return None
+    return np.array([not edge.get("uncertain") for edge in record["edges"]], dtype=bool)
 
 
 def _vertex_line(number: int, node: dict[str, list[float]]) -> str:

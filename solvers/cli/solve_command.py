@@ -16,6 +16,7 @@ from pgo_models.errors import SettingError
 from pgo_models.files import check_writable
 from pgo_models.geometry.poses import absolute_rotation_error, absolute_trajectory_error
 from pgo_models.graphs.datasets import locate
+from pgo_models.graphs.foreign_files import certain_edges
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.plots.style import is_picture, plotly
@@ -322,6 +323,14 @@ class StageOptions:
         """Method that --robust and --known ask for; None for a plain solve."""
         return choices.chosen_robust(self.robust, self.known)
 
+    def wrong_edges_of(self, graph: PoseGraph, path: Path) -> "GNC | PCM | None":
+        """The method for a graph of a file; what the file itself calls certain is known."""
+        method = self.wrong_edges
+        certain = certain_edges(path) if method is not None and self.known is None else None
+        if method is None or certain is None or len(certain) != graph.num_edges:
+            return method
+        return replace(method, known=certain)
+
     def check_robust(self) -> None:
         """Raise a SettingError where a robust solve is to have a first stage."""
         if self.robust is None or self.method in (None, FirstStage.NEWTON):
@@ -560,7 +569,7 @@ def _solve_graph(
         problem,
         stages.pipeline(place.method, place.partition, not network.has_no_driver),
         choices.chosen_start(problem, stages.start),
-        robust=stages.wrong_edges,
+        robust=stages.wrong_edges_of(problem.graph, Path(source.graph)),
         robots=network.robots_at(place),
         anchor=pose_named(problem.graph, anchor) if anchor is not None else None,
         time_limit=stages.time_limit,

@@ -432,6 +432,23 @@ def test_pose_graphs_of_open3d_are_read() -> None:
     np.testing.assert_array_equal(diagonal, [5000.0] * 3 + [200000.0] * 3)
 
 
+@pytest.mark.filterwarnings("ignore:.*edges are uncertain")
+def test_uncertain_edges_of_open3d_are_the_suspects_of_a_robust_solve(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    path = CASES / "b1_open3d_posegraph.json"
+    _, out, _ = pgo_command("solve", path, "--robust", "gnc", "--json")
+    rejected = json.loads(out)["rejected"]
+    assert not json.loads(out)["robust"]["known"]
+    # What the file calls certain is kept, whatever the others say.
+    record = json.loads(path.read_text())
+    record["edges"][rejected[0]]["uncertain"] = False
+    (tmp_path / "claimed.json").write_text(json.dumps(record))
+    _, out, _ = pgo_command("solve", tmp_path / "claimed.json", "--robust", "gnc", "--json")
+    assert json.loads(out)["robust"]["known"] == [rejected[0]]
+    assert rejected[0] not in json.loads(out)["rejected"]
+
+
 @pytest.mark.parametrize("is_of_cameras", [False, True])
 def test_the_rotations_of_view_graphs_are_read(
     is_of_cameras: bool, pgo_command: Call, tmp_path: Path
