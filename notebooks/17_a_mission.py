@@ -64,7 +64,7 @@ draw_world(world, names)
 #
 # A `Robot` is made of its name, the names of the team, and a secret of the team. `Weighting.ISOTROPIC`
 # asks for the paper's cost $F$. With `Sharing.INTERFACE` the edges inside a robot's part stay with it;
-# with `Sharing.MEASUREMENTS` the driver gets them all, and what a certificate says is the same.
+# with `Sharing.MEASUREMENTS` all others get them, and what a certificate says is the same.
 # Measurements are added in batches, every ten seconds, since new measurements make a new solve begin.
 
 # %%
@@ -447,7 +447,7 @@ for second in (80, 83, 87, 140, 143):
 # two groups without a common robot will do for the sum.
 #
 # ```python
-# without_dora = mission(new_team(solvers.Sharing.MEASUREMENTS), ("dora", 80, 140))
+# without_dora = mission(new_team(), ("dora", 80, 140))
 # outcomes = [without_dora[139][name].outcome for name in ("anna", "dora")]
 # assert [outcome.term.driver for outcome in outcomes] == ["anna", "dora"]
 # assert [outcome.covered for outcome in outcomes] == [("anna", "ben", "carl"), ("dora",)]
@@ -483,7 +483,7 @@ for second in (80, 83, 87, 140, 143):
 # been added. Short patience means more greetings and more solves, long patience means older maps.
 #
 # ```python
-# patient = mission(new_team(solvers.Sharing.MEASUREMENTS, patience=100.0), AWAY, seconds=130)
+# patient = mission(new_team(patience=100.0), AWAY, seconds=130)
 # for name in ("anna", "ben"):
 #     outcome = patient[-1][name].outcome
 #     assert outcome.covered == tuple(names)

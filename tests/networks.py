@@ -5,14 +5,17 @@ from __future__ import annotations
 import heapq
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import pgo_models as pgo
 import solvers
 from pgo_models import PoseGraph
+from solvers.carry.wire import opened
+from solvers.team.speakers import Envelope
 
 STEP = 0.02  # seconds
 KEY = b"a key for tests, not for a team"
@@ -58,8 +61,9 @@ class Network:
     @property
     def is_settled(self) -> bool:
         awake = [robot for name, robot in self.robots.items() if name not in self.asleep]
-        terms = {robot.last.term for robot in awake if robot.last is not None}
-        return len(terms) == 1 and all(robot.is_settled for robot in awake)
+        ends = [robot.last for robot in awake if robot.last is not None]
+        revisions = {frozenset(end.revisions.items()) for end in ends}
+        return len(revisions) == 1 and all(robot.is_settled for robot in awake)
 
     def _send(self, name: str, robot: solvers.Robot) -> None:
         while robot.is_computing:  # computing takes no time here
@@ -134,3 +138,39 @@ def robots_with_files(
     for k, robot in enumerate(robots.values()):
         robot.read(folder / f"{k}.g2o")
     return robots
+
+
+def world(d: int = 2, n: int = 40) -> PoseGraph:
+    return replace(pgo.grid_world(1, n, 3, d=d), information=None)
+
+
+def assert_is_the_optimum(
+    robots: dict[str, solvers.Robot],
+    graph: PoseGraph,
+    weighting: pgo.Weighting = pgo.Weighting.ISOTROPIC,
+) -> None:
+    """All have the same outcome, a bound below the optimum, and poses of the central cost."""
+    problem = pgo.PGOProblem(graph, weighting=weighting)
+    best = solvers.solve(problem)
+    revisions = set()
+    poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for robot in robots.values():
+        assert robot.outcome is not None
+        assert robot.solution is not None, robot.failure
+        certificate = robot.solution.certificate
+        assert certificate.is_certified
+        assert certificate.lower_bound <= best.objective * (1 + 1e-12)
+        revisions.add(frozenset(robot.outcome.revisions.items()))
+        poses |= robot.poses
+    assert len(revisions) == 1
+    assert sorted(poses) == graph.pose_ids.tolist()
+    together = pgo.Poses(
+        np.array([poses[k][0] for k in sorted(poses)]),
+        np.array([poses[k][1] for k in sorted(poses)]),
+    )
+    assert problem.objective(together) == pytest.approx(best.objective, rel=1e-6)
+
+
+def message_in(data: bytes) -> object:
+    """What sealed bytes say."""
+    return Envelope.from_bytes(opened(KEY, data)).message

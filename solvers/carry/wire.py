@@ -27,9 +27,23 @@ from solvers.carry.serialization import deserialize, serialize
 
 MARK = b"PGO"
 _VERSION = VERSION.to_bytes(1, "big")
-_SEAL_BYTES = 32  # of HMAC-SHA256
+_SEAL_BYTES = 16  # of HMAC-SHA256, the first 128 bits
 _LENGTH_BYTES = 4  # of the length of the description, which precedes it
 _LEVEL = 1  # of the compression: numbers hardly shrink, trees do
+_NO_HEADER = -15  # of the compression: the seal has a checksum already
+# What most messages begin with, for their compression; a change of it is one of `VERSION`.
+_COMMON = (
+    b'[["tree", "text", [600]], ["0", "|u1", [100]], ["1", "<f8", [3, 3]], ["2", "<i8", [2]]]'
+    b'{"record": "Hello", "fields": {"revision": {"record": "Revision", "fields": {"num_lines": 1, '
+    b'"digest": ""}}, "term": {"record": "Term", "fields": {"number": 1, "driver": ""}}, "known": '
+    b'{"record": "Term", "fields": {"number": 0, "driver": ""}}, "computing": -1, "twins": '
+    b'{"items": []}}}{"record": "News", "fields": {"has": {"keys": ["a", "b"], "values": '
+    b'[{"record": "Revision", "fields": {"num_lines": 10, "digest": "0"}}, {"record": "Revision", '
+    b'"fields": {"num_lines": 100, "digest": "1"}}]}, "hears": {"items": ["a", "b"]}, "pieces": '
+    b'{"items": [{"record": "Piece", "fields": {"owner": "a", "before": {"record": "Revision", '
+    b'"fields": {"num_lines": 10, "digest": "0"}}, "text": {"array": 0}, "is_last": true}}]}, '
+    b'"takes_back": false, "twins": {"items": []}}}'
+)
 # A message may not unpack to more, nor its description, each byte of which may become an object:
 # whoever has the key could else fill the memory of the others.
 MOST_BYTES = 1 << 27
@@ -70,15 +84,21 @@ class Order:
         return partial(function, *given) if given else function
 
 
+def deflated(data: bytes) -> bytes:
+    """Bytes, compressed (RFC 1951) by what they have in common with every message, too."""
+    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, _NO_HEADER, zdict=_COMMON)
+    return packer.compress(data) + packer.flush()
+
+
 def as_bytes(message: object) -> bytes:
     """Bytes of a message, compressed."""
-    return zlib.compress(packed(serialize(message)), _LEVEL)
+    return deflated(packed(serialize(message)))
 
 
 def from_bytes(data: bytes, kind: type[K]) -> K:
     """The message that the bytes are, one of the given kinds; else a WireError."""
     try:
-        unpacker = zlib.decompressobj()
+        unpacker = zlib.decompressobj(_NO_HEADER, _COMMON)
         plain = unpacker.decompress(data, MOST_BYTES)
         if not unpacker.eof:
             raise WireError("a message that is too long")
@@ -90,16 +110,16 @@ def from_bytes(data: bytes, kind: type[K]) -> K:
     return message
 
 
-def sealed(key: bytes, message: object) -> bytes:
-    """Bytes of a message, which only holders of the key can make."""
-    body = as_bytes(message)
-    return MARK + _VERSION + hmac.digest(key, MARK + _VERSION + body, hashlib.sha256) + body
+def sealed(key: bytes, body: bytes) -> bytes:
+    """Bytes with a mark, a version and a seal, which only holders of the key can make."""
+    seal = hmac.digest(key, MARK + _VERSION + body, hashlib.sha256)
+    return MARK + _VERSION + seal[:_SEAL_BYTES] + body
 
 
-def opened(key: bytes, data: bytes, kind: type[K]) -> K:
-    """The message that the bytes are, one of the given kinds.
+def opened(key: bytes, data: bytes) -> bytes:
+    """The bytes under a seal.
 
-    A WireError for bytes of another version, key or kind, and for those that were changed.
+    A WireError for bytes of another version or key, and for those that were changed.
     """
     mark, version, seal, body = _cut(data, len(MARK), len(_VERSION), _SEAL_BYTES)
     if mark != MARK:
@@ -109,9 +129,10 @@ def opened(key: bytes, data: bytes, kind: type[K]) -> K:
             f"a message of version {int.from_bytes(version, 'big')}, and this robot has version "
             f"{VERSION}; install one version on all robots"
         )
-    if not hmac.compare_digest(seal, hmac.digest(key, mark + version + body, hashlib.sha256)):
+    expected = hmac.digest(key, mark + version + body, hashlib.sha256)
+    if not hmac.compare_digest(seal, expected[:_SEAL_BYTES]):
         raise WireError("a message that was not sealed with the key of the team")
-    return from_bytes(body, kind)
+    return body
 
 
 def _cut(data: bytes, *lengths: int) -> list[bytes]:

@@ -15,7 +15,7 @@ from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.files import check_writable
 from pgo_models.problem.weighting import Weighting
 from solvers.cli.choices import chosen_robust, pipeline_of_robots
-from solvers.cli.options import Cost, CostOption, FirstStage, Robust
+from solvers.cli.options import Cost, CostOption, FirstStage, Robust, TrustFolderOption
 from solvers.cli.shell import (
     DONE,
     NOT_CERTIFIED,
@@ -44,6 +44,13 @@ class MethodOfTeam(enum.Enum):
     CONSENSUS = "consensus"
     PAPER = "paper"
     NEWTON = "newton"
+
+
+class SharingOfTeam(enum.Enum):
+    """What robots tell each other."""
+
+    MEASUREMENTS = "measurements"
+    INTERFACE = "interface"
 
 
 def robot_command(
@@ -75,22 +82,29 @@ def robot_command(
         MethodOfTeam | None,
         typer.Option(help="First stage of robots that keep their measurements; newton for none."),
     ] = None,
-    share_measurements: Annotated[
-        bool,
+    sharing: Annotated[
+        SharingOfTeam,
         typer.Option(
-            "--share-measurements",
-            help="Send the measurements to the robot that drives: mostly fewer bytes, and all that "
-            "pgo solve can. Without it they stay with this robot.",
+            help="What others are told: the measurements, each once, or the interface alone, so "
+            "that measurements stay with this robot, which takes many more bytes."
         ),
-    ] = False,
+    ] = SharingOfTeam.MEASUREMENTS,
     robust: Annotated[
         Robust | None,
-        typer.Option(help="Find wrong edges; with --share-measurements as pgo solve does."),
+        typer.Option(help="Find wrong edges; as pgo solve does where measurements are shared."),
     ] = None,
     patience: Annotated[
         float,
         typer.Option("--patience", help="Seconds after which a silent robot counts as absent."),
     ] = 10.0,
+    retry: Annotated[
+        float,
+        typer.Option(
+            "--retry",
+            help="Seconds after which a message without an answer is repeated; the pauses double.",
+        ),
+    ] = 1.0,
+    trust_folder: TrustFolderOption = False,
     wait: Annotated[
         float, typer.Option("--wait", help="Seconds to wait for robots that are absent.")
     ] = math.inf,
@@ -106,8 +120,8 @@ def robot_command(
         check_writable(out)
     if cost not in _WEIGHTINGS:
         raise SettingError("robots of a team minimise chi2 or F; give --cost chi2 or isotropic")
-    if method is not None and share_measurements:
-        raise SettingError("--method is for robots that keep their measurements; leave it out")
+    if method is not None and sharing is not SharingOfTeam.INTERFACE:
+        raise SettingError("--method is for robots that keep theirs; give --sharing interface")
     names = [word.strip() for word in team.split(",")]
     robot = Robot(
         name,
@@ -115,9 +129,11 @@ def robot_command(
         _secret(key),
         pipeline=None if method is None else pipeline_of_robots(FirstStage(method.value)),
         weighting=_WEIGHTINGS[cost],
-        sharing=Sharing.MEASUREMENTS if share_measurements else Sharing.INTERFACE,
+        sharing=Sharing[sharing.name],
         robust=chosen_robust(robust),
+        trust_folder=trust_folder,
         patience=patience,
+        retry=retry,
     )
     robot.read(graph)
     reporter = _Reporter(quiet)

@@ -95,7 +95,6 @@ class OwnLines:
     robot: int
     path: Path
     text: str | None = None
-    is_shared: bool = False  # whether the robot gives the lines to the one that drives
 
     def read(self) -> G2OLines:
         """Return the lines; errors are those of `read_lines`."""

@@ -52,14 +52,6 @@ class Drive:
     _answers: list[Any] = field(default_factory=list)
     _arrived: queue.SimpleQueue[list[Any] | None] = field(default_factory=queue.SimpleQueue)
 
-    @property
-    def needed(self) -> Sequence[str]:
-        """Robots without which the solve cannot go on.
-
-        Robots that share their interface wait for letters of each other, too.
-        """
-        return list(self.waiting) if self.agent.own_lines.is_shared else self.members[1:]
-
     def begin(self) -> None:
         """Run the solve."""
         self.beside.begin(self._run)

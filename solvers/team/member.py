@@ -1,44 +1,33 @@
-"""What a robot of a team brings into its solves, how it solves when it drives, and what it keeps.
+"""What a robot of a team brings into its solves, how it solves, and what it keeps.
 
-Robots that share their interface solve as robots with own files do. In a team that shares its
-measurements the robot that drives solves alone, with all options of `solve`.
+Robots that keep their measurements solve as robots with own files do, one of which drives. A robot
+that has the measurements of its team solves alone, with all options of `solve`.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pgo_models.errors import GraphWarning, PGOError
-from pgo_models.graphs.g2o import graph_of_robots
-from pgo_models.graphs.g2o_parser import parse_lines
-from pgo_models.graphs.precisions import RotationWeight
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.errors import PGOError
 from pgo_models.problem.weighting import Weighting
-from solvers.carry.counted_pool import Count, CountedPool
 from solvers.carry.process import DEFAULT_MEMORY
 from solvers.loop import RunMonitor
-from solvers.pipeline import solution_for
-from solvers.request import Pipeline, SolveRequest
+from solvers.request import Pipeline
 from solvers.robots.agent import Agent, OwnLines
 from solvers.robots.own_file import READ_HERE
 from solvers.robots.setup import SOLVE_PARTS
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
+from solvers.solution import Solution
 from solvers.solves.folder_solve import FilesOfRobots
 from solvers.team.driving import Drive
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.messages import Ended
-from solvers.team.sharing import (
-    OwnAnswer,
-    Sharing,
-    answer_of,
-    give_measurements,
-    take_answer,
-)
+from solvers.team.shared_solve import SharedSolve
+from solvers.team.sharing import OwnAnswer, answer_of
 
 
 @dataclass(eq=False)
@@ -46,17 +35,18 @@ class Member:
     """A robot as its session sees it: measurements, settings of solves, and what was found.
 
     `outcome` is how the last solve that succeeded has ended, and `known` what it has found of the
-    robot's own poses.
+    robot's own poses. A robot that has the measurements of its team has the `solution`, too.
     """
 
     name: str
     pipeline: Pipeline
     weighting: Weighting
-    sharing: Sharing
     robust: GNC | PCM | None
+    trust_folder: bool
     measurements: Measurements = field(default_factory=Measurements)
     outcome: Ended | None = None
     known: OwnAnswer | None = None
+    solution: Solution | None = None
 
     @property
     def revision(self) -> Revision:
@@ -67,50 +57,30 @@ class Member:
         """Its part in a solve, with its measurements as they are now; None where it has none."""
         if self.measurements.d is None:
             return None
-        is_shared = self.sharing is Sharing.MEASUREMENTS
         path = Path(f"{self.name}.g2o")
-        return Agent(OwnLines(place, path, self.measurements.text(), is_shared))
+        return Agent(OwnLines(place, path, self.measurements.text()))
 
     def solve(self, drive: Drive) -> RobotsSolution:
-        """Solve with the robots of a drive, in the way that the measurements are shared."""
+        """Solve with the robots of a drive, which have files of their own."""
+        files = [OwnLines(place, _path_of(name)) for place, name in enumerate(drive.members)]
+        job = FilesOfRobots(
+            "team",
+            files,
+            drive,
+            DEFAULT_MEMORY,
+            self.weighting,
+            trust_folder=self.trust_folder,
+            robust=self.robust,
+        )
         try:
-            if self.sharing is Sharing.MEASUREMENTS:
-                return self._solve_in_one_place(drive)
-            return self._solve_by_robots(drive)
+            return job.solved(self.pipeline, RunMonitor(progress=False))
         except PGOError as error:
             raise PGOError(_with_ways_out_of_teams(str(error))) from error
 
-    def _solve_by_robots(self, drive: Drive) -> RobotsSolution:
-        """The solution by robots with files of their own."""
-        files = [OwnLines(place, _path_of(name)) for place, name in enumerate(drive.members)]
-        job = FilesOfRobots(
-            "team", files, drive, DEFAULT_MEMORY, self.weighting, robust=self.robust
-        )
-        return job.solved(self.pipeline, RunMonitor(progress=False))
-
-    def _solve_in_one_place(self, drive: Drive) -> RobotsSolution:
-        """The solution of the graph of all measurements; each robot is told of its poses."""
-        num_robots = len(drive.members)
-        network = CountedPool(drive, num_robots)
-        texts = network.ask(give_measurements, [None] * num_robots, Count.ROUND)
-        with warnings.catch_warnings():
-            # Poses of absent robots have no estimate, which the outcome says in its own way.
-            warnings.simplefilter("ignore", GraphWarning)
-            files = [
-                parse_lines(_path_of(name), [text.tobytes().decode("utf-8")])
-                for name, text in zip(drive.members, texts, strict=True)
-            ]
-            graph = graph_of_robots(Path("team"), files, RotationWeight.SE_SYNC, is_folder=True)
-        request = SolveRequest(
-            PGOProblem(graph, weighting=self.weighting),
-            self.pipeline,
-            robust=self.robust,
-            monitor=RunMonitor(progress=False),
-        )
-        solution = solution_for(request)
-        answers = [OwnAnswer.of(solution, robot) for robot in range(num_robots)]
-        network.ask(take_answer, answers, Count.ROUND)
-        return RobotsSolution.of(solution, network.ledger)
+    @property
+    def shared_solve(self) -> SharedSolve:
+        """How it solves when it has the measurements of its team."""
+        return SharedSolve(self.name, self.pipeline, self.weighting, self.robust, self.trust_folder)
 
     def has_more_than(self, revisions: Mapping[str, Revision]) -> bool:
         """Whether what was certified holds for measurements of these revisions, and for more."""

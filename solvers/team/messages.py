@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pgo_models import errors
 from pgo_models.errors import PGOError
 from solvers.carry.registry import record
@@ -24,8 +27,9 @@ _PLAIN_ERRORS = {
 class Priority(IntEnum):
     """What a transport may send first where it cannot send everything at once."""
 
-    URGENT = 0  # others wait for it
-    NORMAL = 1
+    HELLO = 0  # short, and a robot that is not heard counts as absent
+    URGENT = 1  # others wait for it
+    NORMAL = 2
 
 
 @record("Term")
@@ -50,6 +54,38 @@ class Hello:
     term: Term
     known: Term
     computing: int = -1
+    twins: tuple[str, ...] = ()
+
+
+@record("Piece")
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Lines of measurements of the robot `owner`, after those of the revision `before`.
+
+    `text` are the lines in UTF-8, compressed with the end of those before as a dictionary.
+    `is_last` says that there are no more.
+    """
+
+    owner: str
+    before: Revision
+    text: NDArray[np.uint8]
+    is_last: bool
+
+
+@record("News")
+@dataclass(frozen=True, eq=False)
+class News:
+    """A robot is there; it has measurements of these revisions, by robot, and gives pieces of some.
+
+    `hears` are robots that it has heard of lately, which send it what they measure themselves.
+    `takes_back` says that it comes from what was saved, and lacks what it has measured since;
+    `twins` are names that two robots have.
+    """
+
+    has: Mapping[str, Revision]
+    hears: tuple[str, ...]
+    pieces: tuple[Piece, ...] = ()
+    takes_back: bool = False
     twins: tuple[str, ...] = ()
 
 
@@ -144,7 +180,8 @@ class Ended:
         names = ", ".join(self.covered)
         said = solution.robust or solution.verdict.name
         gap = solution.certificate.gap_text
-        return f"{said}, for {names}: gap {gap}, {solution.ledger.rounds} rounds"
+        rounds = f", {solution.ledger.rounds} rounds" if solution.ledger.rounds else ""
+        return f"{said}, for {names}: gap {gap}{rounds}"
 
 
 @record("Heard")
@@ -157,13 +194,19 @@ class Heard:
 
 def check_message(message: object, team: tuple[str, ...]) -> None:
     """Raise a WireError for names and numbers that no robot of the team sends."""
-    if not isinstance(message, Hello | Ask | Reply | Letter | LetterLost | Ended | Heard):
+    if not isinstance(message, Hello | News | Ask | Reply | Letter | LetterLost | Ended | Heard):
         raise WireError(f"a {type(message).__name__} is no message")
-    numbers = [getattr(message, name, 0) for name in ("call", "place", "computing")]
-    names = [*getattr(message, "members", ()), *getattr(message, "revisions", ())]
-    names += [*getattr(message, "absent", ()), *getattr(message, "twins", ())]
-    is_known = set(names) <= set(team) and message.term.driver in (*team, "")
-    if not is_known or not all(-1 <= number < _MOST for number in (*numbers, message.term.number)):
+    names: list[str] = []
+    for each in ("members", "revisions", "absent", "twins", "has", "hears"):
+        names += getattr(message, each, ())
+    if isinstance(message, News):
+        names += [piece.owner for piece in message.pieces]
+        numbers = [piece.before.num_lines for piece in message.pieces]
+    else:
+        names += [message.term.driver] if message.term.driver else []
+        numbers = [getattr(message, each, 0) for each in ("call", "place", "computing")]
+        numbers.append(message.term.number)
+    if not set(names) <= set(team) or not all(-1 <= number < _MOST for number in numbers):
         raise WireError(f"a {type(message).__name__} with names or numbers of nobody")
     if isinstance(message, Ask) and message.members:
         is_numbered = 0 < message.place < len(message.members)

@@ -1,20 +1,18 @@
 """A robot of a team that solves together: an object without sockets or a clock.
 
 Whoever has a network gives the robot what arrives (`receive`) and the time (`tick`), and sends what
-it has to say (`outbox`). Every robot keeps its own measurements. The robot whose name comes first
-among those that are awake drives: it runs the solve of robots with files of their own
-(`solvers.solves.folder_solve`), and learns the interface between the robots. What two robots tell
-each other goes from one to the other. Any robot can drive. Messages may be lost, late, repeated, or
-come in any order.
+it has to say (`outbox`). Messages may be lost, late, repeated, or come in any order. Robots tell
+each other what they have measured, and each finds the map of all (`SharedMap`). Or every robot
+keeps its measurements, and one of them drives the solves of all (`DrivenTeam`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pgo_models.errors import SettingError, door
+from pgo_models.errors import PGOError, SettingError, door
 from pgo_models.files import replace_when_done
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
@@ -26,10 +24,12 @@ from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
+from solvers.team.driven import DrivenTeam
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Term
 from solvers.team.session import PATIENCE, RETRY, Message, Session, TeamLedger
+from solvers.team.shared_map import SharedMap
 from solvers.team.sharing import OwnAnswer, Sharing
 
 _FEWEST_KEY_BYTES = 16  # 128 bits, which nobody can guess
@@ -48,6 +48,7 @@ class Saved:
     term: Term
     outcome: Ended | None
     known: OwnAnswer | None
+    others: Mapping[str, Measurements]
 
 
 class Robot:
@@ -66,16 +67,20 @@ class Robot:
     weighting : Weighting
         Cost of such a solve: F, chi2, or the own one of the measurements.
     sharing : Sharing
-        What this robot tells others: its INTERFACE, so that its measurements stay with it, or its
-        MEASUREMENTS, compressed, which mostly are fewer bytes. Then the robot that drives solves
-        alone, with all that `solve` can: priors and GPS, landmarks, robust solves, covariances.
+        What this robot tells others: its MEASUREMENTS, each once, so that every robot solves alone,
+        with all that `solve` can: priors and GPS, landmarks, robust solves, covariances. Or its
+        INTERFACE, so that its measurements stay with it, which takes many more bytes.
     robust : GNC or PCM, optional
         How the team finds wrong edges. A team that does not share its measurements does it as
         robots with own files do (`solve_folder`).
+    trust_folder : bool
+        As of `read_g2o`: whether measurements of several robots are taken as they are, also where
+        they speak against being of one graph.
     patience : float
         Seconds after which a robot that was not heard of counts as absent.
     retry : float
-        Seconds after which a message that was not answered is sent again.
+        Seconds after which a message that was not answered is sent again, for the first time: the
+        pauses double, up to the patience. New measurements are collected for as long.
 
     Raises
     ------
@@ -118,8 +123,9 @@ class Robot:
         *,
         pipeline: Pipeline | None = None,
         weighting: Weighting = Weighting.OWN,
-        sharing: Sharing = Sharing.INTERFACE,
+        sharing: Sharing = Sharing.MEASUREMENTS,
         robust: GNC | PCM | None = None,
+        trust_folder: bool = False,
         patience: float = PATIENCE,
         retry: float = RETRY,
     ) -> None:
@@ -133,8 +139,15 @@ class Robot:
                 "other known edges need sharing=Sharing.MEASUREMENTS"
             )
         pipeline = pipeline if pipeline is not None else Pipeline()
-        self._member = Member(name, pipeline, weighting, sharing, robust)
-        self._session = Session(self._member, self.team, key, patience, retry)
+        self._sharing = sharing
+        self._member = Member(name, pipeline, weighting, robust, trust_folder)
+        self._session = Session(name, self.team, key, patience, retry)
+        self._way: SharedMap | DrivenTeam
+        if sharing is Sharing.MEASUREMENTS:
+            self._way = SharedMap(self._member, self._session)
+        else:
+            self._way = DrivenTeam(self._member, self._session)
+        self._session.way = self._way
 
     # Measurements
 
@@ -196,9 +209,26 @@ class Robot:
         SettingError
             Unless there is either a matrix or both precisions.
         GraphError
-            For shapes that are of no pose.
+            For shapes that are of no pose, ids beyond 64 bits, an edge to itself, numbers that are
+            not finite, and a matrix or precision that is negative.
         """
         self._member.measurements.add_edge(i, j, R, t, information, kappa, tau)
+
+    @door
+    def remove_edge(self, i: int, j: int) -> None:
+        """Take all measurements of pose j as seen from pose i back that this robot has added.
+
+        Parameters
+        ----------
+        i, j : int
+            Ids of the poses.
+
+        Raises
+        ------
+        GraphError
+            Where there is none.
+        """
+        self._member.measurements.remove_edge(i, j)
 
     @door
     def read(self, path: Path | str) -> None:
@@ -236,12 +266,18 @@ class Robot:
     def covariances(self) -> dict[int, Array]:
         """Covariance (p, p) of every pose of this robot, by id, of teams that share measurements.
 
-        Where they are not known, there are none.
+        Where they are not known, there are none. They are computed when they are asked for.
         """
-        known = self._member.known
-        if known is None or known.covariances is None:
+        solution = self._member.solution
+        if solution is None:
             return {}
-        return dict(zip(known.ids.tolist(), known.covariances, strict=True))
+        try:
+            covariances = dict(
+                zip(solution.problem.graph.pose_ids.tolist(), solution.marginals(), strict=True)
+            )
+        except PGOError:
+            return {}
+        return {pose: covariances[pose] for pose in self.poses}
 
     @property
     def rejected(self) -> list[tuple[int, int]]:
@@ -284,7 +320,7 @@ class Robot:
     @property
     def is_computing(self) -> bool:
         """Whether it computes, in a thread beside the calls, which hand on what it has found."""
-        return self._session.is_computing
+        return self._session.beside.is_busy
 
     @property
     def outcome(self) -> Ended | None:
@@ -297,7 +333,7 @@ class Robot:
     @property
     def last(self) -> Ended | None:
         """How the last solve has ended, also if it has failed (`failure` says why)."""
-        return self._session.last
+        return self._way.last
 
     @property
     def is_certified(self) -> bool:
@@ -463,6 +499,8 @@ class Robot:
     def save(self) -> bytes:
         """Return the measurements and the last outcome as bytes, without the key.
 
+        Those of other robots are among them, as far as this one has them.
+
         Returns
         -------
         bytes
@@ -472,11 +510,12 @@ class Robot:
             self.name,
             self.team,
             self._member.weighting,
-            self._member.sharing,
+            self._sharing,
             self._member.measurements,
-            self._session.term,
+            self._way.term,
             self.outcome,
             self._member.known,
+            self._way.others,
         )
         return packed(serialize(saved))
 
@@ -488,6 +527,7 @@ class Robot:
         *,
         pipeline: Pipeline | None = None,
         robust: GNC | PCM | None = None,
+        trust_folder: bool = False,
         patience: float = PATIENCE,
         retry: float = RETRY,
     ) -> Robot:
@@ -501,7 +541,7 @@ class Robot:
             The bytes.
         key : bytes
             Secret of the team.
-        pipeline, robust, patience, retry
+        pipeline, robust, trust_folder, patience, retry
             As of `Robot`.
 
         Returns
@@ -528,16 +568,14 @@ class Robot:
             weighting=saved.weighting,
             sharing=saved.sharing,
             robust=robust,
+            trust_folder=trust_folder,
             patience=patience,
             retry=retry,
         )
-        member = robot._member
-        lines = saved.measurements.lines
-        member.measurements = Measurements(list(lines), saved.measurements.d)
-        member.outcome = saved.outcome
-        member.known = saved.known
-        robot._session.term = saved.term
-        robot._session.last = saved.outcome
+        robot._member.measurements.restore(saved.measurements)
+        robot._member.outcome = saved.outcome
+        robot._member.known = saved.known
+        robot._way.restore(saved.term, saved.outcome, saved.others)
         return robot
 
 

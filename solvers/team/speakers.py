@@ -11,37 +11,58 @@ from __future__ import annotations
 
 import enum
 import secrets
+import struct
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from solvers.carry.wire import WireError, as_bytes, from_bytes
 
-from solvers.carry.registry import record
-from solvers.carry.wire import as_bytes, from_bytes
-
+_BOOT_BYTES = 8
+NO_BOOT = bytes(_BOOT_BYTES)  # before another robot was heard
+# Boots of the sender and of the receiver, number of the message, and lengths of the two names.
+_HEAD = struct.Struct(f"<{_BOOT_BYTES}s{_BOOT_BYTES}sIHH")
 _WINDOW = 4096  # a message that comes later than so many after it counts as repeated
 
 
-@record("Envelope")
 @dataclass(frozen=True)
 class Envelope:
     """A message as bytes, and who it is from and to: names, boots, and its number in the run.
 
-    `heard` is the boot of the receiver, or "" before the sender has heard it.
+    `heard` is the boot of the receiver, or none before the sender has heard it.
     """
 
     sender: str
     receiver: str
-    boot: str
-    heard: str
+    boot: bytes
+    heard: bytes
     number: int
-    content: NDArray[np.uint8]
+    content: bytes
 
     @property
     def message(self) -> Any:  # noqa: ANN401 - a message of any kind
         """The message; a WireError for bytes that are none."""
-        return from_bytes(self.content.tobytes(), object)
+        return from_bytes(self.content, object)
+
+    def as_bytes(self) -> bytes:
+        """Bytes of which `from_bytes` makes the envelope."""
+        names = [name.encode("utf-8") for name in (self.sender, self.receiver)]
+        head = _HEAD.pack(self.boot, self.heard, self.number, *map(len, names))
+        return b"".join([head, *names, self.content])
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Envelope:
+        """Return the envelope that bytes are; a WireError for others."""
+        try:
+            boot, heard, number, *lengths = _HEAD.unpack_from(data)
+            begins = _HEAD.size
+            names = []
+            for length in lengths:
+                names.append(data[begins : begins + length].decode("utf-8"))
+                begins += length
+        except (struct.error, ValueError) as error:
+            raise WireError(f"a message without addresses: {error}") from error
+        sender, receiver = names
+        return cls(sender, receiver, boot, heard, number, data[begins:])
 
 
 class Word(enum.Enum):
@@ -57,7 +78,7 @@ class Word(enum.Enum):
 class _Run:
     """A run of another robot: the highest number heard, and those within the window."""
 
-    boot: str
+    boot: bytes
     since: float
     highest: int = -1
     numbers: set[int] = field(default_factory=set)
@@ -83,23 +104,22 @@ class Speakers:
 
     def __init__(self, name: str, patience: float) -> None:
         self.name = name
-        self.boot = secrets.token_hex(8)
+        self.boot = secrets.token_bytes(_BOOT_BYTES)
         self.twins: set[str] = set()
         self.claimed_since: float | None = None
         self._patience = patience
         self._runs: dict[str, _Run] = {}
-        self._former: dict[str, dict[str, _Run]] = {}
+        self._former: dict[str, dict[bytes, _Run]] = {}
         self._num_sent = 0
 
-    def boot_of(self, robot: str) -> str:
-        """The boot of another robot, or "" before it was heard."""
-        return self._runs[robot].boot if robot in self._runs else ""
+    def boot_of(self, robot: str) -> bytes:
+        """The boot of another robot, or none before it was heard."""
+        return self._runs[robot].boot if robot in self._runs else NO_BOOT
 
-    def addressed(self, receiver: str, message: object, heard: str | None = None) -> Envelope:
-        """A message to a robot, of the run `heard` of it, or of that heard last."""
-        heard = self.boot_of(receiver) if heard is None else heard
+    def addressed(self, receiver: str, message: object, heard: bytes) -> Envelope:
+        """A message to the run `heard` of a robot."""
         self._num_sent += 1
-        content = np.frombuffer(as_bytes(message), np.uint8)
+        content = as_bytes(message)
         return Envelope(self.name, receiver, self.boot, heard, self._num_sent, content)
 
     def word_of(self, envelope: Envelope, now: float) -> Word:
@@ -126,7 +146,7 @@ class Speakers:
 
     def _note_claim(self, envelope: Envelope, now: float) -> None:
         """Note that another robot is spoken to by this name, by one that has heard this one."""
-        if envelope.heard and self.boot_of(envelope.sender) == envelope.boot:
+        if envelope.heard != NO_BOOT and self.boot_of(envelope.sender) == envelope.boot:
             self.claimed_since = now if self.claimed_since is None else self.claimed_since
             if now - self.claimed_since > self._patience:
                 self.twins.add(self.name)

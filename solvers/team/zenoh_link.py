@@ -15,6 +15,7 @@ from contextlib import suppress
 from types import TracebackType
 
 from pgo_models.errors import EngineError, extra_module
+from solvers.team.messages import Priority
 from solvers.team.robot import Robot
 from solvers.team.session import Message
 
@@ -46,6 +47,12 @@ class ZenohLink:
     def __init__(self, robot: Robot, listen: str, connect: Sequence[str] = ()) -> None:
         zenoh = extra_module("zenoh", "team")
         self._error: type[Exception] = zenoh.ZError
+        # What goes first on a slow link; Zenoh cuts long messages, and lets short ones pass.
+        self._priorities = {
+            Priority.HELLO: zenoh.Priority.INTERACTIVE_HIGH,
+            Priority.URGENT: zenoh.Priority.DATA_HIGH,
+            Priority.NORMAL: zenoh.Priority.DATA,
+        }
         config = zenoh.Config()
         settings = {
             "mode": "peer",
@@ -79,7 +86,8 @@ class ZenohLink:
 
     def send(self, message: Message) -> None:
         """Send a message, or lose it if nobody is there: robots repeat what is not answered."""
-        self._session.put(self._expression(message.to), message.data)
+        priority = self._priorities[message.priority]
+        self._session.put(self._expression(message.to), message.data, priority=priority)
 
     def received(self, seconds: float) -> list[bytes]:
         """Return what has arrived, after waiting for it for so many seconds at most."""

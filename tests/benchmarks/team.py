@@ -46,6 +46,7 @@ def carried(files: list[Path], sharing: solvers.Sharing) -> tuple[int, int]:
         robots[name].read(path)
     network = Network(robots, np.random.default_rng(0), delay=1e-3)
     network.run(300.0)
+    network.wait(3.0)
     solution = robots[names[0]].solution
     assert solution is not None
     assert solution.is_certified, str(solution)

@@ -27,7 +27,7 @@ from solvers import (
 )
 from solvers.carry.process import WorkerPool
 from solvers.carry.registry import VERSION, names_and_fields
-from solvers.carry.wire import Order, WireError, opened, sealed
+from solvers.carry.wire import Order, WireError, as_bytes, from_bytes, opened, sealed
 from solvers.studies.tightness import noisy_scene
 
 KEY = b"sixteen or more bytes"
@@ -45,7 +45,7 @@ class OverTheWire:
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         self.num_orders += 1
-        sent = opened(KEY, sealed(KEY, Order.of(order)), Order).function()
+        sent = from_bytes(as_bytes(Order.of(order)), Order).function()
         return [*crossed(self.robots.ask(sent, list(crossed(requests))))]
 
     def close(self) -> None:
@@ -54,7 +54,7 @@ class OverTheWire:
 
 def crossed(values: Sequence[Any]) -> tuple[Any, ...]:
     """Values once they were bytes."""
-    return opened(KEY, sealed(KEY, tuple(values)), tuple)
+    return from_bytes(as_bytes(tuple(values)), tuple)
 
 
 def consensus(**settings: Any) -> Pipeline:
@@ -128,12 +128,12 @@ def test_all_that_robots_with_own_files_say_can_be_sent(
 
 
 def test_bytes_of_another_version_and_orders_that_are_none_are_named() -> None:
-    data = sealed(KEY, Order("soc.solve"))
-    assert opened(KEY, data, Order).name == "soc.solve"
+    data = sealed(KEY, as_bytes(Order("soc.solve")))
+    assert from_bytes(opened(KEY, data), Order).name == "soc.solve"
     with pytest.raises(WireError, match=r"version 0, and this robot has version \d+; install one"):
-        opened(KEY, data[:3] + b"\0" + data[4:], Order)
+        opened(KEY, data[:3] + b"\0" + data[4:])
     with pytest.raises(WireError, match="bytes of another program"):
-        opened(KEY, b"JPG" + data[3:], Order)
+        opened(KEY, b"JPG" + data[3:])
     with pytest.raises(WireError, match=r"'os\.system' is no order"):
         Order("os.system").function()
 

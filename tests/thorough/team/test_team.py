@@ -6,66 +6,41 @@ import gzip
 import re
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from budget import examples
 from graphs import informed
-from networks import KEY, Network, give_edge, robots_of
-from wrong_edges import spoiled
+from networks import (
+    KEY,
+    Network,
+    assert_is_the_optimum,
+    give_edge,
+    message_in,
+    robots_of,
+    world,
+)
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel, PoseGraph
+from pgo_models import NoiseModel
 from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import Sharing
 from solvers.carry.messages import Token
-from solvers.carry.wire import Order, opened
+from solvers.carry.wire import Order
 from solvers.robots.own_file import NumberedLines
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
 from solvers.team.messages import Ask, Ended, Heard, Letter, Reply
 from solvers.team.refusals import function_for_teams
 from solvers.team.session import TeamLedger
-from solvers.team.speakers import Envelope
 
 PEERS = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.CONSENSUS, tolerance=5e-3))
 
 PAPER = solvers.Pipeline(soc=solvers.PaperSOC(max_iterations=100))
-
-
-def world(d: int = 2, n: int = 40) -> PoseGraph:
-    return replace(pgo.grid_world(1, n, 3, d=d), information=None)
-
-
-def assert_is_the_optimum(
-    robots: dict[str, solvers.Robot],
-    graph: PoseGraph,
-    weighting: pgo.Weighting = pgo.Weighting.ISOTROPIC,
-) -> None:
-    """All have the same outcome, a bound below the optimum, and poses of the central cost."""
-    problem = pgo.PGOProblem(graph, weighting=weighting)
-    best = solvers.solve(problem)
-    terms = set()
-    poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    for robot in robots.values():
-        assert robot.outcome is not None
-        assert robot.solution is not None, robot.failure
-        certificate = robot.solution.certificate
-        assert certificate.is_certified
-        assert certificate.lower_bound <= best.objective * (1 + 1e-12)
-        terms.add(robot.outcome.term)
-        poses |= robot.poses
-    assert len(terms) == 1
-    assert sorted(poses) == graph.pose_ids.tolist()
-    together = pgo.Poses(
-        np.array([poses[k][0] for k in sorted(poses)]),
-        np.array([poses[k][1] for k in sorted(poses)]),
-    )
-    assert problem.objective(together) == pytest.approx(best.objective, rel=1e-6)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -341,7 +316,7 @@ def test_two_robots_of_one_name_are_told_of_each_other() -> None:
                 for other in twins if message.to == "r0" else [robots["r1"]]:
                     other.receive(message.data, now)
     for robot in (*twins, robots["r1"]):
-        assert robot.problems == ["two robots are called r0; give each a name of its own"]
+        assert robot.problems == ["two robots are called r0; give each its own name"]
 
 
 @pytest.mark.parametrize("gone", ["r0", "r2"])
@@ -364,11 +339,6 @@ def test_a_joint_certificate_outlives_robots_that_leave_after_it(gone: str) -> N
     network.wait(20.0)
     assert gone in robot.absent
     assert robot.is_certified
-
-
-def message_in(data: bytes) -> object:
-    """What sealed bytes say."""
-    return opened(KEY, data, Envelope).message
 
 
 def losing(
@@ -481,27 +451,6 @@ def test_what_is_measured_later_is_solved_with_the_rest() -> None:
     assert_is_the_optimum(robots, graph)
 
 
-def test_a_team_that_shares_its_measurements_finds_wrong_ones_in_three_messages_each() -> None:
-    graph, is_wrong = spoiled(world(n=100), 0.4, "random", 1)
-    sharing = solvers.Sharing.MEASUREMENTS
-    robots = robots_of(graph, 3, sharing=sharing, robust=solvers.GNC())
-    network = Network(robots, np.random.default_rng(0))
-    network.run(60.0)
-    assert network.is_settled
-    right = graph.without_edges(is_wrong)
-    assert_is_the_optimum(robots, right)
-    wrong = {(int(graph.i[e]), int(graph.j[e])) for e in np.flatnonzero(is_wrong)}
-    found = {pair for robot in robots.values() for pair in robot.rejected}
-    assert found == wrong
-    for robot in robots.values():
-        assert robot.solution is not None
-        assert robot.solution.ledger.rounds == 2
-        assert sorted(robot.covariances) == sorted(robot.poses)
-        assert all(S.shape == (3, 3) for S in robot.covariances.values())
-        assert "closures hold the map" in robot.solution.robust
-        assert robot.is_certified
-
-
 def test_doubts_of_a_robust_solve_reach_all_robots() -> None:
     # A tree with one closure more: nothing checks whether it is right.
     names = ["a", "b"]
@@ -559,23 +508,15 @@ def test_gps_and_landmarks_need_a_team_that_shares_its_measurements(tmp_path: Pa
             assert len(robots["a"].poses) + len(robots["b"].poses) == 30
 
 
-def test_a_robot_that_shares_its_interface_alone_gives_away_nothing_else() -> None:
-    names = ["a", "b"]
-    robots = {}
-    for name, sharing in zip(names, reversed(solvers.Sharing), strict=True):
-        robots[name] = solvers.Robot(name, names, KEY, sharing=sharing)
-        robots[name].add_pose(ord(name))
-        robots[name].add_edge(
-            97, 98, np.eye(2), np.array([1.0, 0.0]), kappa=1.0, tau=1.0 + ord(name)
-        )
-    network = Network(robots, np.random.default_rng(0))
-    network.run(30.0)
-    assert network.is_settled
-    for robot in robots.values():
-        assert robot.outcome is None
-        assert "b shares its interface alone" in robot.failure
+def test_a_team_that_keeps_its_measurements_takes_its_odometry_to_be_right() -> None:
     with pytest.raises(SettingError, match=r"other known edges need sharing=Sharing\.MEASUREMENTS"):
-        solvers.Robot("a", names, KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))
+        solvers.Robot(
+            "a",
+            ["a", "b"],
+            KEY,
+            sharing=Sharing.INTERFACE,
+            robust=solvers.GNC(known=np.ones(9, dtype=bool)),
+        )
 
 
 def test_a_robot_gives_a_driver_that_claims_its_poses_nothing() -> None:
@@ -702,7 +643,7 @@ def test_a_robot_is_saved_before_its_lines_tell_the_dimension(d: int) -> None:
 
 def test_robots_without_a_common_edge_say_so() -> None:
     names = ["a", "b"]
-    robots = {name: solvers.Robot(name, names, KEY) for name in names}
+    robots = {name: solvers.Robot(name, names, KEY, sharing=Sharing.INTERFACE) for name in names}
     for first, robot in zip((0, 10), robots.values(), strict=True):
         robot.add_pose(first)
         robot.add_pose(first + 1)

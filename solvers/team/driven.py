@@ -1,0 +1,430 @@
+"""Solves by robots that keep their measurements: one drives, and the others obey its orders.
+
+The robot whose name comes first among those that are awake and have measured anything drives, and
+the terms of solves only grow. What a robot brings into a solve is its `Member`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pgo_models.errors import EngineError, PGOError
+from solvers.carry.letters import LetterName, Letters
+from solvers.robots.agent import Agent
+from solvers.team.driving import Drive
+from solvers.team.measurements import Measurements, Revision
+from solvers.team.member import Member
+from solvers.team.messages import (
+    Ask,
+    Ended,
+    Heard,
+    Hello,
+    Letter,
+    LetterLost,
+    News,
+    Priority,
+    Reply,
+    Term,
+    error_as_message,
+)
+from solvers.team.refusals import function_for_teams
+from solvers.team.talk import Talk
+
+# Patiences after which a robot that is there, and has not answered, is waited for no more.
+_MOST_PATIENCES = 10.0
+
+
+@dataclass(eq=False)
+class Following:
+    """What a robot does in a solve: its agent obeys each order once. The last answer may be lost.
+
+    `waiting` is an order that waits for letters of other robots, and `obeyed` one that the robot
+    computes the answer to; `members` are all by their places.
+    """
+
+    agent: Agent
+    revision: Revision
+    letters: Letters
+    members: tuple[str, ...]
+    call: int = -1
+    reply: Reply | None = None
+    waiting: Ask | None = None
+    obeyed: Ask | None = None
+
+
+class DrivenTeam:
+    """The solves that robots of a team carry out together.
+
+    `last` is how the last solve has ended, and `term` the last solve that is known of.
+    """
+
+    def __init__(self, member: Member, talk: Talk) -> None:
+        self.name = member.name
+        self.term = Term(0, "")
+        self.last: Ended | None = None
+        self._member = member
+        self._talk = talk
+        self._beside = talk.beside
+        # Of the others: the revisions of their measurements, and the terms of their outcomes.
+        self._revisions: dict[str, Revision] = {}
+        self._known: dict[str, Term] = {}
+        self._sent_at: dict[str, float] = {}  # when the last ask or outcome was sent to each
+        self._num_sent: dict[str, int] = {}  # how often it was sent
+        self._waits_since: float | None = None  # for answers to the orders under way
+        self._following: Following | None = None
+        self._drive: Drive | None = None
+        # Revisions and boots of the robots in the last solve.
+        self._tried: dict[str, tuple[Revision, bytes]] = {}
+        self._unheard: dict[str, Ended] = {}  # robots that have not confirmed the outcome
+        self._said: Revision | None = None
+        self._share_more: set[str] = set()
+
+    @property
+    def others(self) -> dict[str, Measurements]:
+        """Measurements of others: they keep theirs."""
+        return {}
+
+    def restore(
+        self, term: Term, outcome: Ended | None, others: Mapping[str, Measurements]
+    ) -> None:
+        """Go on from what was saved."""
+        self.term = term
+        self.last = outcome
+
+    @property
+    def _revision(self) -> Revision:
+        """Which measurements it has; none before a line has told their dimension."""
+        member = self._member
+        return Revision() if member.measurements.d is None else member.revision
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether a solve was of the whole team and all that this robot has measured.
+
+        Nobody waits for this robot then.
+        """
+        ends = [ended for ended in (self.last, self._member.outcome) if ended is not None]
+        own = self._revision
+        if not any(not end.absent and end.revisions.get(self.name) == own for end in ends):
+            return False
+        return self._drive is None and not self._unheard
+
+    @property
+    def problems(self) -> list[str]:
+        """Robots that share more than this one, a sentence each."""
+        return [
+            f"{name} shares its measurements, and {self.name} its interface alone; give all robots "
+            "the same sharing"
+            for name in sorted(self._share_more)
+        ]
+
+    def greeting(self) -> Hello:
+        """What tells others that this robot is there."""
+        part = self._following
+        is_computing = part is not None and part.obeyed is not None
+        call = part.call + 1 if part is not None and is_computing else -1
+        outcome = self._member.outcome
+        known = Term(0, "") if outcome is None else outcome.term
+        return Hello(self._revision, self.term, known, call, self._talk.twins)
+
+    def take(self, sender: str, message: object, is_latest: bool) -> None:
+        """Update what is known of the team by a message, or obey the order in it."""
+        if isinstance(message, Hello):
+            self._take_hello(sender, message, is_latest)
+        elif isinstance(message, News):
+            self._share_more.add(sender)
+        elif isinstance(message, Ask):
+            self._obey(sender, message)
+        elif isinstance(message, Reply):
+            self._take_reply(sender, message)
+        elif isinstance(message, Letter):
+            self._take_letter(message)
+        elif isinstance(message, LetterLost):
+            self._repeat_letter(message)
+        elif isinstance(message, Ended):
+            self._take_outcome(sender, message)
+        elif isinstance(message, Heard):
+            outcome = self._unheard.get(sender)
+            if outcome is not None and outcome.term == message.term:
+                del self._unheard[sender]
+
+    def _take_hello(self, sender: str, hello: Hello, is_latest: bool) -> None:
+        if is_latest:
+            self._revisions[sender] = hello.revision
+            self._known[sender] = hello.known
+        self._learn_term(hello.term)
+        if self._drive is not None and self._drive.is_computed(sender, hello):
+            self._waits_since = self._talk.now
+            self._sent_at[sender] = self._talk.now
+
+    def tick(self, awake: tuple[str, ...]) -> None:
+        """Begin a solve, repeat what was not answered, give up."""
+        if self._said != self._revision:
+            self._said = self._revision
+            for name in awake:
+                if name != self.name:
+                    self._talk.say_hello(name)
+        if self._drive is not None:
+            self._go_on_driving(awake)
+        if self._drive is None:
+            self._begin_if_due(awake)
+        self._unheard = {name: ended for name, ended in self._unheard.items() if name in awake}
+        self._send_again(self._unheard, Priority.NORMAL)
+
+    def _send_again(self, waiting: Mapping[str, object], priority: Priority) -> None:
+        """Send what was not answered, by receiver, once and then ever more rarely."""
+        for name, message in waiting.items():
+            num_sent = self._num_sent.get(name, 0)
+            if self._talk.now - self._sent_at.get(name, -np.inf) >= self._talk.pause(num_sent):
+                self._sent_at[name] = self._talk.now
+                self._num_sent[name] = num_sent + 1
+                self._talk.send(name, message, priority)
+
+    def _learn_term(self, term: Term) -> None:
+        """Give up a solve that another robot has overtaken, and solve again if this one drives."""
+        if term > self.term:
+            self.term = term
+            self._following = None
+            self._tried = {}
+            self._unheard.clear()
+            self._give_up()
+
+    def _give_up(self) -> None:
+        if self._drive is not None:
+            self._drive.abandon()
+            self._drive = None
+            self._tried = {}
+
+    # Driving
+
+    def _begin_if_due(self, awake: tuple[str, ...]) -> None:
+        """Begin a solve if this robot drives: it comes first of those that have measured anything.
+
+        Everybody is there or was waited for, and something is new: measurements, or a robot that
+        has begun anew. Where robots have gone, a solve would find less than what is known.
+        """
+        revisions = {}
+        for name in awake:
+            own = self._revision if name == self.name else Revision()
+            revision = self._revisions.get(name, own)
+            if revision.num_lines:
+                revisions[name] = revision
+        members = tuple(revisions)
+        if not members or members[0] != self.name:
+            return
+        tried = {}
+        lacks_map = False
+        for name, revision in revisions.items():
+            before = self._tried.get(name)
+            tried[name] = (revision, self._talk.boot_of(name))
+            if before is not None and before[1] != tried[name][1]:  # it has begun anew
+                has_map = self.last is not None and self._known.get(name) == self.last.term
+                tried[name] = (revision, before[1] if has_map else tried[name][1])
+                lacks_map |= not has_map
+        if self._member.has_more_than(revisions) and not lacks_map:
+            return
+        if tried != self._tried and self._talk.is_complete(members):
+            self._begin_drive(members, tried)
+
+    def _begin_drive(
+        self, members: tuple[str, ...], tried: dict[str, tuple[Revision, bytes]]
+    ) -> None:
+        own_revision = self._revision
+        self._tried = tried
+        self._unheard.clear()  # of the last outcome: there will be another one
+        self.term = Term(self.term.number + 1, self.name)
+        agent = self._member.new_agent(0)
+        assert agent is not None  # as it has measurements
+        self._following = Following(agent, own_revision, Letters(0), members)
+        self._drive = Drive(
+            self.term, members, agent, self._member.solve, self._beside, self._after_step
+        )
+        self._drive.begin()
+
+    def _go_on_driving(self, awake: tuple[str, ...]) -> None:
+        """Ask again where no answer came, and give up where a robot has gone.
+
+        A robot that is there and does not answer, as one that cannot read the order, ends the
+        solve with an error.
+        """
+        assert self._drive is not None
+        if not set(self._drive.members) <= set(awake):  # they wait for letters of each other
+            self._give_up()
+            return
+        now = self._talk.now
+        if self._waits_since is None or not self._drive.waiting:
+            self._waits_since = now
+        if now - self._waits_since > _MOST_PATIENCES * self._talk.patience:
+            self._end_without_answers(now)
+            return
+        self._send_again(self._drive.waiting, Priority.URGENT)
+
+    def _end_without_answers(self, now: float) -> None:
+        """End the solve with an error in place of the answers that are missing."""
+        assert self._drive is not None
+        assert self._waits_since is not None
+        seconds = now - self._waits_since
+        error = error_as_message(
+            EngineError(
+                f"it is there, and has not answered for {seconds:.0f} seconds; "
+                "see whether all robots have the same version, and what their ledgers have dropped"
+            )
+        )
+        for name, ask in list(self._drive.waiting.items()):
+            self._drive.take(
+                name,
+                Reply(ask.term, ask.call, self._revisions.get(name, Revision()), None, error),
+            )
+
+    def _take_reply(self, sender: str, reply: Reply) -> None:
+        if self._drive is not None and reply.term == self._drive.term:
+            self._tried[sender] = (reply.revision, self._talk.boot_of(sender))
+            self._drive.take(sender, reply)
+
+    def _after_step(self, drive: Drive) -> None:
+        """Send what the solve asks for, or its outcome if it has ended."""
+        self._waits_since = None
+        self._sent_at.clear()
+        self._num_sent.clear()
+        self._send_again(drive.waiting, Priority.URGENT)
+        if drive.outcome is None:
+            return
+        self._drive = None
+        absent = tuple(name for name in self._talk.team if name not in drive.members)
+        revisions = {name: revision for name, (revision, _) in self._tried.items()}
+        outcome = drive.ended(absent, revisions)
+        self._end_with(outcome)
+        self._unheard = dict.fromkeys(drive.members[1:], outcome)
+        self._send_again(self._unheard, Priority.NORMAL)
+
+    # Following
+
+    def _obey(self, sender: str, ask: Ask) -> None:
+        """Obey an order once, and answer it as often as it is asked."""
+        if ask.term.driver != sender or ask.term < self.term:
+            self._talk.say_hello(sender)
+            return
+        if ask.term > self.term:
+            self._learn_term(ask.term)
+        if ask.call > (0 if self._following is None else self._following.call + 1):
+            self._have_all_begin_again(ask.term)
+            return
+        if self._following is None:
+            agent = self._member.new_agent(ask.place)
+            if agent is None:
+                return
+            letters = Letters(ask.place)
+            self._following = Following(agent, self._revision, letters, ask.members)
+        self._answer(self._following, ask)
+
+    def _answer(self, part: Following, ask: Ask) -> None:
+        """Begin to obey the next order, or send the last answer again."""
+        if part.obeyed is not None:
+            self._talk.say_hello(ask.term.driver)
+        elif ask.call == part.call + 1:
+            lost = self._begin_answer(part, ask)
+            if part.waiting is not None:  # asked again: the letters should be here by now
+                for name in lost:
+                    message = LetterLost(ask.term, name.call, part.letters.place)
+                    self._talk.send(part.members[name.other], message, Priority.URGENT)
+            part.waiting = ask if lost else None
+        elif ask.call == part.call and part.reply is not None:
+            self._talk.send(ask.term.driver, part.reply, Priority.URGENT)
+
+    def _have_all_begin_again(self, term: Term) -> None:
+        """Tell the robot that drives that this one has begun anew and has lost its part."""
+        self.term = Term(term.number + 1, self.name)
+        self._talk.say_hello(term.driver)
+
+    def _begin_answer(self, part: Following, ask: Ask) -> set[LetterName]:
+        """Begin to obey an order, unless letters are missing."""
+        try:
+            request, missing = part.letters.put_in(ask.request)
+        except (LookupError, TypeError, PGOError) as error:
+            part.reply = Reply(ask.term, ask.call, part.revision, None, _as_error(error))
+            part.call = ask.call
+            self._talk.send(ask.term.driver, part.reply, Priority.URGENT)
+            return set()
+        if missing:
+            return {name for name in missing if 0 <= name.other < len(part.members)}
+        part.obeyed = ask
+
+        def compute() -> None:
+            answer: Any = None
+            error = None
+            try:
+                answer = function_for_teams(ask.order)(part.agent, request)
+            except Exception as reason:  # another robot may ask for anything
+                error = _as_error(reason)
+            self._beside.hand_over(lambda: self._end_answer(part, ask, answer, error))
+
+        self._beside.begin(compute)
+        return missing
+
+    def _end_answer(
+        self,
+        part: Following,
+        ask: Ask,
+        answer: Any,  # noqa: ANN401 - the order chooses
+        error: tuple[str, str] | None,
+    ) -> None:
+        """Send an answer, and letters with it, unless the solve is given up."""
+        part.obeyed = None
+        part.call = ask.call
+        answer, letters = part.letters.take_out(ask.call, answer)
+        part.reply = Reply(ask.term, ask.call, part.revision, answer, error)
+        if part is not self._following:
+            return
+        for name in letters:
+            self._send_letter(part, ask.term, name)
+        self._talk.send(ask.term.driver, part.reply, Priority.URGENT)
+
+    def _send_letter(self, part: Following, term: Term, name: LetterName) -> None:
+        letter = Letter(term, name.call, part.letters.place, part.letters.sent[name])
+        self._talk.send(part.members[name.other], letter, Priority.URGENT)
+
+    def _take_letter(self, letter: Letter) -> None:
+        """Keep a letter, and obey the order that has waited for it."""
+        part = self._following
+        if part is None or letter.term != self.term:
+            return
+        part.letters.received[LetterName(letter.place, letter.call)] = letter.content
+        if part.obeyed is not None or part.waiting is None:
+            return
+        if not self._begin_answer(part, part.waiting):
+            part.waiting = None
+
+    def _repeat_letter(self, lost: LetterLost) -> None:
+        """Send a letter again."""
+        if lost.term != self.term:
+            return
+        name = LetterName(lost.place, lost.call)
+        if self._following is None or name not in self._following.letters.sent:
+            self._have_all_begin_again(lost.term)
+            return
+        self._send_letter(self._following, lost.term, name)
+
+    def _take_outcome(self, sender: str, outcome: Ended) -> None:
+        if outcome.term == self.term and outcome.term.driver == sender:
+            if self.last is None or self.last.term != outcome.term:
+                if self._following is None and outcome.solution is not None:
+                    self._have_all_begin_again(outcome.term)  # its poses are lost
+                    return
+                self._end_with(outcome)
+            self._talk.send(sender, Heard(outcome.term), Priority.NORMAL)
+
+    def _end_with(self, outcome: Ended) -> None:
+        """Remember how a solve has ended, and have the robot take what was found."""
+        self.last = outcome
+        self._member.end_with(outcome, None if self._following is None else self._following.agent)
+
+
+def _as_error(error: Exception) -> tuple[str, str]:
+    """An error as a message: what is no PGOError comes of what another robot has sent."""
+    if isinstance(error, PGOError):
+        return error_as_message(error)
+    return error_as_message(PGOError(f"it cannot compute what it was asked: {error!r:.200}"))

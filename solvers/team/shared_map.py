@@ -1,0 +1,340 @@
+"""A map of all that the team has measured, which every robot finds for itself.
+
+A robot tells each other one what it has measured, every line once: the others say which revisions
+they have (`News.has`), and it sends the lines after these. What a robot that is not heard has
+measured others pass on. So nothing has to be agreed on: whoever has the same lines has the same
+map. It stays when robots go, and lost messages are sent again.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgo_models.errors import PGOError
+from solvers.carry.ledger import Ledger
+from solvers.carry.wire import WireError
+from solvers.robots_solution import RobotsSolution
+from solvers.team.measurements import Measurements, Revision
+from solvers.team.member import Member
+from solvers.team.messages import Ended, Hello, News, Piece, Priority, Term
+from solvers.team.shared_solve import SharedAnswer
+from solvers.team.talk import Talk
+
+# Bytes of lines in a message, before they are compressed: longer ones are cut. Another robot may
+# send no more.
+MOST_IN_A_PIECE = 1 << 15
+_DICTIONARY = 1 << 15  # bytes of the lines before, which deflate can refer to at most
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """A piece that was sent: from which line on, when, how often, and whether it was the last."""
+
+    begins: int
+    when: float
+    num_sent: int
+    is_last: bool
+
+
+class SharedMap:
+    """The measurements of the team as far as a robot has them, by robot, and the map of them.
+
+    `last` is how the last solve has ended, and `term` its number.
+    """
+
+    def __init__(self, member: Member, talk: Talk) -> None:
+        self.name = member.name
+        self.term = Term(0, "")
+        self.last: Ended | None = None
+        self.logs: dict[str, Measurements] = {member.name: member.measurements}
+        # Whether the robot comes from what was saved and has measured nothing since: then it takes
+        # back what others still have of it.
+        self.saved: Revision | None = None
+        self._member = member
+        self._talk = talk
+        # Of the others that are awake: what each has, and whom it hears.
+        self._has: dict[str, Mapping[str, Revision]] = {}
+        self._hears: dict[str, tuple[str, ...]] = {}
+        self._flights: dict[tuple[str, str], _Flight] = {}
+        self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
+        # When an answer is owed to robots whose pieces have come: they are collected, too.
+        self._owed: dict[str, float] = {}
+        self._keep_theirs: set[str] = set()
+        self._tried: Mapping[str, Revision] = {}
+        self._changed_at: float | None = None
+        self._is_solving = False
+        self._problems: tuple[str, ...] = ()
+
+    @property
+    def others(self) -> dict[str, Measurements]:
+        """Measurements of others, by robot."""
+        return {name: log for name, log in self.logs.items() if name != self.name}
+
+    def restore(
+        self, term: Term, outcome: Ended | None, others: Mapping[str, Measurements]
+    ) -> None:
+        """Go on from what was saved, and solve again: the solution is not saved."""
+        self.term = term
+        self.last = outcome
+        self.saved = self._member.revision
+        for name, saved in others.items():
+            if name in self._talk.team:
+                self.logs[name] = Measurements(list(saved.lines), saved.d)
+
+    @property
+    def problems(self) -> list[str]:
+        """What was left out, and robots that keep their measurements, a sentence each."""
+        kept = [
+            f"{name} shares its interface alone; give all robots the same sharing"
+            for name in sorted(self._keep_theirs)
+        ]
+        return [*kept, *self._problems]
+
+    @property
+    def revisions(self) -> dict[str, Revision]:
+        """Which measurements this robot has, by robot."""
+        revisions = {name: log.revision for name, log in sorted(self.logs.items())}
+        return {name: revision for name, revision in revisions.items() if revision.num_lines}
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the map is one of all, and everybody who is awake has all that it is of."""
+        outcome = self._member.outcome
+        if outcome is None or outcome.absent or self._is_solving or self._owed:
+            return False
+        revisions = self.revisions
+        return revisions == self._tried and all(has == revisions for has in self._has.values())
+
+    # Lines
+
+    def greeting(self) -> News:
+        """What tells others that this robot is there."""
+        return self._news(())
+
+    def _news(self, pieces: tuple[Piece, ...]) -> News:
+        hears = tuple(self._hears)
+        return News(self.revisions, hears, pieces, self._takes_back, self._talk.twins)
+
+    @property
+    def _takes_back(self) -> bool:
+        return self.saved is not None and self.saved == self._member.revision
+
+    def take(self, sender: str, message: object, is_latest: bool) -> None:
+        """Learn which measurements a robot has, and lines that it gives."""
+        if isinstance(message, Hello):
+            self._keep_theirs.add(sender)
+        if not isinstance(message, News):
+            return
+        for piece in message.pieces:
+            self._learn(sender, piece, is_latest)
+            pause = self._talk.pause(1) / 2 if piece.is_last else 0.0
+            when = min(self._talk.now + pause, self._owed.get(sender, np.inf))
+            self._owed[sender] = when
+        if is_latest:
+            self._has[sender] = message.has
+            self._hears[sender] = message.hears
+            if message.takes_back:
+                self._give_back(sender, message.has.get(sender, Revision()))
+
+    def _learn(self, sender: str, piece: Piece, is_latest: bool) -> None:
+        """Add lines to those of a robot; of its own that robot alone decides which stand."""
+        if piece.owner == self.name:
+            if self._takes_back and piece.before == self.saved:
+                self._member.measurements.end_at(
+                    piece.before.num_lines, _lines_of(piece, self._member.measurements)
+                )
+                self.saved = self._member.revision
+            return
+        log = self.logs.setdefault(piece.owner, Measurements())
+        if not log.begins_with(piece.before):
+            return
+        begins = piece.before.num_lines
+        lines = _lines_of(piece, log)
+        known = log.lines[begins : begins + len(lines)]
+        is_final = sender == piece.owner and is_latest
+        ends = begins + len(lines)
+        if known != lines[: len(known)]:
+            if is_final:
+                log.end_at(begins, lines)
+        elif len(log.lines) < ends:
+            log.end_at(begins + len(known), lines[len(known) :])
+        elif is_final and piece.is_last and len(log.lines) > ends:
+            log.end_at(ends, [])
+
+    def _give_back(self, owner: str, saved: Revision) -> None:
+        """Give a robot that was restored from an older state its lines since then."""
+        log = self.logs.get(owner)
+        if log is not None and log.begins_with(saved) and len(log.lines) > saved.num_lines:
+            piece = self._piece(owner, log, saved.num_lines, owner)
+            if piece is not None:
+                self._talk.send(owner, self._news((piece,)), Priority.NORMAL)
+
+    def tick(self, awake: tuple[str, ...]) -> None:
+        """Send what others lack, and solve where something is new."""
+        self._has = {name: has for name, has in self._has.items() if name in awake}
+        self._hears = {name: self._hears[name] for name in self._has}
+        for name, has in self._has.items():
+            pieces = self._pieces_for(name, has, awake)
+            if pieces or self._owed.get(name, np.inf) <= self._talk.now:
+                self._owed.pop(name, None)
+                self._talk.send(
+                    name, self._news(tuple(pieces)), Priority.NORMAL if pieces else Priority.HELLO
+                )
+        self._solve_if_due()
+
+    def _pieces_for(
+        self, to: str, has: Mapping[str, Revision], awake: tuple[str, ...]
+    ) -> list[Piece]:
+        """Lines that a robot lacks: this robot's, and those of others that it does not hear."""
+        pieces = []
+        for owner, log in self.logs.items():
+            known = has.get(owner, Revision())
+            if owner == to or known == log.revision or not log.lines:
+                self._lags.pop((to, owner), None)
+                continue
+            begins = known.num_lines if log.begins_with(known) else 0
+            if owner != self.name and not self._passes_on(to, owner, known, awake):
+                continue
+            if owner == self.name and self._takes_back and not log.begins_with(known):
+                continue
+            piece = self._piece(to, log, begins, owner)
+            if piece is not None:
+                pieces.append(piece)
+        return pieces
+
+    def _passes_on(self, to: str, owner: str, known: Revision, awake: tuple[str, ...]) -> bool:
+        """Whether to tell a robot what a third one has measured, which it does not hear.
+
+        One after the other would do it, the first robot that is awake at once for one that is gone:
+        others may have met a moment later.
+        """
+        log = self.logs[owner]
+        if owner in self._hears[to] or known.num_lines >= len(log.lines):
+            return False
+        since = self._lags.setdefault((to, owner), self._talk.now)
+        rank = [name for name in awake if name not in (to, owner)].index(self.name)
+        rank += owner in awake
+        is_due = self._talk.now - since >= rank * self._talk.patience / 2
+        return is_due and log.begins_with(known)
+
+    def _piece(self, to: str, log: Measurements, begins: int, owner: str) -> Piece | None:
+        """Lines from one on, cut to a length; None where a robot is to answer first."""
+        flight = self._flights.get((to, owner))
+        now = self._talk.now
+        num_sent = 0
+        if flight is not None:
+            is_repeated = flight.begins == begins
+            num_sent = flight.num_sent if is_repeated else 0
+            # After the last piece, lines are collected for a while.
+            pause = self._talk.pause(1) if flight.is_last else 0.0
+            if is_repeated:
+                pause = 2 * self._talk.pause(num_sent)
+            if now - flight.when < pause:
+                return None
+        ends = begins
+        num_bytes = 0
+        while ends < len(log.lines) and num_bytes < MOST_IN_A_PIECE:
+            num_bytes += len(log.lines[ends])
+            ends += 1
+        is_last = ends == len(log.lines)
+        self._flights[to, owner] = _Flight(begins, now, num_sent + 1, is_last)
+        text = _compressed(log.lines[begins:ends], log.lines[:begins])
+        return Piece(owner, log.revision_at(begins), text, is_last)
+
+    # Solves
+
+    def _solve_if_due(self) -> None:
+        """Solve where lines are new, once those that others have announced are there.
+
+        A robot waits for these for as long as it waits for a robot, at first, and later for as long
+        as a message takes to be sent again.
+        """
+        revisions = self.revisions
+        if self._is_solving or self.name not in revisions or revisions == self._tried:
+            return
+        if self._changed_at is None:
+            self._changed_at = self._talk.now
+        is_first = self.last is None
+        pause = self._talk.patience if is_first else self._talk.pause(1)
+        is_waited_for = self._talk.now - self._changed_at >= pause
+        announced = [has.get(name, Revision()) for name, has in self._has.items()]
+        is_here = all(each in (Revision(), *revisions.values()) for each in announced)
+        if is_first and not self._talk.is_complete(revisions):
+            return
+        if is_here or is_waited_for:
+            self._begin(revisions)
+
+    def _begin(self, revisions: Mapping[str, Revision]) -> None:
+        """Solve beside the robot."""
+        self._tried = revisions
+        self._changed_at = None
+        self._is_solving = True
+        lines = {name: list(self.logs[name].lines) for name in revisions}
+        solve = self._member.shared_solve
+        before = self._member.solution
+
+        def compute() -> None:
+            answer: SharedAnswer | PGOError
+            try:
+                answer = solve.solved(lines, before)
+            except PGOError as error:
+                answer = error
+            except Exception as error:  # robots may measure anything
+                answer = PGOError(f"the measurements cannot be computed with: {error!r:.200}")
+            self._talk.beside.hand_over(lambda: self._end(revisions, answer))
+
+        self._talk.beside.begin(compute)
+
+    def _end(self, revisions: Mapping[str, Revision], answer: SharedAnswer | PGOError) -> None:
+        self._is_solving = False
+        self.term = Term(self.term.number + 1, self.name)
+        if isinstance(answer, PGOError):
+            self._problems = ()
+            self.last = Ended(self.term, revisions, (), None, failure=f"failed: {answer}")
+            return
+        self._problems = answer.problems
+        covered = {name: revisions[name] for name in answer.covered}
+        absent = tuple(name for name in self._talk.team if name not in covered)
+        found = RobotsSolution.of(answer.solution, Ledger(len(revisions)))
+        self.last = Ended(self.term, covered, absent, found.without_histories)
+        self._member.outcome = self.last
+        self._member.known = answer.own
+        self._member.solution = answer.solution
+
+
+def _dictionary(before: Sequence[str]) -> bytes:
+    """The end of lines, in UTF-8."""
+    parts: list[str] = []
+    num_letters = 0
+    for line in reversed(before):
+        if num_letters >= _DICTIONARY:
+            break
+        parts.append(line)
+        num_letters += len(line)
+    return "".join(reversed(parts)).encode("utf-8")[-_DICTIONARY:]
+
+
+def _compressed(lines: Sequence[str], before: Sequence[str]) -> NDArray[np.uint8]:
+    """Lines in UTF-8, compressed by what those before have in common with them."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15, zdict=_dictionary(before))
+    data = packer.compress("".join(lines).encode("utf-8")) + packer.flush()
+    return np.frombuffer(data, np.uint8)
+
+
+def _lines_of(piece: Piece, log: Measurements) -> list[str]:
+    """The lines of a piece; a WireError for bytes that are none, or more than a robot sends."""
+    unpacker: Any = zlib.decompressobj(-15, _dictionary(log.lines[: piece.before.num_lines]))
+    try:
+        data: bytes = unpacker.decompress(piece.text.tobytes(), 4 * MOST_IN_A_PIECE)
+        text = data.decode("utf-8")
+    except (zlib.error, ValueError) as error:
+        raise WireError(f"lines that cannot be read: {error}") from error
+    if not unpacker.eof or (text and not text.endswith("\n")):
+        raise WireError("lines without an end")
+    return text.splitlines(keepends=True)

@@ -1,0 +1,154 @@
+"""The solve of a robot that has the measurements of its team: of the connected part that it is in.
+
+It is that of one place, with all options of `solve`. The next one begins at the map before
+(`extend`).
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pgo_models.errors import GraphError, GraphWarning, PGOError
+from pgo_models.graphs.g2o import graph_of_robots
+from pgo_models.graphs.g2o_parser import G2OLines, parse_lines
+from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.precisions import RotationWeight
+from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
+from solvers.growing import extend
+from solvers.loop import RunMonitor
+from solvers.pipeline import solution_for
+from solvers.request import Pipeline, SolveRequest
+from solvers.robust.consistency import PCM
+from solvers.robust.gnc import GNC
+from solvers.solution import Solution
+from solvers.team.measurements import Measurements
+from solvers.team.sharing import OwnAnswer
+
+# Filters of warnings are of all threads: one at a time changes them.
+_FILTERS = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class SharedAnswer:
+    """What a robot has found: the solution of its part, its own poses, and whose part it is.
+
+    `problems` are sentences on what was left out.
+    """
+
+    solution: Solution
+    own: OwnAnswer
+    covered: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SharedSolve:
+    """Settings of the solves of the robot `name`."""
+
+    name: str
+    pipeline: Pipeline
+    weighting: Weighting
+    robust: GNC | PCM | None
+    trust_folder: bool
+
+    def solved(self, lines: Mapping[str, Sequence[str]], before: Solution | None) -> SharedAnswer:
+        """The solution of the part that the robot is in, of the lines that each robot has measured.
+
+        What cannot be read, or does not fit to the robot's own, is left out. A PGOError where it
+        cannot solve its own.
+        """
+        with _FILTERS, warnings.catch_warnings():
+            # Poses of absent robots have no estimate, which the outcome says in its own way.
+            warnings.simplefilter("ignore", GraphWarning)
+            files, problems = _files_of(lines)
+            if self.name not in files:
+                raise PGOError(problems[0])
+            graph, misfits = self._graph(files)
+        problems += [f"what {name} has measured does not fit: {misfits[name]}" for name in misfits]
+        part = _part_of(graph, files[self.name])
+        solution = self._solution(part, before)
+        fitting = [name for name in files if name not in misfits]
+        covered = [name for name in fitting if _has_poses_of(part, files[name])]
+        is_own = np.isin(part.pose_ids, files[self.name].vertex_ids)
+        num_apart = len(np.setdiff1d(files[self.name].vertex_ids, part.pose_ids))
+        if num_apart:
+            problems.append(f"no edge joins {num_apart} poses of {self.name} with its others")
+        own = OwnAnswer.of(solution, is_own)
+        return SharedAnswer(solution, own, tuple(covered), tuple(problems))
+
+    def _graph(self, files: Mapping[str, G2OLines]) -> tuple[PoseGraph, dict[str, PGOError]]:
+        """The graph of the files that fit to the robot's own, and why the others do not."""
+        try:
+            return self._graph_of(list(files.values())), {}
+        except PGOError:
+            if len(files) == 1:
+                raise
+        fitting = [files[self.name]]
+        graph = self._graph_of(fitting)
+        misfits = {}
+        for name, file in files.items():
+            if name != self.name:
+                try:
+                    graph = self._graph_of([*fitting, file])
+                    fitting.append(file)
+                except PGOError as error:
+                    misfits[name] = error
+        return graph, misfits
+
+    def _graph_of(self, files: list[G2OLines]) -> PoseGraph:
+        weights = RotationWeight.SE_SYNC
+        path = Path("team")
+        return graph_of_robots(path, files, weights, is_folder=True, trust_folder=self.trust_folder)
+
+    def _solution(self, graph: PoseGraph, before: Solution | None) -> Solution:
+        """The solution from the map before, or where that is no part of it, from none."""
+        if before is not None:
+            try:
+                return extend(before, graph, self.pipeline, robust=self.robust)
+            except GraphError:
+                pass
+        problem = PGOProblem(graph, weighting=self.weighting)
+        monitor = RunMonitor(progress=False)
+        return solution_for(
+            SolveRequest(problem, self.pipeline, robust=self.robust, monitor=monitor)
+        )
+
+
+def _files_of(lines: Mapping[str, Sequence[str]]) -> tuple[dict[str, G2OLines], list[str]]:
+    """The lines of each robot, read, and sentences on those that cannot be."""
+    measured = {name: Measurements(list(its)) for name, its in lines.items()}
+    dimensions = [its.told_dimension for its in measured.values()]
+    d = next((each for each in dimensions if each is not None), None)
+    if d is None:
+        raise GraphError("nobody has measured an edge; there is nothing to solve")
+    files = {}
+    problems = []
+    for name, its in measured.items():
+        text = its.text(its.told_dimension or d)
+        try:
+            files[name] = parse_lines(Path("team") / f"{name}.g2o", [text])
+        except PGOError as error:
+            problems.append(f"what {name} has measured cannot be read: {error}")
+    return files, problems
+
+
+def _part_of(graph: PoseGraph, own: G2OLines) -> PoseGraph:
+    """The connected part of a graph in which most poses of a robot are."""
+    parts = graph.components()
+    if len(parts) == 1:
+        return graph
+    num_own = [int(np.isin(graph.pose_ids[part], own.vertex_ids).sum()) for part in parts]
+    return graph.subgraph(np.sort(parts[int(np.argmax(num_own))]))
+
+
+def _has_poses_of(graph: PoseGraph, file: G2OLines) -> bool:
+    """Whether a pose of a robot is in a graph, or one that it has measured."""
+    named = np.concatenate([file.vertex_ids, file.edge_ids.ravel()])
+    return bool(np.isin(graph.pose_ids, named).any())
