@@ -7,7 +7,7 @@ import pytest
 from budget import examples
 from graphs import DIMENSIONS, SEEDS
 from hypothesis import given, settings, strategies as st
-from networks import KEY, Network, robots_with_files
+from networks import Network, robots_with_files
 from robots import Recording
 from wrong_edges import joined_by, spoiled
 
@@ -136,7 +136,9 @@ def test_the_only_edge_between_two_robots_is_told(tmp_path: Path) -> None:
 
 def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_path: Path) -> None:
     graph = world(2, 2, "random", tmp_path)
-    robots = robots_with_files(tmp_path, 3, robust=solvers.PCM(), retry=0.3)
+    robots = robots_with_files(
+        tmp_path, 3, sharing=solvers.Sharing.INTERFACE, robust=solvers.PCM(), retry=0.3
+    )
     network = Network(robots, np.random.default_rng(0), lost=0.2)
     network.run(100.0)
     kept = consistent(graph)
@@ -149,5 +151,3 @@ def test_a_team_that_keeps_its_measurements_finds_wrong_ones_pair_by_pair(tmp_pa
         assert robot.solution.certificate.is_certified
         assert robot.is_certified == robot.solution.is_held
         assert robot.solution.robust.startswith(f"{num_wrong} of {graph.num_edges} edges left out")
-    with pytest.raises(SettingError, match=r"other known edges need sharing=Sharing\.MEASUREMENTS"):
-        solvers.Robot("a", list(robots), KEY, robust=solvers.GNC(known=np.ones(9, dtype=bool)))

@@ -96,7 +96,9 @@ def test_thresholds_follow_errors_that_are_smaller_than_the_matrices_claim(tmp_p
 def test_a_team_that_keeps_its_measurements_does_the_same(tmp_path: Path) -> None:
     world_in_files(tmp_path, 0, 2, "random", 0.3)
     folder = solvers.solve_folder(tmp_path, robust=solvers.GNC(), trust_folder=True)
-    robots = robots_with_files(tmp_path, 4, robust=solvers.GNC(), retry=0.3)
+    robots = robots_with_files(
+        tmp_path, 4, sharing=solvers.Sharing.INTERFACE, robust=solvers.GNC(), retry=0.3
+    )
     network = Network(robots, np.random.default_rng(0), lost=0.1)
     network.run(300.0)
     for robot in robots.values():
