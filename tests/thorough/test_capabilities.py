@@ -152,7 +152,11 @@ class Apart:
         after = self.robot.outcome
         assert before is not None
         assert after is not None
-        return sum(after.revisions.values()) == sum(before.revisions.values()) + 1
+        lines = [
+            sum(revision.num_lines for revision in outcome.revisions.values())
+            for outcome in (before, after)
+        ]
+        return lines[1] == lines[0] + 1
 
 
 def apart(
