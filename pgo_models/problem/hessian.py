@@ -123,7 +123,7 @@ def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
     coupling_vw_sums = incidence.at_beginning(coupling_vw).reshape(-1, *coupling_vw.shape[1:])
     coupling_ww = -2.0 * double_cross(relative_R, coupling_R)
     diagonal_ww = curvature_of_rotations(S_ii)
-    if len(indefinite_W):
+    if len(indefinite_W) and d == 3:  # in the plane such a W is negative: no square is left
         between, at_poses = _squares_of_rotations(here, relative_R, indefinite_W)
         coupling_ww = coupling_ww + between
         diagonal_ww = diagonal_ww + at_poses
@@ -220,7 +220,10 @@ def _squares_of_rotations(here: EvaluatedPoses, relative_R: Array, W: Array) -> 
     quaternions = quaternions_from_rotations(E)
     scalar_part = quaternions[:, 3, None, None]
     doubled = scalar_part * np.eye(3) + hat(quaternions[:, :3])
-    of_j = np.swapaxes(doubled, 1, 2) @ curvature_of_rotations(W) @ doubled
+    values, axes = np.linalg.eigh(curvature_of_rotations(W))
+    # Coupled edges leave an I_rr that is negative by a small share: that part is no square.
+    root = np.swapaxes(axes, 1, 2) @ doubled
+    of_j = np.swapaxes(root, 1, 2) @ (np.maximum(values, 0.0)[:, :, None] * root)
     between = -relative_R @ of_j
     of_i = -between @ np.swapaxes(relative_R, 1, 2)
     return between, here.problem.incidence.at_both(of_i, of_j)

@@ -152,6 +152,8 @@ def partial_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, lis
     level = "0 0 0 0 0 0 1 " + " ".join("0" for _ in range(15))
     gravity = [f"EDGE_SE3_PRIOR {k} 0 {level} 900 0 0 900 0 0" for k in every_tenth]
     yield "gravity", [offset, *space, *gravity]
+    up = "0 0 1 0.01 0.02 1 900 0 0 900 0 900"
+    yield "gravity_vectors", [*space, *(f"EDGE_SE3_PRIORVEC {k} {up}" for k in every_tenth)]
     compass = [f"EDGE_PRIOR_SE2 {k} 0 0 0 0 0 0 0 0 2500" for k in range(0, 60, 30)]
     yield "compass", [*plane, *compass]
     yield "corridor", changed(plane, without_x)
@@ -173,6 +175,8 @@ def exported_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, li
     edges = [line.split()[1:] for line in plane if line.startswith("EDGE")]
     header = "i,j,x,y,theta,xx,xy,xt,yy,yt,tt"
     yield "table", [header, *(",".join(words) for words in edges)]
+    cameras = changed(changed(space, with_rotation_first), as_camera)
+    yield "cameras", [line.replace("VERTEX_SE3:QUAT", "VERTEX_SE3:EXPMAP") for line in cameras]
     yield "rotation_first", changed(space, with_rotation_first)
     yield (
         "reversed_rotation_first",
@@ -187,6 +191,10 @@ def named_by_labels(words: list[str], key: int) -> list[str]:
     count = 2 if words[0].startswith("EDGE") else 1
     ids = [str(key | (65 + int(name) // 30) << 48 | int(name)) for name in words[1 : 1 + count]]
     return [words[0], *ids, *words[1 + count :]]
+
+
+def as_camera(words: list[str]) -> list[str]:
+    return ["EDGE_SE3:EXPMAP", *words[1:]]
 
 
 def with_rotation_first(words: list[str]) -> list[str]:

@@ -126,3 +126,17 @@ def test_gauss_newton_of_yaw_alone_is_semidefinite_and_promises_no_more_than_chi
     assert np.abs(along[~is_seen]).max(initial=0.0) <= 1e-6 * np.linalg.norm(along)
     promised = 0.5 * (along[is_seen] ** 2 / values[is_seen]).sum()
     assert promised <= here.value * (1.0 + 1e-9)
+
+
+@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
+def test_gauss_newton_of_coupled_singular_matrices_is_semidefinite(
+    seed: int, n: int, d: int
+) -> None:
+    graph = varied_graph(seed, n, d)
+    side = 3 * d - 3
+    columns = np.random.default_rng(seed).normal(size=(graph.num_edges, side, 2))
+    information = columns @ np.swapaxes(columns, 1, 2)
+    problem = PGOProblem(replace(graph, information=information), weighting=Weighting.INFORMATION)
+    H = riemannian_hessian(problem.at(random_poses(n, d, seed)), None).toarray()
+    values = np.linalg.eigvalsh(H)
+    assert values[0] >= -1e-9 * values[-1]
