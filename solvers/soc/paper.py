@@ -353,6 +353,9 @@ class PaperSOC:
     - *Stopping* (equation (20)). The paper stops when p_res is at most the residual, which
       is the wrong way round, names no tolerance, and leaves out the stationarity that the text asks
       for. Here both residuals count, unless `stop` says otherwise.
+    - *Use*. It is here to be compared with, and for rotations alone. As the first stage of robots
+      it saves nothing: `pgo solve smallGrid3D --robots 5` sends 0.80 MB in 19 rounds, and with
+      `--method paper` 5.8 MB in 123, to the same certified optimum.
     - *Start and output*. The paper starts at GPS and IMU estimates or at a spanning tree, which is
       the default here; it returns R and omega, here omega is the answer, with the best
       translations for it, where the paper goes on to Gauss-Newton.
