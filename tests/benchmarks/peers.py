@@ -1,7 +1,7 @@
 """Prints the table of distributed methods side by side (README.md beside this file): rounds and
 bytes of the common start, to three levels of F, and to a proof.
 
-    PGO_DATA=folder python tests/benchmarks/peers.py [graph ..] [--robots 5,25,50]
+    PGO_DATA=folder python tests/benchmarks/peers.py [graph ..] [--robots 5,25,50] [--methods MESA]
 
 Every row runs in a process of its own, one thread, all robots in that process.
 """
@@ -49,6 +49,8 @@ MAX_SECONDS = 60.0  # CPU time of a run
 PENALTIES = (0.4, 0.3, 0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)  # of MESA
 MULTIPLIER_STEPS = (1.9, 1.0)  # of MESA
 OVER_RELAXATIONS = (1.0, 1.5, 1.8)  # of DGS
+ALPHAS = (1.0, 1.9)  # of CONSENSUS at its best
+TRANSLATION_PENALTIES = (None, 0.5, 0.2)  # of CONSENSUS at its best
 DGS_TOLERANCE = 1e-3  # change of a sweep after which DGS linearises again
 
 
@@ -109,10 +111,26 @@ class Case:
 
 def consensus(case: Case) -> dict[str, Any]:
     """CONSENSUS, at the poses that the robots hold."""
-    watch = Watch(case.optimum)
+    return _consensus(case, solvers.SOC(robots=case.robots), MAX_ROUNDS)
+
+
+def tuned_consensus(case: Case) -> dict[str, Any]:
+    """CONSENSUS with the best of its over-relaxations and translation penalties."""
+    rows: list[dict[str, Any]] = []
+    for alpha, penalty in product(ALPHAS, TRANSLATION_PENALTIES):
+        soc = solvers.SOC(robots=case.robots, alpha=alpha, translation_penalty=penalty)
+        row = _consensus(case, soc, _rounds_of_best(rows))
+        text = "default" if penalty is None else f"{penalty:g}"
+        rows.append({**row, "remark": f"alpha {alpha:g}, translation penalty {text}"})
+    return min(rows, key=_preference)
+
+
+def _consensus(case: Case, settings: solvers.SOC, max_rounds: int) -> dict[str, Any]:
+    """Figures of CONSENSUS with these settings."""
+    watch = Watch(case.optimum, max_rounds)
     driver = case.opened()
     start = driver.network.ledger
-    soc = solvers.SOC(robots=case.robots, tolerance=1e-12, max_iterations=MAX_ROUNDS)
+    soc = replace(settings, tolerance=1e-12, max_iterations=MAX_ROUNDS)
 
     def is_over(state: object, record: Record) -> bool:
         ledger = driver.network.ledger
@@ -194,20 +212,21 @@ def _rounds_of_best(rows: list[dict[str, Any]]) -> int:
 
 METHODS: dict[str, Callable[[Case], dict[str, Any]]] = {
     "CONSENSUS": consensus,
+    "CONSENSUS*": tuned_consensus,
     "SUBSTRUCTURED": substructured,
     "DGS": gauss_seidel,
     "MESA": mesa,
 }
 
 
-def table(names: list[str], robot_counts: list[int]) -> Table:
+def table(names: list[str], robot_counts: list[int], methods: list[str]) -> Table:
     """Rounds and bytes of every method on every graph."""
     heads = [f"{level:.0e}".replace("e-0", "e-") for level in LEVELS]
     columns = ("graph", "robots", "method", "start", *heads, "proof", "CPU s", "remark")
     printed = Table(*columns, box=MARKDOWN)
     for name in names:
         for robots in robot_counts:
-            for method in METHODS:
+            for method in methods:
                 row = child(name, str(robots), method)
                 cells = [as_text(to) for to in [row.get("start"), *row["levels"], row["proof"]]]
                 seconds = f"{row['seconds']:.1f}"
@@ -240,9 +259,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Print the table of distributed methods.")
     parser.add_argument("graphs", nargs="*", default=GRAPHS)
     parser.add_argument("--robots", default="5,25,50")
+    parser.add_argument("--methods", default=",".join(METHODS))
     arguments = parser.parse_args()
+    methods = arguments.methods.split(",")
     robot_counts = [int(count) for count in arguments.robots.split(",")]
-    Console(width=160).print(table(list(arguments.graphs), robot_counts))
+    Console(width=160).print(table(list(arguments.graphs), robot_counts, methods))
 
 
 if __name__ == "__main__":
