@@ -33,7 +33,7 @@ def film_of_multipliers(
     theta = np.linspace(_FIRST_ANGLE, _LAST_ANGLE, 61)
     costs = cost(np.deg2rad(theta))
     labels = [
-        f"lambda = {lam:.2f}: no answer costs less than {bound:.2f}"
+        f"lambda = {lam:.2f}: none costs less than {bound:.2f}"
         for lam, bound in zip(multipliers, bounds, strict=True)
     ]
     frames: list[list[Trace]] = [

@@ -243,7 +243,7 @@ def write_texts(html: Path) -> None:
     ):
         article = re.search(r"<article.*?</article>", page.read_text(encoding="utf-8"), re.S)
         if article is not None:
-            shown = re.sub(r"<(script|style|svg)\b.*?</\1>|<[^>]+>", " ", article[0], flags=re.S)
+            shown = re.sub(r"<(script|style|svg|h1)\b.*?</\1>|<[^>]+>", " ", article[0], flags=re.S)
             name = page.relative_to(html).as_posix()
             texts[name] = " ".join(unescape(shown).replace("#", " ").split())
     script = f"const TEXTS = {json.dumps(texts)};\n"
