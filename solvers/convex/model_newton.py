@@ -68,20 +68,20 @@ class ModelNewton(ReadOnly):
             if not len(model.gradient):
                 break  # isolated points, as -1 and 1
             step = _solved(model.hessian, model.gradient)
-            is_newton = step is not None
-            if step is None:
-                step = _downhill(model)
-            decrement = float(-model.gradient @ step)
-            if is_newton and decrement > 0.1 * last and last < _SMALL * abs(J):
-                break  # a Newton step squares what is left; this is rounding
-            move = np.zeros(self.form.side)
-            move[model.moved] = model.basis @ step
-            moved, moved_J = self._backtracked(u, J, move, decrement)
+            moved = None
+            decrement = np.inf
+            if step is not None:
+                decrement = float(-model.gradient @ step)
+                if decrement > 0.1 * last and last < _SMALL * abs(J):
+                    break  # a Newton step squares what is left; this is rounding
+                moved, moved_J = self._backtracked(u, J, model, step)
+            last = np.inf if moved is None else decrement
+            if moved is None:  # indefinite, or flat, where a Newton step is long and of rounding
+                moved, moved_J = self._backtracked(u, J, model, _downhill(model))
             if moved is None:
                 break
             u = moved
             J = moved_J
-            last = decrement if is_newton else np.inf
         return u
 
     def on_sets(self, u: Array) -> Array:
@@ -152,9 +152,12 @@ class ModelNewton(ReadOnly):
         return _TangentModel(everywhere, N, N.T @ (S @ u), N.T @ (S @ N), convex)
 
     def _backtracked(
-        self, u: Array, J: float, move: Array, decrement: float
+        self, u: Array, J: float, model: "_TangentModel", step: Array
     ) -> tuple[Array | None, float]:
-        """The first of u + move, u + move / 2, .. on the sets that lowers J enough, and J there."""
+        """The first of u + step, u + step / 2, .. on the sets that lowers J enough, and J there."""
+        move = np.zeros(self.form.side)
+        move[model.moved] = model.basis @ step
+        decrement = float(-model.gradient @ step)
         length = 1.0
         noise = _ROUNDING * abs(J)
         for _ in range(_HALVINGS):

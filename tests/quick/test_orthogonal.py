@@ -215,3 +215,15 @@ def test_other_objectives_that_are_not_convex_get_a_way_in():
     for way, objective in ways.items():
         with pytest.raises(pgo.PGOError, match=way):
             pgo.OrthogonalProblem(cp.Problem(objective), orthogonal=[X])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_data_that_many_rotations_fit_are_fitted_to_rounding(seed):
+    """Two points are brought onto planes by a whole curve of rotations: the Hessian is singular."""
+    rng = np.random.default_rng(seed)
+    X = cp.Variable((3, 3))
+    J = cp.sum_squares(rng.standard_normal((2, 9)) @ cp.vec(X, order="F") - 0.1)
+    solution = solvers.solve_orthogonal(
+        pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J)), rotations=[X]), seed
+    )
+    assert solution.verdict is pgo.Verdict.EXACT
