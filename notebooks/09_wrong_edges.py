@@ -9,7 +9,7 @@
 #
 # **Time:** 40 minutes
 #
-# **Next:** [notebook 10](10_soc_beyond_robots.ipynb), what SOC does beyond robots
+# **Next:** [notebook 10](10_what_else_can_be_proven.ipynb), what can be proven of other models
 #
 # If one place is taken for another that looks the same, a wrong loop closure enters the graph.
 # Least squares treats it like every other measurement. The certificate then proves that no poses
