@@ -63,8 +63,7 @@ class Measurements:
     d: int | None = None
 
     def __post_init__(self) -> None:
-        self._hash = hashlib.sha256()
-        self._digests = [""]  # of the first k lines
+        self._digests = [""]  # of the first k lines: each of the one before and a line
 
     @property
     def revision(self) -> Revision:
@@ -74,8 +73,8 @@ class Measurements:
     def revision_at(self, num_lines: int) -> Revision:
         """The revision of the first lines."""
         for line in self.lines[len(self._digests) - 1 :]:
-            self._hash.update(line.encode("utf-8"))
-            self._digests.append(self._hash.hexdigest()[:_DIGITS_OF_HASH])
+            content = f"{self._digests[-1]}{line}".encode()
+            self._digests.append(hashlib.sha256(content).hexdigest()[:_DIGITS_OF_HASH])
         return Revision(num_lines, self._digests[num_lines])
 
     def restore(self, saved: Measurements) -> None:
@@ -102,8 +101,7 @@ class Measurements:
         """Replace all lines but the first ones by others."""
         if num_lines < len(self.lines):
             del self.lines[num_lines:]
-            self._hash = hashlib.sha256()
-            self._digests = [""]
+            del self._digests[num_lines + 1 :]
         self.lines += more
 
     def add_pose(self, pose_id: int, R: Array | None, t: Array | None, fixed: bool) -> None:
