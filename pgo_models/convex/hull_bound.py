@@ -16,6 +16,7 @@ delta; therefore a small share of a dual point well inside the cone is mixed int
 The bound is mostly wide: hulls have all points between those of the sets.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,7 +78,8 @@ def prove_hull_bound(problem: OrthogonalProblem) -> HullBound | None:
         )
         options = {"max_threads": 1, "tol_gap_rel": _TOLERANCE, "tol_feas": _TOLERANCE}
         raw = chain.solve_via_data(model, data, False, False, options)
-        model.unpack_results(raw, chain, inverse)
+        with warnings.catch_warnings(action="ignore"):  # of digits, which the proof does not need
+            model.unpack_results(raw, chain, inverse)
     except (cp.SolverError, ValueError):
         return None
     point = tuple(variable.value for variable in problem.variables)

@@ -27,6 +27,10 @@ class Beside:
         self._lock = threading.Lock()  # of the count
         _ALL.add(self)
 
+    def __reduce__(self) -> tuple[type[Beside], tuple[()]]:
+        """A copy has no computations: threads are not copied."""
+        return Beside, ()
+
     @property
     def is_busy(self) -> bool:
         """Whether a thread computes; one that waits for others does not."""
