@@ -228,8 +228,7 @@ def fit_sentence(residuals: EdgeResiduals, cost: str) -> str:
         allowed = f"{residuals.overall_allowed:.3g} times that"
         text += f"; by chance it exceeds {allowed} in one of 100 graphs"
     elif 0.0 < overall < _PESSIMISTIC:
-        smaller = f"{overall**-0.5:.3g} times smaller than the matrices say"
-        text += f"; the errors are {smaller}, which can hide wrong edges"
+        text += f"; the {_smaller_errors(overall)}, which can hide wrong edges"
     return text + "."
 
 
@@ -256,9 +255,16 @@ def fit_row(residuals: EdgeResiduals) -> str:
         reasons.append(f"chance allows {residuals.overall_allowed:.3g}")
     if residuals.is_misfit.any():
         reasons.append(_count_of_misfits(residuals))
+    if not reasons and residuals.overall < _PESSIMISTIC:
+        return f"{ratio}; {_smaller_errors(residuals.overall)}"
     if not reasons:
         return ratio
     return f"{ratio}: DOUBTFUL, {' and '.join(reasons)}; try --robust gnc, or pgo doctor"
+
+
+def _smaller_errors(overall: float) -> str:
+    """How much smaller the errors are than their standard deviations, where that is so."""
+    return f"errors are {overall**-0.5:.3g} times smaller than the matrices say"
 
 
 def _times_expected(overall: float) -> str:

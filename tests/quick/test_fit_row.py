@@ -1,5 +1,7 @@
 """Beside the verdict stands whether the measurements fit: a certificate does not ask."""
 
+from dataclasses import replace
+
 import pytest
 
 import pgo_models as pgo
@@ -47,6 +49,13 @@ def test_measurements_that_fit_are_told_without_a_doubt(world: pgo.PoseGraph) ->
     assert "DOUBTFUL" not in str(solution) + repr(solution)
     assert rows_of(str(solution))["fit"] == f"{solution.fit_ratio:.3g} times what is expected"
     assert "do not fit" not in str(solution)
+
+
+def test_errors_far_below_their_deviations_are_told_without_a_doubt(world: pgo.PoseGraph) -> None:
+    loose = replace(world, kappa=0.01 * world.kappa, tau=0.01 * world.tau)
+    ratio = solvers.solve(world).fit_ratio / 100.0
+    row = rows_of(str(solvers.solve(loose)))["fit"]
+    assert row.startswith(f"{ratio:.3g} times what is expected; errors are {ratio**-0.5:.3g} times")
 
 
 def test_what_is_exact_or_unchecked_has_no_row_of_its_fit(world: pgo.PoseGraph) -> None:
