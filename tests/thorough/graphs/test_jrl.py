@@ -187,7 +187,7 @@ def test_landmarks_by_bearing_and_range_belong_to_the_robot_that_logs_them(tmp_p
     }
     graph = read_jrl(write(tmp_path, {"measurements": logs}))
     np.testing.assert_array_equal(graph.landmarks, [3])
-    np.testing.assert_array_equal(graph.robots[:4], [0, 0, 1, 1])
+    np.testing.assert_array_equal(graph.robots[:4], [0, 1, 1, 1])  # B0 by its letter
     np.testing.assert_allclose(graph.t_ij[2], [0, 2], rtol=0, atol=1e-15)
     np.testing.assert_allclose(
         graph.information[2][:2, :2], np.diag([1.0, 0.25]), rtol=0, atol=1e-15
