@@ -29,6 +29,7 @@ from solvers.team.talk import Talk
 # Bytes of lines in a message, before they are compressed: longer ones are cut. Another robot may
 # send no more.
 MOST_IN_A_PIECE = 1 << 15
+_FORGOTTEN = 10.0  # patiences without a sign, after which a robot is not waited for any more
 _DICTIONARY = 1 << 15  # bytes of the lines before, which deflate can refer to at most
 
 
@@ -61,6 +62,8 @@ class SharedMap:
         # Of the others that are awake: what each has, and whom it hears.
         self._has: dict[str, Mapping[str, Revision]] = {}
         self._hears: dict[str, tuple[str, ...]] = {}
+        # What each has, as it has last said, and when: also of those that are out of reach.
+        self._said: dict[str, tuple[Mapping[str, Revision], float]] = {}
         self._flights: dict[tuple[str, str], _Flight] = {}
         self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
         # When an answer is owed to robots whose pieces have come: they are collected, too.
@@ -104,12 +107,17 @@ class SharedMap:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the map is one of all, and everybody who is awake has all that it is of."""
+        """Whether the map is one of all, and everybody has all that it is of.
+
+        A robot that is out of reach may come back for it, and is waited for.
+        """
         outcome = self._member.outcome
         if outcome is None or outcome.absent or self._is_solving or self._owed:
             return False
         revisions = self.revisions
-        return revisions == self._tried and all(has == revisions for has in self._has.values())
+        longest = _FORGOTTEN * self._talk.patience
+        waited_for = [has for has, when in self._said.values() if self._talk.now - when <= longest]
+        return revisions == self._tried and all(has == revisions for has in waited_for)
 
     # Lines
 
@@ -138,6 +146,7 @@ class SharedMap:
             self._owed[sender] = when
         if is_latest:
             self._has[sender] = message.has
+            self._said[sender] = (message.has, self._talk.now)
             self._hears[sender] = message.hears
             if message.takes_back:
                 self._give_back(sender, message.has.get(sender, Revision()))
@@ -179,6 +188,7 @@ class SharedMap:
         """Send what others lack, and solve where something is new."""
         self._has = {name: has for name, has in self._has.items() if name in awake}
         self._hears = {name: self._hears[name] for name in self._has}
+        self._owed = {name: when for name, when in self._owed.items() if name in awake}
         for name, has in self._has.items():
             pieces = self._pieces_for(name, has, awake)
             if pieces or self._owed.get(name, np.inf) <= self._talk.now:
