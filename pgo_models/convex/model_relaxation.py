@@ -24,7 +24,7 @@ from pgo_models.convex.set_equations import SetEquations
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
 
-LARGEST = 120  # coordinates of x up to which the relaxation is solved
+LARGEST = 108  # coordinates of x, those of twelve rotations: half a minute of a solver
 _PENALTY = 100.0  # of equalities, as a multiple of the largest entry of Q
 _ZERO = 1e-6  # eigenvalues of W(u*), whose others are of the order of the largest
 _DEFINITE = 1e-13  # what is added to P, as a share of its largest eigenvalue
