@@ -50,6 +50,15 @@ class Network:
         while self.now < end:
             self._pass_step()
 
+    def run_among_sleepers(self, seconds: float) -> None:
+        """Let time pass as `run` does, with a robot asleep now and then, and then with all awake."""
+        while self.now < seconds and not self.is_settled:
+            self.wait(self.rng.uniform(0.5, 3.0))
+            sleeper = f"r{self.rng.integers(len(self.robots))}"
+            self.asleep = {sleeper} if self.rng.random() < 0.2 else set()
+        self.asleep = set()
+        self.run(seconds)
+
     def _pass_step(self) -> None:
         self.now += STEP
         self._deliver()

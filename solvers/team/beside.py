@@ -13,7 +13,11 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
+from typing import TypeVar
 
+from pgo_models.errors import PGOError
+
+T = TypeVar("T")
 _PAUSE = 0.01  # seconds
 _ALL: weakref.WeakSet[Beside] = weakref.WeakSet()
 
@@ -36,13 +40,28 @@ class Beside:
         """Whether a thread computes; one that waits for others does not."""
         return self._num_busy > 0
 
-    def begin(self, compute: Callable[[], None]) -> None:
-        """Compute in a thread."""
+    def begin(
+        self, compute: Callable[[], T], act: Callable[[T | PGOError], None], failure: str
+    ) -> None:
+        """Compute in a thread, and have the caller of the robot act on the result, or on an error.
+
+        What other robots have sent may be anything: an error that is no PGOError becomes one whose
+        text begins with `failure`.
+        """
         self.count(1)
+
+        def found() -> T | PGOError:
+            try:
+                return compute()
+            except PGOError as error:
+                return error
+            except Exception as error:
+                return PGOError(f"{failure}: {error!r:.200}")
 
         def run() -> None:
             try:
-                compute()
+                result = found()
+                self.hand_over(lambda: act(result))
             finally:
                 self.count(-1)
 

@@ -36,6 +36,7 @@ from solvers.team.talk import Talk
 
 # Patiences after which a robot that is there, and has not answered, is waited for no more.
 _MOST_PATIENCES = 10.0
+_UNKNOWN = "it cannot compute what it was asked"
 
 
 @dataclass(eq=False)
@@ -353,29 +354,24 @@ class DrivenTeam:
             return {name for name in missing if 0 <= name.other < len(part.members)}
         part.obeyed = ask
 
-        def compute() -> None:
-            answer: Any = None
-            error = None
-            try:
-                answer = function_for_teams(ask.order)(part.agent, request)
-            except Exception as reason:  # another robot may ask for anything
-                error = _as_error(reason)
-            self._beside.hand_over(lambda: self._end_answer(part, ask, answer, error))
+        def compute() -> Any:  # noqa: ANN401 - the order chooses
+            return function_for_teams(ask.order)(part.agent, request)
 
-        self._beside.begin(compute)
+        self._beside.begin(compute, lambda found: self._end_answer(part, ask, found), _UNKNOWN)
         return missing
 
     def _end_answer(
         self,
         part: Following,
         ask: Ask,
-        answer: Any,  # noqa: ANN401 - the order chooses
-        error: tuple[str, str] | None,
+        found: Any,  # noqa: ANN401 - the order chooses
     ) -> None:
-        """Send an answer, and letters with it, unless the solve is given up."""
+        """Send an answer or an error, and letters with it, unless the solve is given up."""
         part.obeyed = None
         part.call = ask.call
-        answer, letters = part.letters.take_out(ask.call, answer)
+        is_error = isinstance(found, PGOError)
+        error = error_as_message(found) if is_error else None
+        answer, letters = part.letters.take_out(ask.call, None if is_error else found)
         part.reply = Reply(ask.term, ask.call, part.revision, answer, error)
         if part is not self._following:
             return
@@ -427,4 +423,4 @@ def _as_error(error: Exception) -> tuple[str, str]:
     """An error as a message: what is no PGOError comes of what another robot has sent."""
     if isinstance(error, PGOError):
         return error_as_message(error)
-    return error_as_message(PGOError(f"it cannot compute what it was asked: {error!r:.200}"))
+    return error_as_message(PGOError(f"{_UNKNOWN}: {error!r:.200}"))

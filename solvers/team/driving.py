@@ -54,23 +54,18 @@ class Drive:
 
     def begin(self) -> None:
         """Run the solve."""
-        self.beside.begin(self._run)
+        self.beside.begin(
+            self._run, self._end, "an answer of another robot cannot be computed with"
+        )
 
-    def _run(self) -> None:
-        outcome: RobotsSolution | PGOError
+    def _run(self) -> RobotsSolution | None:
+        """The solution; None of a solve that is given up."""
         try:
-            outcome = self.solve(self)
-        except PGOError as error:
-            outcome = error
+            return self.solve(self)
         except _AbandonedError:
-            return
-        except Exception as error:
-            outcome = PGOError(
-                f"an answer of another robot cannot be computed with: {error!r:.200}"
-            )
-        self.beside.hand_over(lambda: self._end(outcome))
+            return None
 
-    def _end(self, outcome: RobotsSolution | PGOError) -> None:
+    def _end(self, outcome: RobotsSolution | PGOError | None) -> None:
         self.outcome = outcome
         self.tell(self)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,14 @@ class _Flight:
     is_last: bool
 
 
+class _Said(NamedTuple):
+    """What a robot has, whom it hears, and when it said so."""
+
+    has: Mapping[str, Revision]
+    hears: tuple[str, ...]
+    when: float
+
+
 class SharedMap:
     """The measurements of the team as far as a robot has them, by robot, and the map of them.
 
@@ -59,11 +67,9 @@ class SharedMap:
         self.saved: Revision | None = None
         self._member = member
         self._talk = talk
-        # Of the others that are awake: what each has, and whom it hears.
-        self._has: dict[str, Mapping[str, Revision]] = {}
-        self._hears: dict[str, tuple[str, ...]] = {}
-        # What each has, as it has last said, and when: also of those that are out of reach.
-        self._said: dict[str, tuple[Mapping[str, Revision], float]] = {}
+        # What the others have last said, also those that are out of reach, and who is within it.
+        self._said: dict[str, _Said] = {}
+        self._near: set[str] = set()
         self._flights: dict[tuple[str, str], _Flight] = {}
         self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
         # When an answer is owed to robots whose pieces have come: they are collected, too.
@@ -73,6 +79,11 @@ class SharedMap:
         self._changed_at: float | None = None
         self._is_solving = False
         self._problems: tuple[str, ...] = ()
+
+    @property
+    def _has(self) -> dict[str, Mapping[str, Revision]]:
+        """What each of the others has that is within reach."""
+        return {name: said.has for name, said in self._said.items() if name in self._near}
 
     @property
     def others(self) -> dict[str, Measurements]:
@@ -116,8 +127,8 @@ class SharedMap:
             return False
         revisions = self.revisions
         longest = _FORGOTTEN * self._talk.patience
-        waited_for = [has for has, when in self._said.values() if self._talk.now - when <= longest]
-        return revisions == self._tried and all(has == revisions for has in waited_for)
+        waited_for = [said for said in self._said.values() if self._talk.now - said.when <= longest]
+        return revisions == self._tried and all(said.has == revisions for said in waited_for)
 
     # Lines
 
@@ -126,8 +137,7 @@ class SharedMap:
         return self._news(())
 
     def _news(self, pieces: tuple[Piece, ...]) -> News:
-        hears = tuple(self._hears)
-        return News(self.revisions, hears, pieces, self._takes_back, self._talk.twins)
+        return News(self.revisions, tuple(self._has), pieces, self._takes_back, self._talk.twins)
 
     @property
     def _takes_back(self) -> bool:
@@ -145,9 +155,8 @@ class SharedMap:
             when = min(self._talk.now + pause, self._owed.get(sender, np.inf))
             self._owed[sender] = when
         if is_latest:
-            self._has[sender] = message.has
-            self._said[sender] = (message.has, self._talk.now)
-            self._hears[sender] = message.hears
+            self._said[sender] = _Said(message.has, message.hears, self._talk.now)
+            self._near.add(sender)
             if message.takes_back:
                 self._give_back(sender, message.has.get(sender, Revision()))
 
@@ -186,8 +195,7 @@ class SharedMap:
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Send what others lack, and solve where something is new."""
-        self._has = {name: has for name, has in self._has.items() if name in awake}
-        self._hears = {name: self._hears[name] for name in self._has}
+        self._near &= set(awake)
         self._owed = {name: when for name, when in self._owed.items() if name in awake}
         for name, has in self._has.items():
             pieces = self._pieces_for(name, has, awake)
@@ -225,7 +233,7 @@ class SharedMap:
         others may have met a moment later.
         """
         log = self.logs[owner]
-        if owner in self._hears[to] or known.num_lines >= len(log.lines):
+        if owner in self._said[to].hears or known.num_lines >= len(log.lines):
             return False
         since = self._lags.setdefault((to, owner), self._talk.now)
         rank = [name for name in awake if name not in (to, owner)].index(self.name)
@@ -289,17 +297,11 @@ class SharedMap:
         solve = self._member.shared_solve
         before = self._member.solution
 
-        def compute() -> None:
-            answer: SharedAnswer | PGOError
-            try:
-                answer = solve.solved(lines, before)
-            except PGOError as error:
-                answer = error
-            except Exception as error:  # robots may measure anything
-                answer = PGOError(f"the measurements cannot be computed with: {error!r:.200}")
-            self._talk.beside.hand_over(lambda: self._end(revisions, answer))
-
-        self._talk.beside.begin(compute)
+        self._talk.beside.begin(
+            lambda: solve.solved(lines, before),
+            lambda answer: self._end(revisions, answer),
+            "the measurements cannot be computed with",
+        )
 
     def _end(self, revisions: Mapping[str, Revision], answer: SharedAnswer | PGOError) -> None:
         self._is_solving = False

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 from budget import examples
-from graphs import informed
 from networks import (
     KEY,
     Network,
@@ -21,7 +20,7 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel, PoseGraph
+from pgo_models import PoseGraph
 from pgo_models.errors import GraphError
 from solvers.team.messages import News
 
@@ -32,27 +31,13 @@ def shared(graph: PoseGraph, num_robots: int, **settings: object) -> dict[str, s
     return robots_of(graph, num_robots, sharing=SHARED, **settings)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("d", [2, 3])
-def test_robots_minimise_chi2_of_information_matrices(d: int) -> None:
-    graph = informed(3, 30, d, coupled=True, spread=0.5, noise=NoiseModel(1e-2, 1e-2))
-    network = Network(shared(graph, 3, weighting=pgo.Weighting.OWN), np.random.default_rng(0))
-    network.run(60.0)
-    assert network.is_settled
-    assert_is_the_optimum(network.robots, graph, pgo.Weighting.INFORMATION)
-
-
 @pytest.mark.parametrize("seed", range(examples(6)))
 def test_messages_may_be_lost_late_repeated_and_in_any_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = world(n=20)
     lost, repeated = rng.uniform(0.0, 0.4, 2)
     network = Network(shared(graph, 3), rng, lost, repeated, delay=rng.uniform(0.0, 0.3))
-    while network.now < 100.0 and not network.is_settled:
-        network.wait(rng.uniform(0.5, 3.0))
-        sleeper = f"r{rng.integers(3)}"
-        network.asleep = {sleeper} if rng.random() < 0.2 else set()
-    network.asleep = set()
-    network.run(100.0)
+    network.run_among_sleepers(100.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
 

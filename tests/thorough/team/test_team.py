@@ -43,10 +43,11 @@ PEERS = solvers.Pipeline(soc=solvers.SOC(coupling=solvers.Coupling.CONSENSUS, to
 PAPER = solvers.Pipeline(soc=solvers.PaperSOC(max_iterations=100))
 
 
+@pytest.mark.parametrize("sharing", Sharing)
 @pytest.mark.parametrize("d", [2, 3])
-def test_robots_minimise_chi2_of_information_matrices(d: int) -> None:
+def test_robots_minimise_chi2_of_information_matrices(d: int, sharing: Sharing) -> None:
     graph = informed(3, 30, d, coupled=True, spread=0.5, noise=NoiseModel(1e-2, 1e-2))
-    network = Network(robots_of(graph, 3, pgo.Weighting.OWN), np.random.default_rng(0))
+    network = Network(robots_of(graph, 3, pgo.Weighting.OWN, sharing), np.random.default_rng(0))
     network.run(60.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph, pgo.Weighting.INFORMATION)
@@ -59,12 +60,7 @@ def test_messages_may_be_lost_late_repeated_and_in_any_order(seed: int) -> None:
     lost, repeated = rng.uniform(0.0, 0.4, 2)
     robots = robots_of(graph, 3, pipeline=PEERS if seed % 3 == 0 else None)
     network = Network(robots, rng, lost, repeated, delay=rng.uniform(0.0, 0.3))
-    while network.now < 600.0 and not network.is_settled:
-        network.wait(rng.uniform(0.5, 3.0))
-        sleeper = f"r{rng.integers(3)}"
-        network.asleep = {sleeper} if rng.random() < 0.2 else set()
-    network.asleep = set()
-    network.run(600.0)
+    network.run_among_sleepers(600.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
 
