@@ -51,7 +51,7 @@ class Network:
             self._pass_step()
 
     def run_among_sleepers(self, seconds: float) -> None:
-        """Let time pass as `run` does, with a robot asleep now and then, and then with all awake."""
+        """`run` with a robot asleep now and then, and once more with all awake."""
         while self.now < seconds and not self.is_settled:
             self.wait(self.rng.uniform(0.5, 3.0))
             sleeper = f"r{self.rng.integers(len(self.robots))}"

@@ -78,26 +78,32 @@ def _constant_to_add(
     if not np.isfinite(H).all():
         return None
     number = sum(variable.size for variable in constant)
-    H_yy = H[number:, number:]
-    scale = float(np.linalg.norm(H, 2))
-    least_of_others = float(np.linalg.eigvalsh(H_yy).min(initial=0.0))
-    pseudo_inverse = np.linalg.pinv(H_yy, rcond=_ROUNDING, hermitian=True)
-    unbounded = H[:number, number:] @ (np.eye(len(H_yy)) - pseudo_inverse @ H_yy)
+    H_xx, H_xy, H_yy = H[:number, :number], H[:number, number:], H[number:, number:]
+    rounding = _ROUNDING * float(np.linalg.norm(H, 2))
     names = ", ".join(variable.name() for variable in others)
-    if least_of_others < -_ROUNDING * scale:
+    # No constant mends what is not convex in y, or linear in a direction of y with a factor in x.
+    least_of_others = float(np.linalg.eigvalsh(H_yy).min(initial=0.0))
+    if least_of_others < -rounding:
         return (
             f"its Hessian has the eigenvalue {least_of_others:.3g} in {names}, which no set bounds"
         )
-    if np.linalg.norm(unbounded) > _ROUNDING * scale:
+    pseudo_inverse = np.linalg.pinv(H_yy, rcond=_ROUNDING, hermitian=True)
+    unbounded = H_xy @ (np.eye(len(H_yy)) - pseudo_inverse @ H_yy)
+    if np.linalg.norm(unbounded) > rounding:
         return f"it multiplies {names} with other unknowns: name its set, or hold it as a Parameter"
-    schur = H[:number, :number] - H[:number, number:] @ pseudo_inverse @ H[number:, :number]
+    schur = H_xx - H_xy @ pseudo_inverse @ H_xy.T
     least = 0.5 * float(np.linalg.eigvalsh(schur).min(initial=0.0))
-    if least >= -_ROUNDING * scale:
+    if least >= -rounding:
         seen = "concave" if maximises else "convex"
         return f"it is {seen}, which cvxpy does not see; {_rewritten('-A' if maximises else 'A')}"
+    return _advice(constant, least, maximises=maximises)
+
+
+def _advice(variables: Sequence[cp.Variable], least: float, *, maximises: bool) -> str:
+    """What to add to a function with the eigenvalue `least` of its matrix, and how to write it."""
     c = f"{-_MARGIN * least:.3g}"
-    squares = " + ".join(f"||{variable.name()}||_F^2" for variable in constant)
-    if len(constant) > 1:
+    squares = " + ".join(f"||{variable.name()}||_F^2" for variable in variables)
+    if len(variables) > 1:
         squares = f"({squares})"
     shifted = f"{c} {squares}, which is constant on the set"
     if maximises:

@@ -90,9 +90,15 @@ def _can_be_read_again(graph: str) -> bool:
     return path.is_file() or path.is_dir()
 
 
-def edge_fit(problem: PGOProblem, poses: Poses, graph: str, dropped: Dropped) -> EdgeFit:
+def edge_fit(
+    problem: PGOProblem,
+    poses: Poses,
+    graph: str,
+    dropped: Dropped,
+    residuals: EdgeResiduals | None = None,
+) -> EdgeFit:
     """How well the edges fit, with `file:line` of the first indefinite matrix."""
-    fit = judge_edges(problem, poses)
+    fit = judge_edges(problem, poses, residuals)
     if fit.no_chi2:
         # The file may have changed since it was read.
         with suppress(PGOError):
@@ -102,7 +108,8 @@ def edge_fit(problem: PGOProblem, poses: Poses, graph: str, dropped: Dropped) ->
 
 def edge_fit_of_solution(solution: Solution, graph: str, dropped: Dropped) -> EdgeFit:
     """How well the edges fit, with `file:line` of every edge if the advice is to leave one out."""
-    fit = edge_fit(solution.problem, solution.poses, graph, dropped)
+    residuals = solution.edge_residuals  # which the printed row of the fit has, too
+    fit = edge_fit(solution.problem, solution.poses, graph, dropped, residuals)
     if solution.robust is not None or not fit.suspected.is_misfit.any():
         return fit
     num_edges = len(fit.residuals.cost)

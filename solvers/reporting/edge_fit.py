@@ -172,7 +172,9 @@ class EdgeFit(Summarised):
         return suggestions
 
 
-def judge_edges(problem: PGOProblem, poses: Poses) -> EdgeFit:
+def judge_edges(
+    problem: PGOProblem, poses: Poses, residuals: EdgeResiduals | None = None
+) -> EdgeFit:
     """Judge the edges at poses: by chi2 if the graph has matrices, else by the problem's cost.
 
     If F was minimised, one more factorisation shows whether chi2 can be lowered.
@@ -183,6 +185,8 @@ def judge_edges(problem: PGOProblem, poses: Poses) -> EdgeFit:
         The problem that was solved.
     poses : Poses
         Its solution.
+    residuals : EdgeResiduals, optional
+        `edge_residuals` of both, where they are at hand.
 
     Returns
     -------
@@ -197,7 +201,7 @@ def judge_edges(problem: PGOProblem, poses: Poses) -> EdgeFit:
     >>> judge_edges(PGOProblem(graph), graph.truth).cost
     'F'
     """
-    residuals = edge_residuals(problem, poses)
+    residuals = residuals or edge_residuals(problem, poses)
     if problem.weighting is not Weighting.ISOTROPIC or problem.graph.information is None:
         return EdgeFit(problem.cost_name, residuals)
     is_indefinite = indefinite_edges(problem.graph)

@@ -25,7 +25,7 @@ from pgo_models.plots.graph_plots import MOST_LINES, thinning_step
 from pgo_models.plots.interactive_plots import MOST_DOTS, explore_graph
 from pgo_models.plots.pages import PAGE_CONFIG
 from pgo_models.plots.style import plotly
-from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
+from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.carry.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.edge_fit import Advice, EdgeFit, fit_row, judge_edges
@@ -116,7 +116,7 @@ def report_page(solution: Solved, *, source: str | None = None, fit: EdgeFit | N
     robots = _partition(solution)
     certificate = solution.certificate
     graph = solution.problem.graph.with_robots(robots.robot)
-    fit = fit or judge_edges(solution.problem, solution.poses)
+    fit = fit or judge_edges(solution.problem, solution.poses, solution.edge_residuals)
     stage_names = _stage_names(solution)
     plots = _plots(solution, graph, fit, stage_names)
     figures = ",".join(f'"{name}":{figure.to_json()}' for name, figure in plots.items())
@@ -268,7 +268,7 @@ def _robots(solution: Solved, robots: Partition) -> _Table:
 def _share_of_robots(solution: Solved, robots: Partition) -> Array:
     """Share of every robot in the cost, (num_robots,); an edge counts half at either end."""
     graph = solution.problem.graph
-    half = 0.5 * edge_residuals(solution.problem, solution.poses).share
+    half = 0.5 * solution.edge_residuals.share
     at_i = np.bincount(robots.robot[graph.i], half, robots.num_robots)
     at_j = np.bincount(robots.robot[graph.j], half, robots.num_robots)
     return np.asarray(at_i + at_j, dtype=float)

@@ -17,6 +17,7 @@ from pgo_models.graphs.g2o_folder import FILES_HERE
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import EdgeResiduals
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.ledger import Ledger
 from solvers.reporting.edge_fit import Advice, EdgeFit
@@ -83,6 +84,10 @@ class Solved(Protocol):
     @property
     def robust(self) -> Rejection | None:
         """Which edges a robust solve kept."""
+
+    @property
+    def edge_residuals(self) -> EdgeResiduals:
+        """How well every edge fits the poses, in the cost that was solved."""
 
     def before(self) -> tuple[Poses, str]:
         """Poses before the solve, and what they are."""
