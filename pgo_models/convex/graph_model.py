@@ -16,9 +16,10 @@ from pgo_models.convex.graph_subproblem import (
     change_of,
     check_terms_are_added_to_F,
     pose_variables,
+    weights_of_kept_edges,
 )
 from pgo_models.convex.orthogonality import OrthogonalProblem
-from pgo_models.problem.matrices import isotropic_weights, residual_matrix
+from pgo_models.problem.matrices import residual_matrix
 from pgo_models.problem.problem import PGOProblem
 
 
@@ -61,13 +62,9 @@ def graph_model(problem: PGOProblem, changer: Changer | None = None) -> Orthogon
     t = cp.Variable((n, d), name="t")
     X = cp.vstack([t, *(R_i.T for R_i in R)])
     A = residual_matrix(graph)
-    columns = np.arange((d + 1) * n)
-    variables = pose_variables(graph, Unknowns.POSES, np.arange(n), columns, A, X)
+    variables = pose_variables(graph, Unknowns.POSES, A, X)
     change = change_of(changer, variables)
-    shares = np.ones(graph.num_edges)
-    shares[np.array(change.replaced_edges, dtype=int)] = 0.0
-    weights = isotropic_weights(graph).row_weights
-    weights = weights * np.concatenate([shares, np.repeat(shares, d)])
+    weights = weights_of_kept_edges(graph, change)
     counted = np.flatnonzero(weights)
     roots = diags_array(np.sqrt(weights[counted]))
     J = sum(change.terms, cp.sum_squares(roots @ A[counted] @ X))

@@ -1,4 +1,4 @@
-"""The R-subproblem of a graph or of one robot as a cvxpy model, to which terms can be added.
+"""The R-subproblem of a graph as a cvxpy model, to which terms can be added.
 
     minimise   sum_e kappa ||R_j - R_i R_ij||_F^2 + tau ||t_j - t_i - R_i t_ij||^2
                + rho/2 ||R - omega + B||^2
@@ -14,7 +14,7 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
-from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse import csr_array, eye_array
 
 from pgo_models.convex.convex_solver import ConvexSolver, HoldsModel, check_terms
 from pgo_models.convex.rotation_subproblem import RotationQP, rotation_qp
@@ -32,13 +32,6 @@ class Unknowns(enum.Enum):
 
     ROTATIONS = "rotations only, on the rotation residuals: the paper's step (a)"
     POSES = "rotations and translations together"
-
-
-class Neighbours(enum.Enum):
-    """What the program of a robot does with the poses of others that its edges lead to."""
-
-    COPIES = "copies of them are unknowns too, and an edge between robots counts half"
-    FROZEN = "they stay where they are, and enter the shift"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +69,8 @@ class Stack:
         chosen_in_program = chosen[:, self.columns]
         if chosen_in_program.nnz < chosen.nnz:
             raise SettingError(
-                f"[{which!r:.60}] needs rows of t or R that are not unknown in this program, which "
-                f"has {len(self.columns)} of {chosen.shape[1]}; ask for its own poses, or "
-                "Unknowns.POSES for t"
+                f"[{which!r:.60}] needs translations, and the program is for rotations only; "
+                "ask for Unknowns.POSES"
             )
         stacked = chosen_in_program @ self.X
         if np.ndim(numbers) == 0:
@@ -105,8 +97,6 @@ class PoseVariables(HoldsModel):
         The whole graph.
     unknowns : Unknowns
         Whether translations are unknown too.
-    poses : (n_a,) array
-        Poses of the graph that are unknown, ascending.
     X : cp.Expression
         Rows t_i (not for ROTATIONS), then the rows of every R_i^T.
     t : Stack
@@ -121,7 +111,6 @@ class PoseVariables(HoldsModel):
 
     graph: PoseGraph
     unknowns: Unknowns
-    poses: IntArray
     X: cp.Expression
     t: Stack
     R: Stack
@@ -181,12 +170,10 @@ class GraphQP(Summarised):
         The cvxpy problem and its Parameter.
     change : ModelChange
         What the user's model adds.
-    A : (rows, N_a) sparse array
+    A : (rows, N) sparse array
         Residuals of the edges that count, in the rows of X.
     w : (rows,) array
         Weights of the residuals.
-    between : (N_a, N) sparse array
-        A^T diag(w) A_of_graph on the rows of frozen neighbours; empty unless FROZEN.
     """
 
     variables: PoseVariables
@@ -194,14 +181,13 @@ class GraphQP(Summarised):
     change: ModelChange
     A: csr_array
     w: Array
-    between: csr_array
 
     def with_penalty(self, penalty: Array) -> "GraphQP":
         """Pose the program anew with other penalties, in the same variables.
 
         Parameters
         ----------
-        penalty : Array, (N_a,)
+        penalty : Array, (N,)
             Diagonal of D: penalties of the rows of X.
         """
         X = self.variables.X
@@ -210,38 +196,24 @@ class GraphQP(Summarised):
         qp = rotation_qp(self.A, self.w, penalty, d, X, terms, constraints, self.qp.solver)
         return replace(self, qp=qp)
 
-    def solve(self, V: Array, neighbours: Array | None = None) -> Array:
+    def solve(self, V: Array) -> Array:
         """Solve the subproblem for a shift.
 
         Parameters
         ----------
-        V : Array, (N_a, d)
+        V : Array, (N, d)
             The shift omega - B.
-        neighbours : Array, (N, d), optional
-            X of the whole graph, needed where the neighbours are frozen: the shift becomes V - 2
-            D^-1 M_between X.
 
         Returns
         -------
-        Array, (N_a, d)
+        Array, (N, d)
             The minimiser X.
 
         Raises
         ------
-        SettingError
-            When the neighbours are missing.
         PGOError
             When nothing solves it, as where constraints contradict each other.
         """
-        if self.between.nnz:
-            if neighbours is None:
-                raise SettingError(
-                    "the neighbours are frozen; give X of the whole graph, whose rows say where"
-                )
-            pull = 2.0 * (self.between @ neighbours)
-            held = self.qp.penalty > 0
-            V = V.copy()
-            V[held] -= pull[held] / self.qp.penalty[held, None]
         return self.qp.solve(V)
 
     def cost(self, X: Array) -> float:
@@ -249,7 +221,7 @@ class GraphQP(Summarised):
 
         Parameters
         ----------
-        X : Array, (N_a, d)
+        X : Array, (N, d)
             Any point; it need not be feasible.
         """
         residuals = self.A @ X
@@ -268,7 +240,7 @@ class GraphQP(Summarised):
 
         Returns
         -------
-        Array, (N_a, d)
+        Array, (N, d)
             The gradient in X; zeros where the term does not depend on X.
         """
         X = self.variables.X
@@ -328,12 +300,25 @@ def graph_qp(
     if isinstance(graph, PGOProblem):
         check_terms_are_added_to_F(graph)
         graph = graph.graph
-    rho = _penalties(rho, "rho", graph)
-    if rho_t is not None:
-        rho_t = _penalties(rho_t, "rho_t", graph)
-    all_poses = np.ones(graph.num_poses, dtype=bool)
-    shares = np.ones(graph.num_edges)
-    return _posed(graph, all_poses, shares, rho, rho_t, unknowns, changer, solver)
+    n = graph.num_poses
+    d = graph.d
+    has_translations = unknowns is Unknowns.POSES
+    penalty = np.repeat(_penalties(rho, "rho", graph), d)
+    if has_translations:
+        penalty_t = np.zeros(n) if rho_t is None else _penalties(rho_t, "rho_t", graph)
+        penalty = np.concatenate([penalty_t, penalty])
+    A = residual_matrix(graph)
+    X = cp.Variable((len(penalty), d), name="X")
+    variables = pose_variables(graph, unknowns, A, X)
+    change = change_of(changer, variables)
+    weights = weights_of_kept_edges(graph, change)
+    if not has_translations:
+        weights[: graph.num_edges] = 0.0
+    rows = weights > 0
+    A_counted = A[rows][:, variables.R.columns].tocsr()
+    w = weights[rows]
+    qp = rotation_qp(A_counted, w, penalty, d, X, change.terms, change.constraints, solver)
+    return GraphQP(variables, qp, change, A_counted, w)
 
 
 def check_terms_are_added_to_F(problem: PGOProblem) -> None:
@@ -355,121 +340,34 @@ def _penalties(rho: Array | float, name: str, graph: PoseGraph) -> Array:
     return np.broadcast_to(penalties, graph.num_poses)
 
 
-def robot_qp(
-    graph: PoseGraph,
-    robot: int,
-    rho: Array,
-    neighbours: Neighbours = Neighbours.FROZEN,
-    unknowns: Unknowns = Unknowns.ROTATIONS,
-    changer: Changer | None = None,
-    rho_t: Array | None = None,
-    solver: ConvexSolver | str = "CLARABEL",
-) -> GraphQP:
-    """Pose the R-subproblem of one robot of `graph.robots`, with the edges to its neighbours.
-
-    The parameters are those of `graph_qp`. With COPIES and `rho_t` on the separators it is the
-    subproblem of SOC's CONSENSUS coupling, whose penalties are the shares of the copies; with
-    FROZEN and ROTATIONS it is the paper's. A SettingError when the robot owns no pose, or frozen
-    neighbours pull on translations that have no penalty.
-    """
-    owned = graph.robots == robot
-    if not owned.any():
-        raise SettingError(
-            f"robot {robot} owns no pose; the graph has robots 0 to {graph.num_robots - 1}"
-        )
-    owns_i = owned[graph.i].astype(int)
-    num_own_ends = owns_i + owned[graph.j]
-    touches = num_own_ends > 0
-    if neighbours is Neighbours.FROZEN:
-        shares = touches.astype(float)
-        unknown = owned
-    else:
-        shares = 0.5 * num_own_ends
-        unknown = owned.copy()
-        unknown[graph.i[touches]] = True
-        unknown[graph.j[touches]] = True
-    return _posed(graph, unknown, shares, rho, rho_t, unknowns, changer, solver)
-
-
-def _posed(
-    graph: PoseGraph,
-    unknown: BoolArray,
-    shares: Array,
-    rho: Array,
-    rho_t: Array | None,
-    unknowns: Unknowns,
-    changer: Changer | None,
-    solver: ConvexSolver | str,
-) -> GraphQP:
-    """The program of the `unknown` poses, with `shares`, (m,), of the edges."""
-    n = graph.num_poses
-    m = graph.num_edges
-    d = graph.d
-    poses = np.flatnonzero(unknown)
-    # Which rows t_i and R_i^T of the whole graph are unknown, and their penalties.
-    columns = rotation_columns(poses, n, d).ravel()
-    penalty = np.repeat(rho[poses], d)
-    has_translations = unknowns is Unknowns.POSES
-    if has_translations:
-        penalty_t = np.zeros(len(poses)) if rho_t is None else rho_t[poses]
-        columns = np.concatenate([poses, columns])
-        penalty = np.concatenate([penalty_t, penalty])
-
-    A_of_graph = residual_matrix(graph)
-    weights = isotropic_weights(graph).row_weights
-    X = cp.Variable((len(columns), graph.d), name="X")
-    variables = pose_variables(graph, unknowns, poses, columns, A_of_graph, X)
-    change = change_of(changer, variables)
-    shares = shares.copy()
-    shares[np.array(change.replaced_edges, dtype=int)] = 0.0
-    shares_of_translations = shares if has_translations else np.zeros(m)
-    shares_of_rotations = np.repeat(shares, d)
-    weights = weights * np.concatenate([shares_of_translations, shares_of_rotations])
-    is_counted = weights > 0
-    w = weights[is_counted]
-    A_counted = A_of_graph[is_counted]
-    A = A_counted[:, columns].tocsr()
-
-    is_frozen = np.ones((d + 1) * n)
-    is_frozen[columns] = 0.0
-    between = csr_array(A.T @ diags_array(w) @ A_counted @ diags_array(is_frozen))
-    between.eliminate_zeros()
-    is_pulled = np.diff(between.indptr) > 0
-    if (penalty[is_pulled] == 0).any():
-        raise SettingError(
-            "frozen neighbours enter the shift, so every row they pull on needs a penalty; "
-            "give rho_t"
-        )
-    qp = rotation_qp(A, w, penalty, d, variables.X, change.terms, change.constraints, solver)
-    return GraphQP(variables, qp, change, A, w, between)
-
-
 def pose_variables(
-    graph: PoseGraph,
-    unknowns: Unknowns,
-    poses: IntArray,
-    columns: IntArray,
-    A_of_graph: csr_array,
-    X: cp.Expression,
+    graph: PoseGraph, unknowns: Unknowns, A: csr_array, X: cp.Expression
 ) -> PoseVariables:
-    """The unknowns, in the `columns` of the whole graph, which the rows of X are.
-
-    `A_of_graph` gives the residuals.
-    """
+    """The unknowns as rows of X; `A` gives the residuals of the edges in all t_i and R_i^T."""
     n = graph.num_poses
     m = graph.num_edges
     d = graph.d
-    identity = csr_array(eye_array(A_of_graph.shape[1]))
+    identity = csr_array(eye_array(A.shape[1]))
+    columns = np.arange(A.shape[1])
+    if unknowns is Unknowns.ROTATIONS:
+        columns = columns[n:]
     return PoseVariables(
         graph,
         unknowns,
-        poses,
         X,
         t=Stack(identity[:n], columns, X, 1),
         R=Stack(identity[n:], columns, X, d),
-        translation_residual=Stack(A_of_graph[:m], columns, X, 1),
-        rotation_residual=Stack(A_of_graph[m:], columns, X, d),
+        translation_residual=Stack(A[:m], columns, X, 1),
+        rotation_residual=Stack(A[m:], columns, X, d),
     )
+
+
+def weights_of_kept_edges(graph: PoseGraph, change: ModelChange) -> Array:
+    """Weights of the residuals, ((d + 1) m,), of translations first; 0 for replaced edges."""
+    is_kept = np.ones(graph.num_edges)
+    is_kept[np.array(change.replaced_edges, dtype=int)] = 0.0
+    is_row_kept = np.concatenate([is_kept, np.repeat(is_kept, graph.d)])
+    return isotropic_weights(graph).row_weights * is_row_kept
 
 
 def change_of(changer: Changer | None, variables: PoseVariables) -> ModelChange:

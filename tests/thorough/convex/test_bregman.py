@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from budget import examples
 from hypothesis import given, settings, strategies as st
-from shared_rotations import shared_rotation_step
 from signals import sparse_signal
 
-from pgo_models import BregmanProblem, grid, partition, random_rotations
+from pgo_models import BregmanProblem, grid, random_rotations
 from pgo_models.convex.bregman import BregmanPoint
 from pgo_models.convex.bregman_examples import (
     differences,
@@ -19,7 +18,7 @@ from pgo_models.convex.bregman_examples import (
 )
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, stack_transposes
-from pgo_models.problem.matrices import connection_laplacian
+from pgo_models.problem.matrices import connection_laplacian, isotropic_weights, residual_matrix
 from solvers import (
     AlternatingBregman,
     Bregman,
@@ -178,15 +177,26 @@ def test_an_indicator_adds_constraints() -> None:
 def test_two_robots_agree_on_the_r_step(form) -> None:
     rng = np.random.default_rng(0)
     graph = grid(rng)
-    V = random_rotations(graph.num_poses, 3, rng)
+    n = graph.num_poses
+    m = graph.num_edges
+    A = residual_matrix(graph)[m:, n:]
+    half_of_each = 0.5 * isotropic_weights(graph).row_weights[m:]
+    own_weights = half_of_each * (1.0 + rng.uniform(-1.0, 1.0, len(half_of_each)))
+    V = stack_transposes(random_rotations(n, 3, rng))
     rho = 20.0
-    shared = shared_rotation_step(graph, partition(graph, 2), V, rho)
-    outcome = run(form(alpha=10.0), shared.problem)
+    copies = [cp.Variable((3 * n, 3)) for _ in range(2)]
+    J = sum(
+        cp.sum_squares(cp.multiply(np.sqrt(w)[:, None], A @ X)) + rho / 4 * cp.sum_squares(X - V)
+        for w, X in zip((own_weights, 2.0 * half_of_each - own_weights), copies, strict=True)
+    )
+    identity = np.eye(V.size)
+    problem = BregmanProblem(J, copies, np.hstack([identity, -identity]), np.zeros(V.size))
+    outcome = run(form(alpha=10.0), problem)
     assert outcome.status is Status.CONVERGED
     L = connection_laplacian(graph).toarray()
-    expected = np.linalg.solve(L + 0.5 * rho * np.eye(len(L)), 0.5 * rho * stack_transposes(V))
-    rotations = stack_transposes(shared.rotations(outcome.state.x))
-    np.testing.assert_allclose(rotations, expected, rtol=0, atol=10 * form.tolerance)
+    expected = np.linalg.solve(L + 0.5 * rho * np.eye(len(L)), 0.5 * rho * V)
+    for X in copies:
+        np.testing.assert_allclose(X.value, expected, rtol=0, atol=10 * form.tolerance)
 
 
 # The contract of every solver.

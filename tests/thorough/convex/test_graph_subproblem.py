@@ -5,12 +5,11 @@ from budget import examples
 from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import ModelChange, PGOProblem, graph_qp, partition
-from pgo_models.convex.graph_subproblem import Neighbours, PoseVariables, Unknowns, robot_qp
+from pgo_models import ModelChange, PGOProblem, graph_qp
+from pgo_models.convex.graph_subproblem import PoseVariables, Unknowns
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, stack_transposes
-from solvers import PaperSOC, RStep
-from solvers.soc.paper import PaperState
+from pgo_models.geometry.rotations import Array
+from solvers import RStep
 from solvers.soc.r_step import RSubproblem, prepare
 
 ACCURACY = 1e-8
@@ -49,43 +48,6 @@ def test_the_rotation_program_solves_its_normal_equations(seed: int, n: int, d: 
     half = 0.5 * np.repeat(rho, d)
     expected = np.linalg.solve(problem.L.toarray() + np.diag(half), half[:, None] * V[n:])
     np.testing.assert_allclose(X, expected, rtol=0, atol=ACCURACY)
-
-
-@settings(max_examples=examples(8))
-@given(seed=SEEDS, n=st.integers(4, 10), d=DIMENSIONS)
-def test_with_frozen_neighbours_it_is_the_papers_step(seed: int, n: int, d: int) -> None:
-    problem, _, _ = drawn(seed, n, d)
-    robots = partition(problem.graph, 2)
-    graph = problem.graph.with_robots(robots.robot)
-    soc = PaperSOC(robots=robots)
-    state = soc.init(problem, random_poses(n, d, seed))
-    assert isinstance(state, PaperState)
-    following = soc.step(problem, state)
-    assert isinstance(following, PaperState)
-    X = np.concatenate([np.zeros((n, d)), stack_transposes(state.R)])
-    for robot in range(2):
-        qp = robot_qp(graph, robot, np.full(n, state.rho))
-        own = np.flatnonzero(graph.robots == robot)
-        Y = qp.solve(stack_transposes((state.omega - state.B)[own]), X)
-        np.testing.assert_allclose(Y, stack_transposes(following.R[own]), rtol=0, atol=ACCURACY)
-
-
-def test_a_frozen_translation_needs_a_penalty() -> None:
-    problem, rho, V = drawn(0, 6, 2)
-    graph = problem.graph.with_robots(np.arange(6) // 3)
-    with pytest.raises(SettingError, match="give rho_t"):
-        robot_qp(graph, 0, rho, Neighbours.FROZEN, Unknowns.POSES)
-    qp = robot_qp(graph, 0, rho, Neighbours.FROZEN, Unknowns.POSES, rho_t=rho)
-    own = np.concatenate([np.arange(3), 6 + np.arange(6)])
-    others = np.setdiff1d(np.arange(18), own)
-    half = 0.5 * np.concatenate([rho, np.repeat(rho, 2)])[own]
-    M = problem.M.toarray()
-    K = M[np.ix_(own, own)] + np.diag(half)
-    pull_of_others = M[np.ix_(own, others)] @ V[others]
-    expected = np.linalg.solve(K, half[:, None] * V[own] - pull_of_others)
-    np.testing.assert_allclose(qp.solve(V[own], V), expected, rtol=0, atol=ACCURACY)
-    with pytest.raises(SettingError, match="neighbours are frozen"):
-        qp.solve(V[own])
 
 
 @settings(max_examples=examples(10))
@@ -145,12 +107,6 @@ def test_replaced_edges_leave_the_cost() -> None:
 
 def test_what_is_not_there_is_named() -> None:
     problem, rho, _ = drawn(3, 6, 2)
-    graph = problem.graph.with_robots(np.arange(6) // 3)
-    with pytest.raises(SettingError, match="robot 5 owns no pose"):
-        robot_qp(graph, 5, rho)
-
-    def rotation_of_another_robot(unknown: PoseVariables) -> ModelChange:
-        return ModelChange(terms=[cp.sum_squares(unknown.R(5))])
 
     def translation(unknown: PoseVariables) -> ModelChange:
         return ModelChange(terms=[cp.sum_squares(unknown.t(0))])
@@ -158,13 +114,10 @@ def test_what_is_not_there_is_named() -> None:
     def concave(unknown: PoseVariables) -> ModelChange:
         return ModelChange(terms=[-cp.sum_squares(unknown.t(0))])
 
-    needs_rows = r"\[5\] needs rows .* in this program, which has 6 of 18"
-    with pytest.raises(SettingError, match=needs_rows):
-        robot_qp(graph, 0, rho, changer=rotation_of_another_robot)
-    with pytest.raises(SettingError, match=r"or Unknowns\.POSES"):
-        graph_qp(graph, rho, Unknowns.ROTATIONS, translation)
+    with pytest.raises(SettingError, match=r"\[0\] needs translations.* Unknowns\.POSES"):
+        graph_qp(problem.graph, rho, Unknowns.ROTATIONS, translation)
     with pytest.raises(SettingError, match="not convex"):
-        graph_qp(graph, rho, changer=concave)
+        graph_qp(problem.graph, rho, changer=concave)
 
 
 def test_edges_are_replaced_by_number_by_array_or_by_mask() -> None:
