@@ -33,7 +33,6 @@ from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.place import (
     BROKEN_OFF,
     Attempt,
-    Ending,
     OwnStart,
     Place,
     Step,
@@ -305,13 +304,12 @@ class Here(Place):
         """Whether a start or a run has given poses."""
         return bool(self.monitor.poses_found)
 
-    def salvage(self, ending: Ending) -> Attempt:
+    def salvage(self, reason: Status) -> Attempt:
         """The cheapest poses so far, or those along a spanning tree, with the bound F >= 0."""
         candidates = self.monitor.poses_found or [spanning_tree_start(self.problem.graph)]
         poses = min(candidates, key=self.problem.objective)
-        stage = ending(self.problem.objective(poses))
-        self.table.add(stage)
-        return self.without_bound(Attempt(poses, stage.status))
+        self.table.add(Stage.without_steps(reason, self.problem.objective(poses)))
+        return self.without_bound(Attempt(poses, reason))
 
     def without_bound(self, attempt: Attempt) -> Attempt:
         """Return the attempt with the bound F >= 0, which needs no proof."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import enum
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +32,6 @@ if TYPE_CHECKING:  # what a plain solve does not need
     from solvers.robust.gnc import GNC, Inliers
 
 BROKEN_OFF = (*OUT_OF_TIME, Status.STOPPED)
-Ending = Callable[[float], Stage]
 
 
 class Automatic(enum.Enum):
@@ -262,10 +260,10 @@ class Place(ABC):
         """Whether there is an answer when the first attempt is interrupted now."""
 
     @abstractmethod
-    def salvage(self, ending: Ending) -> Attempt:
+    def salvage(self, reason: Status) -> Attempt:
         """Return what there is when the first attempt is broken off, with no bound but F >= 0.
 
-        `ending` makes the stage that says why, from the cost of the poses.
+        A line of the table says the reason.
         """
 
     def finish(self, best: Attempt) -> None:

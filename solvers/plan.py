@@ -68,11 +68,11 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     except KeyboardInterrupt:
         if not place.has_poses:
             raise
-        return place.salvage(Stage.interruption)
+        return place.salvage(Status.INTERRUPTED)
     except NotPositiveDefiniteError:
-        return place.salvage(Stage.without_factor)
+        return place.salvage(Status.NOT_FACTORED)
     except RobotSilentError as error:
-        return replace(place.salvage(Stage.silence), failures=(str(error),))
+        return replace(place.salvage(Status.SILENT), failures=(str(error),))
     if not place.traits.has_driver:
         return first
     best = improved(Step.GROWING, from_growing_start, place, settings, first)  # step 5
@@ -191,10 +191,11 @@ def unless_it_fails(
     try:
         return improve(place, settings, best)
     except KeyboardInterrupt:
-        place.table.add(Stage.interruption(best.proof.objective))
+        place.table.add(Stage.without_steps(Status.INTERRUPTED, best.proof.objective))
         return replace(best, status=Status.INTERRUPTED)
     except FAILURES as error:
-        place.table.add(Stage.failure(step.value, best.proof.objective))
+        failure = Stage.without_steps(Status.FAILED, best.proof.objective, step.value)
+        place.table.add(failure)
         sentence = f"{step.value} failed ({error}); the answer before it stands"
         return replace(best, failures=(*best.failures, sentence))
 

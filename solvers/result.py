@@ -226,6 +226,14 @@ class Run(Outcome[S]):
     poses: Poses
 
 
+# What breaks a solve off, as tables name it.
+EVENTS = {
+    Status.NOT_FACTORED: "factorisation",
+    Status.INTERRUPTED: "interruption",
+    Status.SILENT: "wait for a robot",
+}
+
+
 @record("Stage")
 @dataclass(frozen=True)
 class Stage(Summarised):
@@ -291,93 +299,28 @@ class Stage(Summarised):
         )
 
     @classmethod
-    def without_factor(cls, objective: float) -> "Stage":
-        """Return a stage that says that a matrix had no Cholesky factor.
+    def without_steps(
+        cls, status: Status, objective: float, name: str = "", reason: str = ""
+    ) -> "Stage":
+        """Return a line that says what broke a solve off, or why a step gave nothing.
 
         Parameters
         ----------
-        objective : float
-            Cost of the poses that are returned.
-
-        Returns
-        -------
-        Stage
-            With `Status.NOT_FACTORED`.
-        """
-        return cls("factorisation", Status.NOT_FACTORED, 0, objective, 0.0, History())
-
-    @classmethod
-    def failure(cls, name: str, objective: float) -> "Stage":
-        """Return a stage that says that a step which may only improve the answer has failed.
-
-        Parameters
-        ----------
-        name : str
-            Name of the step.
+        status : Status
+            What happened. After FAILED and SKIPPED, of a step that could only improve the answer,
+            the poses are those before it.
         objective : float
             Cost of the poses that stand.
-
-        Returns
-        -------
-        Stage
-            With `Status.FAILED`.
-        """
-        return cls(name, Status.FAILED, 0, objective, 0.0, History(), finds_poses=False)
-
-    @classmethod
-    def skipped(cls, name: str, reason: str, objective: float) -> "Stage":
-        """Return a stage that says that a step was wanted and not taken.
-
-        Parameters
-        ----------
         name : str
-            Name of the step.
+            Name of the step; that of `EVENTS` unless given.
         reason : str
-            Why it was not taken, in a few words.
-        objective : float
-            Cost of the poses that stand.
-
-        Returns
-        -------
-        Stage
-            With `Status.SKIPPED`.
+            Why a step was skipped, in a few words.
         """
-        history = History()
+        finds_poses = status not in (Status.FAILED, Status.SKIPPED)
+        name = name or EVENTS[status]
         return cls(
-            name, Status.SKIPPED, 0, objective, 0.0, history, finds_poses=False, reason=reason
+            name, status, 0, objective, 0.0, History(), finds_poses=finds_poses, reason=reason
         )
-
-    @classmethod
-    def interruption(cls, objective: float) -> "Stage":
-        """Return a stage that says that the solve was broken off.
-
-        Parameters
-        ----------
-        objective : float
-            Cost of the poses that are returned.
-
-        Returns
-        -------
-        Stage
-            With `Status.INTERRUPTED`.
-        """
-        return cls("interruption", Status.INTERRUPTED, 0, objective, 0.0, History())
-
-    @classmethod
-    def silence(cls, objective: float) -> "Stage":
-        """Return a stage that says that a robot was silent for too long.
-
-        Parameters
-        ----------
-        objective : float
-            Cost of the poses that are returned.
-
-        Returns
-        -------
-        Stage
-            With `Status.SILENT`.
-        """
-        return cls("wait for a robot", Status.SILENT, 0, objective, 0.0, History())
 
 
 class StageTable:
@@ -401,6 +344,6 @@ class StageTable:
 
     def skip(self, name: str, reason: str, objective: float) -> None:
         """Write down that a step was wanted and not taken, once."""
-        line = Stage.skipped(name, reason, objective)
+        line = Stage.without_steps(Status.SKIPPED, objective, name, reason)
         if line not in self.stages:  # a checkpoint may have it
             self.add(line)

@@ -367,7 +367,8 @@ def weights_of_kept_edges(graph: PoseGraph, change: ModelChange) -> Array:
     is_kept = np.ones(graph.num_edges)
     is_kept[np.array(change.replaced_edges, dtype=int)] = 0.0
     is_row_kept = np.concatenate([is_kept, np.repeat(is_kept, graph.d)])
-    return isotropic_weights(graph).row_weights * is_row_kept
+    weights: Array = isotropic_weights(graph).row_weights * is_row_kept
+    return weights
 
 
 def change_of(changer: Changer | None, variables: PoseVariables) -> ModelChange:

@@ -23,8 +23,8 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
-from solvers.place import BROKEN_OFF, Attempt, Ending
-from solvers.result import StageTable, Status
+from solvers.place import BROKEN_OFF, Attempt
+from solvers.result import Stage, StageTable, Status
 from solvers.robots.driver import CoverPoses, Driver
 from solvers.robots.own_file import Answer, keep_answer, move_answer, return_to_answer
 
@@ -113,14 +113,13 @@ class AnswerAtRobots:
         """A second attempt runs SOC once more."""
         return None
 
-    def salvage(self, ending: Ending) -> Attempt:
+    def salvage(self, reason: Status) -> Attempt:
         """The poses that the robots keep; a PGOError where a matrix had no factor before any."""
         if self.kept is None:
             raise PGOError(f"{self.name}: weights too far apart for doubles; see pgo info FILE")
-        stage = ending(self.kept.objective)
-        self.table.add(stage)
+        self.table.add(Stage.without_steps(reason, self.kept.objective))
         certificate = self._certificate(NO_BOUND, BoundSource.GIVEN)
-        return Attempt(status=stage.status, certificate=certificate)
+        return Attempt(status=reason, certificate=certificate)
 
     def move_to_frame(self, driver: Driver, best: Attempt) -> tuple[Attempt, str, float]:
         """Have the robots move the answer to its frame; which that is, and F there.

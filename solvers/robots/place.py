@@ -34,7 +34,6 @@ from solvers.here import Here
 from solvers.place import (
     AnySOC,
     Attempt,
-    Ending,
     OwnStart,
     Place,
     Step,
@@ -331,12 +330,12 @@ class PlaceOfRobots(Place):
             return self.holder.kept is not None
         return bool(self.table.stages)
 
-    def salvage(self, ending: Ending) -> Attempt:
+    def salvage(self, reason: Status) -> Attempt:
         """The best poses known, those of the robots among them, with the bound F >= 0."""
-        robots_have_poses = ending in (Stage.interruption, Stage.silence)
+        robots_have_poses = reason in (Status.INTERRUPTED, Status.SILENT)
         if self.here is not None and robots_have_poses:
             self.monitor.poses_found.append(collect(self.driver)[0])
-        return self.holder.salvage(ending)
+        return self.holder.salvage(reason)
 
     # Steps after the first attempt
 

@@ -27,7 +27,7 @@ from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
-from solvers.place import AnySOC, Attempt, Ending, OwnStart, Traits
+from solvers.place import AnySOC, Attempt, OwnStart, Traits
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.robots.consensus import (
@@ -161,9 +161,9 @@ class RobotsAlone(PlaceOfRobots):
         """Return the certificate with the bound F >= 0: another needs a driver."""
         return self.known_here.without_bound(attempt)
 
-    def salvage(self, ending: Ending) -> Attempt:
+    def salvage(self, reason: Status) -> Attempt:
         """The best poses known, with the bound F >= 0."""
-        return self.known_here.salvage(ending)
+        return self.known_here.salvage(reason)
 
 
 def cheaper_end(

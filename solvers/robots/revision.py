@@ -36,7 +36,7 @@ from solvers.carry.messages import Messages
 from solvers.carry.registry import order, record
 from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
-from solvers.result import Stage
+from solvers.result import Stage, Status
 from solvers.robots import poses as pose_orders
 from solvers.robots.agent import Agent, held_poses
 from solvers.robots.consistency import (
@@ -100,7 +100,7 @@ def revised(opened: OpenedFiles, job: Pass, monitor: RunMonitor) -> Revision:
     try:
         stage, kept = _judged(opened, borders, job, monitor)
     except FAILURES:
-        stage, kept = Stage.failure("GNC", objective), None
+        stage, kept = Stage.without_steps(Status.FAILED, objective, "GNC"), None
     if kept is not None:
         return Revision(kept, stage, is_better=True)
     nothing = [None] * network.ledger.num_robots
