@@ -218,6 +218,7 @@ def definite(information: Array) -> Array:
     if not is_singular.any():
         return information
     diagonal = np.einsum("mkk->mk", information[is_singular])
+    diagonal = np.where(diagonal > 0.0, diagonal, diagonal.max(axis=1, keepdims=True))
     raised = information.copy()
     raised[is_singular] += LEAST_SCALED * diagonal[:, :, None] * np.eye(information.shape[1])
     return raised

@@ -255,8 +255,9 @@ def compare_readings(
         best = proposed[0] if proposed else written
         if _may_be_pair(best):
             pairs = trial.fits([reading for reading in Reading if reading.is_pair])
+            turned = [fit for fit in pairs if _needs_reversal(fit, others, written)]
             others += pairs
-            proposed = _proposed(pairs, best) or proposed
+            proposed = _proposed(tuple(turned), best) or proposed
     is_misfit = residuals.is_overall_misfit
     return ReadingComparison(problem.cost_name, written, others, proposed, is_misfit=is_misfit)
 
@@ -265,6 +266,18 @@ def _may_be_pair(best: ReadingFit) -> bool:
     """Whether the cost of the best fit is so far from what is expected that more may be wrong."""
     is_too_small = best.times_expected <= 1.0 / _LEAST_MISFIT[Reading.ROTATION_FIRST]
     return is_too_small or best.times_expected >= _LEAST_EXCESS
+
+
+def _needs_reversal(pair: ReadingFit, others: tuple[ReadingFit, ...], written: ReadingFit) -> bool:
+    """Whether reversed edges fit clearly better than the same matrices with edges as written.
+
+    Of edges that fit exactly as written only the matrices could be others.
+    """
+    if pair.reading not in ROTATION_FIRST:
+        return True
+    alone = [fit for fit in others if fit.reading is Reading.ROTATION_FIRST]
+    same_matrices = alone[0] if alone else written
+    return not pair.cost * _LEAST_RATIO > same_matrices.cost
 
 
 def _readings_of_invalid(

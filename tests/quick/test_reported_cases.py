@@ -375,6 +375,18 @@ def test_two_things_at_once_may_be_other_than_written(pgo_command: Call, tmp_pat
     assert json.loads(out)["proposed"] == ["reversed-rotation-first"]
 
 
+def test_edges_that_fit_exactly_are_not_said_to_be_reversed(pgo_command: Call) -> None:
+    for name in ("q1_noise_free_square", "q1_estimate_6_digits"):
+        _, out, _ = pgo_command("doctor", CASES / f"{name}.g2o", "--json")
+        assert json.loads(out)["proposed"] == []
+
+
+def test_wrong_edges_are_looked_for_among_edges_that_measure_a_part(pgo_command: Call) -> None:
+    case = CASES / "a5_corridor_2d.g2o"
+    _, out, _ = pgo_command("solve", case, "--robust", "gnc", "--json")
+    assert json.loads(out)["objective"] == pytest.approx(0.348717, rel=1e-5)
+
+
 def test_every_component_is_solved_when_asked(pgo_command: Call, tmp_path: Path) -> None:
     edges = [(0, 1), (1, 2), (2, 0), (7, 8), (8, 9), (9, 7), (9, 8)]
     matrix = "100 0 0 100 0 400"
