@@ -244,10 +244,12 @@ class Source:
     def _note_remainders(self, kind: Tag, parsed: ParsedLines, lines: list[str]) -> None:
         """Note what the positions of priors have beyond their doubles, as far ones are shifted."""
         first = 1 + kind.num_ids + kind.num_other_ids
-        values = parsed.numbers[:, : kind.d].tolist()
+        count = 2 if kind.is_level else kind.d
+        values = parsed.numbers[:, :count].tolist()
         for number, line, row in zip(parsed.lines.tolist(), lines, values, strict=True):
-            words = line.split(None, first + kind.d)[first : first + kind.d]
-            self.remainders[number] = list(map(remainder_of, words, row))
+            words = line.split(None, first + count)[first : first + count]
+            remainders = map(remainder_of, words, row)
+            self.remainders[number] = [*remainders, *[0.0] * (kind.d - count)]
 
     def _check_line(self, tag: str, number: int, line: str) -> None:
         """Raise a FileFormatError when a word of a line is wrong, or there are not enough."""

@@ -69,7 +69,8 @@ class Tag:
 
     The noise is the upper triangle of an information matrix, row by row, unless `noise` says
     otherwise; with `is_complete` it is the whole matrix. A point has d numbers, or bearing and
-    range with DEVIATIONS, and its matrix is d x d. A rotation in space is a quaternion, its w
+    range with DEVIATIONS, and its matrix is d x d; with `is_level` its height is missing in both.
+    A rotation in space is a quaternion, its w
     first, and its matrix is 3 x 3. So is that of a direction, which is one of the world, then the
     measured one. With `is_rotation_first` the rows of the rotation in the matrix are before
     those of the translation. A similarity has rotation vector, translation and scale of a
@@ -90,6 +91,7 @@ class Tag:
     is_toro: bool = False
     is_rotation: bool = False
     is_direction: bool = False
+    is_level: bool = False
     is_rotation_first: bool = False
     is_similarity: bool = False
     is_complete: bool = False
@@ -208,6 +210,8 @@ class Tag:
         """Rows of the information matrix."""
         if self.is_similarity:
             return 7
+        if self.is_level:
+            return 2
         is_small = self.is_point or self.is_rotation or self.is_direction
         return self.d if is_small else 3 * self.d - 3
 
@@ -252,14 +256,15 @@ class Tag:
         num_measured = 4 * d - 5  # x y theta, or x y z and a quaternion
         num_in_triangle = k * (k + 1) // 2 if self.is_edge else 0
         rows = np.zeros((len(numbers), num_measured + num_in_triangle))
-        rows[:, :d] = numbers[:, :d]
+        side = self._side
+        rows[:, :side] = numbers[:, :side]
         rows[:, num_measured - 1] = d - 2  # the angle 0, or the w of the quaternion 0 0 0 1
-        # Entries of the pose's triangle that belong to the d x d block of the translation. Row by
-        # row they are in the order of the point's own triangle.
+        # Entries of the pose's triangle that belong to the block of the translation. Row by row
+        # they are in the order of the point's own triangle.
         _, column = np.triu_indices(k)
-        in_block = np.flatnonzero(column < d)
+        in_block = np.flatnonzero(column < side)
         if self.is_edge:
-            rows[:, num_measured + in_block] = numbers[:, d:]
+            rows[:, num_measured + in_block] = numbers[:, side:]
         return rows
 
 
@@ -400,6 +405,7 @@ OTHER_TAGS = {
     "EDGE_SE3_SWITCHABLE": Tag(3, 2, num_switches=1),
     "EDGE_SE3_PRIORQUAT": Tag(3, 1, is_rotation=True),
     "EDGE_SE3_PRIORVEC": Tag(3, 1, is_direction=True),
+    "EDGE_SE3_PRIORXY": Tag(3, 1, is_point=True, is_level=True),
     "EDGE_SE3:EXPMAP": Tag(3, 2, is_rotation_first=True),
     "VERTEX_SIM3:EXPMAP": Tag(3, 1, is_edge=False, is_similarity=True),
     "EDGE_SIM3:EXPMAP": Tag(3, 2, is_similarity=True, is_rotation_first=True),
@@ -445,6 +451,11 @@ ALIASES = {
     "TUTORIAL_PARAMS_SE2_OFFSET": "PARAMS_SE2OFFSET",
     "EDGE_SE3:QUAT_SWITCHABLE": "EDGE_SE3_SWITCHABLE",
     "EDGE_SE3_PRIORXYZ": "EDGE_SE3_XYZ_PRIOR",
+    "EDGE_SE3_PRIOR_XYZ": "EDGE_SE3_XYZ_PRIOR",
+    "EDGE_SE3_PRIOR_XY": "EDGE_SE3_PRIORXY",
+    "EDGE_SE3_PRIOR_QUAT": "EDGE_SE3_PRIORQUAT",
+    "EDGE_SE2_PRIOR_XY": "EDGE_PRIOR_SE2_XY",
+    "EDGE_SE2_XY_PRIOR": "EDGE_PRIOR_SE2_XY",
 }
 # What lines of these tags are if they have three angles, as many words tell.
 WITH_ANGLES = {"VERTEX_SE3": "VERTEX3", "EDGE_SE3": "EDGE3"}
@@ -474,7 +485,6 @@ SKIPPED_TAGS = {
 # Tags of measurements that no edge of a pose graph has.
 REFUSED_TAGS = {
     "EDGE_RANGE": "a range without a bearing",
-    "EDGE_SE3_PRIORXY": "a position without its height",
     "EDGE_SE3_PLANE": "a plane",
 }
 

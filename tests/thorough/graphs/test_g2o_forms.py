@@ -242,7 +242,15 @@ def test_positions_of_hdl_graph_slam_are_priors(tmp_path: Path) -> None:
     assert_same(graph, read(tmp_path, [EDGE_3D, "EDGE_SE3_XYZ_PRIOR 1 3 4 5 2 0 0 2 0 2"]))
 
 
-@pytest.mark.parametrize("tag", ["EDGE_SE3_PRIORXY", "EDGE_SE3_PLANE"])
+def test_positions_without_height_are_those_of_which_nothing_measures_the_height(
+    tmp_path: Path,
+) -> None:
+    graph = read(tmp_path, [EDGE_3D, "EDGE_SE3_PRIORXY 1 3.1 4.1  2.3 0.5 7"])
+    whole = "EDGE_SE3_XYZ_PRIOR 1 3.1 4.1 0 2.3 0.5 0 7 0 0"
+    assert_same(graph, read(tmp_path, [EDGE_3D, whole]))
+
+
+@pytest.mark.parametrize("tag", ["EDGE_RANGE", "EDGE_SE3_PLANE"])
 def test_what_is_no_edge_is_refused_with_the_reason(tmp_path: Path, tag: str) -> None:
     with pytest.raises(FileFormatError, match=f":2: {tag} measures a .*--skip-unknown"):
         read(tmp_path, [EDGE_3D, f"{tag} 1 2 3 4"])
