@@ -19,9 +19,13 @@ from pgo_models.geometry.rotations import (
     BoolArray,
     project_to_rotations,
     quaternions_from_rotations,
+    rotations_from_quaternions,
 )
 
-_VIEW_WORDS = 14  # i j, a rotation by rows, a translation
+# Words on a line of a view graph: i j, a quaternion or a rotation by rows, perhaps a translation.
+_QUATERNION_WORDS = (6, 9)
+_VIEW_WORDS = (*_QUATERNION_WORDS, 11, 14)
+_NOT_UNIT = 1e-3  # of a quaternion or matrix that is no rotation
 _UNIT_ROTATION = " ".join(["0"] * 15 + ["1 0 0 1 0 1"])  # information of a rotation alone
 _NAMES_OF_FIRST = {"i", "from", "id1", "id_1", "id_a", "source", "src", "start", "pose_i"}
 _NAMES_OF_SECOND = {"j", "to", "id2", "id_2", "id_b", "target", "dst", "end", "pose_j"}
@@ -70,7 +74,7 @@ def as_g2o(path: Path, blocks: Iterable[str]) -> Iterator[str]:
     rest = chain([opening], stream)
     if first.lstrip().startswith("{"):
         return iter([_of_open3d(path, "".join(rest))])
-    if _is_view(first.split()):
+    if _view(first.split()) is not None:
         return iter([_of_views(path, "".join(rest))])
     table = _table_of(first)
     if table is not None:
@@ -151,15 +155,26 @@ def _words(numbers: Array) -> str:
 # View graphs
 
 
-def _is_view(words: list[str]) -> bool:
-    """Whether a line has two ids, and a rotation by rows with a translation."""
-    if len(words) != _VIEW_WORDS or not all(word.isdigit() for word in words[:2]):
-        return False
+def _view(words: list[str]) -> Array | None:
+    """Rotation, (3, 3), between two views with ids or names; None if a line has no such thing.
+
+    It is given by rows, as in EGs.txt, or as a quaternion, its w first, as GLOMAP reads it. A
+    translation may follow.
+    """
+    are_numbers = [word.isdigit() for word in words[:2]]
+    if len(words) not in _VIEW_WORDS or are_numbers[0] is not are_numbers[1]:
+        return None
     try:
-        R = np.array(words[2:11], dtype=float).reshape(3, 3)
+        numbers = np.array(words[2:], dtype=float)
     except ValueError:
-        return False
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-3)
+        return None
+    if len(words) in _QUATERNION_WORDS:
+        w, x, y, z = numbers[:4]
+        is_unit = abs(np.linalg.norm(numbers[:4]) - 1.0) < _NOT_UNIT
+        return rotations_from_quaternions(np.array([[x, y, z, w]]))[0] if is_unit else None
+    R = numbers[:9].reshape(3, 3)
+    is_rotation = np.abs(R @ R.T - np.eye(3)).max() < _NOT_UNIT and np.linalg.det(R) > 0.0
+    return R if is_rotation else None
 
 
 def _of_views(path: Path, text: str) -> str:
@@ -171,34 +186,44 @@ def _of_views(path: Path, text: str) -> str:
     lines = text.split("\n")
     rotations = {}
     for place, line in enumerate(lines):
-        words = line.split()
         if not _has_words(line):
             continue
-        if not _is_view(words):
-            problem = "no view: give i j, a rotation by rows, and a translation"
+        R = _view(line.split())
+        if R is None:
+            problem = (
+                "no view: give two ids or names, a rotation by rows or as qw qx qy qz, and a "
+                "translation or nothing"
+            )
             raise FileFormatError(path, place + 1, problem)
-        rotations[place] = np.array(words[2:11], dtype=float).reshape(3, 3)
-    ends = {}
-    for place in rotations:
-        first, second = lines[place].split()[:2]
-        ends[place] = (int(first), int(second))
-    are_transposed = _are_transposed({ends[place]: R for place, R in rotations.items()})
+        rotations[place] = R
+    ends = {place: lines[place].split()[:2] for place in rotations}
+    names = sorted({name for pair in ends.values() for name in pair})
+    are_named = not names[0].isdigit()
+    number_of = {name: k if are_named else int(name) for k, name in enumerate(names)}
+    pairs = {place: (number_of[i], number_of[j]) for place, (i, j) in ends.items()}
+    are_transposed = _are_transposed({pairs[place]: R for place, R in rotations.items()}, are_named)
     written = [""] * len(lines)
     for place, R in rotations.items():
-        i, j = ends[place]
+        i, j = pairs[place]
         pose = _words_of_pose(R.T if are_transposed else R, np.zeros(3))
         written[place] = f"EDGE_SE3:QUAT {i} {j} {pose} {_UNIT_ROTATION}"
-    kind = "R_j R_i^T of R_i, from the world to camera i" if are_transposed else "R_i^T R_j"
+    note = "R_j R_i^T of R_i, from the world to camera i" if are_transposed else "R_i^T R_j"
+    if are_named:
+        note += f"; views have the numbers 0 ({names[0]}) to {len(names) - 1} ({names[-1]}), sorted"
     warnings.warn(
-        f"{printable(str(path))}: a view graph, of which the rotations are read, as {kind}",
+        f"{printable(str(path))}: a view graph, of which the rotations are read, as "
+        f"{printable(note)}",
         GraphWarning,
         stacklevel=2,
     )
     return "\n".join(written)
 
 
-def _are_transposed(rotations: dict[tuple[int, int], Array]) -> bool:
-    """Whether cycles of three views fit R_jk R_ij = R_ik better than R_ij R_jk = R_ik."""
+def _are_transposed(rotations: dict[tuple[int, int], Array], by_default: bool) -> bool:
+    """Whether cycles of three views fit R_jk R_ij = R_ik better than R_ij R_jk = R_ik.
+
+    Without cycles the default is returned.
+    """
     successors: dict[int, list[int]] = {}
     for i, j in rotations:
         successors.setdefault(i, []).append(j)
@@ -212,7 +237,7 @@ def _are_transposed(rotations: dict[tuple[int, int], Array]) -> bool:
                 transposed = np.linalg.norm(second @ first - third)
                 misfits.append((float(direct), float(transposed)))
     if not misfits:
-        return False
+        return by_default
     of_direct, of_transposed = np.median(misfits, axis=0)
     return bool(of_transposed < of_direct)
 

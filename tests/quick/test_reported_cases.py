@@ -12,6 +12,7 @@ import pytest
 import solvers
 from pgo_models import PoseGraph, Reading
 from pgo_models.errors import FileFormatError, GraphWarning
+from pgo_models.geometry.rotations import quaternions_from_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 
 pytest.importorskip("flint")
@@ -476,6 +477,32 @@ def test_the_rotations_of_view_graphs_are_read(
     assert code == 0
     assert "a view graph, of which the rotations are read" in err
     assert json.loads(out)["objective"] == pytest.approx(13.86581241, rel=1e-6)
+
+
+@pytest.mark.parametrize("with_translation", [False, True])
+@pytest.mark.parametrize("is_of_cameras", [False, True])
+def test_views_may_have_names_and_quaternions(
+    is_of_cameras: bool, with_translation: bool, tmp_path: Path
+) -> None:
+    with pytest.warns(GraphWarning):
+        same = read_g2o(CASES / "EGs.txt")
+    names = [f"image_{k:03}.jpg" for k in range(same.num_poses)]
+    quaternions = quaternions_from_rotations(same.R_ij)
+    quaternions[:, :3] *= -1.0 if is_of_cameras else 1.0
+    lines = ["# views"]
+    for i, j, (x, y, z, w) in zip(same.i, same.j, quaternions, strict=True):
+        numbers = [w, x, y, z, *([0.6, 0.0, 0.8] if with_translation else [])]
+        lines.append(" ".join([names[i], names[j], *map(repr, map(float, numbers))]))
+    path = tmp_path / "views.txt"
+    path.write_text("\n".join(lines))
+    with pytest.warns(GraphWarning, match=r"0 \(image_000.jpg\) to \d+ \(image_0\d\d.jpg\)"):
+        graph = read_g2o(path)
+    np.testing.assert_array_equal(graph.i, same.i)
+    np.testing.assert_array_equal(graph.j, same.j)
+    np.testing.assert_allclose(graph.R_ij, same.R_ij, rtol=0, atol=1e-14)
+    path.write_text("\n".join([*lines, f"{names[0]} {names[1]} 1 1 0 0"]))
+    with pytest.raises(FileFormatError, match=rf"views.txt:{len(lines) + 1}: no view"):
+        read_g2o(path)
 
 
 @pytest.mark.parametrize(
