@@ -7,7 +7,7 @@ neither. To second order in the residuals, chi2 is twice GTSAM's error. The extr
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,12 +60,56 @@ _FACTORS = {
     "AttitudeFactorPose3": Tag(3, 1, is_direction=True),
     "AttitudeFactorRot3": Tag(3, 1, is_direction=True),
     "BearingRangeFactor2D": Tag(2, 2, is_point=True, to_landmark=True, noise=Noise.DEVIATIONS),
+    "GPSFactorArm": Tag(3, 2, is_point=True, to_landmark=True),
 }
+_ARM = "GPSFactorArm"  # two edges, see `_Antenna`
 _SOURCE = Path("factors of GTSAM")  # in messages, in place of a file
 
 
 class _UnreadableFactorError(Exception):
     """A factor that is no edge; the text says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Antenna:
+    """A landmark for an antenna, which is at `arm` (3,) in the frame of a pose.
+
+    Measured is its position (3,) in the world, with the information L. An edge from the pose to the
+    landmark has the information w I, a prior on the landmark P, with P^-1 + I / w = L^-1. Where the
+    landmark is best, both cost r^T L r together, r = R arm + t - position.
+    """
+
+    place: int  # of the factor, from 1
+    pose: int  # its key
+    arm: Array
+    position: Array
+    w: float
+    P: Array
+
+    @classmethod
+    def of(cls, gtsam: ModuleType, factor: Any, information: Array, place: int) -> _Antenna:  # noqa: ANN401
+        """The antenna of a GPSFactorArm, whose error at the identity is arm - position."""
+        position = np.asarray(factor.measurementIn())
+        precisions, axes = np.linalg.eigh(information)
+        w = 2.0 * float(precisions[-1])
+        P = (axes * (precisions * w / (w - precisions))) @ axes.T
+        arm = factor.evaluateError(gtsam.Pose3()) + position
+        return cls(place, int(factor.keys()[0]), arm, position, w, P)
+
+    def edges(self, key: int) -> tuple[tuple[str, list[int], list[float]], ...]:
+        """Type, ids and numbers of the edge and of the prior, with the key of the landmark."""
+        upper = np.triu_indices(3)
+        to_antenna = [*self.arm.tolist(), *(self.w * np.eye(3))[upper].tolist()]
+        of_world = [*self.position.tolist(), *self.P[upper].tolist()]
+        return (
+            (_ARM, [self.pose, key], to_antenna),
+            ("PriorFactorPoint3", [WORLD_ID, key], of_world),
+        )
+
+    def best_position(self, gtsam_pose: Any) -> Array:  # noqa: ANN401
+        """Position of the landmark, (3,), at which its two edges cost least."""
+        pulled = self.P @ self.position + self.w * gtsam_pose.transformFrom(self.arm)
+        return np.linalg.solve(self.P + self.w * np.eye(3), pulled)
 
 
 def from_gtsam(
@@ -78,11 +122,12 @@ def from_gtsam(
     """Make a PoseGraph of a factor graph of GTSAM, to solve it or to certify GTSAM's answer.
 
     Read are between factors and priors of poses and rotations, GPS and other positions of poses,
-    attitudes, positions of points, and bearing and range in the plane. Of a robust noise model its
-    Gaussian is read, with a warning. A pose whose only prior is a constrained one is an anchor: it
-    is where the prior has it. Other constrained factors are no edges with information matrices.
-    Keys become the ids of the poses, and a letter in the key of a pose names the robot. Slots
-    without a factor, as iSAM2 leaves them, are skipped.
+    attitudes, positions of points, and bearing and range in the plane. GPS at a lever arm measures
+    the position of the antenna, which becomes a landmark with the next free key. Of a robust noise
+    model its Gaussian is read, with a warning. A pose whose only prior is a constrained one is an
+    anchor: it is where the prior has it. Other constrained factors are no edges with information
+    matrices. Keys become the ids of the poses, and a letter in the key of a pose names the robot.
+    Slots without a factor, as iSAM2 leaves them, are skipped.
 
     Parameters
     ----------
@@ -123,7 +168,7 @@ def from_gtsam(
         raise SettingError(f"factors are a {type(factors).__name__}; give a NonlinearFactorGraph")
     if values is not None and not isinstance(values, gtsam.Values):
         raise SettingError(f"values are a {type(values).__name__}; give gtsam.Values")
-    by_type, unreadable, num_robust = _measurements(gtsam, factors)
+    by_type, unreadable, num_robust, antennas = _measurements(gtsam, factors)
     if unreadable:
         _report_unreadable(unreadable, skip_unknown)
     if num_robust:
@@ -141,7 +186,7 @@ def from_gtsam(
     graph = replace(graph, name="gtsam")
     if values is None:
         return graph
-    return replace(graph, initial=_poses_of_values(gtsam, values, graph))
+    return replace(graph, initial=_poses_of_values(gtsam, values, graph, antennas))
 
 
 def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
@@ -231,33 +276,50 @@ def poses_in_gtsam(gtsam: ModuleType, poses: Poses) -> list[Any]:
 def _measurements(
     gtsam: ModuleType,
     factors: Any,  # noqa: ANN401
-) -> tuple[dict[str, Measurements], dict[str, list[int]], int]:
-    """Measurements by the type of their factors, factors that are no edges, and robust ones."""
+) -> tuple[dict[str, Measurements], dict[str, list[int]], int, dict[int, _Antenna]]:
+    """Measurements by the type of their factors, factors that are no edges, and robust ones.
+
+    Antennas are returned by the keys of their landmarks.
+    """
     by_type: dict[str, Measurements] = {}
     unreadable: dict[str, list[int]] = {}
     num_robust = 0
     num_priors = _num_priors(factors)
+    antennas: list[_Antenna] = []
+
+    def add(place: int, name: str, ids: list[int], numbers: list[float]) -> None:
+        of_type = by_type.setdefault(name, Measurements(_FACTORS[name]))
+        of_type.places.append(place)
+        of_type.ids.append(ids)
+        of_type.numbers.append(numbers)
+
     for place in range(factors.size()):
         factor = factors.at(place)
         if factor is None:
             continue
         try:
-            name, ids, numbers = _measurement(gtsam, factor, num_priors)
+            if type(factor).__name__ == _ARM:
+                information = _information(gtsam, _ARM, factor.noiseModel(), num_priors)
+                antennas.append(_Antenna.of(gtsam, factor, information, place + 1))
+            else:
+                add(place + 1, *_measurement(gtsam, factor, num_priors))
         except _UnreadableFactorError as error:
             unreadable.setdefault(str(error), []).append(place + 1)
             continue
         num_robust += isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
-        of_type = by_type.setdefault(name, Measurements(_FACTORS[name]))
-        of_type.places.append(place + 1)
-        of_type.ids.append(ids)
-        of_type.numbers.append(numbers)
-    return by_type, unreadable, num_robust
+    free_key = 1 + max(map(int, gtsam.KeyVector(factors.keyVector())), default=0)
+    by_key = dict(enumerate(antennas, free_key))
+    for key, antenna in by_key.items():
+        for edge in antenna.edges(key):
+            add(antenna.place, *edge)
+    return by_type, unreadable, num_robust, by_key
 
 
 def _num_priors(factors: Any) -> int:  # noqa: ANN401
     """Number of factors that are priors."""
     names = [type(factors.at(place)).__name__ for place in range(factors.size())]
-    return sum(name in _FACTORS and _FACTORS[name].num_ids == 1 for name in names)
+    one_pose = {name for name, kind in _FACTORS.items() if kind.num_ids == 1} | {_ARM}
+    return sum(name in one_pose for name in names)
 
 
 def _measurement(
@@ -371,13 +433,21 @@ def _letters(ids: IntArray, landmarks: IntArray) -> list[int]:
     return [int(code) for code in codes if code > 0]
 
 
-def _poses_of_values(gtsam: ModuleType, values: Any, graph: PoseGraph) -> Poses:  # noqa: ANN401
+def _poses_of_values(
+    gtsam: ModuleType,
+    values: Any,  # noqa: ANN401
+    graph: PoseGraph,
+    antennas: dict[int, _Antenna],
+) -> Poses:
     """Poses of all keys of a graph; the world is at the origin, and landmarks are not turned."""
     d = graph.d
     R = np.tile(np.eye(d), (graph.num_poses, 1, 1))
     t = np.zeros((graph.num_poses, d))
     for place in graph.in_files.tolist():
         key = int(graph.pose_ids[place])
+        if key in antennas and values.exists(antennas[key].pose):
+            t[place] = antennas[key].best_position(values.atPose3(antennas[key].pose))
+            continue
         if not values.exists(key):
             name = gtsam.DefaultKeyFormatter(key)
             raise GraphError(f"the values have no pose {name}; give one for every key")

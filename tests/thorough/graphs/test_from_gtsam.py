@@ -204,6 +204,32 @@ def test_attitudes_and_rotation_priors_cost_what_gtsam_says_to_second_order() ->
     assert solvers.solve(problem).is_certified
 
 
+def test_gps_at_a_lever_arm_costs_what_gtsam_says() -> None:
+    rng = np.random.default_rng(4)
+    poses = turned_poses(rng, 6)
+    factors = gtsam.NonlinearFactorGraph()
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(x(k), pose)
+        if k:
+            between = poses[k - 1].between(pose)
+            factors.add(gtsam.BetweenFactorPose3(x(k - 1), x(k), between, sigmas(*[0.1] * 6)))
+        root = rng.normal(size=(3, 3))
+        noise = gtsam.noiseModel.Gaussian.Covariance(root @ root.T + 0.1 * np.eye(3))
+        arm = rng.normal(size=3)
+        fix = pose.transformFrom(arm) + rng.normal(size=3)
+        factors.add(gtsam.GPSFactorArm(x(k), fix, arm, noise))
+    graph = pgo.from_gtsam(factors, values)
+    assert len(graph.landmarks) == 6
+    problem = pgo.PGOProblem(graph)
+    assert problem.objective(graph.initial) == pytest.approx(2.0 * factors.error(values), rel=1e-9)
+    solution = solvers.solve(problem)
+    best = optimised(factors, values)
+    assert solution.is_certified
+    assert solution.objective == pytest.approx(2.0 * factors.error(best), rel=2e-2)
+    assert solvers.certify(problem, pgo.from_gtsam(factors, best).initial).gap < 0.05
+
+
 def test_graphs_of_rotations_alone_are_read() -> None:
     rng = np.random.default_rng(1)
     rotations = [pose.rotation() for pose in turned_poses(rng, 6)]
