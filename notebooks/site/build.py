@@ -16,8 +16,11 @@ import os
 import re
 import shutil
 import sys
+import tomllib
 from html import unescape
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 SITE = Path(__file__).parent
 ROOT = SITE.parent.parent
@@ -167,8 +170,28 @@ def table_text(text: str) -> str:
     return cell
 
 
-def with_films(notebook: str) -> str:
-    """Return a notebook, as JSON, whose plotly figures are HTML that needs no Python.
+def repository_address(pyproject: str) -> str | None:
+    """Return the address under `Repository` in the table `[project.urls]`, or None."""
+    return tomllib.loads(pyproject)["project"].get("urls", {}).get("Repository")
+
+
+def binder_link(address: str, notebook: str) -> str:
+    """Return the address at which Binder opens a notebook of a public git repository."""
+    path = quote(f"notebooks/{notebook}", safe="")
+    return f"https://mybinder.org/v2/git/{quote(address, safe='')}/HEAD?labpath={path}"
+
+
+def with_link_to_run(content: dict[str, Any], address: str, notebook: str) -> None:
+    """Add a link to Binder to the first cell of a notebook, below the line that installs it."""
+    link = f"[Or run it without installing]({binder_link(address, notebook)})"
+    how = "[as described here](../notebooks.md#without-installing)"
+    source = "".join(content["cells"][0]["source"])
+    title, installing, rest = source.split("\n\n", 2)
+    content["cells"][0]["source"] = "\n\n".join([title, installing, f"{link}, {how}.", rest])
+
+
+def with_films(notebook: str) -> dict[str, Any]:
+    """Return a notebook whose plotly figures are HTML that needs no Python.
 
     Links to pages of the site lead to them from where notebooks are on the site.
     """
@@ -182,11 +205,14 @@ def with_films(notebook: str) -> str:
                 height = f"{figure.layout.height or 480}px"
                 output["data"] = {"text/html": figure_html(figure, script, height)}
                 script = False
-    return json.dumps(content)
+    return content
 
 
-def fill_front_pages(source: Path) -> None:
-    """Put films, thumbnails and links where comments of front page and indices ask for them."""
+def fill_front_pages(source: Path, address: str | None) -> None:
+    """Put films, thumbnails and links where comments of front page and indices ask for them.
+
+    What stands between two comments `binder` is left out if the repository has no address.
+    """
     import pictures  # beside this file; needs plotly
 
     film = json.dumps(pictures.outputs(FRONT_FILM, FILM)[0])
@@ -198,24 +224,31 @@ def fill_front_pages(source: Path) -> None:
         ("notebooks.md", "<!-- notebooks -->", table),
     ):
         path = source / page
-        content = path.read_text(encoding="utf-8")
-        path.write_text(content.replace(mark, text), encoding="utf-8")
+        content = path.read_text(encoding="utf-8").replace(mark, text)
+        if address is None:
+            content = re.sub(r"<!-- binder -->.*?<!-- /binder -->", "", content, flags=re.S)
+        path.write_text(content, encoding="utf-8")
     gallery = source / "guide" / "gallery.md"
     text = pictures.with_thumbnails(gallery.read_text(encoding="utf-8"))
     gallery.write_text(text, encoding="utf-8")
 
 
-def assemble(source: Path) -> None:
-    """Write all pages, notebooks and pictures to a folder."""
+def assemble(source: Path, address: str | None) -> None:
+    """Write all pages, notebooks and pictures to a folder.
+
+    Notebooks get links that run them if the repository has an address.
+    """
     shutil.copytree(
         SITE, source, ignore=shutil.ignore_patterns("_build", "*.py", "static", "__pycache__")
     )
-    fill_front_pages(source)
+    fill_front_pages(source, address)
     (source / "notebooks").mkdir()
     notebooks = sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb"))
     for notebook in notebooks:
-        text = with_films(notebook.read_text(encoding="utf-8"))
-        (source / "notebooks" / notebook.name).write_text(text, encoding="utf-8")
+        content = with_films(notebook.read_text(encoding="utf-8"))
+        if address is not None:
+            with_link_to_run(content, address, notebook.name)
+        (source / "notebooks" / notebook.name).write_text(json.dumps(content), encoding="utf-8")
     shutil.copytree(
         ROOT / "notebooks" / "drawings",
         source / "notebooks" / "drawings",
@@ -268,7 +301,8 @@ def main() -> int:
     out = arguments.out.resolve()
     for part in ("source", "html", "doctrees"):
         shutil.rmtree(out / part, ignore_errors=True)
-    assemble(out / "source")
+    pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assemble(out / "source", repository_address(pyproject))
     options = [
         "-c",
         str(SITE),

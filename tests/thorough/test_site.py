@@ -336,6 +336,27 @@ def test_all_formulas_of_the_reference_are_typeset(browser, site):
         assert browser.value(wrong) == [], page.name
 
 
+BUILDER = runpy.run_path(str(BUILD))
+PYPROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def test_notebooks_are_run_by_a_link_once_the_repository_has_an_address(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(BUILD.parent))
+    without_urls = re.sub(r"^\[project\.urls\]$.*?(?=^\[)", "", PYPROJECT, flags=re.M | re.S)
+    urls = '[project.urls]\nRepository = "https://example.org/some/name"\n'
+    for text, has_address in ((without_urls, False), (without_urls + urls, True)):
+        source = tmp_path / str(has_address)
+        BUILDER["assemble"](source, BUILDER["repository_address"](text))
+        index = (source / "notebooks.md").read_text(encoding="utf-8")
+        assert ("Without installing" in index) == has_address
+        for notebook in (source / "notebooks").glob("*.ipynb"):
+            text = "".join(json.loads(notebook.read_text("utf-8"))["cells"][0]["source"])
+            links = re.findall(r"\]\((https://mybinder[^)]+)\)", text)
+            address = "git/https%3A%2F%2Fexample.org%2Fsome%2Fname/HEAD"
+            path = f"?labpath=notebooks%2F{notebook.name}"
+            assert links == [f"https://mybinder.org/v2/{address}{path}"] * has_address
+
+
 FORMULAS = runpy.run_path(str(ROOT / "notebooks" / "site" / "formulas.py"))
 
 
