@@ -249,7 +249,8 @@ class GraphFrames:
             }
         middle = 0.5 * (self.lower + self.upper)
         half = max(0.52 * float((self.upper - self.lower).max()), 1e-9)
-        scene: dict[str, object] = {"aspectmode": "cube"}
+        # Seen from a little below the default, so that the titles of the axes are not cut off.
+        scene: dict[str, object] = {"aspectmode": "cube", "camera": {"center": {"z": -0.2}}}
         for letter, centre in zip("xyz", middle.tolist(), strict=True):
             limits = [centre - half, centre + half]
             scene[f"{letter}axis"] = {"title": {"text": f"{letter} (m)"}, "range": limits}

@@ -232,5 +232,6 @@ def _layout(of_graph: dict[str, Any], num_frames: int) -> dict[str, object]:
         "gridcolor": "#eeeeee",
     }
     layout["legend"] = {"orientation": "h", "x": 0.0, "y": 0.30, "yanchor": "middle"}
+    layout["margin"] = {"l": 75}
     layout["height"] = 640
     return layout

@@ -24,11 +24,12 @@ _LEAST_SHOWN = 0.1  # edges, on the logarithmic axis
 def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
     """Plotly histogram of the errors sqrt(cost / allowed) of the edges, and the expected one.
 
-    The expected histogram is a dotted line, and what is allowed a vertical one. On a graph that
-    fits better than expected the bars are left of the dotted line, and the title says that no edge
-    is a misfit. For errors as the information matrices say, in d dimensions, cost / allowed is
-    chi^2_p divided by its quantile 1 - FALSE_ALARM / m, with p = 3 or 6: exactly for chi2, and for
-    F if its weights are equal. Edges without an allowed cost are left out.
+    The expected histogram is a dotted line, and what is allowed a vertical one. For errors as the
+    information matrices say, in d dimensions, cost / allowed is chi^2_p divided by its quantile
+    1 - FALSE_ALARM / m, with p = 3 or 6: exactly for chi2, and for F if its weights are equal.
+    Poses that are fitted to the measurements reduce the sum of the costs to the share that
+    `EdgeResiduals.overall` takes; the dotted line has every edge reduced to that share. Edges
+    without an allowed cost are left out.
     """
     is_counted = residuals.allowed > 0.0
     ratio = residuals.cost[is_counted] / residuals.allowed[is_counted]
@@ -40,7 +41,9 @@ def explore_fit(residuals: EdgeResiduals, d: int) -> "Figure":
     count = np.histogram(np.minimum(error, ends[-1]), ends)[0]
     p = tangent_dimension(d) + d
     quantile = chdtri(p, FALSE_ALARM / max(len(error), 1))
-    expected = len(error) * np.diff(chdtr(p, quantile * 100.0**ends))
+    unfitted = residuals.allowed.sum() / residuals.scale * p / quantile
+    fitted = residuals.cost.sum() / residuals.overall if residuals.overall > 0.0 else unfitted
+    expected = len(error) * np.diff(chdtr(p, quantile * unfitted / fitted * 100.0**ends))
 
     figure = plotly("graph_objects").Figure()
     middles = (ends[:-1] + 0.5 / _BARS_PER_DECADE).tolist()

@@ -136,6 +136,19 @@ def test_the_page_of_MIT_says_that_its_edges_do_not_fit(benchmark_data: Path) ->
     assert "No edge costs more" not in page.text
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("d", [2, 3])
+def test_errors_as_the_matrices_say_lie_along_the_dotted_line(seed: int, d: int) -> None:
+    pytest.importorskip("plotly")
+    graph = pgo.grid_world(1, 200, seed, d=d)
+    solution = solvers.solve(graph)
+    bars, line = explore_fit(solution.edge_residuals, graph.d).data
+    errors = 10.0 ** np.array(bars.x)
+    heights = (np.nan_to_num(np.array(trace.y, dtype=float)) for trace in (bars, line))
+    cost, expected = (float(height @ errors**2) for height in heights)
+    assert cost / expected == pytest.approx(solution.fit_ratio, rel=0.1)
+
+
 def test_a_graph_without_errors_has_no_misfit_in_its_histogram() -> None:
     pytest.importorskip("plotly")
     noisy = pgo.grid_world(1, 40, 3, d=2)
