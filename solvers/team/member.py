@@ -21,7 +21,6 @@ from solvers.robots.setup import SOLVE_PARTS
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
-from solvers.solution import Solution
 from solvers.solves.folder_solve import FilesOfRobots
 from solvers.team.driving import Drive
 from solvers.team.measurements import Measurements, Revision
@@ -35,7 +34,8 @@ class Member:
     """A robot as its session sees it: measurements, settings of solves, and what was found.
 
     `outcome` is how the last solve that succeeded has ended, and `known` what it has found of the
-    robot's own poses. A robot that has the measurements of its team has the `solution`, too.
+    robot's own poses. A robot that has the measurements of its team has the `solution`, too, as
+    bytes (`SharedAnswer`).
     """
 
     name: str
@@ -46,7 +46,7 @@ class Member:
     measurements: Measurements = field(default_factory=Measurements)
     outcome: Ended | None = None
     known: OwnAnswer | None = None
-    solution: Solution | None = None
+    solution: bytes | None = None
 
     @property
     def revision(self) -> Revision:

@@ -8,6 +8,7 @@ keeps its measurements, and one of them drives the solves of all (`DrivenTeam`).
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -268,9 +269,9 @@ class Robot:
 
         Where they are not known, there are none. They are computed when they are asked for.
         """
-        solution = self._member.solution
-        if solution is None:
+        if self._member.solution is None:
             return {}
+        solution = pickle.loads(self._member.solution)
         try:
             covariances = dict(
                 zip(solution.problem.graph.pose_ids.tolist(), solution.marginals(), strict=True)
@@ -319,7 +320,7 @@ class Robot:
 
     @property
     def is_computing(self) -> bool:
-        """Whether it computes, in a thread beside the calls, which hand on what it has found."""
+        """Whether it computes, beside the calls, which hand on what it has found."""
         return self._session.beside.is_busy
 
     @property

@@ -11,15 +11,15 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError
-from solvers.carry.ledger import Ledger
 from solvers.carry.wire import WireError
-from solvers.robots_solution import RobotsSolution
+from solvers.team.beside import OTHER_PROCESS
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, News, Piece, Priority, Term
@@ -79,6 +79,7 @@ class SharedMap:
         self._changed_at: float | None = None
         self._is_solving = False
         self._problems: tuple[str, ...] = ()
+        OTHER_PROCESS.start()
 
     @property
     def _has(self) -> dict[str, Mapping[str, Revision]]:
@@ -289,16 +290,14 @@ class SharedMap:
             self._begin(revisions)
 
     def _begin(self, revisions: Mapping[str, Revision]) -> None:
-        """Solve beside the robot."""
+        """Solve in the process beside the robot."""
         self._tried = revisions
         self._changed_at = None
         self._is_solving = True
-        lines = {name: list(self.logs[name].lines) for name in revisions}
-        solve = self._member.shared_solve
-        before = self._member.solution
-
+        lines = {name: "".join(self.logs[name].lines) for name in revisions}
+        solve = partial(self._member.shared_solve.solved, lines, self._member.solution)
         self._talk.beside.begin(
-            lambda: solve.solved(lines, before),
+            lambda: OTHER_PROCESS.result_of(solve),
             lambda answer: self._end(revisions, answer),
             "the measurements cannot be computed with",
         )
@@ -313,8 +312,7 @@ class SharedMap:
         self._problems = answer.problems
         covered = {name: revisions[name] for name in answer.covered}
         absent = tuple(name for name in self._talk.team if name not in covered)
-        found = RobotsSolution.of(answer.solution, Ledger(len(revisions)))
-        self.last = Ended(self.term, covered, absent, found.without_histories)
+        self.last = Ended(self.term, covered, absent, answer.found)
         self._member.outcome = self.last
         self._member.known = answer.own
         self._member.solution = answer.solution

@@ -1,14 +1,14 @@
 """The solve of a robot that has the measurements of its team: of the connected part that it is in.
 
 It is that of one place, with all options of `solve`. The next one begins at the map before
-(`extend`).
+(`extend`). It runs in a process of its own (`solvers.team.beside`).
 """
 
 from __future__ import annotations
 
-import threading
+import pickle
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,28 +21,29 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
+from solvers.carry.ledger import Ledger
 from solvers.growing import extend
 from solvers.loop import RunMonitor
 from solvers.pipeline import solution_for
 from solvers.request import Pipeline, SolveRequest
+from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.solution import Solution
 from solvers.team.measurements import Measurements
 from solvers.team.sharing import OwnAnswer
 
-# Filters of warnings are of all threads: one at a time changes them.
-_FILTERS = threading.Lock()
-
 
 @dataclass(frozen=True, eq=False)
 class SharedAnswer:
     """What a robot has found: the solution of its part, its own poses, and whose part it is.
 
-    `problems` are sentences on what was left out.
+    `found` is what is told of the solution, which itself is a pickle: the next solve begins there,
+    in the other process. `problems` are sentences on what was left out.
     """
 
-    solution: Solution
+    found: RobotsSolution
+    solution: bytes
     own: OwnAnswer
     covered: tuple[str, ...]
     problems: tuple[str, ...]
@@ -58,13 +59,13 @@ class SharedSolve:
     robust: GNC | PCM | None
     trust_folder: bool
 
-    def solved(self, lines: Mapping[str, Sequence[str]], before: Solution | None) -> SharedAnswer:
+    def solved(self, lines: Mapping[str, str], before: bytes | None) -> SharedAnswer:
         """The solution of the part that the robot is in, of the lines that each robot has measured.
 
         What cannot be read, or does not fit to the robot's own, is left out. A PGOError where it
         cannot solve its own.
         """
-        with _FILTERS, warnings.catch_warnings():
+        with warnings.catch_warnings():
             # Poses of absent robots have no estimate, which the outcome says in its own way.
             warnings.simplefilter("ignore", GraphWarning)
             files, problems = _files_of(lines)
@@ -73,7 +74,7 @@ class SharedSolve:
             graph, misfits = self._graph(files)
         problems += [f"what {name} has measured does not fit: {misfits[name]}" for name in misfits]
         part = _part_of(graph, files[self.name])
-        solution = self._solution(part, before)
+        solution = self._solution(part, None if before is None else pickle.loads(before))
         fitting = [name for name in files if name not in misfits]
         covered = [name for name in fitting if _has_poses_of(part, files[name])]
         is_own = np.isin(part.pose_ids, files[self.name].vertex_ids)
@@ -81,7 +82,8 @@ class SharedSolve:
         if num_apart:
             problems.append(f"no edge joins {num_apart} poses of {self.name} with its others")
         own = OwnAnswer.of(solution, is_own)
-        return SharedAnswer(solution, own, tuple(covered), tuple(problems))
+        found = RobotsSolution.of(solution, Ledger(len(lines))).without_histories
+        return SharedAnswer(found, pickle.dumps(solution), own, tuple(covered), tuple(problems))
 
     def _graph(self, files: Mapping[str, G2OLines]) -> tuple[PoseGraph, dict[str, PGOError]]:
         """The graph of the files that fit to the robot's own, and why the others do not."""
@@ -121,9 +123,9 @@ class SharedSolve:
         )
 
 
-def _files_of(lines: Mapping[str, Sequence[str]]) -> tuple[dict[str, G2OLines], list[str]]:
+def _files_of(lines: Mapping[str, str]) -> tuple[dict[str, G2OLines], list[str]]:
     """The lines of each robot, read, and sentences on those that cannot be."""
-    measured = {name: Measurements(list(its)) for name, its in lines.items()}
+    measured = {name: Measurements(its.splitlines(keepends=True)) for name, its in lines.items()}
     dimensions = [its.told_dimension for its in measured.values()]
     d = next((each for each in dimensions if each is not None), None)
     if d is None:

@@ -44,6 +44,7 @@ class Mission:
     bits: float
     carried: int = 0  # bytes that have arrived
     longest: float = 0.0  # seconds of a call
+    busiest: float = 0.0  # CPU seconds of a call, of all threads: what it takes on a free machine
     arriving: list[tuple[float, int, str, bytes]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -95,9 +96,10 @@ class Mission:
         return now
 
     def timed(self, call: Callable[..., Any], *arguments: object) -> Any:
-        before = time.perf_counter()
+        before, cpu_before = time.perf_counter(), time.process_time()
         answer = call(*arguments)
         self.longest = max(self.longest, time.perf_counter() - before)
+        self.busiest = max(self.busiest, time.process_time() - cpu_before)
         return answer
 
     def has_map(self, num_edges: int) -> bool:
@@ -125,7 +127,7 @@ def main(sharing: str, num_poses: int, seconds: float, bits: float) -> None:
         f"{mission.carried / 1e3:.0f} kB carried in {now:.0f} s, the edges compressed are "
         f"{compressed_edges(graph) / 1e3:.0f} kB; the last closure took {now - closed_at:.2f} s "
         f"and {(mission.carried - carried_before) / 1e3:.1f} kB; the longest call took "
-        f"{mission.longest * 1e3:.0f} ms"
+        f"{mission.longest * 1e3:.0f} ms, and at most {mission.busiest * 1e3:.0f} ms of CPU"
     )
 
 

@@ -1,0 +1,94 @@
+"""Solves in a process beside the robot: scripts as they are written, and processes that die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from networks import KEY, give_edge, world
+
+import pgo_models as pgo
+import solvers
+
+SECONDS = 120.0
+CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"
+# A main script without a guard, which a second run of would print its first line twice.
+SCRIPT = """
+import sys, time, numpy as np, solvers
+print("begins", flush=True)
+robot = solvers.Robot("a", ["a"], b"sixteen or more bytes")
+robot.add_pose(0)
+robot.add_edge(0, 1, np.eye(2), np.array([1.0, 0.0]), kappa=100.0, tau=100.0)
+while not robot.is_settled:
+    robot.tick(time.monotonic())
+print(robot.solution.verdict.name, sorted(robot.covariances), flush=True)
+time.sleep(float(sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("ends_by", [None, signal.SIGINT, signal.SIGKILL])
+def test_a_script_without_a_guard_runs_once_and_leaves_no_process(
+    ends_by: signal.Signals | None, tmp_path: Path
+) -> None:
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT)
+    seconds = "0" if ends_by is None else str(SECONDS)
+    script = subprocess.Popen(
+        [sys.executable, str(path), seconds],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert script.stdout is not None
+    assert [script.stdout.readline() for _ in range(2)] == ["begins\n", "EXACT [0]\n"]
+    if ends_by is not None:
+        os.killpg(script.pid, ends_by)
+    # Ends when nobody has its standard error any more.
+    rest, errors = script.communicate(timeout=SECONDS)
+    assert rest == ""
+    assert errors.count("Traceback") == (ends_by is signal.SIGINT)
+
+
+@pytest.mark.skipif(not CHILDREN.exists(), reason="/proc names the children of a process")
+def test_where_the_process_dies_the_next_solve_starts_another() -> None:
+    graph = world(n=20)
+    robot = solvers.Robot("a", ["a"], KEY, weighting=pgo.Weighting.ISOTROPIC)
+    for pose in range(graph.num_poses):
+        robot.add_pose(pose)
+    for e in range(graph.num_edges - 1):
+        give_edge(robot, graph, e)
+    compute(robot)
+    assert robot.is_certified
+    cost = robot.solution.objective
+    pids = [int(pid) for pid in CHILDREN.read_text().split()]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    give_edge(robot, graph, graph.num_edges - 1)
+    while not robot.is_computing:
+        robot.tick(time.monotonic())
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+    compute(robot)
+    assert "SIGKILL" in robot.failure
+    assert robot.solution.objective == cost
+    robot.add_edge(0, 1, graph.R_ij[0], graph.t_ij[0], kappa=1.0, tau=1.0)
+    compute(robot)
+    assert robot.failure == ""
+    assert robot.is_certified
+    assert robot.solution.sizes[1] == graph.num_edges + 1
+    assert np.all([np.isfinite(covariance).all() for covariance in robot.covariances.values()])
+
+
+def compute(robot: solvers.Robot) -> None:
+    """Call a robot until it has solved."""
+    number = robot.last
+    while robot.last is number:
+        robot.tick(time.monotonic())
+        time.sleep(1e-3)
