@@ -101,7 +101,7 @@ def robot_command(
         float,
         typer.Option(
             "--retry",
-            help="Seconds after which a message without an answer is repeated; the pauses double.",
+            help="Seconds after which a message without an answer is repeated, at the earliest.",
         ),
     ] = 1.0,
     trust_folder: TrustFolderOption = False,

@@ -79,7 +79,8 @@ class News:
 
     `hears` are robots that it has heard of lately, which send it what they measure themselves.
     `takes_back` says that it comes from what was saved, and lacks what it has measured since;
-    `twins` are names that two robots have.
+    `twins` are names that two robots have. `sent` is when pieces were sent, in milliseconds of the
+    sender's clock, and `answers` that number of those that have come last, or -1.
     """
 
     has: Mapping[str, Revision]
@@ -87,6 +88,8 @@ class News:
     pieces: tuple[Piece, ...] = ()
     takes_back: bool = False
     twins: tuple[str, ...] = ()
+    sent: int = -1
+    answers: int = -1
 
 
 @record("Ask")
@@ -202,6 +205,7 @@ def check_message(message: object, team: tuple[str, ...]) -> None:
     if isinstance(message, News):
         names += [piece.owner for piece in message.pieces]
         numbers = [piece.before.num_lines for piece in message.pieces]
+        numbers += [message.sent, message.answers]
     else:
         names += [message.term.driver] if message.term.driver else []
         numbers = [getattr(message, each, 0) for each in ("call", "place", "computing")]

@@ -80,8 +80,8 @@ class Robot:
     patience : float
         Seconds after which a robot that was not heard of counts as absent.
     retry : float
-        Seconds after which a message that was not answered is sent again, for the first time: the
-        pauses double, up to the patience. New measurements are collected for as long.
+        Seconds after which a message that was not answered is sent again, at the earliest: links
+        may be slow. New measurements are collected for as long.
 
     Raises
     ------

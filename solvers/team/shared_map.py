@@ -9,8 +9,9 @@ map. It stays when robots go, and lost messages are sent again.
 from __future__ import annotations
 
 import zlib
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,12 +24,10 @@ from solvers.team.beside import OTHER_PROCESS
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, News, Piece, Priority, Term
+from solvers.team.pace import MOST_IN_A_PIECE, Pace
 from solvers.team.shared_solve import SharedAnswer
 from solvers.team.talk import Talk
 
-# Bytes of lines in a message, before they are compressed: longer ones are cut. Another robot may
-# send no more.
-MOST_IN_A_PIECE = 1 << 15
 _FORGOTTEN = 10.0  # patiences without a sign, after which a robot is not waited for any more
 _DICTIONARY = 1 << 15  # bytes of the lines before, which deflate can refer to at most
 
@@ -71,6 +70,7 @@ class SharedMap:
         self._said: dict[str, _Said] = {}
         self._near: set[str] = set()
         self._flights: dict[tuple[str, str], _Flight] = {}
+        self._paces: defaultdict[str, Pace] = defaultdict(Pace)
         self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
         # When an answer is owed to robots whose pieces have come: they are collected, too.
         self._owed: dict[str, float] = {}
@@ -135,10 +135,13 @@ class SharedMap:
 
     def greeting(self) -> News:
         """What tells others that this robot is there."""
-        return self._news(())
+        return News(self.revisions, tuple(self._has), (), self._takes_back, self._talk.twins)
 
-    def _news(self, pieces: tuple[Piece, ...]) -> News:
-        return News(self.revisions, tuple(self._has), pieces, self._takes_back, self._talk.twins)
+    def _news(self, to: str, pieces: tuple[Piece, ...]) -> News:
+        """The greeting to a robot, with pieces, and as the answer to those that have come."""
+        sent = int(1000 * self._talk.now)
+        answers, self._paces[to].heard = self._paces[to].heard, -1
+        return replace(self.greeting(), pieces=pieces, sent=sent, answers=answers)
 
     @property
     def _takes_back(self) -> bool:
@@ -150,12 +153,17 @@ class SharedMap:
             self._keep_theirs.add(sender)
         if not isinstance(message, News):
             return
+        pace = self._paces[sender]
         for piece in message.pieces:
             self._learn(sender, piece, is_latest)
             pause = self._talk.pause(1) / 2 if piece.is_last else 0.0
             when = min(self._talk.now + pause, self._owed.get(sender, np.inf))
             self._owed[sender] = when
         if is_latest:
+            if message.pieces:
+                pace.heard = message.sent
+            if message.answers >= 0:
+                pace.note_answer(message.answers, self._talk.now, self._talk.pause(1))
             self._said[sender] = _Said(message.has, message.hears, self._talk.now)
             self._near.add(sender)
             if message.takes_back:
@@ -192,7 +200,7 @@ class SharedMap:
         if log is not None and log.begins_with(saved) and len(log.lines) > saved.num_lines:
             piece = self._piece(owner, log, saved.num_lines, owner)
             if piece is not None:
-                self._talk.send(owner, self._news((piece,)), Priority.NORMAL)
+                self._talk.send(owner, self._news(owner, (piece,)), Priority.NORMAL)
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Send what others lack, and solve where something is new."""
@@ -202,9 +210,8 @@ class SharedMap:
             pieces = self._pieces_for(name, has, awake)
             if pieces or self._owed.get(name, np.inf) <= self._talk.now:
                 self._owed.pop(name, None)
-                self._talk.send(
-                    name, self._news(tuple(pieces)), Priority.NORMAL if pieces else Priority.HELLO
-                )
+                priority = Priority.NORMAL if pieces else Priority.HELLO
+                self._talk.send(name, self._news(name, tuple(pieces)), priority)
         self._solve_if_due()
 
     def _pieces_for(
@@ -246,19 +253,21 @@ class SharedMap:
         """Lines from one on, cut to a length; None where a robot is to answer first."""
         flight = self._flights.get((to, owner))
         now = self._talk.now
+        pace = self._paces[to]
         num_sent = 0
         if flight is not None:
-            is_repeated = flight.begins == begins
-            num_sent = flight.num_sent if is_repeated else 0
             # After the last piece, lines are collected for a while.
             pause = self._talk.pause(1) if flight.is_last else 0.0
-            if is_repeated:
-                pause = 2 * self._talk.pause(num_sent)
+            if flight.begins == begins:
+                num_sent = flight.num_sent
+                pause = pace.pause(now - self._said[to].when, self._talk.pause(1))
             if now - flight.when < pause:
                 return None
+        if num_sent:
+            pace.shorten()
         ends = begins
         num_bytes = 0
-        while ends < len(log.lines) and num_bytes < MOST_IN_A_PIECE:
+        while ends < len(log.lines) and num_bytes < pace.num_bytes:
             num_bytes += len(log.lines[ends])
             ends += 1
         is_last = ends == len(log.lines)

@@ -76,6 +76,23 @@ def test_a_new_closure_reaches_all_in_a_short_message() -> None:
     assert network.carried - carried < 2000
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_lost_lines_are_sent_again_soon_while_the_others_are_heard(seed: int) -> None:
+    graph = world(n=40)
+    robots = shared(graph, 4)
+    network = Network(robots, np.random.default_rng(seed), lost=0.3)
+    network.run(60.0)
+    assert network.is_settled
+    for robot in robots.values():
+        pose = min(robot.poses)
+        robot.add_edge(pose, max(robot.poses), np.eye(2), np.zeros(2), kappa=1e-9, tau=1e-9)
+    revisions = {name: robot.revision for name, robot in robots.items()}
+    network.wait(12 * robots["r0"].retry)
+    for robot in robots.values():
+        assert robot.outcome is not None
+        assert robot.outcome.revisions == revisions
+
+
 # Who is not there.
 
 
