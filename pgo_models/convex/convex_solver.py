@@ -215,7 +215,7 @@ class ConvexSolver:
         SettingError
             If a time limit is given and the solver's name for it is not known.
         """
-        options = self._options(tolerance, time_limit)
+        options = self.all_options(tolerance, time_limit)
         with warnings.catch_warnings():
             # Callers check the status, which says whether the solution is inaccurate. Stacks of
             # matrices have three dimensions.
@@ -228,8 +228,8 @@ class ConvexSolver:
             except _solver_error() as error:
                 raise cp.SolverError(" ".join(str(error).split())) from error
 
-    def _options(self, tolerance: float, time_limit: float) -> dict[str, Any]:
-        """The options of a solve, in the names of this solver."""
+    def all_options(self, tolerance: float, time_limit: float = math.inf) -> dict[str, Any]:
+        """Return the options of a solve, in the names of this solver."""
         tolerance_names, time_limit_name, others = _OPTIONS.get(self.name, ((), None, {}))
         if self.is_first_order:
             tolerance = max(tolerance, FIRST_ORDER_TOLERANCE)
@@ -287,9 +287,15 @@ def solve_compiled(
         if status == cp.OPTIMAL or (is_last and status == accepted):
             return
         if status in _WHY or is_last:
-            reason = _WHY.get(status, why)
-            raise PGOError(f"{solver.name} ended with status {status} on the {name}: {reason}")
+            check_solved(status, solver, name, why)
         tolerance = min(100.0 * tolerance, LOOSEST_TOLERANCE)
+
+
+def check_solved(status: str, solver: ConvexSolver, name: str, why: str) -> None:
+    """Raise a PGOError unless a solve ended well; it says what the status means, or `why`."""
+    if status != cp.OPTIMAL:
+        reason = _WHY.get(status, why)
+        raise PGOError(f"{solver.name} ended with status {status} on the {name}: {reason}")
 
 
 def finite_array(values: object, name: str) -> Array:

@@ -9,7 +9,7 @@ in solvers/convex/orthogonal.py.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -34,8 +34,9 @@ from pgo_models.convex.convex_solver import (
     check_variable,
     finite_array,
 )
+from pgo_models.convex.convex_step import ConeStep, PosedStep
 from pgo_models.errors import SettingError, check_settings
-from pgo_models.geometry.arrays import real_array
+from pgo_models.geometry.arrays import ReadOnly, real_array
 from pgo_models.geometry.rotations import Array
 from pgo_models.summaries import Summarised
 
@@ -344,6 +345,24 @@ class OrthogonalProblem(HoldsModel):
             first.setdefault(term.variable, copy)
         return tuple(first[position] for position in range(len(self.variables)))
 
+    def sums(self, of_terms: Sequence[Array]) -> list[Array]:
+        """Add arrays of terms up, for every variable those of its terms.
+
+        Parameters
+        ----------
+        of_terms : sequence of arrays
+            One for every term, in the shape of its variable.
+
+        Returns
+        -------
+        list of arrays
+            One for every variable.
+        """
+        sums = [np.zeros(variable.shape) for variable in self.variables]
+        for term, array in zip(self.terms, of_terms, strict=True):
+            sums[term.variable] += array
+        return sums
+
     def assign(self, values: Sequence[Array], others: Sequence[Array] = ()) -> None:
         """Write values into the cvxpy variables.
 
@@ -436,7 +455,20 @@ class OrthogonalProblem(HoldsModel):
             If a Parameter of the problem has no value, or is not used by cvxpy's rules of DPP.
         """
         check_parameters(self.problem)
-        return replace(self._compiled, solver=solver)
+        if not self.minimisation.is_dcp(dpp=True):
+            raise SettingError(
+                "the problem uses a Parameter in a way that breaks the rules of disciplined "
+                "parametrized programming (DPP); see cvxpy's manual"
+            )
+        solver = convex_solver.as_solver(solver)
+        variables = (*self.variables, *self.others)
+        counts = tuple(len(self.terms_of(place)) for place in range(len(self.variables)))
+        step: ConeStep | PosedStep | None = None
+        if solver.name == cp.CLARABEL:
+            step = ConeStep.of(self.minimisation, variables, counts, solver)
+        return SplitProblem(
+            self, step or PosedStep.of(self.minimisation, variables, counts, solver)
+        )
 
     @cached_property
     def minimisation(self) -> cp.Problem:
@@ -447,25 +479,6 @@ class OrthogonalProblem(HoldsModel):
         """
         return cp.Problem(cp.Minimize(self.J), self.problem.constraints)
 
-    @cached_property
-    def _compiled(self) -> "SplitProblem":
-        root = cp.Parameter(nonneg=True, name="root")
-        shifts = tuple(cp.Parameter(variable.shape, name="shift") for variable in self.variables)
-        penalty: Any = 0
-        variables_and_shifts = zip(self.variables, shifts, strict=True)
-        for position, (variable, shift) in enumerate(variables_and_shifts):
-            num_terms = len(self.terms_of(position))
-            squares = cp.sum_squares(root * variable - shift)
-            penalty += 0.5 * num_terms * squares
-        objective = cp.Minimize(self.J + penalty)
-        problem = cp.Problem(objective, self.problem.constraints)
-        if not problem.is_dcp(dpp=True):
-            raise SettingError(
-                "the problem uses a Parameter in a way that breaks the rules of disciplined "
-                "parametrized programming (DPP); see cvxpy's manual"
-            )
-        return SplitProblem(problem, self.variables, self.others, self.terms, root, shifts)
-
 
 class Split(Protocol):
     """Step (a) of a problem."""
@@ -475,21 +488,16 @@ class Split(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class SplitProblem(HoldsModel):
-    """The compiled subproblem: min J(X, y) + sum over the terms of rho/2 ||X - V_term||^2, convex.
+class SplitProblem(ReadOnly):
+    """min J(X, y) + sum over the terms of rho/2 ||X - V_term||^2, convex, by a solver."""
 
-    The terms of one variable add up to count * rho/2 ||X - mean V||^2. Its Parameters, root =
-    sqrt(rho) and shift = sqrt(rho) mean V, enter affinely (DPP), so that neither a new V nor a new
-    rho compiles again.
-    """
+    problem: OrthogonalProblem
+    step: ConeStep | PosedStep
 
-    problem: cp.Problem
-    variables: tuple[cp.Variable, ...]
-    others: tuple[cp.Variable, ...]
-    terms: tuple[Term, ...]
-    root: cp.Parameter
-    shifts: tuple[cp.Parameter, ...]
-    solver: ConvexSolver | str = COLD
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The terms of the problem."""
+        return self.problem.terms
 
     def at(self, rho: float) -> "SplitProblem":
         """The same: a new rho does not compile again."""
@@ -502,17 +510,9 @@ class SplitProblem(HoldsModel):
         of rho (V_term - X) is a subgradient at X of J minimised over y and the convex constraints.
         A PGOError when the convex constraints contradict each other, or J has no minimum over y.
         """
-        root = np.sqrt(rho)
-        self.root.value = root
-        for position, shift in enumerate(self.shifts):
-            V_of_variable = []
-            for term, V_term in zip(self.terms, V, strict=True):
-                if term.variable == position:
-                    V_of_variable.append(V_term)
-            mean_V = np.mean(V_of_variable, axis=0)
-            shift.value = root * mean_V
-        convex_solver.solve_compiled(self.problem, "split subproblem", solver=self.solver)
-        return _values(self.variables), _values(self.others)
+        values = self.step.solve(self.problem.sums(V), rho)
+        count = len(self.problem.variables)
+        return values[:count], values[count:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -560,21 +560,17 @@ def kkt_residuals(
     """
     normals = []
     V = []
+    multipliers = []
     for term, copy, given in zip(problem.terms, point.copies, point.normals, strict=True):
         normal = term.constraint.normal_part(copy, given)
         normals.append(normal)
         V.append(copy - normal / rho)
+        is_orthonormal = isinstance(term.constraint, Orthonormal)
+        multipliers.append(-copy.T @ normal if is_orthonormal else -normal)
     Z, others = (split or problem.split(solver)).solve(V, rho)
-    gaps = [np.zeros(minimiser.shape) for minimiser in Z]
-    for term, copy in zip(problem.terms, point.copies, strict=True):
-        gaps[term.variable] += rho * (copy - Z[term.variable])
-    gradients = [np.zeros(minimiser.shape) for minimiser in Z]
-    multipliers = []
-    for term, copy, normal in zip(problem.terms, point.copies, normals, strict=True):
-        gradients[term.variable] -= normal
-        multipliers.append(
-            -copy.T @ normal if isinstance(term.constraint, Orthonormal) else -normal
-        )
+    pairs = zip(problem.terms, point.copies, strict=True)
+    gaps = problem.sums([rho * (copy - Z[term.variable]) for term, copy in pairs])
+    gradients = problem.sums(normals)
     feasibility = problem.infeasibility(point.copies, others)
     stationarity = norm_of_all(gaps)
     gradient_norm = norm_of_all(gradients)
@@ -588,10 +584,6 @@ def norm_of_all(arrays: Sequence[Array]) -> float:
 
 def _real_arrays(arrays: Sequence[Array], name: str) -> tuple[Array, ...]:
     return tuple(real_array(array, f"the point's {name}", SettingError) for array in arrays)
-
-
-def _values(variables: Sequence[cp.Variable]) -> tuple[Array, ...]:
-    return tuple(np.array(variable.value, dtype=float) for variable in variables)
 
 
 def _check_not_imposed_twice(constraints: Sequence[cp.Constraint], in_sets: set[int]) -> None:

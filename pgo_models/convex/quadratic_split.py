@@ -52,9 +52,7 @@ class QuadraticSplit(ReadOnly):
     def solve(self, V: Sequence[Array], rho: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """As `SplitProblem.solve`."""
         form = self.form
-        sums = [np.zeros(variable.shape) for variable in self.problem.variables]
-        for term, V_term in zip(self.terms, V, strict=True):
-            sums[term.variable] += V_term
+        sums = self.problem.sums(V)
         entries = np.concatenate([total.reshape(-1, order="F") for total in sums])
         pull = rho * (self._x_of_entries @ entries)
         u = self._solved_dense(pull, rho) if form.reduction is not None else self._solved(pull, rho)

@@ -62,7 +62,7 @@ _FAINT = 1e-6
 # Residuals are balanced every `_BALANCE_EVERY` iterations, when one is `_BALANCE_RATIO` times the
 # other. After `_BALANCE_UNTIL` iterations rho is only raised, so that the recursion can settle.
 _BALANCE_EVERY = 5
-_BALANCE_UNTIL = 500
+_BALANCE_UNTIL = 100
 _BALANCE_RATIO = 10.0
 _LOWER = 1e-6  # share of J by which a run from a reflected point has to end lower
 
@@ -672,8 +672,8 @@ def _with_residuals(
     """State after the step from shifts V, with its residuals."""
     X_of_terms = [state.X[term.variable] for term in problem.terms]
     subgradients = [state.rho * (v - x) for v, x in zip(V, X_of_terms, strict=True)]
-    G = _sums_by_variable(problem, subgradients)
-    N = _sums_by_variable(problem, [state.rho * B for B in state.B])
+    G = problem.sums(subgradients)
+    N = problem.sums([state.rho * B for B in state.B])
     scale = max(state.scale, norm_of_all(G), np.finfo(float).tiny)
     disagreement = [x - P for x, P in zip(X_of_terms, state.copies, strict=True)]
     imbalance = [g + n for g, n in zip(G, N, strict=True)]
@@ -683,13 +683,6 @@ def _with_residuals(
         primal_residual=norm_of_all(disagreement) / _size_of(state.copies),
         dual_residual=norm_of_all(imbalance) / scale,
     )
-
-
-def _sums_by_variable(problem: OrthogonalProblem, of_terms: Sequence[Array]) -> list[Array]:
-    sums = [np.zeros(variable.shape) for variable in problem.variables]
-    for term, array in zip(problem.terms, of_terms, strict=True):
-        sums[term.variable] += array
-    return sums
 
 
 def _identity(shape: tuple[int, ...]) -> Array:
