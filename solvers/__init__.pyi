@@ -12,11 +12,8 @@ from solvers.convex.bregman import (
     TwoLineBregman as TwoLineBregman,
 )
 from solvers.convex.extended_soc import ExtendedSOC as ExtendedSOC
-from solvers.convex.orthogonal import (
-    OrthogonalSOC as OrthogonalSOC,
-    XStep as XStep,
-    solve_orthogonal as solve_orthogonal,
-)
+from solvers.convex.orthogonal import OrthogonalSOC as OrthogonalSOC, XStep as XStep
+from solvers.convex.solve_orthogonal import solve_orthogonal as solve_orthogonal
 from solvers.growing import extend as extend
 from solvers.loop import Solver as Solver, iterate as iterate, run as run
 from solvers.pipeline import solve as solve

@@ -514,6 +514,12 @@ class SplitProblem(ReadOnly):
         count = len(self.problem.variables)
         return values[:count], values[count:]
 
+    def measured(self, copies: Sequence[Array], others: Sequence[Array]) -> tuple[float, float]:
+        """J at copies, and how much they and the others violate."""
+        problem = self.problem
+        objective = problem.objective(problem.values(copies), others)
+        return objective, problem.infeasibility(copies, others)
+
 
 @dataclass(frozen=True, eq=False)
 class KKTResiduals(Summarised):

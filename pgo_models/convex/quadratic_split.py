@@ -93,9 +93,10 @@ class QuadraticSplit(ReadOnly):
             tuple(values[place] for place in ordered), tuple(normals[place] for place in ordered)
         )
 
-    def objective(self, values: Sequence[Array]) -> float:
-        """J at values of the constrained variables, with the best ones of all others."""
-        return self.form.objective(self.form.u_of(values))
+    def measured(self, copies: Sequence[Array], others: Sequence[Array]) -> tuple[float, float]:
+        """J at copies with the best other variables, and how much the copies violate."""
+        u = self.form.u_of(self.problem.values(copies))
+        return self.form.objective(u), self.problem.distance(copies)
 
     @cached_property
     def _entries_of_x(self) -> csc_array:

@@ -29,7 +29,6 @@ import pgo_models as pgo
 import solvers
 from pgo_models.convex.orthogonality_examples import procrustes
 from pgo_models.convex.quadratic_split import QuadraticSplit
-from solvers.convex.hand_over import SOCWithNewton
 from solvers.convex.model_newton import ModelNewton
 
 try:
@@ -223,8 +222,7 @@ def speed() -> None:
         starts = [model.random_point(rng) for _ in range(STARTS)]
         begun = time.process_time()
         split = QuadraticSplit(model, pgo.quadratic_form(model))
-        soc = solvers.OrthogonalSOC(x_step=split)
-        method = SOCWithNewton(soc, split, ModelNewton(split.form))
+        method = solvers.OrthogonalSOC(x_step=split, newton=ModelNewton(split.form))
         outcomes = [solvers.run(method, model, start) for start in starts]
         ours = time.process_time() - begun
 
