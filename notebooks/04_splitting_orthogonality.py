@@ -95,9 +95,11 @@ print(f"X is 8 by 3: U V^T costs {no_closed_form:.2f}, the X of SOC {found_thin:
 #
 # The paper's equation (19), and its flow chart drawn anew:
 #
-# $$\text{(a)}\; R = \arg\min_R f(R) + \tfrac\rho2 \lVert R - \omega + B \rVert_F^2, \qquad
-#   \text{(b)}\; \omega = \text{nearest rotation to } R + B, \qquad
-#   \text{(c)}\; B \leftarrow B + R - \omega.$$
+# $$\begin{aligned}
+#   \text{(a)}\quad R &= \arg\min_R f(R) + \tfrac\rho2 \lVert R - \omega + B \rVert_F^2 \\
+#   \text{(b)}\quad \omega &= \text{nearest rotation to } R + B \\
+#   \text{(c)}\quad B &\leftarrow B + R - \omega
+# \end{aligned}$$
 #
 # Here $f$ is the complete cost of equation (16) in rotations *and* translations. (The paper's step
 # (a) has rotations only, and each robot keeps its neighbours fixed;

@@ -42,12 +42,13 @@ from pgo_models.graphs.separators import report_partition
 plt.rcParams["figure.dpi"] = 120
 
 # %% [markdown]
-# ## A picture first
+# ## Four robots find one map
 #
 # The paper's figure 1 shows four robots with four poses each. Here is a pose graph like it: robot
 # $a$ owns the poses $4a$ to $4a + 3$, an edge along its trajectory is a measurement of its own
 # motion, and an edge between two robots is a *meeting*. The measurements have noise of 20 degrees
-# and 0.3 m.
+# and 0.3 m. In the film the poses begin far from the optimum. In each round every robot moves its
+# own poses, and then it tells its neighbours where the poses are that it and they hold. Press play.
 
 # %%
 corners = np.array([[0.0, 2.2], [2.2, 2.2], [0.0, 0.0], [2.2, 0.0]])  # of robots 0 to 3
@@ -69,6 +70,18 @@ figure_1 = observe(
     rng=np.random.default_rng(10),
     robot=np.repeat(np.arange(4), 4),
 )
+small_problem = pgo.PGOProblem(figure_1)
+neighbours = solvers.SOC(robots=pgo.partition(figure_1), coupling=solvers.Coupling.CONSENSUS)
+film_states = solvers.iterate(neighbours, small_problem, pgo.spanning_tree_start(figure_1))
+film_poses = [neighbours.poses(small_problem, state) for state in itertools.islice(film_states, 16)]
+film_labels = [f"round {k}" for k in range(16)]
+pgo.animate_poses(figure_1, film_poses, film_labels)
+
+# %% [markdown]
+# What has to cross between robots for this? The next picture shows the robots, and what two of them
+# exchange.
+
+# %%
 draw_figure_1(figure_1)
 
 # %% [markdown]
@@ -112,7 +125,7 @@ print(f"the two robots of the grid: {together.status.name}, F = {together.object
 # ## Four robots
 #
 # `robots` is a grid world of four robots with 40 poses each, and all that follows is computed on
-# it, but for the first film.
+# it, but for the film of the messages.
 
 # %%
 graph = pgo.load("robots")
@@ -141,11 +154,11 @@ print(report_partition(pgo.partition(graph, 4, pgo.PartitionMethod.METIS), graph
 #
 # $$\begin{aligned}
 #   x_a &= \arg\min_x f_a(x) + \tfrac12 \lVert x - z + u_a \rVert_\rho^2 && \text{each robot alone} \\
-#   z_i &= \text{mean over the copies of } (x_a + u_a)_i, \text{ its rotation projected to } \mathrm{SO}(d)
-#     && \text{between neighbours} \\
+#   z_i &= \text{mean over the copies of } (x_a + u_a)_i && \text{between neighbours} \\
 #   u_a &\leftarrow u_a + x_a - z && \text{each robot alone}
 # \end{aligned}$$
 #
+# The rotation of every mean is projected to $\mathrm{SO}(d)$.
 # These are steps (a), (b) and (c) of Algorithm 1, with $u_a$ for $B$. Only the rows $(x_a + u_a)_i$
 # of poses with more than one copy cross the network: $d (d + 1)$ numbers per pose. No robot sees
 # the measurements of another robot, or its other poses.
@@ -305,7 +318,6 @@ def gap(poses, best=best):
 # the grey line is the run in which all messages arrive.
 
 # %%
-small_problem = pgo.PGOProblem(figure_1)
 small_best = solvers.solve(small_problem)
 small_start = pgo.chordal_start(small_problem).aligned_to(small_best.poses)
 small_team = divide(small_problem, pgo.partition(figure_1))
@@ -547,6 +559,7 @@ draw_faults(curves, (3, 23))
 # %%
 with NamedNumbers():
     assert [len(poses) for _, poses in at_the_seam.values()] == [4, 12, 18]
+    assert small_problem.objective(film_poses[-1]) < (1 + 1e-2) * small_best.objective
     assert together.status is solvers.Status.CONVERGED
     assert small_gaps[-1] < 1e-3 < 1e-1 < small_gaps[0]
     assert difference < 1e-8

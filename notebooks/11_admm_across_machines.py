@@ -152,9 +152,11 @@ print(f"differs from ours by {difference:.0e} in 10 rounds")
 # No station needs to see the plan of another one, only the *mean* (section 7.3): with $\bar x$ the
 # mean of the plans and $\bar z$ its target value,
 #
-# $$x_a \leftarrow \operatorname{prox}_{f_a / \rho}\bigl(x_a + \bar z - \bar x - u\bigr), \qquad
-#   \bar z \leftarrow \arg\min_{\bar z} g(N \bar z) + \tfrac{N \rho}2 \lVert \bar z - u - \bar x \rVert^2, \qquad
-#   u \leftarrow u + \bar x - \bar z .$$
+# $$\begin{aligned}
+#   x_a &\leftarrow \operatorname{prox}_{f_a / \rho}\bigl(x_a + \bar z - \bar x - u\bigr) \\
+#   \bar z &\leftarrow \arg\min_{\bar z} g(N \bar z) + \tfrac{N \rho}2 \lVert \bar z - u - \bar x \rVert^2 \\
+#   u &\leftarrow u + \bar x - \bar z
+# \end{aligned}$$
 
 # %%
 stations, hours, w = 12, 24, 4.0

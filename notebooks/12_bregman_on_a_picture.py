@@ -70,12 +70,13 @@ def decibel(picture):
 # *split Bregman* method of Goldstein and Osher (2009):
 #
 # $$\begin{aligned}
-#   u &= (I + \alpha D^\top D)^{-1} \bigl(f + \alpha D^\top (d - b)\bigr) && \text{diagonal in Fourier space, if } D
-#     \text{ wraps round} \\
-#   d_p &= \max(1 - w / (\alpha \lVert v_p \rVert), 0) \, v_p, \quad v = D u + b
-#     && \text{a threshold on lengths, a prox} \\
+#   u &= (I + \alpha D^\top D)^{-1} \bigl(f + \alpha D^\top (d - b)\bigr) \\
+#   d_p &= \max(1 - w / (\alpha \lVert v_p \rVert), 0) \, v_p, \quad v = D u + b \\
 #   b &\leftarrow b + D u - d
 # \end{aligned}$$
+#
+# The first step is diagonal in Fourier space if $D$ wraps round; the second is a threshold on lengths,
+# which is a prox.
 
 
 # %%

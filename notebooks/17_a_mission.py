@@ -250,9 +250,11 @@ draw_drivers(log, AWAY)
 # edge is kept by one robot, so the cost of the team is a sum, and that of a group $A$ of robots is a
 # part of this sum:
 #
-# $$F = \sum_r F_r, \qquad F_A = \sum_{r \in A} F_r, \qquad
-#   F_r(R, t) = \sum_{(i,j) \in E_r} \kappa_{ij} \|R_j - R_i R_{ij}\|^2
-#   + \tau_{ij} \|t_j - t_i - R_i t_{ij}\|^2.$$
+# $$\begin{aligned}
+#   F &= \sum_r F_r, \qquad F_A = \sum_{r \in A} F_r, \\
+#   F_r(R, t) &= \sum_{(i,j) \in E_r} \kappa_{ij} \|R_j - R_i R_{ij}\|^2
+#   + \tau_{ij} \|t_j - t_i - R_i t_{ij}\|^2.
+# \end{aligned}$$
 #
 # Let $F_A^* = \min F_A$ be the least value over all poses. A certificate that covers $A$ has a number
 # `lower_bound` with $\ell_A \le F_A^*$: no poses whatsoever, neither the ones found nor any others,

@@ -245,6 +245,14 @@ TOO_WIDE = """
 """
 
 
+# Formulas that are wider than their column, of which one has to scroll to see the end.
+CUT_OFF = """
+[...document.querySelectorAll('mjx-container[display=true]')]
+  .filter((formula) => formula.scrollWidth > formula.clientWidth + 1)
+  .map((formula) => formula.closest('section').id)
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [390, 768, 1280, 1920])
 def test_nothing_on_a_page_is_wider_than_its_column(width, browser, site):
@@ -259,7 +267,7 @@ def test_nothing_on_a_page_is_wider_than_its_column(width, browser, site):
             browser.wait_for(
                 f"{films}.every(f => f.querySelector('.main-svg')?.clientWidth === f.clientWidth)"
             )
-            found = browser.value(TOO_WIDE)
+            found = browser.value(TOO_WIDE) + (browser.value(CUT_OFF) if width >= 1280 else [])
             if found or browser.value("document.documentElement.scrollWidth > innerWidth"):
                 wide[page.name] = found[:3]
     assert wide == {}
