@@ -22,6 +22,7 @@ from pgo_models.certificates.lower_bound import (
     has_complex_form,
     prove_at,
 )
+from pgo_models.certificates.polished import Polished
 from pgo_models.certificates.rounding_errors import (
     ObjectiveRounding,
     rounding_of,
@@ -140,6 +141,9 @@ class Certificate(ReadOnly):
         The cost of the file is between 1 - weights_error and 1 + weights_error times that of the
         weights as they are stored (`PoseGraph.weights_error`), of which `objective` and `bound`
         are. `lower_bound`, `objective_at_most` and what follows from them count it.
+    polished : Polished, optional
+        How far the poses given are from those at which the bound was proved, which cost less;
+        `certify` says so of poses that are not certified.
     """
 
     objective: float
@@ -158,6 +162,7 @@ class Certificate(ReadOnly):
     has_translations: bool = True
     fit: Fit = NO_FIT
     weights_error: float = 0.0
+    polished: Polished | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "Lambda", real_array(self.Lambda, "Lambda", SettingError))
@@ -252,7 +257,7 @@ class Certificate(ReadOnly):
             return "0: every edge fits to its rounding"
         text = rounded_up(self.proven_gap, 3)
         if self.fit.is_exact:
-            return f"{text}, of a cost that the last digits of the edges explain"
+            return f"{text}, of a cost that {self.fit.cause} explain"
         return f"{text}, proven to {self.digits} digits" if self.digits > 3 else text
 
     @property
@@ -289,7 +294,12 @@ class Certificate(ReadOnly):
             ("verdict", self.verdict_text),
         ]
         if self.source is not BoundSource.GIVEN:
-            facts.insert(1, (f"best known {self.cost}", rounded_up(self.poses_objective)))
+            best_known = rounded_up(self.poses_objective)
+            if self.polished is not None:
+                best_known += f"   ({self.polished.text})"
+            facts.insert(1, (f"best known {self.cost}", best_known))
+        if self.polished is not None and not math.isnan(self.polished.gtsam_cost):
+            facts.append(("by GTSAM", self.polished.reason(self.stationarity, self.cost)))
         return facts
 
     @property

@@ -29,7 +29,7 @@ _COST_OF_BILLIONTHS = 1e-12  # squared, a millionth of a standard deviation
 # than five deviations.
 _HALF_UNITS = 4.0
 # What the coordinates of a far frame leave open of an edge is no excuse beyond a millionth of it.
-_MOST_OF_FRAME = 1e-6
+_MILLIONTH = 1e-6
 _NEARLY = 2.0  # times what is allowed: above that there is no need to look at every edge
 
 
@@ -70,6 +70,12 @@ class Fit:
         if self.share > _BILLIONTH and self.units < math.inf:
             return f"every edge fits to {self.units:.2g} units of the last digit that its file has"
         return f"every edge fits to {self.share:.2g} of what it measures"
+
+    @property
+    def cause(self) -> str:
+        """What the cost of exact poses comes from, in words."""
+        by_optimiser = self.share > _BILLIONTH and self.units == math.inf
+        return "the last steps of an optimiser" if by_optimiser else "the last digits of the edges"
 
     @classmethod
     def of_all(cls, fits: Iterable["Fit"]) -> "Fit":
@@ -198,7 +204,7 @@ def fit_at(at: EvaluatedPoses, rounding: EdgeErrors) -> Fit:
     poses = problem.seen_poses(at.poses)
     written = written_errors(problem)
     sizes = _measured_sizes(problem)
-    of_frame = np.minimum(frame_error(problem.graph), _MOST_OF_FRAME * sizes.translation)
+    of_frame = np.minimum(frame_error(problem.graph), _MILLIONTH * sizes.translation)
     explained = EdgeErrors(rounding.translation + of_frame, rounding.rotation)
     if written is not None:
         explained = explained.plus(written)
@@ -221,6 +227,20 @@ def fit_at(at: EvaluatedPoses, rounding: EdgeErrors) -> Fit:
     if of_digits is not None:
         units = residuals.largest_share(problem, of_digits.times(2.0))
     return Fit(True, is_to_rounding, share, units)
+
+
+def fit_beside_exact(problem: PGOProblem, poses: Poses, cost: float) -> Fit:
+    """Fit of poses with at most this cost where other poses fit every edge to rounding.
+
+    The measurements agree with one another then. Poses are exact if they cost at most 1e-12 and
+    fit every edge to a millionth of what it measures: an optimiser stops at that, and its errors
+    are a millionth of the standard deviations that the weights state.
+    """
+    poses = problem.seen_poses(poses)
+    residuals = _residual_norms(problem, poses).plus(edge_roundings(problem, poses))
+    share = residuals.largest_share(problem, _measured_sizes(problem))
+    fits = cost <= _COST_OF_BILLIONTHS and share <= _MILLIONTH
+    return Fit(is_exact=True, share=share) if fits else NO_FIT
 
 
 def fits_to_rounding(problem: PGOProblem, poses: Poses) -> bool:

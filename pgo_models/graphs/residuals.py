@@ -124,13 +124,8 @@ def chi2(
     """
     check_poses(graph, poses)
     d = graph.d
-    R_i = poses.R[graph.i]
-    R_j = poses.R[graph.j]
-    R_ji = np.swapaxes(graph.R_ij, 1, 2)
-    E = R_ji @ np.swapaxes(R_i, 1, 2) @ R_j
     shift = poses.t[graph.j] - poses.t[graph.i]
-    shift_in_i = np.einsum("mba,mb->ma", R_i, shift)
-    r_t = np.einsum("mab,mb->ma", R_ji, shift_in_i - graph.t_ij)
+    E, r_t = _motions(graph, poses.R[graph.i], poses.R[graph.j], shift)
     w = log_map(E)
     angle = np.linalg.norm(w, axis=1)
     half_angle = 0.5 * angle[:, None]
@@ -147,15 +142,38 @@ def chi2(
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
     if convention is Chi2Convention.GTSAM:
-        # Where only a position is measured, the error is r_t itself.
-        to_landmark = np.isin(graph.j, graph.landmarks)
-        has_rotation = ~to_landmark & I_rr.any(axis=(1, 2))
-        measured_w = np.where(has_rotation[:, None], w, 0.0)
-        r_t = logarithm_translation(measured_w, r_t)
+        is_turned = measures_rotation(graph, information)
+        r_t = logarithm_translation(np.where(is_turned[:, None], w, 0.0), r_t)
     of_translations = _sum_of_forms(r_t, I_tt, r_t)
     of_coupling = _sum_of_forms(2.0 * r_t, I_tr, r_coupled)
     of_rotations = _sum_of_forms(r_r, I_rr, r_r)
     return of_translations + of_coupling + of_rotations
+
+
+def logarithms(
+    graph: PoseGraph, R_i: Array, R_j: Array, shift: Array, is_turned: BoolArray
+) -> Array:
+    """Residuals of GTSAM, (m, k), of the rotations of both ends of every edge and of t_j - t_i.
+
+    `is_turned` (m,) says which edges measure a rotation; of others r_t is the error itself.
+    """
+    E, r_t = _motions(graph, R_i, R_j, shift)
+    w = log_map(E)
+    return np.hstack([logarithm_translation(np.where(is_turned[:, None], w, 0.0), r_t), w])
+
+
+def _motions(graph: PoseGraph, R_i: Array, R_j: Array, shift: Array) -> tuple[Array, Array]:
+    """Rigid motions of edges: E (m, d, d) and r_t (m, d), see `chi2`."""
+    R_ji = np.swapaxes(graph.R_ij, 1, 2)
+    E = R_ji @ np.swapaxes(R_i, 1, 2) @ R_j
+    shift_in_i = np.einsum("mba,mb->ma", R_i, shift)
+    return E, np.einsum("mab,mb->ma", R_ji, shift_in_i - graph.t_ij)
+
+
+def measures_rotation(graph: PoseGraph, information: Array) -> BoolArray:
+    """Whether an edge measures a rotation, (m,), by the information matrices."""
+    to_landmark = np.isin(graph.j, graph.landmarks)
+    return np.asarray(~to_landmark & information[:, graph.d :, graph.d :].any(axis=(1, 2)))
 
 
 def _sum_of_forms(left: Array, blocks: Array, right: Array) -> float:

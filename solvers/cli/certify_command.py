@@ -139,6 +139,7 @@ def _record(problem: PGOProblem, poses: Poses, certificate: Certificate) -> dict
         "objective": certificate.objective,
         **both_costs(problem, poses),
         **certificate_json(certificate),
+        "polished": None if certificate.polished is None else certificate.polished.as_dict(),
         "source": certificate.source.name,
         "best_known_objective": certificate.poses_objective,
         "versions": installed_versions(problem.backend),

@@ -17,11 +17,14 @@ from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
     BoundSource,
     Certificate,
+    Verdict,
     certify_at,
     judge,
     with_terms,
 )
+from pgo_models.certificates.fit import fit_beside_exact
 from pgo_models.certificates.lower_bound import has_complex_form
+from pgo_models.certificates.polished import Polished
 from pgo_models.errors import FAILURES, GraphWarning, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -118,9 +121,9 @@ def certify(
     certificate = _certificate_near(problem, near, gap)
     # What nothing measures costs nothing, wherever the poses given are.
     measured = problem.measured
-    if measured is problem and not problem.graph.has_far_priors:
-        return certificate
-    return judge(measured, poses, certificate)
+    if measured is not problem or problem.graph.has_far_priors:
+        certificate = judge(measured, poses, certificate)
+    return _beside_polished(problem, near, certificate)
 
 
 def certify_to_digits(
@@ -213,6 +216,23 @@ def _certificate_near(problem: PGOProblem, poses: Poses, gap: float) -> Certific
         if not bound_is_tight(problem, certificate):
             certificate = _improved(improve, problem, poses, certificate)
     return certificate
+
+
+def _beside_polished(problem: PGOProblem, given: Poses, certificate: Certificate) -> Certificate:
+    """The certificate, with how far poses that are not certified are from the best ones known.
+
+    Where these fit every edge to rounding, poses close to them are exact (`fit_beside_exact`).
+    """
+    if certificate.is_certified or not certificate.poses_objective < certificate.objective:
+        return certificate
+    measured = problem.measured
+    best = judge(measured, certificate.poses, certificate)
+    if best.fit.is_to_rounding:
+        fit = fit_beside_exact(measured, given, certificate.objective_at_most)
+        if fit.is_exact:
+            return replace(certificate, fit=fit, verdict=Verdict.EXACT)
+    polished = Polished.of(problem, given, certificate.poses, best.is_certified)
+    return replace(certificate, polished=polished)
 
 
 def _improved(

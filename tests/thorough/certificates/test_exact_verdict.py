@@ -138,10 +138,14 @@ def test_a_heavy_edge_does_not_hide_light_ones(
     shift[i, 0] = 10.0**size
     away = Poses(graph.truth.R, graph.truth.t + shift)
     assert weight < 1e30 or problem.objective(away) <= rounding_level(problem, away)
-    for certificate in (judged(problem, away), certify(problem, away)):
-        assert not certificate.fit.is_to_rounding
-        # A shift of 1e-9 m is of no account beside these edges.
-        assert not certificate.fit.is_exact or size < -8.0
+    at_poses = judged(problem, away)
+    beside_exact_ones = certify(problem, away)
+    assert not at_poses.fit.is_to_rounding
+    assert not beside_exact_ones.fit.is_to_rounding
+    # A shift of 1e-9 m is of no account beside these edges, and one of 1e-6 m is what an optimiser
+    # leaves where Newton's method finds poses that fit to rounding.
+    assert not at_poses.fit.is_exact or size < -8.0
+    assert not beside_exact_ones.fit.is_exact or size < -5.5
 
 
 @pytest.mark.parametrize("d", [2, 3])

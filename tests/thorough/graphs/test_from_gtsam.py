@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from graphs import informed, varied_graph
+from typer.testing import CliRunner
 
 import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel
 from pgo_models.errors import GraphError, GraphWarning
+from solvers.cli.app import app
+from solvers.cli.shell import NOT_CERTIFIED
 
 gtsam = pytest.importorskip("gtsam")
 
@@ -268,3 +273,103 @@ def test_weights_alone_are_written_as_matrices() -> None:
     factors, values = pgo.to_gtsam(graph, graph.truth)
     assert factors.size() == graph.num_edges
     assert values.size() == graph.num_poses
+
+
+def pose3_example() -> tuple[Any, Any]:
+    """GTSAM's pose3example with a prior on its first pose, and the start of the file."""
+    factors, values = gtsam.readG2o(gtsam.findExampleDataFile("pose3example.txt"), True)
+    factors.add(gtsam.PriorFactorPose3(0, values.atPose3(0), sigmas(*[1e-2] * 6)))
+    return factors, values
+
+
+@pytest.mark.parametrize(("iterations", "why"), [(100, "another residual"), (2, "stopped early")])
+def test_the_reason_of_a_gap_is_told_by_the_gradients_of_both_costs(
+    iterations: int, why: str
+) -> None:
+    factors, values = pose3_example()
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    params.setMaxIterations(iterations)
+    found = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
+    graph = pgo.from_gtsam(factors, found)
+    certificate = solvers.certify(graph, graph.initial)
+    polished = certificate.polished
+    assert polished is not None
+    assert polished.is_certified
+    assert polished.gtsam_cost == pytest.approx(2.0 * factors.error(found), rel=1e-9)
+    linear = factors.linearize(found)
+    promised = linear.error(linear.optimize())
+    decrease = 1.0 - promised / factors.error(found)
+    assert polished.gtsam_decrease == pytest.approx(decrease, rel=1e-5, abs=1e-12)
+    assert why in str(certificate)
+    best = solvers.solve(graph).poses
+    moves = np.linalg.norm(best.t - graph.initial.t, axis=1)
+    assert polished.metres == pytest.approx(moves.max(), rel=1e-3)
+
+
+def test_a_file_of_gtsam_is_told_how_far_its_poses_move(tmp_path: Path) -> None:
+    factors, values = pose3_example()
+    gtsam.writeG2o(factors, optimised(factors, values), str(tmp_path / "answer.g2o"))
+    finished = CliRunner().invoke(app, ["certify", str(tmp_path / "answer.g2o"), "--json"])
+    assert finished.exit_code == NOT_CERTIFIED
+    polished = json.loads(finished.stdout)["polished"]
+    assert polished["is_certified"]
+    assert 0.01 < polished["metres"] < 1.0
+    assert polished["gtsam_decrease"] < 1e-4
+
+
+def planar_slam_example(spread: float = 1.0) -> tuple[Any, Any]:
+    """GTSAM's PlanarSLAMExample without noise, with standard deviations larger by a factor."""
+
+    def spread_sigmas(*values: float) -> Any:
+        return sigmas(*(spread * value for value in values))
+
+    factors = gtsam.NonlinearFactorGraph()
+    prior = spread_sigmas(0.3, 0.3, 0.1)
+    factors.add(gtsam.PriorFactorPose2(x(1), gtsam.Pose2(0, 0, 0), prior))
+    odometry = spread_sigmas(0.2, 0.2, 0.1)
+    for k in (1, 2):
+        factors.add(gtsam.BetweenFactorPose2(x(k), x(k + 1), gtsam.Pose2(2, 0, 0), odometry))
+    landmarks = [int(gtsam.symbol("l", k)) for k in (4, 5)]
+    sights = [(1, 0, 45.0, np.sqrt(8.0)), (2, 0, 90.0, 2.0), (2, 1, 45.0, np.sqrt(8.0))]
+    for pose, landmark, degrees, distance in [*sights, (3, 1, 90.0, 2.0)]:
+        bearing = gtsam.Rot2.fromDegrees(degrees)
+        noise = spread_sigmas(0.1, 0.2)
+        key = landmarks[landmark]
+        factors.add(gtsam.BearingRangeFactor2D(x(pose), key, bearing, distance, noise))
+    values = gtsam.Values()
+    for k, guess in enumerate([(-0.25, 0.2, 0.15), (2.3, 0.1, -0.2), (4.1, 0.1, 0.1)], 1):
+        values.insert(x(k), gtsam.Pose2(*guess))
+    for key, point in zip(landmarks, ((1.8, 2.1), (4.1, 1.8)), strict=True):
+        values.insert(key, gtsam.Point2(*point))
+    return factors, values
+
+
+def test_the_answer_of_planar_slam_without_noise_is_exact() -> None:
+    factors, values = planar_slam_example()
+    found = optimised(factors, values)
+    graph = pgo.from_gtsam(factors, found)
+    certificate = solvers.certify(graph, graph.initial)
+    assert 1e-16 < certificate.objective < 1e-12
+    assert certificate.verdict is pgo.Verdict.EXACT
+    assert graph.num_robots == 1  # a letter of landmarks is no robot
+
+
+def test_poses_that_cost_nothing_because_nothing_has_weight_are_not_exact() -> None:
+    factors, values = planar_slam_example(spread=1e8)
+    graph = pgo.from_gtsam(factors, values)
+    certificate = solvers.certify(graph, graph.initial)
+    assert certificate.objective < 1e-12
+    assert not certificate.is_certified
+
+
+def test_empty_slots_are_skipped_and_the_world_is_the_last_pose() -> None:
+    factors, values = planar_slam_example()
+    factors.add(gtsam.BetweenFactorPose2(x(1), x(3), gtsam.Pose2(4, 0, 0), sigmas(0.2, 0.2, 0.1)))
+    factors.remove(1)
+    graph = pgo.from_gtsam(factors, optimised(factors, values))
+    solution = solvers.solve(graph)
+    keys = graph.pose_ids[graph.in_files]
+    assert sorted(keys.tolist()) == sorted(values.keys())
+    assert graph.in_files.tolist() == list(range(len(keys)))
+    assert solution.verdict is pgo.Verdict.EXACT
