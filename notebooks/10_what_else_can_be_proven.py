@@ -248,8 +248,9 @@ print(nearest.verdict.name, f"gap {nearest.gap:.0e}; differs from U V^T by {erro
 # 2. **Equations that say too little.** The two columns $X$ with the least
 #    $\operatorname{tr}(X^\top C X N)$, $N = \operatorname{diag}(1, 2)$, are eigenvectors of $C$ (Brockett), and the
 #    runs find them. But the equations of $X^\top X = I$ in six dimensions do not say
-#    $X X^\top \preceq I$, and without it nothing better than $J \ge 0$ follows. The answer is
-#    right, and not proven.
+#    $X X^\top \preceq I$, and without it nothing better than $J \ge 0$ follows. The multiplier
+#    of this inequality, a positive semidefinite matrix, is that of sorting the eigenvalues: the
+#    library knows it in closed form, and has the proof.
 
 # %%
 points = rng.standard_normal((40, 3))
@@ -347,4 +348,4 @@ with NamedNumbers():
     assert errors[1] < 1.0 < errors[0]
     assert 0.0 < robust.gap < 1.0
     assert np.isclose(brockett.objective, known)
-    assert not brockett.is_certified
+    assert brockett.is_certified

@@ -14,19 +14,13 @@ every positive semidefinite P (Anstreicher, *Kronecker product constraints*, 201
 space give one of side 16, that of q x q'.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, UnitRows
 from pgo_models.convex.quadratic_form import Block, QuadraticForm
-from pgo_models.convex.set_equations import (
-    ONE,
-    HullProduct,
-    SetEquations,
-    Terms,
-    entries_of_terms,
-)
+from pgo_models.convex.set_equations import ONE, SetEquations, Terms
 from pgo_models.graphs.pose_graph import IntArray
 
 # All products together have at most so many entries above and on their diagonals: those of six
@@ -116,26 +110,10 @@ def with_hull_products(form: QuadraticForm, equations: SetEquations) -> SetEquat
     if not pairs:
         return None
     products = []
-    terms: list[Terms] = []
     for first, second in pairs:
-        start = equations.number + len(terms)
-        side = first.side * second.side
         of = ((first.block, first.part), (second.block, second.part))
-        products.append(HullProduct(of, start, side))
-        terms += _product_terms(first, second)
-    k, i, j, entries = entries_of_terms(form.side, terms)
-    none = np.zeros(len(terms))
-    return replace(
-        equations,
-        number=equations.number + len(terms),
-        k=np.concatenate([equations.k, equations.number + k]),
-        i=np.concatenate([equations.i, i]),
-        j=np.concatenate([equations.j, j]),
-        entries=np.concatenate([equations.entries, entries]),
-        penalty=np.concatenate([equations.penalty, none]),
-        norms=np.concatenate([equations.norms, none]),
-        products=tuple(products),
-    )
+        products.append((of, first.side * second.side, _product_terms(first, second)))
+    return equations.with_products(products)
 
 
 def _pairs(hulls: list[Hull]) -> list[tuple[Hull, Hull]]:

@@ -31,8 +31,10 @@ _DEFINITE = 1e-13  # what is added to P, as a share of its largest eigenvalue
 _DAMPING = 1e-14  # of the normal equations, as a share of their diagonal
 
 
-def closed_form_multipliers(form: QuadraticForm, equations: SetEquations, u: Array) -> Array:
-    """Multipliers of the basic equations alone with S u nearest to 0.
+def closed_form_multipliers(
+    form: QuadraticForm, equations: SetEquations, u: Array, further: Array | None = None
+) -> Array:
+    """Multipliers of the basic equations, beside given further ones, with S u nearest to 0.
 
     For X^T X = I they are sym(X^T G) / 2, with the gradient G of J. Equalities have a multiplier,
     too, and a penalty.
@@ -43,7 +45,7 @@ def closed_form_multipliers(form: QuadraticForm, equations: SetEquations, u: Arr
     columns = equations.times(u)[free][:, used]
     normal = csc_array(columns.T @ columns)
     normal = csc_array(normal + diags_array(_DAMPING * normal.diagonal() + 1e-300))
-    multipliers = np.zeros(equations.number)
+    multipliers = np.zeros(equations.number) if further is None else further.copy()
     for _ in range(2):  # the second is for the rounding of the first
         left = residual - equations.combined(multipliers) @ u
         multipliers[used] += splu(normal).solve(columns.T @ left[free])

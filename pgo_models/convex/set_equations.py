@@ -12,7 +12,7 @@ at most J on the sets.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array
@@ -34,8 +34,9 @@ class HullProduct:
 
     Parameters
     ----------
-    of : pair of (int, int)
-        Of both hulls, the position of the variable and its column or row.
+    of : one or two of (int, int)
+        Of both hulls, the position of the variable and its column or row. One alone is that of
+        W = I - X X^T, of a variable X with orthonormal columns.
     start : int
         The k of the first entry of P. Those of its upper triangle follow, row by row, and the
         other triangle is counted with them.
@@ -43,7 +44,7 @@ class HullProduct:
         Of P and W.
     """
 
-    of: tuple[tuple[int, int], tuple[int, int]]
+    of: tuple[tuple[int, int], ...]
     start: int
     side: int
 
@@ -126,6 +127,29 @@ class SetEquations(ReadOnly):
         """The columns A_k u, (N, number)."""
         data = self.entries * u[self.j]
         return csc_array(coo_array((data, (self.i, self.k)), shape=(self.side, self.number)))
+
+    def with_products(
+        self, products: Sequence[tuple[tuple[tuple[int, int], ...], int, list[Terms]]]
+    ) -> "SetEquations":
+        """The equations, and after them those of products: `of`, side and W's upper triangle."""
+        hull_products = []
+        terms: list[Terms] = []
+        for of, side, its_terms in products:
+            hull_products.append(HullProduct(of, self.number + len(terms), side))
+            terms += its_terms
+        k, i, j, entries = entries_of_terms(self.side, terms)
+        none = np.zeros(len(terms))
+        return replace(
+            self,
+            number=self.number + len(terms),
+            k=np.concatenate([self.k, self.number + k]),
+            i=np.concatenate([self.i, i]),
+            j=np.concatenate([self.j, j]),
+            entries=np.concatenate([self.entries, entries]),
+            penalty=np.concatenate([self.penalty, none]),
+            norms=np.concatenate([self.norms, none]),
+            products=(*self.products, *hull_products),
+        )
 
     def terms(self, multipliers: Array, u: Array) -> Array:
         """The terms of sum l_k u^T A_k u, of at most four factors each."""

@@ -11,13 +11,14 @@ have orthonormal columns, are a rotation, or have unit columns or rows.
 entries of z. With any multipliers l_k of equations q_k that hold on the sets (columns and, of a
 square matrix, rows are orthonormal; in SO(3) a column is the cross product of the two others),
 
-    L(v) = objective - sum_k l_k q_k - sum_j <P_j, H_j x H'_j>,
+    L(v) = objective - sum_k l_k q_k - sum_j <P_j, W_j>,
 
-is a quadratic function of the entries v that are left, and at most the objective on the sets. H and
-H' are matrices, affine in a variable, that are positive semidefinite on its set (`hull`), and so is
-their Kronecker product; P_j has to be, which is shown as the following is. The minimum of L over
-all v is a lower bound. The square is completed entry by entry: where all pivots are positive (or a
-whole row of zeros), the constant that remains is that minimum.
+is a quadratic function of the entries v that are left, and at most the objective on the sets. W is
+positive semidefinite on the sets: the Kronecker product of two matrices, affine in a variable, that
+are so (`hull`), or I - X X^T of X with orthonormal columns. P_j has to be, too, which is shown as
+the following is. The minimum of L over all v is a lower bound. The square is completed entry by
+entry: where all pivots are positive (or a whole row of zeros), the constant that remains is that
+minimum.
 
 **A variable that is held.** The objective and the sets may stay as they are when all variables are
 turned together. Then one of them may be taken to be the identity (`held_entries`).
@@ -26,7 +27,7 @@ All is done in rational numbers, without any rounding. Nothing outside `pgo_mode
 imported but `pgo_models.errors`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ BITS = 128  # of the ball that the bound, a rational number, is printed as
 ONE = -1  # stands for the constant among the entries of z
 Affine = dict[int, fmpq]
 Quadratic = dict[int, dict[int, fmpq]]
+# Side of a matrix W, and products of affine functions whose sum is an entry of it.
+Products = tuple[int, Callable[[int, int], list[tuple[Affine, Affine]]]]
 
 
 def verify_model(path: Path) -> Verification:
@@ -194,21 +197,48 @@ def objective(record: dict[str, Any], solved: dict[int, Affine]) -> Quadratic:
 def subtract_product(
     L: Quadratic, solved: dict[int, Affine], variables: list[dict[str, Any]], record: dict[str, Any]
 ) -> bool:
-    """Subtract <P, H x H'>, and say whether P is positive semidefinite."""
+    """Subtract <P, W>, and say whether P is positive semidefinite."""
+    side, W = outside(variables, record) if len(record["of"]) == 1 else hulls(variables, record)
+    entries = list(reversed(record["P"]))
+    P: Quadratic = {}
+    for row in range(side):
+        for column in range(row, side):
+            value = exact(float(entries.pop()))
+            P.setdefault(row, {})[column] = P.setdefault(column, {})[row] = value
+            for first, second in W(row, column):
+                factor = -value * (1 if row == column else 2)
+                add_product(L, substituted(solved, first), substituted(solved, second), factor)
+    return least_value(P) is not None
+
+
+def outside(variables: list[dict[str, Any]], record: dict[str, Any]) -> Products:
+    """I - X X^T of a variable with orthonormal columns."""
+    ((place, _),) = record["of"]
+    variable = variables[place]
+    if not set(variable["sets"]) <= {"rotation", "orthonormal"}:
+        raise ValueError("a product of a variable whose columns are not orthonormal")
+    n, p = (int(size) for size in variable["shape"])
+    first = int(variable["first"])
+
+    def entry(a: int, b: int) -> list[tuple[Affine, Affine]]:
+        unit = [({ONE: fmpq(1)}, {ONE: fmpq(1)})] if a == b else []
+        columns = range(first, first + n * p, n)
+        return unit + [({k + a: fmpq(-1)}, {k + b: fmpq(1)}) for k in columns]
+
+    return n, entry
+
+
+def hulls(variables: list[dict[str, Any]], record: dict[str, Any]) -> Products:
+    """The Kronecker product of two hulls."""
     (first, part), (second, other_part) = record["of"]
     side, H = hull(variables[first], part)
     other_side, other_H = hull(variables[second], other_part)
-    entries = list(reversed(record["P"]))
-    P: Quadratic = {}
-    for row in range(side * other_side):
-        for column in range(row, side * other_side):
-            value = exact(float(entries.pop()))
-            P.setdefault(row, {})[column] = P.setdefault(column, {})[row] = value
-            of_first = H.get((row // other_side, column // other_side), {})
-            of_second = other_H.get((row % other_side, column % other_side), {})
-            factor = -value * (1 if row == column else 2)
-            add_product(L, substituted(solved, of_first), substituted(solved, of_second), factor)
-    return least_value(P) is not None
+
+    def entry(a: int, b: int) -> list[tuple[Affine, Affine]]:
+        of_first = H.get((a // other_side, b // other_side), {})
+        return [(of_first, other_H.get((a % other_side, b % other_side), {}))]
+
+    return side * other_side, entry
 
 
 def equalities(record: dict[str, Any]) -> Iterable[Affine]:

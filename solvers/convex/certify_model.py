@@ -1,9 +1,9 @@
 """Certify values of a quadratic model: the bound of closed-form multipliers, or of the relaxation.
 
-The bound is proven at the stationary point beside the values. Where closed-form multipliers do not
-give the gap, the relaxation is solved, if the model is small, and where that leaves a gap, the
-relaxation with products of hulls. Their points, projected, are more candidates, and their
-multipliers, moved to the best candidate, give the bound.
+The bound is proven at the stationary point beside the values. Where closed-form multipliers of
+columns do not give the gap, those of columns and rows are tried, then the relaxation, if the model
+is small, and where that leaves a gap, the relaxation with products of hulls. Their points,
+projected, are more candidates, and their multipliers, moved to the best candidate, give the bound.
 """
 
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import cvxpy as cp
 
 from pgo_models.certificates.certificate import DEFAULT_GAP
+from pgo_models.convex.assignment import assignment_multipliers
 from pgo_models.convex.convex_solver import solve_compiled
 from pgo_models.convex.gauge import with_gauge_held
 from pgo_models.convex.hull_bound import prove_hull_bound
@@ -83,6 +84,11 @@ def best_bound(
     search = _Search(newton, newton.polish(u) if newton.is_possible else u, gap)
     closed = closed_form_multipliers(form, equations, search.best)
     search.add(prove_model_bound(form, equations, closed, search.best))
+    sorted_both = None if search.is_done else assignment_multipliers(form, equations)
+    if sorted_both is not None:
+        with_rows, further = sorted_both
+        both = closed_form_multipliers(form, with_rows, search.best, further)
+        search.add(best_model_bound(form, with_rows, both, search.best))
     if not search.is_done and form.num_constrained <= LARGEST:
         search.relax(equations)
         tighter = None if search.is_done else with_hull_products(form, equations)

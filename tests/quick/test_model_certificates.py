@@ -97,6 +97,52 @@ def test_products_of_hulls_certify_what_equations_do_not(
     assert "P of a product" in verified(products=negative).failure
 
 
+def of_known_least(name: str, size: int) -> tuple[pgo.OrthogonalProblem, float]:
+    """A model over the orthogonal group, or four columns, and its minimum in closed form."""
+    A, B = np.random.default_rng(5).standard_normal((2, size, size))
+    X = cp.Variable((size, 4 if name == "Brockett" else size))
+    if name == "Brockett":
+        weights = np.array([0.5, 1.0, 1.5, 2.5])
+        J = cp.sum_squares(A @ X @ np.diag(np.sqrt(weights)))
+        least = weights[::-1] @ np.linalg.eigvalsh(A.T @ A)[:4]
+    elif name == "assignment":
+        A, B = A + A.T, B + B.T
+        J = cp.sum_squares(A @ X - X @ B)
+        least = np.sum((np.linalg.eigvalsh(A) - np.linalg.eigvalsh(B)) ** 2)
+    else:
+        J = cp.sum_squares(A @ X - B)
+        least = np.sum(A**2) + np.sum(B**2) - 2.0 * np.linalg.norm(A.T @ B, "nuc")
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J)), orthogonal=[X]), least
+
+
+@pytest.mark.parametrize(
+    ("name", "size"), [("Brockett", 30), ("assignment", 11), ("Procrustes", 12)]
+)
+def test_columns_and_rows_certify_models_too_large_for_the_relaxation(name, size) -> None:
+    model, least = of_known_least(name, size)
+    solution = solvers.solve_orthogonal(model, 0)
+    assert solution.is_certified
+    assert solution.objective == pytest.approx(least, rel=1e-9)
+    assert solution.lower_bound <= least * (1.0 + 1e-12)
+
+
+@pytest.mark.parametrize("name", ["Brockett", "assignment", "Procrustes"])
+def test_multipliers_of_columns_and_rows_are_verified_exactly(name, tmp_path) -> None:
+    pytest.importorskip("flint")
+    path = tmp_path / "proof.json"
+    solution = solvers.solve_orthogonal(of_known_least(name, 5)[0], 0)
+    solution.save_proof(path)
+    assert pgo.verify_proof(path).is_verified
+    record = json.loads(path.read_text())
+    if name == "Brockett":
+        assert record["products"]  # I - X X^T
+        record["products"][0]["P"][0] = -1.0
+    else:
+        record["variables"][0]["multipliers"]["rows"][0] += 1e-3
+    path.write_text(json.dumps(record))
+    assert not pgo.verify_proof(path).is_verified
+
+
 def test_the_form_is_the_objective_with_the_best_free_variables() -> None:
     model = random_model(0, "rotations", (3, 3), 1)
     form = pgo.quadratic_form(model)
