@@ -42,6 +42,8 @@ _MOST_PATHS = 1_000_000
 _MOST_CYCLES = 40
 # Other paths between the same poses with which a path of two edges closes cycles of four.
 _PARTNERS = 3
+# Cycles from which on the scale of their errors is told.
+_FEW_CYCLES = 10
 # Mean of the noise on the weights of a tree: log 2, as between an edge whose votes all agree, and
 # one of which half do.
 _MEAN_NOISE = 0.7
@@ -52,10 +54,13 @@ _SEED = 0  # fixed, so that every solve is the same
 class Cycles:
     """Cycles of k edges each, `edges` (c, k), k = 3 or 4.
 
-    `agrees` (c,) says whether the motions along them compose to the identity within their errors.
+    `ratio` (c,) is the squared distance of the motions along them from the identity, in units of
+    the covariance claimed, over the quantile that right ones keep to; and `agrees` (c,) whether it
+    is within the scale of the errors.
     """
 
     edges: IntArray
+    ratio: Array
     agrees: BoolArray
 
     def votes(self, of_each: Array, num_edges: int) -> Array:
@@ -70,6 +75,7 @@ class Agreement:
 
     num_edges: int
     cycles: tuple[Cycles, ...]
+    dof: int  # degrees of freedom of the errors along a cycle
 
     @classmethod
     def of(cls, problem: PGOProblem, scale: float = 1.0) -> Agreement:
@@ -83,7 +89,7 @@ class Agreement:
         cycles = (walks.cycles_of_three(paths), walks.cycles_of_four(paths))
         m = problem.graph.num_edges
         few = (of_length[_few_of_each_edge(of_length % m, rng)] for of_length in cycles)
-        return cls(m, tuple(walks.judged(of_length, scale) for of_length in few))
+        return cls(m, tuple(walks.judged(of_length, scale) for of_length in few), walks.dof)
 
     @cached_property
     def shares(self) -> Array:
@@ -98,6 +104,18 @@ class Agreement:
         cycles have a wrong edge, and one of which nothing can be said has a half, about.
         """
         return self._shares([_least_of_others(self.shares[cycles.edges]) for cycles in self.cycles])
+
+    @cached_property
+    def noise(self) -> float:
+        """How many times their claim the squared errors are, by the cycles that agree best; or 0.
+
+        Most cycles may have a wrong edge, so that their tenth is taken for the tenth of chi^2.
+        """
+        ratios = np.concatenate([cycles.ratio for cycles in self.cycles])
+        if len(ratios) < _FEW_CYCLES:
+            return 0.0
+        of_right = scipy.special.chdtri(self.dof, [0.9, 1.0 - QUANTILE])
+        return float(np.quantile(ratios, 0.1) * of_right[1] / of_right[0])
 
     def trees(self, number: int) -> Iterator[Array]:
         """Weights of the edges, (m,): trees of least weight have edges that others agree with.
@@ -165,6 +183,12 @@ class _Walks:
         """Number of edges, m."""
         return len(self.begins) // 2
 
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom of the errors of a motion."""
+        d = self.motions[1].shape[1]
+        return tangent_dimension(d) + (d if self.has_translations else 0)
+
     def back(self, steps: IntArray) -> IntArray:
         """The inverse of each step."""
         return np.where(steps < self.num_edges, steps + self.num_edges, steps - self.num_edges)
@@ -220,10 +244,9 @@ class _Walks:
     def judged(self, cycles: IntArray, scale: float) -> Cycles:
         """Cycles of steps, (c, k), as edges, and whether they agree."""
         motion, covariance = self._along(cycles)
-        d = motion[1].shape[1]
-        dof = tangent_dimension(d) + d * self.has_translations
-        allowed = scale * float(scipy.special.chdtri(dof, 1.0 - QUANTILE))
-        return Cycles(cycles % self.num_edges, squared_distances(motion, covariance) <= allowed)
+        allowed = scipy.special.chdtri(self.dof, 1.0 - QUANTILE)
+        ratio = squared_distances(motion, covariance) / allowed
+        return Cycles(cycles % self.num_edges, ratio, ratio <= scale)
 
     def _along(self, cycles: IntArray) -> tuple[Motions, Array]:
         """Motions along cycles of steps, (c, k), and their covariances."""

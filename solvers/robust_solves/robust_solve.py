@@ -16,6 +16,7 @@ from pgo_models.errors import FAILURES, GraphError, SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import BoolArray, tangent_dimension
 from pgo_models.problem.initialization import chordal_start
+from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
 from solvers.carry.ledger import Ledger
 from solvers.place import is_open
@@ -85,6 +86,8 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
        whether it is certified or not. Newton and all further steps of the pipeline
        (`solvers.plan`) solve for the edges kept.
+       Where it is doubtful, and errors along short cycles are larger than the matrices claim, it is
+       sought with matrices that claim as much (`answer_with_larger_errors`).
     4. Verdict. `Rejection` says what supports these edges.
 
     The solves of steps 1 to 3 are made at the place of the request, here or by robots, whose
@@ -104,7 +107,8 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     ending = job.make_attempts(robust)
     if ending not in OUT_OF_TIME:
         job = job.with_odometry_doubted(robust)
-    return job.answer_by_attempts(ending)
+    answer = job.answer_by_attempts(ending)
+    return job.answer_with_larger_errors(answer, robust) or answer
 
 
 def go_on_robustly(
@@ -474,6 +478,53 @@ class _RobustSolve:
         solution = replace(solution, stages=(*stages, *solution.stages), status=status)
         return self._result(solution, chosen.kept, chosen.scale, chosen.attempt.name)
 
+    def answer_with_larger_errors(self, answer: Solution, settings: GNC) -> Solution | None:
+        """The solution of the edges that fit each other if all errors are larger than claimed.
+
+        Matrices may say how edges compare, and not how large errors are: those of Open3D count
+        points. So the edges are looked for with matrices that claim the errors of short cycles
+        (`Agreement.noise`). The answer is one if most closures fit, and costs are as alike as those
+        of right edges; it is None elsewhere, and where the first answer is certified, or rests on
+        odometry that nobody has named.
+        """
+        if answer.is_certified or self.known.is_claim or self.doubted.is_large:
+            return None
+        problem = self.doubted.problem
+        noise = Agreement.of(problem).noise
+        is_open = answer.status not in OUT_OF_TIME and self.start is None
+        if not (is_open and noise > LARGEST_SCALE):
+            return None
+
+        def keeps_most(rejection: Rejection) -> bool:
+            return bool(rejection.kept[~self.doubted.known].mean() >= 0.5)
+
+        request = replace(self.places.request, problem=_with_larger_errors(problem, noise))
+        try:
+            scaled = solve_robustly(settings, request)
+            rejection = scaled.robust
+            if rejection is None or not (scaled.is_certified and keeps_most(rejection)):
+                return None
+            solution = self.places.solution(rejection.kept, scaled.poses)
+        except FAILURES:  # the answer stands
+            return None
+        residuals = solution.edge_residuals
+        is_even = float(np.median(residuals.cost)) >= _EVEN * float(residuals.cost.mean())
+        if not is_even or residuals.overall <= LARGEST_SCALE:
+            return None
+        rejection = replace(
+            rejection,
+            problem=problem,
+            cost=noise * rejection.cost,
+            attempts=tuple(replace(a, cost=noise * a.cost) for a in rejection.attempts),
+            verdict=solution.certificate.verdict,
+            fit=solution.certificate.fit,
+            noise=residuals.overall,
+            is_misfit=False,
+        )
+        stages = (*answer.stages, *scaled.stages, *solution.stages)
+        seconds = time.perf_counter() - self.began
+        return replace(solution, robust=rejection, stages=stages, seconds=seconds)
+
     def _finished(self, cheapest: Estimate) -> Estimate:
         """The cheapest attempt, to which edges come back that are likely right.
 
@@ -552,3 +603,16 @@ class _RobustSolve:
         seconds = time.perf_counter() - self.began
         note = joined_notes(solution.note, *self.failures)
         return replace(solution, robust=rejection, ledger=ledger, seconds=seconds, note=note)
+
+
+def _with_larger_errors(problem: PGOProblem, noise: float) -> PGOProblem:
+    """The problem with squared errors so many times those that its matrices claim."""
+    graph = problem.graph
+    information = graph.information
+    scaled = replace(
+        graph,
+        kappa=graph.kappa / noise,
+        tau=graph.tau / noise,
+        information=None if information is None else information / noise,
+    )
+    return PGOProblem(scaled, problem.backend, problem.weighting)
