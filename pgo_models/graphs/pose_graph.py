@@ -696,6 +696,28 @@ class PoseGraph(ReadOnly):
 
         return sorted(parts, key=largest_then_first)
 
+    def parts(self) -> list[IntArray]:
+        """Return the poses of every part that is solved on its own, the largest part first.
+
+        Parts are the components, but for priors of rotations alone, which tie no positions: where
+        nothing else joins two parts, each has the world of its priors.
+
+        Returns
+        -------
+        list of IntArray
+            Poses of every part, ascending.
+        """
+        ties = ~self.is_prior | (self.tau > 0.0)
+        if ties.all() or not self.has_translations:
+            return self.components()
+        of_world = np.array([self.world])
+        parts = [part for part in self.components(ties) if not np.array_equal(part, of_world)]
+        with_priors = self.j[self.is_prior]
+        return [
+            np.union1d(part, of_world) if np.isin(part, with_priors).any() else part
+            for part in parts
+        ]
+
     @property
     def is_connected(self) -> bool:
         """Whether every pose can be reached from every other along edges."""
@@ -753,7 +775,7 @@ class PoseGraph(ReadOnly):
 
     def _check_one_component(self) -> None:
         """Raise a GraphError that names the components where there are several."""
-        parts = self.components()
+        parts = self.parts()
         alone = [part[0] for part in parts[1:] if len(part) == 1]
         if alone and len(alone) == len(parts) - 1:
             first = self.pose_name(alone[0])

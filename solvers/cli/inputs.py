@@ -221,7 +221,7 @@ def with_estimated_noise(graph: PoseGraph) -> PoseGraph:
 
 def _largest_component(graph: PoseGraph) -> PoseGraph:
     """The largest component of a graph; a GraphWarning says what is left out."""
-    largest, *others = graph.components()
+    largest, *others = graph.parts()
     if not others:
         return graph
     part = graph.subgraph(largest)
@@ -237,7 +237,7 @@ def components_of(graph: PoseGraph) -> list[PoseGraph]:
 
     A GraphWarning says how many poses have no edges.
     """
-    parts = graph.components()
+    parts = graph.parts()
     with_edges = [part for part in parts if len(part) > 1]
     num_alone = len(parts) - len(with_edges)
     if num_alone:

@@ -23,7 +23,7 @@ def describe_graph(graph: PoseGraph, indefinite: str = "") -> list[tuple[str, st
     if is_indefinite.any() and not indefinite:
         indefinite = text_of_indefinite(graph, is_indefinite)
     rows = graph.facts()
-    components = graph.components()
+    components = graph.parts()
     sizes = ", ".join(str(len(part)) for part in components[:_SHOWN_COMPONENTS])
     degree = np.bincount(np.concatenate([graph.i, graph.j]), minlength=graph.num_poses)
     degrees = f"{degree.min()} to {degree.max()}, mean {degree.mean():.2f}"
@@ -51,7 +51,9 @@ def _cost_facts(graph: PoseGraph, has_chi2: bool) -> list[tuple[str, str]]:
             for convention in Chi2Convention:
                 cost = rounded_up(chi2(graph, estimate, convention), 8)
                 rows.append((f"chi2, {convention.name.lower()}", cost))
-    rows.append((f"{name}, tree", rounded_up(problem.objective(spanning_tree_start(graph)), 8)))
+    rows.append(
+        (f"{name}, tree", rounded_up(problem.objective(spanning_tree_start(problem.graph)), 8))
+    )
     rows.append((f"{name}, chordal", rounded_up(problem.objective(chordal_start(problem)), 8)))
     return rows
 

@@ -403,6 +403,24 @@ def test_every_component_is_solved_when_asked(pgo_command: Call, tmp_path: Path)
     assert read_g2o(tmp_path / "map.2.g2o").pose_ids.tolist() == [7, 8, 9]
 
 
+def test_parts_with_headings_alone_are_solved_apart(pgo_command: Call, tmp_path: Path) -> None:
+    """A compass joins two parts through the world, and ties no position."""
+    case = CASES / "a6_compass_2d.g2o"
+    lines = [line.split() for line in case.read_text().splitlines() if line[:1] in "VE"]
+    for tag, *words in lines.copy():
+        count = 2 if tag == "EDGE_SE2" else 1
+        ids = [str(int(word) + 1000) for word in words[:count]]
+        lines.append([tag, *ids, *words[count:]])
+    path = tmp_path / "two.g2o"
+    path.write_text("\n".join(map(" ".join, lines)))
+    code, out, _ = pgo_command("solve", path, "--all-components")
+    assert code == 0
+    assert out.count("the position of the map is free") == 2
+    assert out.count("4.563456161") >= 2
+    assert pgo_command("info", case)[0] == 0
+    assert "2 components" in pgo_command("solve", path)[2]
+
+
 def test_measurements_without_a_cycle_are_said_to_check_nothing(
     pgo_command: Call, tmp_path: Path
 ) -> None:
