@@ -43,9 +43,16 @@ def run_command(app: typer.Typer, arguments: list[str]) -> int:
     """Run a command, and return its exit code.
 
     An error is printed on stderr as one line, or a line for each wrong line of a file; a warning
-    is one line.
+    is one line, which is printed once although a file is read twice.
     """
-    warnings.showwarning = _show_warning
+    seen: set[str] = set()
+
+    def show_warning(message: Warning | str, *_: object, **__: object) -> None:
+        if (text := shown(str(message))) not in seen:
+            seen.add(text)
+            print(f"pgo: warning: {text}", file=sys.stderr)
+
+    warnings.showwarning = show_warning
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             # Characters that the terminal cannot show are escaped.
@@ -54,10 +61,6 @@ def run_command(app: typer.Typer, arguments: list[str]) -> int:
     if message:
         print(f"pgo: {shown(message)}", file=sys.stderr)
     return code
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"pgo: warning: {shown(str(message))}", file=sys.stderr)
 
 
 def shown(message: str) -> str:
