@@ -42,7 +42,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.html_tables import facts_table
-from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.problem import PGOProblem, as_problem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
 from pgo_models.problem.weighting import Weighting, name_of_cost
 
@@ -378,7 +378,7 @@ def certify_at(
     Raises
     ------
     SettingError
-        Unless the gap is positive and finite.
+        Unless the gap is positive and finite, or for a tangent (`PGOProblem.tangent_at`).
     GraphError
         When the poses do not fit the graph.
 
@@ -391,6 +391,7 @@ def certify_at(
     >>> bool(0 < certificate.lower_bound <= certificate.objective)
     True
     """
+    problem = as_problem(problem)
     check_poses(problem.graph, poses)
     poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
     if problem.graph.has_far_priors:

@@ -23,7 +23,7 @@ from pgo_models.problem.cholesky import (
     SymbolicCholesky,
     analyze,
 )
-from pgo_models.problem.costs import EdgeCost, EdgePoint, rotation_cost
+from pgo_models.problem.costs import EdgeCost, EdgePoint, TangentCost, rotation_cost
 from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.ordering import most_counts, pose_order, row_order
 from pgo_models.problem.right_costs import RightCosts
@@ -801,5 +801,14 @@ class _SameGraph(_SamePattern):
 
 
 def as_problem(given: PGOProblem | PoseGraph) -> PGOProblem:
-    """Return the problem that is given, or that of the graph that is given."""
-    return given if isinstance(given, PGOProblem) else PGOProblem(given)
+    """Return the problem that is given, or that of the graph that is given.
+
+    A SettingError for a tangent, whose values may be negative: zero bounds chi2, and not it.
+    """
+    problem = given if isinstance(given, PGOProblem) else PGOProblem(given)
+    if isinstance(problem.weighting, TangentCost):
+        raise SettingError(
+            f"{problem!r} is a tangent, a lower bound on chi2 and not a cost of its own; "
+            "give the problem that it is a tangent of"
+        )
+    return problem

@@ -25,7 +25,7 @@ from pgo_models.certificates.rounding_errors import (
     objective_rounding,
 )
 from pgo_models.certificates.shrunk_information import shrink_information
-from pgo_models.errors import GraphError
+from pgo_models.errors import GraphError, SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.precisions import are_definite, proper_information, uncoupled_share
@@ -433,3 +433,14 @@ def test_the_bound_is_one_on_the_geodesic_cost_too(d: int) -> None:
     graph = informed(0, 12, d, coupled=False, spread=0.5)
     solution = solvers.solve(of_file(graph), progress=False)
     assert solution.lower_bound <= chi2(graph, solution.poses, Chi2Convention.GEODESIC)
+
+
+def test_nothing_is_certified_of_a_tangent_whose_values_may_be_negative() -> None:
+    problem = of_file(informed(0, 6, 2, True, 2.0))
+    poses = random_poses(6, 2, 0)
+    tangent = problem.tangent_at(poses)
+    others = (random_poses(6, 2, seed) for seed in range(20))
+    assert min(tangent.objective(other) for other in others) < 0.0
+    for judge in (solvers.solve, certify, certify_at):
+        with pytest.raises(SettingError, match="is a tangent, a lower bound on chi2"):
+            judge(tangent) if judge is solvers.solve else judge(tangent, poses)
