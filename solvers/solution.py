@@ -155,6 +155,13 @@ class Solution:
         return self.edge_residuals.overall
 
     @property
+    def fit_text(self) -> str:
+        """How the edges fit in the cost solved; "" where the verdict or a robust solve says so."""
+        if self.robust is not None or self.certificate.fit.is_exact:
+            return ""
+        return fit_row(self.edge_residuals)
+
+    @property
     def is_doubtful(self) -> bool:
         """Whether edges fit worse than their weights allow, one by one or together.
 
@@ -432,8 +439,8 @@ class Solution:
             ("gap", certificate.gap_text),
             ("verdict", self._verdict_text()),
         ]
-        if self._fit_text():
-            facts.append(("fit", self._fit_text()))
+        if self.fit_text:
+            facts.append(("fit", self.fit_text))
         if self.robust is not None:
             facts += self.robust.facts()
         if self.note:
@@ -449,12 +456,6 @@ class Solution:
         if self.robust is None and self.is_certified and self.is_doubtful:
             text += ", of measurements that do not fit"
         return text + verdict_suffix(len(self.problem.graph.absent))
-
-    def _fit_text(self) -> str:
-        """How the edges fit; empty where the verdict or a robust solve says so."""
-        if self.robust is not None or self.certificate.fit.is_exact:
-            return ""
-        return fit_row(self.edge_residuals)
 
     def _network_facts(self) -> Facts:
         """What is printed of robots and of what they sent."""

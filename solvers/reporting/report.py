@@ -28,7 +28,7 @@ from pgo_models.plots.style import plotly
 from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.carry.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
-from solvers.reporting.edge_fit import Advice, EdgeFit, fit_row, judge_edges
+from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
 from solvers.reporting.fit_plots import explore_fit
 from solvers.reporting.report_text import (
     Solved,
@@ -126,8 +126,8 @@ def report_page(solution: Solved, *, source: str | None = None, fit: EdgeFit | N
     content = {
         "headline": headline(certificate) if robust is None else robust_headline(robust),
         "verdict": certificate.verdict if robust is None else robust.standing,
-        "fit": "" if robust is not None or certificate.fit.is_exact else fit_row(fit.suspected),
-        "is_doubtful": robust is None and fit.suspected.is_doubtful,
+        "fit": solution.fit_text,
+        "is_doubtful": robust is None and solution.is_doubtful,
         "meaning": meaning(certificate),
         "ate": _trajectory_error(solution, graph),
         "advice": _advice(solution, graph, fit, source),

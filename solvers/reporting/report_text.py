@@ -89,6 +89,14 @@ class Solved(Protocol):
     def edge_residuals(self) -> EdgeResiduals:
         """How well every edge fits the poses, in the cost that was solved."""
 
+    @property
+    def fit_text(self) -> str:
+        """How the edges fit in that cost; "" where the verdict or a robust solve says so."""
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether edges fit worse than their weights allow."""
+
     def before(self) -> tuple[Poses, str]:
         """Poses before the solve, and what they are."""
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from graphs import informed
 from pages import Page, own_part
 
 import pgo_models as pgo
@@ -305,3 +306,15 @@ def test_a_map_without_absent_robots_is_first_advised_to_have_them():
 
 def judge_edges_of(graph):
     return judge_edges(pgo.PGOProblem(graph), graph.initial)
+
+
+def test_the_fit_is_that_of_the_cost_solved_as_it_is_printed() -> None:
+    """F of this graph is another multiple of what is expected than chi2 at its minimum."""
+    graph = informed(0, 20, 2, coupled=False, spread=2.0, noise=pgo.NoiseModel(1e-2, 1e-2))
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.ISOTROPIC)
+    solution = solvers.solve(problem)
+    fit = judge_edges(problem, solution.poses)
+    assert f"{fit.suspected.overall:.3g}" != f"{solution.fit_ratio:.3g}"
+    page = report_page(solution)
+    assert f"Fit: {solution.fit_text}." in page
+    assert ("of measurements that do not fit" in page) == solution.is_doubtful
