@@ -19,12 +19,11 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.residuals import check_poses
 from pgo_models.plots import graph_plots
+from pgo_models.plots.interactive_plots import Trace, layout_around
 from pgo_models.plots.style import COLOURS, QUIET_COLOUR, plotly
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
-
-Trace = dict[str, object]  # a plotly trace is plain data
 
 MOST_BYTES = 300_000  # of a film in a page, which stays quick to open with a few of them
 MOST_FRAMES = 24  # six seconds at `_FRAME_MILLISECONDS`
@@ -239,22 +238,7 @@ class GraphFrames:
 
     def layout(self) -> dict[str, object]:
         """Axes around all pictures, with equal scales."""
-        if len(self.lower) == 2:
-            margin = 0.04 * float((self.upper - self.lower).max())
-            x, y = np.stack([self.lower - margin, self.upper + margin], axis=1).tolist()
-            axis = {"zeroline": False, "gridcolor": "#eeeeee"}
-            return {
-                "xaxis": {**axis, "range": x, "title": {"text": "x (m)"}},
-                "yaxis": {**axis, "range": y, "scaleanchor": "x", "title": {"text": "y (m)"}},
-            }
-        middle = 0.5 * (self.lower + self.upper)
-        half = max(0.52 * float((self.upper - self.lower).max()), 1e-9)
-        # Seen from a little below the default, so that the titles of the axes are not cut off.
-        scene: dict[str, object] = {"aspectmode": "cube", "camera": {"center": {"z": -0.2}}}
-        for letter, centre in zip("xyz", middle.tolist(), strict=True):
-            limits = [centre - half, centre + half]
-            scene[f"{letter}axis"] = {"title": {"text": f"{letter} (m)"}, "range": limits}
-        return {"scene": scene}
+        return layout_around(self.lower, self.upper)
 
 
 def _lines_that_fit(graph: PoseGraph, t: Array, num_frames: int) -> IntArray:

@@ -303,33 +303,14 @@ def compare_poses(
     ['truth', 'start']
     """
     titled = [("", panels)] if isinstance(panels, Poses) else panels
-    row = [(title, graph, poses) for title, poses in titled]
-    return plot_panels([row], residuals)
-
-
-def plot_panels(
-    panels: list[list[tuple[str, PoseGraph, Poses]]], residuals: EdgeResiduals | None = None
-) -> Figure:
-    """Figure with a row of panels for every list of (title, graph, poses).
-
-    `residuals` are those of the last panel, whose edges are marked by them.
-    """
-    num_rows = len(panels)
-    num_columns = max(len(row) for row in panels)
-    with column_figure(height=1.0 * num_rows, width=num_columns) as figure:
-        for r, row in enumerate(panels):
-            is_last_row = r == num_rows - 1
-            for column, (title, graph, poses) in enumerate(row):
-                is_last = is_last_row and column == len(row) - 1
-                is_marked = is_last and residuals is not None
-                place = r * num_columns + column + 1
-                axes = _add_axes(figure, graph, num_rows, num_columns, place)
-                draw_graph(graph, poses, axes, is_marked, residuals if is_marked else None)
-                axes.set_title(title)
+    with column_figure(height=1.0, width=len(titled)) as figure:
+        for column, (title, poses) in enumerate(titled, 1):
+            axes = _add_axes(figure, graph, 1, len(titled), column)
+            is_marked = residuals is not None and column == len(titled)
+            draw_graph(graph, poses, axes, is_marked, residuals if is_marked else None)
+            axes.set_title(title)
         if residuals is not None:
-            _, graph, poses = panels[-1][-1]
-            kind = edge_kinds(graph, poses, residuals=residuals)
-            handles = _legend(graph, kind)
+            handles = _legend(graph, edge_kinds(graph, titled[-1][1], residuals=residuals))
             if handles:
                 figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure

@@ -114,7 +114,8 @@ def explore_graph(
     if covariances is not None:
         traces.append(_ellipses(poses[shown], covariances[shown]))
     figure = go.Figure(traces)
-    _arrange(figure, poses.t[shown], title)
+    lay_out(figure, title, legend_y=-0.12 if graph.d == 2 else 0.0)
+    figure.update_layout(**layout_around(poses.t[shown].min(axis=0), poses.t[shown].max(axis=0)))
     return figure
 
 
@@ -288,26 +289,22 @@ def _misfit_texts(graph: PoseGraph, edges: IntArray, residuals: EdgeResiduals) -
     return texts
 
 
-def _arrange(figure: Figure, points: Array, title: str) -> None:
-    """Set title, legend, and axes with equal scales around points, (k, d)."""
-    d = points.shape[1]
-    lay_out(figure, title, legend_y=-0.12 if d == 2 else 0.0)
-    lower = points.min(axis=0)
-    upper = points.max(axis=0)
+def layout_around(lower: Array, upper: Array) -> dict[str, object]:
+    """Axes with equal scales and their unit, from the lowest to the highest coordinates, (d,)."""
     extent = float((upper - lower).max())
-    if d == 2:
+    if len(lower) == 2:
         margin = 0.04 * extent
-        ranges = np.stack([lower - margin, upper + margin], axis=1)
-        x_range = list(ranges[0])
-        y_range = list(ranges[1])
-        style = {"zeroline": False, "gridcolor": "#eeeeee"}
-        figure.update_xaxes(title_text="x (m)", range=x_range, **style)
-        figure.update_yaxes(title_text="y (m)", range=y_range, scaleanchor="x", **style)
-        return
-    middle = (lower + upper) / 2
+        x, y = np.stack([lower - margin, upper + margin], axis=1).tolist()
+        axis = {"zeroline": False, "gridcolor": "#eeeeee"}
+        return {
+            "xaxis": {**axis, "range": x, "title": {"text": "x (m)"}},
+            "yaxis": {**axis, "range": y, "scaleanchor": "x", "title": {"text": "y (m)"}},
+        }
+    middle = 0.5 * (lower + upper)
     half = max(0.52 * extent, 1e-9)
+    # Seen from a little below the default, so that the titles of the axes are not cut off.
+    scene: dict[str, object] = {"aspectmode": "cube", "camera": {"center": {"z": -0.2}}}
     for letter, centre in zip("xyz", middle.tolist(), strict=True):
-        title_of_axis = {"text": f"{letter} (m)"}
-        axis = {"title": title_of_axis, "range": [centre - half, centre + half]}
-        figure.update_scenes({f"{letter}axis": axis})
-    figure.update_scenes(aspectmode="cube")
+        limits = [centre - half, centre + half]
+        scene[f"{letter}axis"] = {"title": {"text": f"{letter} (m)"}, "range": limits}
+    return {"scene": scene}

@@ -1,11 +1,10 @@
-"""Figures of the matrices: the spectrum of S near zero, and the sparsity of M and of its factor."""
+"""Figure of the spectrum of the certificate matrix S near zero."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csc_array
 from scipy.sparse.linalg import eigsh
 
 from pgo_models.certificates.certificate import Certificate
@@ -13,24 +12,14 @@ from pgo_models.certificates.spectrum import rotation_inverse, smallest_definite
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.plots.style import (
-    ALARM_COLOUR,
-    COLOURS,
-    QUIET_COLOUR,
-    SMALL_POINTS,
-    column_figure,
-    count_along_x,
-)
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, column_figure, count_along_x
 from pgo_models.problem.problem import PGOProblem
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _FIRST_SHIFT = 1e-6  # as a share of the mean diagonal entry of M
 _DENSE_SIDE = 200  # up to this side of S all eigenvalues are computed by a dense method
-_CELLS = 300  # along a side of the picture of a pattern
 
 
 def smallest_eigenvalues(problem: PGOProblem, Lambda: Array, count: int = 12) -> Array:
@@ -99,62 +88,3 @@ def plot_spectrum(problem: PGOProblem, certificate: Certificate, count: int = 12
         count_along_x(axes)
         figure.legend(loc="outside lower center", ncols=3, columnspacing=1.0, handletextpad=0.4)
     return figure
-
-
-def factor_of_M(problem: PGOProblem) -> tuple[csc_array, IntArray]:
-    """Cholesky factor L of M with its diagonal doubled, and the order of a solve.
-
-    M itself is singular; the pattern of its factor is the same.
-    """
-    data = problem.M.data.copy()
-    data[problem.diagonal_positions] *= 2.0
-    definite = problem.with_pattern_of_M(data)
-    return problem.analysis.lower_factor(definite)
-
-
-def plot_sparsity(problem: PGOProblem) -> Figure:
-    """Figure of the patterns of M, in the order of the poses, and of its Cholesky factor.
-
-    The entries of both and the fill-in are counted.
-    """
-    M = problem.M
-    L, _ = factor_of_M(problem)
-    fill_in = L.nnz - (M.nnz + problem.side) // 2
-    with column_figure(height=0.6) as figure:
-        left, right = figure.subplots(1, 2)
-        _draw_pattern(left, M)
-        _draw_pattern(right, L)
-        left.set_title(f"M, {problem.side} x {problem.side}\n{M.nnz:,} entries")
-        right.set_title(f"Cholesky factor\n{L.nnz:,} entries")
-        share = 100.0 * fill_in / L.nnz
-        figure.supxlabel(
-            f"fill-in: {fill_in:,} entries, {share:.0f} % of the factor", fontsize=SMALL_POINTS
-        )
-    return figure
-
-
-def _draw_pattern(axes: Axes, matrix: csc_array) -> None:
-    """Draw the number of stored entries in every cell, on a logarithmic scale.
-
-    While the matrix is small, a cell is an entry.
-    """
-    side = matrix.shape[0]
-    num_cells = min(side, _CELLS)
-    entries_of_column = np.diff(matrix.indptr)
-    columns = np.repeat(np.arange(side), entries_of_column)
-    cell_row = matrix.indices * num_cells // side
-    cell_column = columns * num_cells // side
-    cell = cell_row * num_cells + cell_column
-    counts_of_cells = np.bincount(cell, minlength=num_cells * num_cells)
-    counts = counts_of_cells.reshape(num_cells, num_cells)
-    shades = np.where(counts > 0, np.log1p(counts), np.nan)
-    darkest = float(np.nanmax(shades))
-    axes.imshow(
-        shades,
-        cmap="cividis_r",
-        extent=(0, side, side, 0),
-        interpolation="nearest",
-        vmin=-darkest,  # leaves out the lighter half of the colours, too faint for single cells
-    )
-    axes.set_xticks([0, side])
-    axes.set_yticks([0, side])

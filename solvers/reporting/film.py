@@ -13,7 +13,8 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.plots.films import GraphFrames, Trace, animate, frames_to_show
+from pgo_models.plots.films import GraphFrames, animate, frames_to_show
+from pgo_models.plots.interactive_plots import Trace
 from pgo_models.plots.style import COLOURS
 from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.problem import PGOProblem, as_problem

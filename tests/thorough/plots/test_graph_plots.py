@@ -17,7 +17,7 @@ from pgo_models.plots.graph_plots import (
     plot_against_truth,
     thinning_step,
 )
-from pgo_models.plots.matrix_plots import plot_sparsity, plot_spectrum
+from pgo_models.plots.matrix_plots import plot_spectrum
 from pgo_models.plots.style import save_figure
 from solvers.reporting.comparison_plots import plot_efforts
 from solvers.reporting.convergence_plots import Curve, plot_convergence
@@ -137,7 +137,6 @@ def test_figures_are_a_column_wide_and_readable_there(tmp_path):
         pgo.plot_graph(graph, graph.truth),
         plot_against_truth(graph, solution.poses),
         plot_spectrum(problem, solution.certificate),
-        plot_sparsity(problem),
         plot_decay([("half", 0.5 ** np.arange(5))], "error (m)"),
         plot_tightness([("circle", np.array([0.5, 1.0]), np.array([1.0, 0.5]))]),
         plot_convergence(stages, solution.lower_bound),
