@@ -25,6 +25,8 @@ from pgo_models.geometry.rotations import (
 # Words on a line of a view graph: i j, a quaternion or a rotation by rows, perhaps a translation.
 _QUATERNION_WORDS = (6, 9)
 _VIEW_WORDS = (*_QUATERNION_WORDS, 11, 14)
+_CLEARLY = 0.7  # share of a misfit that is better not only by chance
+_FAR = 1.0  # misfit of a cycle that has a wrong edge, or is read in the wrong order
 _NOT_UNIT = 1e-3  # of a quaternion or matrix that is no rotation
 _UNIT_ROTATION = " ".join(["0"] * 15 + ["1 0 0 1 0 1"])  # information of a rotation alone
 _NAMES_OF_FIRST = {"i", "from", "id1", "id_1", "id_a", "source", "src", "start", "pose_i"}
@@ -222,7 +224,7 @@ def _of_views(path: Path, text: str) -> str:
 def _are_transposed(rotations: dict[tuple[int, int], Array], by_default: bool) -> bool:
     """Whether cycles of three views fit R_jk R_ij = R_ik better than R_ij R_jk = R_ik.
 
-    Without cycles the default is returned.
+    The default is returned where they do not tell.
     """
     successors: dict[int, list[int]] = {}
     for i, j in rotations:
@@ -238,8 +240,11 @@ def _are_transposed(rotations: dict[tuple[int, int], Array], by_default: bool) -
                 misfits.append((float(direct), float(transposed)))
     if not misfits:
         return by_default
-    of_direct, of_transposed = np.median(misfits, axis=0)
-    return bool(of_transposed < of_direct)
+    # Right rotations that commute fit in both orders, and a wrong one fits in none.
+    of_direct, of_transposed = np.minimum(misfits, _FAR).sum(axis=0)
+    if by_default:
+        return not bool(of_direct < _CLEARLY * of_transposed)
+    return bool(of_transposed < _CLEARLY * of_direct)
 
 
 # Tables

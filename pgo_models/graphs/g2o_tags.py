@@ -166,7 +166,8 @@ class Tag:
             largest = precisions[:, :, None] * np.eye(2)
             everywhere = np.ones((len(numbers), 2, 2))
             error = entry_error(information, congruence_error(everywhere, largest))
-        return both(both(error, precision_error(information, self.d)), of_direction)
+        of_blocks = precision_error(information, min(self.d, self._side))
+        return both(both(error, of_blocks), of_direction)
 
     def with_translation_first(self, numbers: Array) -> Array:
         """Numbers on lines whose matrices have the rotation first, with the translation first.

@@ -3,7 +3,8 @@ files that this script writes itself, and the data files that GTSAM comes with (
 
     python tests/benchmarks/dialects.py [--seconds 60] [--gtsam] [FILE ..]
 
-Without arguments, small files of every form. With `--gtsam`, all files of GTSAM's folder `Data`;
+Without arguments, small files of every form, and factor graphs of GTSAM where it is installed. With
+`--gtsam`, all files of GTSAM's folder `Data`;
 else those that are named. A row has what the file holds, the verdict of `solve` and the proven gap,
 its CPU seconds, and what was assumed in reading, or why the file is refused. Of the files of this
 script it also has the reading that `pgo doctor` names. A solve ends after so many seconds at its
@@ -15,11 +16,13 @@ from __future__ import annotations
 import argparse
 import gzip
 import importlib.util
+import json
 import os
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -153,6 +156,8 @@ def partial_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, lis
     gravity = [f"EDGE_SE3_PRIOR {k} 0 {level} 900 0 0 900 0 0" for k in every_tenth]
     yield "gravity", [offset, *space, *gravity]
     up = "0 0 1 0.01 0.02 1 900 0 0 900 0 900"
+    level_fixes = [f"EDGE_SE3_PRIORXY {k} {' '.join(places[k][:2])} 4 0 4" for k in every_tenth]
+    yield "hdl_fixes_without_height", [*space, *level_fixes]
     yield "gravity_vectors", [*space, *(f"EDGE_SE3_PRIORVEC {k} {up}" for k in every_tenth)]
     compass = [f"EDGE_PRIOR_SE2 {k} 0 0 0 0 0 0 0 0 2500" for k in range(0, 60, 30)]
     yield "compass", [*plane, *compass]
@@ -177,6 +182,11 @@ def exported_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, li
     yield "table", [header, *(",".join(words) for words in edges)]
     cameras = changed(changed(space, with_rotation_first), as_camera)
     yield "cameras", [line.replace("VERTEX_SE3:QUAT", "VERTEX_SE3:EXPMAP") for line in cameras]
+    yield "similarities", changed(space, as_similarity)
+    yield "open3d.json", [as_open3d(space)]
+    yield "EGs.txt", [as_view(line) for line in space if line.startswith("EDGE")]
+    named = [as_view(line, "image_{:03}.jpg") for line in space if line.startswith("EDGE")]
+    yield "relative_poses.txt", named
     yield "rotation_first", changed(space, with_rotation_first)
     yield (
         "reversed_rotation_first",
@@ -197,6 +207,106 @@ def as_camera(words: list[str]) -> list[str]:
     return ["EDGE_SE3:EXPMAP", *words[1:]]
 
 
+def as_similarity(words: list[str]) -> list[str]:
+    """Edges as logarithms of similarities of scale 1, which are about those of their poses."""
+    numbers = np.array(words[3:10], dtype=float)
+    w = pgo.log_map(rotation_of(numbers)[None])[0]
+    angle = np.linalg.norm(w)
+    W = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+    V = np.eye(3)
+    if angle > 0.0:
+        V += (1 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W
+    u = np.linalg.solve(V, numbers[:3])
+    diagonal = np.array([float(words[10 + place]) for place in (15, 18, 20, 0, 6, 11)])
+    matrix = np.diag([*diagonal, 1.0])[np.triu_indices(7)]
+    shown = map(repr, [*w.tolist(), *u.tolist(), 0.0, *matrix.tolist()])
+    return ["EDGE_SIM3:EXPMAP", *words[1:3], *shown]
+
+
+def rotation_of(numbers: np.ndarray) -> np.ndarray:
+    """Rotation of x y z qx qy qz qw."""
+    x, y, z, w = numbers[3:]
+    q = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2.0 * w * q + 2.0 * q @ q
+
+
+def as_open3d(lines: list[str]) -> str:
+    """A pose graph of Open3D, whose edges lead from the later pose to the earlier one."""
+    nodes = []
+    edges = []
+    for line in lines:
+        tag, *words = line.split()
+        is_edge = tag.startswith("EDGE")
+        start = 2 if is_edge else 1
+        numbers = np.array(words[start : start + 7], dtype=float)
+        X = np.eye(4)
+        X[:3, :3] = rotation_of(numbers)
+        X[:3, 3] = numbers[:3]
+        if not is_edge:
+            nodes.append({"pose": X.T.ravel().tolist()})
+            continue
+        upper = np.zeros((6, 6))
+        upper[np.triu_indices(6)] = np.array(words[9:], dtype=float)
+        matrix = np.roll(upper + np.triu(upper, 1).T, 3, axis=(0, 1))
+        edge = {"source_node_id": int(words[1]), "target_node_id": int(words[0])}
+        edge |= {"uncertain": is_closure(line.split()), "confidence": 1.0}
+        edge |= {"transformation": X.T.ravel().tolist(), "information": matrix.ravel().tolist()}
+        edges.append(edge)
+    return json.dumps({"class_name": "PoseGraph", "nodes": nodes, "edges": edges})
+
+
+def as_view(line: str, name: str = "") -> str:
+    """A view of EGs.txt; with names one of GLOMAP, a quaternion that leads to the second camera."""
+    _, i, j, *words = line.split()
+    numbers = np.array(words[:7], dtype=float)
+    direction = (numbers[:3] / np.linalg.norm(numbers[:3])).tolist()
+    if not name:
+        shown = [*rotation_of(numbers).ravel().tolist(), *direction]
+        return " ".join([i, j, *map(repr, shown)])
+    x, y, z, w = numbers[3:].tolist()
+    names = [name.format(int(i)), name.format(int(j))]
+    return " ".join([*names, *map(repr, [w, -x, -y, -z, *direction])])
+
+
+def factor_graphs() -> Iterator[tuple[str, Callable[[], pgo.PoseGraph]]]:
+    """Factor graphs of GTSAM, and how they are read; none where it is not installed."""
+    if importlib.util.find_spec("gtsam") is None:
+        return
+    import gtsam
+
+    rng = np.random.default_rng(0)
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.05)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(1.345)
+    turns = gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3)
+    poses = [gtsam.Pose3(turns.compose(gtsam.Rot3.Rz(k)), [k % 4, k % 3, k % 5]) for k in range(20)]
+    pairs = [(k, k + 1) for k in range(19)] + [(k, k + 5) for k in range(0, 15, 3)]
+
+    def cycles(noise) -> gtsam.NonlinearFactorGraph:
+        factors = gtsam.NonlinearFactorGraph()
+        for i, j in pairs:
+            measured = poses[i].between(poses[j]).retract(0.05 * rng.normal(size=6))
+            factors.add(gtsam.BetweenFactorPose3(i, j, measured, noise))
+        return factors
+
+    robust = cycles(gtsam.noiseModel.Robust.Create(huber, noise))
+    attitudes = cycles(noise)
+    antennas = cycles(noise)
+    constrained = cycles(noise)
+    constrained.add(gtsam.PriorFactorPose3(0, poses[0], gtsam.noiseModel.Constrained.All(6)))
+    for k in range(0, 20, 4):
+        up = gtsam.Unit3(poses[k].rotation().unrotate(np.array([0.0, 0.0, 1.0])))
+        tilt = gtsam.noiseModel.Isotropic.Sigma(2, 0.02)
+        attitudes.add(gtsam.AttitudeFactorPose3(k, gtsam.Unit3([0, 0, 1]), tilt, up))
+        arm = np.array([0.3, 0.0, 1.0])
+        fix = poses[k].transformFrom(arm) + 0.1 * rng.normal(size=3)
+        sigmas = gtsam.noiseModel.Diagonal.Sigmas([0.1, 0.1, 0.3])
+        antennas.add(gtsam.GPSFactorArm(k, fix, arm, sigmas))
+    yield "gtsam, robust", partial(pgo.from_gtsam, robust)
+    yield "gtsam, attitudes", partial(pgo.from_gtsam, attitudes)
+    yield "gtsam, GPS at an arm", partial(pgo.from_gtsam, antennas)
+    yield "gtsam, constrained prior", partial(pgo.from_gtsam, constrained)
+
+
 def with_rotation_first(words: list[str]) -> list[str]:
     """Matrices with the rotation first, of diagonal ones in space."""
     triangle = words[10:]
@@ -213,25 +323,27 @@ def without_path(text: str, path: Path) -> str:
     return on_one_line.replace("|", "/")[:SHOWN]
 
 
-def row(path: Path, seconds: float, with_readings: bool) -> str:
-    """Row of the table for one file."""
+def row(name: str, read: Callable[[], pgo.PoseGraph], seconds: float, path: Path | None) -> str:
+    """Row of the table for one graph; the readings are compared of the file at `path`."""
+    shown_path = path or Path(name)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            graph = pgo.load(path)
+            graph = read()
             began = time.process_time()
             solution = solvers.solve(graph, time_limit=seconds, progress=False)
         except PGOError as error:
-            reason = without_path(str(error), path)
-            return f"| {path.name} | - | - | - | - | - | refused | - | {reason} |"
+            reason = without_path(str(error), shown_path)
+            return f"| {name} | - | - | - | - | - | refused | - | {reason} |"
     spent = time.process_time() - began
-    notes = list(dict.fromkeys(without_path(str(warning.message), path) for warning in caught))
-    if with_readings:
+    texts = (without_path(str(warning.message), shown_path) for warning in caught)
+    notes = list(dict.fromkeys(texts))
+    if path is not None:
         with warnings.catch_warnings(action="ignore"):
             notes += [f"read {fit.text}?" for fit in compare_readings(path).proposed]
     certificate = solution.certificate
     cells = [
-        path.name,
+        name,
         len(graph.bodies),
         len(graph.landmarks),
         graph.num_edges,
@@ -247,7 +359,8 @@ def row(path: Path, seconds: float, with_readings: bool) -> str:
 def show(paths: list[Path], seconds: float, with_readings: bool) -> None:
     print(HEAD)
     for path in sorted(paths, key=lambda path: path.name.lower()):
-        print(row(path, seconds, with_readings), flush=True)
+        compared = path if with_readings else None
+        print(row(path.name, partial(pgo.load, path), seconds, compared), flush=True)
 
 
 def main() -> None:
@@ -265,12 +378,14 @@ def main() -> None:
         folder = Path(name)
         paths = []
         for form, lines in forms(folder):
-            path = folder / f"{form}.g2o"
+            path = folder / (form if "." in form else f"{form}.g2o")
             path.write_text("\n".join(lines) + "\n")
             paths.append(path)
         packed = folder / "compressed.g2o.gz"
         packed.write_bytes(gzip.compress((folder / "plain_2d.g2o").read_bytes()))
         show([*paths, packed], arguments.seconds, with_readings=True)
+    for name, read in factor_graphs():
+        print(row(name, read, arguments.seconds, None), flush=True)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import pytest
 import solvers
 from pgo_models import PoseGraph, Reading
 from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.geometry.rotations import quaternions_from_rotations
+from pgo_models.geometry.rotations import exp_map, quaternions_from_rotations
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 
 pytest.importorskip("flint")
@@ -500,6 +500,27 @@ def test_the_rotations_of_view_graphs_are_read(
     assert code == 0
     assert "a view graph, of which the rotations are read" in err
     assert json.loads(out)["objective"] == pytest.approx(13.86581241, rel=1e-6)
+
+
+@pytest.mark.parametrize("num_telling", [0, 3])
+def test_the_order_of_views_is_told_by_cycles_that_do_not_commute(
+    num_telling: int, tmp_path: Path
+) -> None:
+    """Turns about one axis fit in both orders: without others the order is that of numbers."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        turns = np.zeros((24, 3))
+        turns[:, 2] = rng.normal(size=24)
+        turns[24 - num_telling :] = rng.normal(size=(num_telling, 3))
+        R = exp_map(turns)
+        lines = []
+        for i, j in [(k, k + step) for k in range(22) for step in (1, 2)]:
+            R_ij = R[i].T @ R[j] @ exp_map(0.01 * rng.normal(size=(1, 3)))[0]
+            R_ij = R_ij.T if num_telling else R_ij
+            lines.append(" ".join(map(str, [i, j, *R_ij.ravel()])))
+        (tmp_path / "EGs.txt").write_text("\n".join(lines))
+        with pytest.warns(GraphWarning, match="as R_j R_i" if num_telling else r"as R_i\^T R_j"):
+            read_g2o(tmp_path / "EGs.txt")
 
 
 @pytest.mark.parametrize("with_translation", [False, True])

@@ -248,6 +248,10 @@ def test_positions_without_height_are_those_of_which_nothing_measures_the_height
     graph = read(tmp_path, [EDGE_3D, "EDGE_SE3_PRIORXY 1 3.1 4.1  2.3 0.5 7"])
     whole = "EDGE_SE3_XYZ_PRIOR 1 3.1 4.1 0 2.3 0.5 0 7 0 0"
     assert_same(graph, read(tmp_path, [EDGE_3D, whole]))
+    covariances = [EDGE_3D, "EDGE_SE3_PRIORXY 1 3.1 4.1  0.25 0 0.5"]
+    (tmp_path / "covariances.g2o").write_text("\n".join(covariances))
+    graph = read_g2o(tmp_path / "covariances.g2o", reading=Reading.COVARIANCES)
+    np.testing.assert_allclose(graph.information[1, :3, :3], np.diag([4.0, 2.0, 0.0]), atol=1e-12)
 
 
 @pytest.mark.parametrize("tag", ["EDGE_RANGE", "EDGE_SE3_PLANE"])
