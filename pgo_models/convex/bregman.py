@@ -116,51 +116,18 @@ class BregmanProblem(HoldsModel):
         return tuple(slice(start, end) for start, end in pairwise(ends))
 
     def stacked(self, values: Sequence[Array]) -> Array:
-        """Stack the values of all variables.
-
-        Parameters
-        ----------
-        values : sequence of arrays
-            One array for every variable, in its shape.
-
-        Returns
-        -------
-        (m,) array
-            x.
-        """
+        """Stack the values of all variables: x, (m,)."""
         return np.concatenate([np.ravel(value) for value in values])
 
     def unstacked(self, x: Array) -> tuple[Array, ...]:
-        """Split x into the values of the variables; the inverse of `stacked`.
-
-        Parameters
-        ----------
-        x : (m,) array
-            All variables, stacked.
-
-        Returns
-        -------
-        tuple of arrays
-            One array for every variable, in its shape.
-        """
+        """Split x, (m,), into the values of the variables; the inverse of `stacked`."""
         values = []
         for block, variable in zip(self.blocks, self.variables, strict=True):
             values.append(x[block].reshape(variable.shape))
         return tuple(values)
 
     def objective(self, x: Array) -> float:
-        """Evaluate J.
-
-        Parameters
-        ----------
-        x : (m,) array
-            All variables, stacked.
-
-        Returns
-        -------
-        float
-            J(x); inf outside the domain of J.
-        """
+        """Evaluate J(x), which is inf outside the domain of J."""
         values = self.unstacked(x)
         for variable, value in zip(self.variables, values, strict=True):
             variable.save_value(value)
@@ -169,18 +136,7 @@ class BregmanProblem(HoldsModel):
         return math.inf if math.isnan(value_of_J) else value_of_J
 
     def residual(self, x: Array) -> Array:
-        """Return how far x is from satisfying the constraint.
-
-        Parameters
-        ----------
-        x : (m,) array
-            All variables, stacked.
-
-        Returns
-        -------
-        (s,) array
-            K x - f.
-        """
+        """Return K x - f, (s,)."""
         return np.asarray(self.K @ x - self.f)
 
 
@@ -246,11 +202,8 @@ def bregman_subproblem(problem: BregmanProblem, alpha: float) -> Subproblem:
     _, m = problem.K.shape
     p = cp.Parameter(m, name="p")
     x = _stack(problem.variables)
-    root = np.sqrt(alpha / 2)
-    residual = problem.K @ x - problem.f
-    penalty = cp.sum_squares(root * residual)
-    objective = problem.J - p @ x + penalty
-    model = cp.Problem(cp.Minimize(objective))
+    penalty = alpha / 2 * cp.sum_squares(problem.K @ x - problem.f)
+    model = cp.Problem(cp.Minimize(problem.J - p @ x + penalty))
     return Subproblem(model, problem.variables, p, 1.0)
 
 
@@ -272,10 +225,8 @@ def augmented_lagrangian_subproblem(problem: BregmanProblem, alpha: float) -> Su
     lam = cp.Parameter(s, name="lam")
     x = _stack(problem.variables)
     residual = problem.f - problem.K @ x
-    root = np.sqrt(alpha / 2)
-    penalty = cp.sum_squares(root * residual)
-    objective = problem.J + lam @ residual + penalty
-    model = cp.Problem(cp.Minimize(objective))
+    penalty = alpha / 2 * cp.sum_squares(residual)
+    model = cp.Problem(cp.Minimize(problem.J + lam @ residual + penalty))
     return Subproblem(model, problem.variables, lam, 1.0)
 
 

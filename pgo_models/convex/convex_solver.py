@@ -28,8 +28,8 @@ _OPTIONS: dict[str, tuple[tuple[str, ...], str | None, dict[str, int]]] = {
 }
 _DCP = "rewrite it by the rules of disciplined convex programming"
 _PRODUCT = (
-    "put in the best one for the other, as C = D^T Y in Y - D C where D^T D = I "
-    "(orthogonality_examples.sparse_low_rank), or hold one as a cp.Parameter"
+    "put in the best one for the other, as C = D^T Y in Y - D C where D^T D = I, "
+    "or hold one as a cp.Parameter"
 )
 _LAST_NUMBER = "last number of a variable"
 _MAX_SHOWN = 120  # characters of an expression in a message

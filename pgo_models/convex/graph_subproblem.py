@@ -183,13 +183,7 @@ class GraphQP(Summarised):
     w: Array
 
     def with_penalty(self, penalty: Array) -> "GraphQP":
-        """Pose the program anew with other penalties, in the same variables.
-
-        Parameters
-        ----------
-        penalty : Array, (N,)
-            Diagonal of D: penalties of the rows of X.
-        """
+        """Pose the program anew with other penalties, (N,), of the rows of the same X."""
         X = self.variables.X
         terms, constraints = self.change.terms, self.change.constraints
         d = self.variables.graph.d
@@ -197,33 +191,11 @@ class GraphQP(Summarised):
         return replace(self, qp=qp)
 
     def solve(self, V: Array) -> Array:
-        """Solve the subproblem for a shift.
-
-        Parameters
-        ----------
-        V : Array, (N, d)
-            The shift omega - B.
-
-        Returns
-        -------
-        Array, (N, d)
-            The minimiser X.
-
-        Raises
-        ------
-        PGOError
-            When nothing solves it, as where constraints contradict each other.
-        """
+        """Return the minimiser X, (N, d), for the shift V = omega - B, as `RotationQP`."""
         return self.qp.solve(V)
 
     def cost(self, X: Array) -> float:
-        """Compute F of the edges that count plus the added terms, without the penalty.
-
-        Parameters
-        ----------
-        X : Array, (N, d)
-            Any point; it need not be feasible.
-        """
+        """Compute F of the edges that count plus the added terms at X, feasible or not."""
         residuals = self.A @ X
         self.variables.X.value = X
         added = sum(float(term.value) for term in self.change.terms)
@@ -231,18 +203,7 @@ class GraphQP(Summarised):
         return float(self.w @ squares) + added
 
     def gradient_of(self, term: cp.Expression) -> Array:
-        """Compute the gradient of a term at the value of X.
-
-        Parameters
-        ----------
-        term : cvxpy.Expression
-            One of the added terms.
-
-        Returns
-        -------
-        Array, (N, d)
-            The gradient in X; zeros where the term does not depend on X.
-        """
+        """Compute the gradient, (N, d), of one of the added terms at the value of X."""
         X = self.variables.X
         zeros = csr_array((X.size, 1))
         gradient = term.grad.get(X, zeros)

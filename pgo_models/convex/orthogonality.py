@@ -200,22 +200,9 @@ class OrthogonalProblem(HoldsModel):
         return f"OrthogonalProblem({', '.join(parts)})"
 
     def point(self, values: Sequence[Array]) -> OrthogonalPoint:
-        """Project values onto the sets.
+        """Project values, one for every variable of `variables`, onto the sets; no multipliers.
 
-        Parameters
-        ----------
-        values : sequence of arrays
-            One for every variable of `variables`, in its shape.
-
-        Returns
-        -------
-        OrthogonalPoint
-            The projections, without multipliers.
-
-        Raises
-        ------
-        SettingError
-            If the number or the shapes of the values do not fit, or entries are not finite.
+        A SettingError if their number or their shapes do not fit, or entries are not finite.
         """
         checked = []
         for place, value in enumerate(values):
@@ -235,23 +222,7 @@ class OrthogonalProblem(HoldsModel):
         return OrthogonalPoint(tuple(copies), tuple(normals))
 
     def near_point(self, values: Sequence[Array]) -> OrthogonalPoint:
-        """Project values that are in the sets to 1e-6.
-
-        Parameters
-        ----------
-        values : sequence of arrays
-            One for every variable of `variables`, in its shape.
-
-        Returns
-        -------
-        OrthogonalPoint
-            The projections.
-
-        Raises
-        ------
-        SettingError
-            As `point`, and if a value is farther away from its set.
-        """
+        """Project values that are in the sets to 1e-6; a SettingError unless they are."""
         point = self.point(values)
         for term, copy in zip(self.terms, point.copies, strict=True):
             value = np.asarray(values[term.variable], dtype=float)
@@ -264,19 +235,7 @@ class OrthogonalProblem(HoldsModel):
         return point
 
     def check_point(self, point: OrthogonalPoint) -> None:
-        """Check that a point fits this problem.
-
-        Parameters
-        ----------
-        point : OrthogonalPoint
-            Where a run is to start.
-
-        Raises
-        ------
-        SettingError
-            Unless its arrays have the right shapes and are finite, and its copies are in their
-            sets.
-        """
+        """Raise a SettingError unless a point has the right shapes, is finite and in the sets."""
         needed = [self.variables[term.variable].shape for term in self.terms]
         for name in ("copies", "normals"):
             arrays = getattr(point, name)
@@ -294,18 +253,7 @@ class OrthogonalProblem(HoldsModel):
                 )
 
     def random_point(self, rng: np.random.Generator) -> OrthogonalPoint:
-        """Draw a point at random.
-
-        Parameters
-        ----------
-        rng : np.random.Generator
-            Source of randomness.
-
-        Returns
-        -------
-        OrthogonalPoint
-            Its variables are random points of their first sets.
-        """
+        """Draw a point whose variables are random points of their first sets."""
         values = []
         for position, variable in enumerate(self.variables):
             first_set = self.terms_of(position)[0]
@@ -313,105 +261,41 @@ class OrthogonalProblem(HoldsModel):
         return self.point(values)
 
     def terms_of(self, variable: int) -> list[ConstraintSet]:
-        """Return the sets that a variable is in.
-
-        Parameters
-        ----------
-        variable : int
-            Position in `variables`.
-
-        Returns
-        -------
-        list of ConstraintSet
-            In the order of `terms`.
-        """
+        """Return the sets of a variable, given by its position, in the order of `terms`."""
         return [term.constraint for term in self.terms if term.variable == variable]
 
     def values(self, copies: Sequence[Array]) -> tuple[Array, ...]:
-        """Choose one copy for every variable.
-
-        Parameters
-        ----------
-        copies : sequence of arrays
-            One for every term, in the shape of its variable.
-
-        Returns
-        -------
-        tuple of arrays
-            For every variable the copy that is in the first of its sets.
-        """
+        """Choose for every variable, of copies for every term, the one in the first of its sets."""
         first: dict[int, Array] = {}
         for term, copy in zip(self.terms, copies, strict=True):
             first.setdefault(term.variable, copy)
         return tuple(first[position] for position in range(len(self.variables)))
 
     def sums(self, of_terms: Sequence[Array]) -> list[Array]:
-        """Add arrays of terms up, for every variable those of its terms.
-
-        Parameters
-        ----------
-        of_terms : sequence of arrays
-            One for every term, in the shape of its variable.
-
-        Returns
-        -------
-        list of arrays
-            One for every variable.
-        """
+        """Add up, for every variable, the arrays of its terms."""
         sums = [np.zeros(variable.shape) for variable in self.variables]
         for term, array in zip(self.terms, of_terms, strict=True):
             sums[term.variable] += array
         return sums
 
     def assign(self, values: Sequence[Array], others: Sequence[Array] = ()) -> None:
-        """Write values into the cvxpy variables.
-
-        Parameters
-        ----------
-        values : sequence of arrays
-            For every variable of `variables`, in its shape.
-        others : sequence of arrays
-            For every variable of `others`, in its shape.
-        """
+        """Write values of `variables`, and of `others`, into the cvxpy variables."""
         variables = (*self.variables, *self.others)
         all_values = (*values, *others)
         for variable, value in zip(variables, all_values, strict=False):
             variable.save_value(value)
 
     def objective(self, values: Sequence[Array], others: Sequence[Array] = ()) -> float:
-        """Evaluate J.
-
-        Parameters
-        ----------
-        values : sequence of arrays
-            For every variable of `variables`, in its shape.
-        others : sequence of arrays
-            For every variable of `others`, in its shape.
-
-        Returns
-        -------
-        float
-            J there; nan or inf outside its domain.
-        """
+        """Evaluate J at values of `variables` and `others`: nan or inf outside its domain."""
         self.assign(values, others)
         with np.errstate(all="ignore"):  # outside the domain the value is nan or inf
             return float(self.J.value)
 
     def infeasibility(self, copies: Sequence[Array], others: Sequence[Array] = ()) -> float:
-        """Measure how much a point violates the constraints.
+        """Measure how much copies, one a term, and `others` violate the constraints.
 
-        Parameters
-        ----------
-        copies : sequence of arrays
-            One for every term, in the shape of its variable.
-        others : sequence of arrays
-            For every variable of `others`, in its shape.
-
-        Returns
-        -------
-        float
-            Norm of all violations: of the sets, of the agreement between the copies of a variable,
-            and of the convex constraints.
+        It is the norm of all violations: of the sets, of the agreement between the copies of a
+        variable, and of the convex constraints.
         """
         violations = [self.distance(copies)]
         self.assign(self.values(copies), others)
@@ -421,18 +305,7 @@ class OrthogonalProblem(HoldsModel):
         return float(np.linalg.norm(violations))
 
     def distance(self, copies: Sequence[Array]) -> float:
-        """Measure how far copies are from their sets and from agreement.
-
-        Parameters
-        ----------
-        copies : sequence of arrays
-            One for every term, in the shape of its variable.
-
-        Returns
-        -------
-        float
-            Norm of these violations.
-        """
+        """Measure how far copies, one a term, are from their sets and from agreement."""
         values = self.values(copies)
         violations = []
         for term, copy in zip(self.terms, copies, strict=True):
@@ -444,15 +317,7 @@ class OrthogonalProblem(HoldsModel):
     def split(self, solver: ConvexSolver | str = COLD) -> "SplitProblem":
         """Return the convex subproblem of the split form, step (a), which is compiled once.
 
-        Returns
-        -------
-        SplitProblem
-            The compiled subproblem.
-
-        Raises
-        ------
-        SettingError
-            If a Parameter of the problem has no value, or is not used by cvxpy's rules of DPP.
+        A SettingError if a Parameter has no value, or is not used by cvxpy's rules of DPP.
         """
         check_parameters(self.problem)
         if not self.minimisation.is_dcp(dpp=True):

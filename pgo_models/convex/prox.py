@@ -2,11 +2,11 @@
 
     prox_sf(v) = argmin over x of  s f(x) + 1/2 ||x - v||^2
 
-Each is a function of the point v and the step s. The proximal operator of the indicator function of
-a set is the projection onto it, for every step. The sets of sparse arrays, of unit columns, of
-orthonormal columns and SO(d) are not convex: the projection is one of the nearest points. Numbers
-in brackets are sections of Parikh & Boyd, Proximal Algorithms, 2014. The projection onto SO(d),
-step (b) of SOC, is `project_to_rotations`.
+Each is a function of the point v, an array, and the step s, and has the shape of v. The proximal
+operator of the indicator function of a set is the projection onto it, for every step. The sets of
+sparse arrays, of unit columns, of orthonormal columns and SO(d) are not convex: the projection is
+one of the nearest points. Numbers in brackets are sections of Parikh & Boyd, Proximal Algorithms,
+2014. The projection onto SO(d), step (b) of SOC, is `project_to_rotations`.
 """
 
 import numpy as np
@@ -18,18 +18,6 @@ from pgo_models.geometry.rotations import Array, project_to_rotations as project
 
 def soft_threshold(v: Array, step: float) -> Array:
     """Proximal operator of ||x||_1: sign(v) max(|v| - s, 0), entry by entry (6.5).
-
-    Parameters
-    ----------
-    v : array
-        The point, of any shape.
-    step : float
-        s.
-
-    Returns
-    -------
-    array
-        Of the shape of v.
 
     Examples
     --------
@@ -44,17 +32,7 @@ def soft_threshold(v: Array, step: float) -> Array:
 def group_soft_threshold(v: Array, step: float) -> Array:
     """Proximal operator of sum_g ||x_g||_2: v_g max(1 - s / ||v_g||, 0), group by group (6.5).
 
-    Parameters
-    ----------
-    v : (.., k) array
-        The point; the last axis is one group.
-    step : float
-        s.
-
-    Returns
-    -------
-    (.., k) array
-        Every group shortened by s, or zero.
+    The last axis of v is one group.
 
     Examples
     --------
@@ -70,18 +48,6 @@ def group_soft_threshold(v: Array, step: float) -> Array:
 
 def singular_value_threshold(v: Array, step: float) -> Array:
     """Proximal operator of the nuclear norm: U soft(D) V^T of the SVD v = U D V^T (6.7).
-
-    Parameters
-    ----------
-    v : (n, p) array
-        The point.
-    step : float
-        s.
-
-    Returns
-    -------
-    (n, p) array
-        A matrix whose singular values are those of v, less s.
 
     References
     ----------
@@ -101,18 +67,6 @@ def singular_value_threshold(v: Array, step: float) -> Array:
 def shrink(v: Array, step: float) -> Array:
     """Proximal operator of ||x||^2 / 2: v / (1 + s) (6.1).
 
-    Parameters
-    ----------
-    v : array
-        The point, of any shape.
-    step : float
-        s.
-
-    Returns
-    -------
-    array
-        Of the shape of v.
-
     Examples
     --------
     >>> shrink(np.array([2.0, -4.0]), 1.0).tolist()
@@ -121,99 +75,11 @@ def shrink(v: Array, step: float) -> Array:
     return v / (1.0 + step)
 
 
-# Projections onto convex sets.
-
-
-def project_box(v: Array, lower: Array | float, upper: Array | float) -> Array:
-    """Project onto lower <= x <= upper, entry by entry (6.2).
-
-    Parameters
-    ----------
-    v : array
-        The point, of any shape.
-    lower, upper : float or array
-        Bounds, of a shape that goes with that of v.
-
-    Returns
-    -------
-    array
-        Of the shape of v.
-
-    Examples
-    --------
-    >>> project_box(np.array([-1.0, 0.5, 2.0]), 0.0, 1.0).tolist()
-    [0.0, 0.5, 1.0]
-    """
-    return np.clip(v, lower, upper)
-
-
-def project_ball(v: Array, radius: float) -> Array:
-    """Project onto ||x||_2 <= radius: v radius / max(radius, ||v||) (6.5).
-
-    Parameters
-    ----------
-    v : array
-        The point; the norm is that of all entries.
-    radius : float
-        Of the ball.
-
-    Returns
-    -------
-    array
-        Of the shape of v.
-
-    Examples
-    --------
-    >>> project_ball(np.array([3.0, 4.0]), 1.0).round(3).tolist()
-    [0.6, 0.8]
-    """
-    norm = float(np.linalg.norm(v))
-    # The smallest positive number avoids 0 / 0 for v = 0 and a radius of zero.
-    divisor = max(radius, norm, np.finfo(float).tiny)
-    scale = radius / divisor
-    return np.asarray(v * scale)
-
-
-def project_psd(v: Array) -> Array:
-    """Project onto the positive semidefinite matrices: V max(D, 0) V^T of (v + v^T) / 2 (6.3).
-
-    Parameters
-    ----------
-    v : (n, n) array
-        The point; it need not be symmetric.
-
-    Returns
-    -------
-    (n, n) array
-        The nearest symmetric matrix without negative eigenvalues.
-
-    Examples
-    --------
-    >>> project_psd(np.diag([2.0, -1.0])).tolist()
-    [[2.0, 0.0], [0.0, 0.0]]
-    """
-    symmetric = 0.5 * (v + v.T)
-    eigenvalues, eigenvectors = np.linalg.eigh(symmetric)
-    nonnegative = np.maximum(eigenvalues, 0.0)
-    scaled_columns = eigenvectors * nonnegative
-    return np.asarray(scaled_columns @ eigenvectors.T)
-
-
 # Projections onto sets that are not convex.
 
 
 def project_stiefel(v: Array) -> Array:
     """Project onto x^T x = I: the polar factor U V^T of the SVD v = U D V^T.
-
-    Parameters
-    ----------
-    v : (n, p) array
-        The point, n >= p.
-
-    Returns
-    -------
-    (n, p) array
-        A nearest matrix with orthonormal columns.
 
     References
     ----------
@@ -229,17 +95,9 @@ def project_stiefel(v: Array) -> Array:
 
 
 def project_unit_columns(v: Array) -> Array:
-    """Project onto ||x_j||_2 = 1 for every column: v_j / ||v_j||.
+    """Project onto ||x_j||_2 = 1 for every column: v_j / ||v_j||; a vector is one column.
 
-    Parameters
-    ----------
-    v : (n, p) or (n,) array
-        The point; a vector is one column.
-
-    Returns
-    -------
-    (n, p) or (n,) array
-        The normalised columns. A zero column becomes the first unit vector.
+    A zero column becomes the first unit vector.
 
     Examples
     --------
@@ -256,19 +114,9 @@ def project_unit_columns(v: Array) -> Array:
 
 
 def project_sparse(v: Array, nonzeros: int) -> Array:
-    """Project onto ||x||_0 <= nonzeros by hard thresholding.
+    """Project onto ||x||_0 <= nonzeros by hard thresholding: the largest entries are kept.
 
-    Parameters
-    ----------
-    v : array
-        The point, of any shape.
-    nonzeros : int
-        Largest number of entries that differ from zero.
-
-    Returns
-    -------
-    array
-        The entries of v of largest magnitude, and zeros; of equal ones the first are kept.
+    Of entries of equal magnitude the first are.
 
     Examples
     --------

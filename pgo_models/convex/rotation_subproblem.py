@@ -50,22 +50,9 @@ class RotationQP(HoldsModel):
     last: dict[bytes, Array] = field(default_factory=dict)
 
     def solve(self, V: Array) -> Array:
-        """Solve the subproblem for a shift.
+        """Return the minimiser X, (N, d), for a shift V, whose rows without a penalty do not count.
 
-        Parameters
-        ----------
-        V : Array, (N, d)
-            The shift; rows without a penalty are ignored.
-
-        Returns
-        -------
-        Array, (N, d)
-            The minimiser X.
-
-        Raises
-        ------
-        PGOError
-            When the solver does not end with a solution; the message has its status.
+        A PGOError, with the solver's status, when there is no solution.
         """
         held = self.penalty > 0
         root_D = np.sqrt(self.penalty[held])

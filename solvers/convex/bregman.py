@@ -182,13 +182,7 @@ class Bregman(BregmanSettings):
         return BregmanState(state.k + 1, x, state.subproblem, p)
 
     def point(self, problem: BregmanProblem, state: BregmanState) -> BregmanPoint:
-        """Return the point of a state, from which a run of any form can go on.
-
-        Returns
-        -------
-        BregmanPoint
-            x, and the least-squares lam of p = K^T lam.
-        """
+        """Return x and the least-squares lam of p = K^T lam, from which any form can go on."""
         lam = np.linalg.lstsq(problem.K.T.toarray(), state.p, rcond=None)[0]
         return BregmanPoint(state.x, lam)
 
@@ -224,13 +218,7 @@ class TwoLineBregman(BregmanSettings):
         return TwoLineState(state.k + 1, x, state.subproblem, b)
 
     def point(self, problem: BregmanProblem, state: TwoLineState) -> BregmanPoint:
-        """Return the point of a state, from which a run of any form can go on.
-
-        Returns
-        -------
-        BregmanPoint
-            x, and lam = -alpha b.
-        """
+        """Return x, and lam = -alpha b, from which a run of any form can go on."""
         return BregmanPoint(state.x, -self.alpha * state.b)
 
 
@@ -262,13 +250,7 @@ class MethodOfMultipliers(BregmanSettings):
         return MultiplierState(state.k + 1, x, state.subproblem, lam)
 
     def point(self, problem: BregmanProblem, state: MultiplierState) -> BregmanPoint:
-        """Return the point of a state, from which a run of any form can go on.
-
-        Returns
-        -------
-        BregmanPoint
-            x and lam.
-        """
+        """Return x and lam, from which a run of any form can go on."""
         return BregmanPoint(state.x, state.lam)
 
 
@@ -333,13 +315,7 @@ class AlternatingBregman(BregmanSettings):
         return AlternatingState(state.k + 1, x, lam, state.subproblems, stationarity)
 
     def point(self, problem: BregmanProblem, state: AlternatingState) -> BregmanPoint:
-        """Return the point of a state, from which a run of any form can go on.
-
-        Returns
-        -------
-        BregmanPoint
-            x and lam.
-        """
+        """Return x and lam, from which a run of any form can go on."""
         return BregmanPoint(state.x, state.lam)
 
     def _pass_over_blocks(

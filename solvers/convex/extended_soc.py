@@ -120,23 +120,7 @@ class ExtendedSOC:
         return self._recursion(model).init(problem, start)
 
     def model(self, problem: PGOProblem) -> GraphQP:
-        """Compile the changed program with penalties of 1.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is changed.
-
-        Returns
-        -------
-        GraphQP
-            The program, whose `cost` is the changed objective.
-
-        Raises
-        ------
-        SettingError
-            Unless the cost of the problem is F.
-        """
+        """Compile the changed program, with penalties of 1; a SettingError unless the cost is F."""
         return graph_qp(problem, 1.0, changer=self.changer, solver=self.solver)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:
@@ -151,31 +135,12 @@ class ExtendedSOC:
         return Measurement(objective, state.primal_residual, state.dual_residual)
 
     def poses(self, problem: PGOProblem, state: SOCState) -> Poses:
-        """Return the poses that a state stands for.
-
-        Returns
-        -------
-        Poses
-            Omega with the translations of step (a).
-        """
+        """Return omega with the translations of step (a)."""
         X = state.r_step.solve_stacked(state.omega - state.B)
         return Poses(state.omega, X[: problem.num_poses])
 
     def cost(self, state: SOCState, poses: Poses) -> float:
-        """Evaluate the changed objective.
-
-        Parameters
-        ----------
-        state : SOCState
-            A state of this solver, which has the model.
-        poses : Poses
-            Any poses of the graph.
-
-        Returns
-        -------
-        float
-            F of the edges that count plus the added terms.
-        """
+        """Evaluate F of the edges that count plus the added terms, in a state's model, at poses."""
         return model_of(state).cost(poses.stacked())
 
     def converged(self, state: SOCState, measurement: Measurement) -> Status | None:

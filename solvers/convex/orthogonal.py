@@ -246,13 +246,7 @@ class OrthogonalSOC:
         return replace(self.init(problem, start), k=state.k, scale=state.scale)
 
     def point(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalPoint:
-        """Return the point of a state, from which a run can go on.
-
-        Returns
-        -------
-        OrthogonalPoint
-            The copies and the multipliers rho B.
-        """
+        """Return the copies and the multipliers rho B of a state, from which a run can go on."""
         normals = []
         for term, P, B in zip(problem.terms, state.copies, state.B, strict=True):
             normals.append(term.constraint.normal_part(P, state.rho * B))

@@ -5,11 +5,11 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from graphs import polar_factor
-from orthogonal_models import one_norm_components
+from orthogonal_models import one_norm_components, smallest_eigenvectors, sparse_low_rank
 
 from pgo_models import OrthogonalProblem
 from pgo_models.convex.orthogonality import OrthogonalPoint
-from pgo_models.convex.orthogonality_examples import procrustes, sparse_components, sparse_low_rank
+from pgo_models.convex.orthogonality_examples import procrustes
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array, orthogonality_error
 from solvers import OrthogonalSOC, Status, iterate, run, solve_orthogonal
@@ -80,7 +80,7 @@ def test_one_norm_component_ignores_outliers(seed: int) -> None:
 
 def test_sparse_components_reach_their_bound() -> None:
     values = np.arange(1.0, 9.0)
-    solution = solve_orthogonal(sparse_components(np.diag(values), 2, 0.5), rng_of(0), starts=4)
+    solution = solve_orthogonal(smallest_eigenvectors(np.diag(values), 2, 0.5), rng_of(0), starts=4)
     assert_solved(solution)
     bound = values[:2].sum() + 0.5 * 2
     assert bound * (1.0 - TOLERANCE) <= solution.objective <= bound * (1.0 + TOLERANCE)
