@@ -1,7 +1,7 @@
 """A proven lower bound on any convex objective: the least J over the convex hulls of the sets.
 
-The hulls are those of `pgo_models.convex.hulls`; unit columns have the unit ball. cvxpy states the
-convex program as
+The hulls are those of `pgo_models.convex.hulls`; unit columns have the unit ball. With the hulls
+below what cvxpy states of the model, the convex program is
 
     minimise c^T x + constant   subject to   A x + s = b,  s in a cone K of numbers that are not
     negative, second-order cones and semidefinite matrices.
@@ -16,20 +16,24 @@ delta; therefore a small share of a dual point well inside the cone is mixed int
 The bound is mostly wide: hulls have all points between those of the sets.
 """
 
-import warnings
-from dataclasses import dataclass
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
-from scipy.sparse import coo_array, csc_array
+from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import CLARABEL
+from scipy.sparse import csc_array, csr_array, diags_array, lil_array, vstack
 
-from pgo_models.convex.constraint_sets import ConstraintSet, Orthonormal, UnitColumns, UnitRows
+from pgo_models.convex.constraint_sets import Orthonormal, UnitColumns
 from pgo_models.convex.convex_solver import has_attributes
-from pgo_models.convex.hulls import hulls_of
+from pgo_models.convex.hulls import Affine, Hull, hulls_of
 from pgo_models.convex.model_bound import is_proven_definite, prove_matrix
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.convex.quadratic_form import Block
+from pgo_models.convex.set_equations import ONE
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
@@ -54,11 +58,17 @@ class HullBound(ReadOnly):
         What was subtracted for rounding, and for what the solver left.
     point : tuple of arrays
         The variables at the least J over the hulls, as the solver gives them; they are in no set.
+    program : HullProgram
+        The convex program.
+    y : array
+        Its dual point, which is the proof.
     """
 
     value: float
     rounding: float
     point: tuple[Array, ...]
+    program: "HullProgram"
+    y: Array
 
 
 def prove_hull_bound(problem: OrthogonalProblem) -> HullBound | None:
@@ -68,87 +78,193 @@ def prove_hull_bound(problem: OrthogonalProblem) -> HullBound | None:
     where the program has exponential cones, is not strictly feasible, or leaves a direction of the
     variables without a set free.
     """
-    hulls = hull_constraints(problem)
-    if hulls is None or any(has_attributes(variable) for variable in problem.variables):
+    program = _program_over_hulls(problem)
+    if program is None:
         return None
-    model = cp.Problem(cp.Minimize(problem.J), [*problem.problem.constraints, *hulls])
-    try:
-        data, chain, inverse = model.get_problem_data(
-            cp.CLARABEL, solver_opts={"use_quad_obj": False}
-        )
-        options = {"max_threads": 1, "tol_gap_rel": _TOLERANCE, "tol_feas": _TOLERANCE}
-        raw = chain.solve_via_data(model, data, False, False, options)
-        with warnings.catch_warnings(action="ignore"):  # of digits, which the proof does not need
-            model.unpack_results(raw, chain, inverse)
-    except (cp.SolverError, ValueError):
+    x, z = program.solve()
+    if not np.isfinite(x).all():
         return None
-    point = tuple(variable.value for variable in problem.variables)
-    if any(value is None for value in point):
-        return None
-    is_bounded = np.zeros(len(data["c"]), dtype=bool)
-    columns = data["param_prob"].var_id_to_col
-    for variable in problem.variables:
-        first = columns[variable.id]
-        is_bounded[first : first + variable.size] = True
-    program = _ConeProgram(csc_array(data["A"]), data["b"], data["c"], data["dims"], is_bounded)
+    point = program.variables(x)
     inside = program.point_inside()
     if inside is None:
         return None
-    y = np.asarray(raw.z, dtype=float)
-    bounds = (program.bound((1.0 - share) * y + share * inside) for share in _SHARES)
-    found = next((bound for bound in bounds if bound is not None), None)
-    if found is None:
+    for share in _SHARES:
+        found = program.bound(program.scale * ((1.0 - share) * z + share * inside))
+        if found is not None:
+            y, value, rounding = found
+            return HullBound(value, rounding, point, program, y)
+    return None
+
+
+def _program_over_hulls(problem: OrthogonalProblem) -> "HullProgram | None":
+    """The convex program as cvxpy states it, with the hulls of all variables."""
+    if any(has_attributes(variable) for variable in problem.variables):
         return None
-    value, rounding = found
-    constant = float(inverse[-1]["offset"])
-    rounding += gamma(2.0) * (abs(value) + abs(constant))
-    return HullBound(value + constant - 2.0 * gamma(2.0) * abs(constant), rounding, point)
+    if not all(isinstance(term.constraint, Orthonormal | UnitColumns) for term in problem.terms):
+        return None
+    model = cp.Problem(cp.Minimize(problem.J), problem.problem.constraints)
+    try:
+        data, _, inverse = model.get_problem_data(cp.CLARABEL, solver_opts={"use_quad_obj": False})
+    except (cp.SolverError, ValueError):
+        return None
+    dims = data["dims"]
+    if dims.exp or dims.p3d or len(dims.pnd):
+        return None
+    columns = data["param_prob"].var_id_to_col
+    blocks = tuple(
+        Block(columns[X.id], X.shape, tuple(problem.terms_of(position)))
+        for position, X in enumerate(problem.variables)
+    )
+    return _with_hulls(data, float(inverse[-1]["offset"]), blocks)
 
 
-def hull_constraints(problem: OrthogonalProblem) -> list[cp.Constraint] | None:
-    """The hulls of all variables as constraints of cvxpy; None where a set has none here."""
-    constraints: list[cp.Constraint] = []
-    for term in problem.terms:
-        X = problem.variables[term.variable]
-        if not isinstance(term.constraint, Orthonormal | UnitColumns):
-            return None
-        constraints += _hull_of(X, term.constraint)
-    return constraints
-
-
-def _hull_of(X: cp.Variable, kind: ConstraintSet) -> list[cp.Constraint]:
-    if isinstance(kind, UnitRows):
-        return [cp.norm(X, axis=1) <= 1.0] if X.ndim == 2 else [cp.abs(X) <= 1.0]
-    if isinstance(kind, UnitColumns):
-        return [cp.norm(X, axis=0) <= 1.0] if X.ndim == 2 else [cp.norm(X) <= 1.0]
-    block = Block(0, X.shape, (kind,))
-    (hull,) = hulls_of(0, block)
-    entries = [
-        (a + hull.side * b, coordinate % (X.size + 1), factor)
-        for (a, b), terms in hull.entries.items()
-        for coordinate, factor in terms
+def _with_hulls(data: dict[str, Any], constant: float, blocks: tuple[Block, ...]) -> "HullProgram":
+    """A program with the hulls of variables, whose rows are put where cvxpy's order has them."""
+    A, b, c, dims = csr_array(data["A"]), data["b"], data["c"], data["dims"]
+    equalities: list[Affine] = []
+    balls: list[list[Affine]] = []
+    matrices: list[Hull] = []
+    for block in blocks:
+        if block.is_plane:
+            x = block.start
+            equalities += [[(x, 1.0), (x + 3, -1.0)], [(x + 1, 1.0), (x + 2, 1.0)]]
+        for kind in block.sets:
+            hulls = hulls_of(0, replace(block, sets=(kind,)))
+            if isinstance(kind, UnitColumns):
+                balls += [_ball(hull) for hull in hulls]
+            else:
+                matrices += hulls
+    of_balls = [row for ball in balls for row in ball]
+    of_matrices = [row for hull in matrices for row in _triangle(hull)]
+    end = dims.zero + dims.nonneg + sum(dims.soc)
+    parts = [
+        _rows(equalities, len(c)),
+        (A[:end], b[:end]),
+        _rows(of_balls, len(c)),
+        (A[end:], b[end:]),
+        _rows(of_matrices, len(c)),
     ]
-    rows, of, factors = zip(*entries, strict=True)
-    to_H = csc_array(coo_array((factors, (rows, of)), shape=(hull.side**2, X.size + 1)))
-    H = to_H @ cp.hstack([cp.vec(X, order="F"), np.ones(1)])
-    constraints = [cp.reshape(H, (hull.side, hull.side), order="F") >> 0]
-    if block.is_plane:
-        constraints += [X[0, 0] == X[1, 1], X[0, 1] == -X[1, 0]]
-    return constraints
+    of_all = copy.copy(dims)
+    of_all.zero += len(equalities)
+    of_all.soc = [*dims.soc, *map(len, balls)]
+    of_all.psd = [*dims.psd, *(hull.side for hull in matrices)]
+    of_model = np.arange(len(b)) + len(equalities)
+    of_model[end:] += len(of_balls)
+    rows = csc_array(vstack([rows for rows, _ in parts]))
+    right = np.concatenate([right for _, right in parts])
+    return HullProgram(rows, right, c, constant, of_all, blocks, of_model, dims)
 
 
-@dataclass(frozen=True)
-class _ConeProgram:
-    """minimise c^T x subject to b - A x in a cone; |x_i| <= 1 where `is_bounded`."""
+def _ball(hull: Hull) -> list[Affine]:
+    """(1, x), a vector of the second-order cone, of (I, x; x^T, 1)."""
+    last = hull.side - 1
+    return [[(ONE, 1.0)], *(hull.entries[k, last] for k in range(last))]
+
+
+def _triangle(hull: Hull) -> list[Affine]:
+    """The upper triangle of H, column by column, off the diagonal doubled."""
+    return [
+        [(k, factor * (1.0 if a == b else 2.0)) for k, factor in hull.entries.get((a, b), [])]
+        for b in range(hull.side)
+        for a in range(b + 1)
+    ]
+
+
+def _rows(functions: Sequence[Affine], num_columns: int) -> tuple[csr_array, Array]:
+    """A and b with b - A x of affine functions."""
+    b = np.zeros(len(functions))
+    A = lil_array((len(functions), num_columns))
+    for row, terms in enumerate(functions):
+        for column, factor in terms:
+            if column == ONE:
+                b[row] += factor
+            else:
+                A[row, column] = -factor
+    return csr_array(A), b
+
+
+@dataclass(frozen=True, eq=False)
+class HullProgram(ReadOnly):
+    """minimise c^T x + constant subject to b - A x in a cone; the last rows are those of hulls H.
+
+    Of H(x) these are the upper triangle, off the diagonal doubled, so that their y are the entries
+    of a matrix P, and all numbers are exact. Of semidefinite matrices of the model rows and y are
+    as solvers take them, off the diagonal times root 2.
+
+    Parameters
+    ----------
+    A, b, c, constant, dims
+        The program, and the sizes of its cones in cvxpy's order.
+    blocks : tuple of Block
+        The variables in sets; `start` is the first entry in x.
+    of_model : array of ints
+        The rows that are not of hulls.
+    dims_of_model : object
+        The sizes of their cones.
+    """
 
     A: csc_array
     b: Array
     c: Array
+    constant: float
     dims: Any
-    is_bounded: BoolArray
+    blocks: tuple[Block, ...]
+    of_model: IntArray
+    dims_of_model: Any
+
+    @property
+    def is_bounded(self) -> BoolArray:
+        """Which entries of x are of variables in sets, and at most 1."""
+        is_bounded = np.zeros(len(self.c), dtype=bool)
+        for block in self.blocks:
+            is_bounded[block.start : block.start + math.prod(block.shape)] = True
+        return is_bounded
+
+    @property
+    def scale(self) -> Array:
+        """What a solver's y is multiplied by, (rows,)."""
+        scale = np.ones(len(self.b))
+        first = len(self.b)
+        for side in reversed(self.dims.psd[len(self.dims_of_model.psd) :]):
+            triangle = np.eye(side)[np.tril_indices(side)]
+            first -= len(triangle)
+            scale[first : first + len(triangle)] = np.where(triangle, 1.0, np.sqrt(0.5))
+        return scale
+
+    def variables(self, x: Array) -> tuple[Array, ...]:
+        """The variables in sets, each in its shape."""
+        sizes = [(block, math.prod(block.shape)) for block in self.blocks]
+        return tuple(
+            x[block.start : block.start + size].reshape(block.shape, order="F")
+            for block, size in sizes
+        )
+
+    def solve(self) -> tuple[Array, Array]:
+        """The point and the dual point of a solver; not finite where it has none."""
+        scale = self.scale
+        scaled = csc_array(diags_array(scale) @ self.A)
+        data = {"A": scaled, "b": scale * self.b, "c": self.c, "dims": self.dims}
+        options = {"max_threads": 1, "tol_gap_rel": _TOLERANCE, "tol_feas": _TOLERANCE}
+        raw = CLARABEL().solve_via_data(data, False, False, options)
+        return np.array(raw.x, dtype=float), np.array(raw.z, dtype=float)
+
+    def semidefinite(self, y: Array) -> list[Array]:
+        """The matrices of y, those of the model first, rounded, then every P, exactly."""
+        first = len(y) - sum(side * (side + 1) // 2 for side in self.dims.psd)
+        matrices = []
+        for place, side in enumerate(self.dims.psd):
+            last = first + side * (side + 1) // 2
+            is_of_model = place < len(self.dims_of_model.psd)
+            to_matrix = _to_matrix(int(side), np.sqrt(0.5) if is_of_model else 1.0)
+            matrices.append((to_matrix @ y[first:last]).reshape(side, side))
+            first = last
+        return matrices
 
     def point_inside(self) -> Array | None:
-        """A point well inside the dual cone with g = 0 where x is free, up to rounding."""
+        """A point well inside the dual cone with g = 0 where x is free, up to rounding.
+
+        It is a solver's; rows of hulls, which `scale` is of, have no x that is free.
+        """
         y = cp.Variable(len(self.b))
         margin = cp.Variable()
         scale = float(abs(self.c).max()) or 1.0
@@ -165,7 +281,8 @@ class _ConeProgram:
             constraints.append(cp.norm(y[first + 1 : last]) + margin <= y[first])
         for side in self.dims.psd:
             first, last = last, last + side * (side + 1) // 2
-            Y = cp.reshape(_to_matrix(int(side)) @ y[first:last], (side, side), order="F")
+            to_matrix = _to_matrix(int(side), np.sqrt(0.5))
+            Y = cp.reshape(to_matrix @ y[first:last], (side, side), order="F")
             constraints.append(Y - margin * np.eye(side) >> 0)
         try:
             cp.Problem(cp.Maximize(margin), constraints).solve(solver=cp.CLARABEL)
@@ -173,10 +290,8 @@ class _ConeProgram:
             return None
         return y.value if y.value is not None and margin.value > 0.0 else None
 
-    def bound(self, y: Array) -> tuple[float, float] | None:
-        """A lower bound of any y, and what was subtracted; None where y proves nothing."""
-        if self.dims.exp or self.dims.p3d or len(self.dims.pnd):
-            return None
+    def bound(self, y: Array) -> tuple[Array, float, float] | None:
+        """Y moved, its lower bound, and what was subtracted; None where it proves nothing."""
         free = np.flatnonzero(~self.is_bounded)
         A_free = csc_array(self.A[:, free])
         sigma = _least_singular_value(A_free)
@@ -196,7 +311,9 @@ class _ConeProgram:
         share: float = gamma(float(len(y) + 4))
         rounding = share * float(np.sum(abs(terms))) + delta * float(np.linalg.norm(self.b))
         left = OUTWARD * float(np.sum(in_box)) + rounding
-        return float(np.sum(terms)) - OUTWARD * left, left
+        value = float(np.sum(terms))
+        left += gamma(4.0) * (abs(value) + abs(self.constant))
+        return y, value + self.constant - OUTWARD * left, left
 
     def _gradient(self, y: Array) -> tuple[Array, Array]:
         """C + A^T y and a bound on its rounding."""
@@ -223,25 +340,22 @@ class _ConeProgram:
             radius = OUTWARD**2 * (float(np.linalg.norm(y[first + 1 : last])) + 2.0 * delta)
             if not y[first] >= (1.0 + gamma(float(size) + 4.0)) * radius:
                 return False
-        for side in self.dims.psd:
-            first, last = last, last + side * (side + 1) // 2
-            Y = (_to_matrix(int(side)) @ y[first:last]).reshape(side, side)
+        for Y in self.semidefinite(y):
             rounding = gamma(4.0) * float(np.linalg.norm(Y))
-            shifted = Y - OUTWARD * (delta + rounding) * np.eye(side)
-            if not is_proven_definite(shifted):
+            if not is_proven_definite(Y - OUTWARD * (delta + rounding) * np.eye(len(Y))):
                 return False
-        return last == len(y)
+        return True
 
 
-def _to_matrix(side: int) -> csc_array:
-    """To a matrix from its upper triangle, column by column, off the diagonal times root 2.
+def _to_matrix(side: int, off_diagonal: float) -> csc_array:
+    """To a matrix from its upper triangle, column by column, with a factor off the diagonal.
 
-    The Euclidean norm of the triangle is the Frobenius norm of the matrix.
+    Where it is the root of 1/2, the norms of triangle and matrix are the same.
     """
     columns, rows = np.tril_indices(side)
     k = np.arange(len(rows))
     off = rows != columns
-    factors = np.where(off, 1.0 / np.sqrt(2.0), 1.0)
+    factors = np.where(off, off_diagonal, 1.0)
     entries = np.concatenate([rows + side * columns, (columns + side * rows)[off]])
     data = np.concatenate([factors, factors[off]])
     return csc_array((data, (entries, np.concatenate([k, k[off]]))), shape=(side**2, len(k)))

@@ -12,7 +12,7 @@ import numpy as np
 from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex.hull_bound import HullBound
 from pgo_models.convex.model_bound import ModelBound
-from pgo_models.convex.model_proof_file import write_model_proof
+from pgo_models.convex.model_proof_file import write_hull_proof, write_model_proof
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.convex.set_equations import SetEquations
 from pgo_models.errors import ProofError, SettingError
@@ -108,9 +108,10 @@ class ModelCertificate(ReadOnly):
         """
         if self.bound is None:
             raise SettingError("no proof to write: no bound was found")
-        if isinstance(self.bound, HullBound) or self.form is None:
-            raise SettingError("no proof to write: a bound by hulls has no file")
-        write_model_proof(self.form, self.bound, path)
+        if isinstance(self.bound, HullBound):
+            write_hull_proof(self.bound, path)
+        elif self.form is not None:
+            write_model_proof(self.form, self.bound, path)
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the figures as they are printed, with their labels."""

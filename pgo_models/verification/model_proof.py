@@ -28,15 +28,10 @@ imported but `pgo_models.errors`.
 """
 
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
-from pgo_models.errors import FileFormatError
-from pgo_models.verification.balls import arb, ctx, exact, fmpq
-from pgo_models.verification.proof import MODEL_FORMAT, read_record
-from pgo_models.verification.verification import MODEL, Verification
+from pgo_models.verification.balls import exact, fmpq
 
-BITS = 128  # of the ball that the bound, a rational number, is printed as
 ONE = -1  # stands for the constant among the entries of z
 Affine = dict[int, fmpq]
 Quadratic = dict[int, dict[int, fmpq]]
@@ -44,27 +39,15 @@ Quadratic = dict[int, dict[int, fmpq]]
 Products = tuple[int, Callable[[int, int], list[tuple[Affine, Affine]]]]
 
 
-def verify_model(path: Path) -> Verification:
-    """What the proof of a model proves; `pgo_models.verify_proof` is its door."""
-    record = read_record(path, MODEL_FORMAT)
-    try:
-        claim = float(record["lower_bound"])
-        variables = record["variables"]
-        name = f"{path}: {len(variables)} variables in sets, {len(record['c'])} numbers"
-        L, failure = lagrangian(record)
-        bound = None if failure else least_value(L)
-        if claim <= 0.0 and is_sum_of_squares(record):  # whatever the multipliers prove
-            bound = max(bound or fmpq(0), fmpq(0))
-            failure = ""
-    except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
-        raise FileFormatError(path, None, f"not a proof of a model: {error!r:.80}") from error
+def quadratic_bound(record: dict[str, Any]) -> tuple[fmpq | None, str]:
+    """The bound that a proof with equations of the sets proves, and what failed, if anything."""
+    L, failure = lagrangian(record)
+    bound = None if failure else least_value(L)
+    if float(record["lower_bound"]) <= 0.0 and is_sum_of_squares(record):
+        return max(bound or fmpq(0), fmpq(0)), ""  # whatever the multipliers prove
     if not failure and bound is None:
         failure = "the minimum: a pivot of the Lagrangian is not positive"
-    if bound is not None and not exact(claim) <= bound:
-        failure = "the claim: the lower bound that is claimed is above the proven one"
-    with ctx.workprec(BITS):
-        ball = None if bound is None else arb(bound)
-    return Verification(name, MODEL, bound=ball, failure=failure)
+    return bound, failure
 
 
 def is_sum_of_squares(record: dict[str, Any]) -> bool:

@@ -132,7 +132,6 @@ from pgo_models.verification.costs import (
 )
 from pgo_models.verification.doubles import Resolution
 from pgo_models.verification.measurements import WORLD, Graph, read_graph
-from pgo_models.verification.model_proof import verify_model
 from pgo_models.verification.proof import (
     ROTATION_COSTS,
     HandednessTerm,
@@ -142,6 +141,7 @@ from pgo_models.verification.proof import (
 )
 from pgo_models.verification.robot_logs import SUFFIX as LOG_SUFFIX, read_robot_log
 from pgo_models.verification.verification import DIGITS, Verification
+from pgo_models.verification.verify_model import verify_model
 
 # Bits; the next where a ball is too wide to decide. With the last ones every pivot that is not zero
 # to 2,400 digits has a sign, and a proof that needs more is not one of doubles.

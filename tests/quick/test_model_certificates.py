@@ -389,3 +389,40 @@ def test_a_robust_registration_is_bounded_closely() -> None:
     assert 0.0 <= solution.gap <= 0.1
     assert solution.verdict is Verdict.NOT_CERTIFIED
     assert "hulls" in str(solution)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize(
+    ("kind", "shape"), [("rotations", (3, 3)), ("rotations", (2, 2)), ("unit_rows", (3, 2))]
+)
+def test_proofs_by_hulls_are_verified_and_tampered_ones_rejected(kind, shape, loss, tmp_path):
+    pytest.importorskip("flint")
+    path = tmp_path / "proof.json"
+    model = robust_model(1, kind, shape, LOSSES[loss])
+    certificate = solvers.certify(
+        model, model.values(model.random_point(np.random.default_rng(0)).copies)
+    )
+    certificate.save_proof(path)
+    found = pgo.verify_proof(path)
+    assert found.is_verified, found.failure
+    assert certificate.bound.value <= found.bound
+    assert float(found.bound) <= certificate.objective
+    record = json.loads(path.read_text())
+
+    def failure(**changes) -> str:
+        path.write_text(json.dumps({**record, **changes}))
+        return pgo.verify_proof(path).failure
+
+    raised = float(found.bound) + 1e-9 * abs(float(found.bound))
+    assert "claim" in failure(lower_bound=raised)
+    assert "claim" in failure(constant=record["constant"] - 1e-3)
+    moves = 10.0 * np.random.default_rng(1).standard_normal(len(record["y"]))
+    assert "dual cone" in failure(y=(moves + record["y"]).tolist())
+    assert failure(y=[0.5 * value for value in record["y"]])
+    if "P" in record["variables"][0]:
+        variables = json.loads(json.dumps(record["variables"]))
+        variables[0]["P"][0] = -1.0
+        assert "P is not positive semidefinite" in failure(variables=variables)
+    for changes in ({"y": record["y"][:-1]}, {"A": [[-1, 0, 1.0]]}, {"cones": {}}):
+        with pytest.raises(pgo.PGOError, match="not a proof of a model"):
+            failure(**changes)
