@@ -213,19 +213,9 @@ def _unknown(name: str, registry: Registry) -> DatasetError:
 
 
 def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
-    """Return the names that `load` takes.
+    """Return the names that `load` takes, in alphabetical order.
 
     They are those of the files in the data folders, and of those that can be downloaded.
-
-    Parameters
-    ----------
-    registry : Registry
-        Public data sets; those of SE-Sync unless given.
-
-    Returns
-    -------
-    tuple of str
-        Names in alphabetical order.
 
     Examples
     --------

@@ -87,16 +87,6 @@ def with_free_directions_held(graph: PoseGraph) -> PoseGraph:
     Its `free` names the directions and says how they are held. A graph without such directions is
     returned as it is.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        Any connected graph.
-
-    Returns
-    -------
-    PoseGraph
-        The same measurements; the information of one edge a direction is larger.
-
     Examples
     --------
     >>> from pgo_models.graphs.scenes import grid

@@ -46,15 +46,7 @@ class Reading(enum.Enum):
     def of(cls, given: object) -> "Reading":
         """Return a reading that is given itself, or by its value or name in any case.
 
-        Parameters
-        ----------
-        given : object
-            A Reading, or a word such as "w-first".
-
-        Returns
-        -------
-        Reading
-            The reading; a SettingError is raised where there is no such one.
+        A SettingError says which readings there are where the word is that of none.
         """
         word = given.lower().replace("_", "-") if isinstance(given, str) else given
         try:

@@ -49,6 +49,8 @@ def grid_world(
     closures leave groups of robots apart, the smallest group gets an edge to the rest between the
     two poses that come closest, until there is one group.
 
+    It has owners, estimate and truth.
+
     Parameters
     ----------
     num_robots : int
@@ -64,11 +66,6 @@ def grid_world(
         `noise.kappa(d)`.
     loop_closure_probability : float
         Probability that two poses which see each other are measured.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with owners, estimate and truth.
 
     Raises
     ------

@@ -140,11 +140,6 @@ def from_gtsam(
     skip_unknown : bool
         Whether other factors are left out, with a warning that names and counts them.
 
-    Returns
-    -------
-    PoseGraph
-        Graph with the information matrices of the noise models.
-
     Raises
     ------
     GraphError

@@ -42,11 +42,6 @@ def far_middle(positions: Array, offsets: Array) -> Array:
     offsets : Array, (l, d)
         Measured translations between poses. Far is what is many times the spread of the positions
         and the usual length of these.
-
-    Returns
-    -------
-    Array, (d,)
-        The middle.
     """
     if not len(positions):
         return np.zeros(positions.shape[1])

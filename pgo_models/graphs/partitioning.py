@@ -64,17 +64,7 @@ class Partition(ReadOnly):
         return np.bincount(self.robot, minlength=self.num_robots)
 
     def cut_edges(self, graph: PoseGraph) -> BoolArray:
-        """Return which edges of a graph join two robots.
-
-        Parameters
-        ----------
-        graph : PoseGraph
-            Graph of the n poses.
-
-        Returns
-        -------
-        BoolArray
-            (m,), true for an edge between poses of different robots.
+        """Return which edges of a graph, (m,), join two robots.
 
         Raises
         ------
@@ -89,18 +79,7 @@ class Partition(ReadOnly):
         return np.asarray(self.robot[graph.i] != self.robot[graph.j])
 
     def separators(self, graph: PoseGraph) -> IntArray:
-        """Return the poses that have an edge to a pose of another robot.
-
-        Parameters
-        ----------
-        graph : PoseGraph
-            Graph of the n poses.
-
-        Returns
-        -------
-        IntArray
-            (k,), ascending.
-        """
+        """Return the poses, ascending, that have an edge to a pose of another robot."""
         cut = self.cut_edges(graph)
         return np.unique(np.concatenate([graph.i[cut], graph.j[cut]]))
 
@@ -123,11 +102,6 @@ def partition(
         every pose is a robot.
     method : PartitionMethod, optional
         GIVEN when the graph names as many robots as asked for, else CONTIGUOUS, unless given.
-
-    Returns
-    -------
-    Partition
-        Owner of every pose.
 
     Raises
     ------

@@ -272,15 +272,7 @@ class PoseGraph(ReadOnly):
     def pose_name(self, pose: int) -> str:
         """Return the id of a pose, for messages.
 
-        Parameters
-        ----------
-        pose : int
-            Number of the pose, 0-based. It may be a number that the graph does not have.
-
-        Returns
-        -------
-        str
-            The id of the pose as text, or "the world".
+        The world pose is "the world". A number that the graph does not have is its own name.
         """
         if pose == self.world:
             return "the world"
@@ -289,18 +281,7 @@ class PoseGraph(ReadOnly):
         return str(pose)
 
     def edge_label(self, e: int) -> str:
-        """Return the number of an edge and the ids of its poses, for messages.
-
-        Parameters
-        ----------
-        e : int
-            Number of the edge, 0-based.
-
-        Returns
-        -------
-        str
-            Text such as "edge 3 (17 -> 18)".
-        """
+        """Return the number of an edge and the ids of its poses, such as "edge 3 (17 -> 18)"."""
         name_i = self.pose_name(self.i[e])
         name_j = self.pose_name(self.j[e])
         return f"edge {e} ({name_i} -> {name_j})"
@@ -326,13 +307,7 @@ class PoseGraph(ReadOnly):
         return facts_table(self.facts())
 
     def facts(self) -> list[tuple[str, str]]:
-        """Return what the graph consists of, as labels and texts.
-
-        Returns
-        -------
-        list of (str, str)
-            A label and a text for every row of the table that a notebook or `pgo info` shows.
-        """
+        """Return what the graph consists of, as labels and texts."""
         tau = "no edge measures a translation"
         if self.has_translations:
             tau = f"{self.tau.min():.4g} to {self.tau.max():.4g} per m^2"
@@ -436,11 +411,6 @@ class PoseGraph(ReadOnly):
     def near_zero(self, poses: Poses) -> Poses:
         """Return poses of a graph with far priors in the frame of the world pose; others as given.
 
-        Parameters
-        ----------
-        poses : Poses
-            All poses of the graph, in any frame.
-
         Returns
         -------
         Poses
@@ -457,11 +427,6 @@ class PoseGraph(ReadOnly):
 
     def in_frame_of_priors(self, poses: Poses) -> Poses:
         """Return poses of a graph with priors in the frame of its file.
-
-        Parameters
-        ----------
-        poses : Poses
-            All poses of the graph, in any frame.
 
         Returns
         -------
@@ -672,11 +637,6 @@ class PoseGraph(ReadOnly):
         edges : BoolArray, (m,), optional
             Edges that connect poses; all edges unless given.
 
-        Returns
-        -------
-        list of IntArray
-            Poses of every component, ascending.
-
         Examples
         --------
         >>> from pgo_models.graphs.datasets import load
@@ -701,11 +661,6 @@ class PoseGraph(ReadOnly):
 
         Parts are the components, but for priors of rotations alone, which tie no positions: where
         nothing else joins two parts, each has the world of its priors.
-
-        Returns
-        -------
-        list of IntArray
-            Poses of every part, ascending.
         """
         ties = ~self.is_prior | (self.tau > 0.0)
         if ties.all() or not self.has_translations:
@@ -831,19 +786,9 @@ class PoseGraph(ReadOnly):
             )
 
     def is_world_fixed(self, kept: BoolArray) -> bool:
-        """Return whether positions fix the rotation of the world.
+        """Return whether positions among the kept edges, (m,), fix the rotation of the world.
 
         In a point or, in space, on a line they do not.
-
-        Parameters
-        ----------
-        kept : BoolArray, (m,)
-            Edges that count.
-
-        Returns
-        -------
-        bool
-            Whether those of them that are priors of positions do.
         """
         measured = self._first_positions(self.is_prior & kept)
         if len(measured) < self.d:
@@ -911,18 +856,10 @@ class PoseGraph(ReadOnly):
         )
 
     def edge_subgraph(self, edges: IntArray) -> PoseGraph:
-        """Return the graph of some edges, in the given order, and of the poses that they join.
+        """Return the graph of some edges, (k,), in the given order, and of the poses they join.
 
-        Parameters
-        ----------
-        edges : IntArray, (k,)
-            Numbers of the edges.
-
-        Returns
-        -------
-        PoseGraph
-            Graph of these edges. The poses keep their ids, and are numbered anew in ascending
-            order. Estimates, truth, robots and times are left out.
+        The poses keep their ids, and are numbered anew in ascending order. Estimates, truth, robots
+        and times are left out.
 
         Examples
         --------
@@ -946,10 +883,7 @@ class PoseGraph(ReadOnly):
     def unit_weights(self) -> PoseGraph:
         """Return the graph with kappa = tau = 1, as in the paper, but where they are zero.
 
-        Returns
-        -------
-        PoseGraph
-            The same measurements; information matrices as read are left out.
+        Information matrices as read are left out.
 
         References
         ----------
@@ -962,48 +896,26 @@ class PoseGraph(ReadOnly):
     def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
         """Return the graph with other precisions.
 
+        Information matrices as read are left out.
+
         Parameters
         ----------
         kappa : Array, (m,)
             Precisions of the rotations, per radian^2.
         tau : Array, (m,)
             Precisions of the translations, per metre^2.
-
-        Returns
-        -------
-        PoseGraph
-            The same measurements; information matrices as read are left out.
         """
         return replace(self, kappa=kappa, tau=tau, information=None, unheld=None, weights_error=0.0)
 
     def with_robots(self, robot: IntArray) -> PoseGraph:
-        """Return the graph with other owners of the poses.
-
-        Parameters
-        ----------
-        robot : IntArray, (n,)
-            Robot 0 .. num_robots - 1 that owns every pose.
-
-        Returns
-        -------
-        PoseGraph
-            The same graph, shared by these robots.
-        """
+        """Return the graph with other owners of the poses, (n,), each 0 .. num_robots - 1."""
         return replace(self, robot=robot)
 
     @door
     def without_edges(self, mask: BoolArray) -> PoseGraph:
-        """Return the graph without some edges.
+        """Return the graph without the edges that a mask, (m,), names.
 
-        Parameters
-        ----------
-        mask : BoolArray, (m,)
-            Edges to leave out.
-
-        Returns
-        -------
-        PoseGraph
-            Graph of the other edges. It has no world pose if no prior is left.
+        It has no world pose if no prior is left.
 
         Raises
         ------
@@ -1023,7 +935,7 @@ class PoseGraph(ReadOnly):
     def with_edges(
         self, i: IntArray, j: IntArray, measured: Poses, kappa: Weights, tau: Weights
     ) -> PoseGraph:
-        """Return the graph with additional edges.
+        """Return the graph with additional edges, the new ones last.
 
         Where the graph has information matrices, the new edges have those of their precisions.
 
@@ -1037,11 +949,6 @@ class PoseGraph(ReadOnly):
             Precisions of the rotations, per radian^2, or one for all new edges.
         tau : Array, (k,), or float
             Precisions of the translations, per metre^2, or one for all new edges.
-
-        Returns
-        -------
-        PoseGraph
-            Graph with m + k edges, the new ones last.
 
         Raises
         ------
@@ -1095,11 +1002,6 @@ class PoseGraph(ReadOnly):
         tau : Array, (k,), or float
             Precisions of the positions, per metre^2.
 
-        Returns
-        -------
-        PoseGraph
-            Graph with k more edges and, unless it had one, a world pose.
-
         Raises
         ------
         GraphError
@@ -1123,11 +1025,6 @@ class PoseGraph(ReadOnly):
             Measured positions in the frame of the world, metres.
         tau : Array, (k,), or float
             Precisions of the positions, per metre^2.
-
-        Returns
-        -------
-        PoseGraph
-            Graph with k more edges and, unless it had one, a world pose.
 
         Raises
         ------

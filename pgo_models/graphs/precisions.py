@@ -88,17 +88,9 @@ def are_singular(blocks: Array) -> BoolArray:
 
 
 def partial_edges(graph: PoseGraph) -> BoolArray:
-    """Return which edges measure rotations or positions in some directions alone.
+    """Return which edges, (m,), measure rotations or positions in some directions alone.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        Any graph; one without information matrices has no such edges.
-
-    Returns
-    -------
-    BoolArray
-        (m,), true where a block of the information matrix is singular and not zero.
+    A block of their information matrix is singular and not zero.
 
     Examples
     --------
@@ -270,15 +262,7 @@ def without_indefinite_coupling(graph: PoseGraph) -> PoseGraph:
     that of its file, which can be negative. `PoseGraph.uncoupled` says which edges have lost their
     block, and `Solution.note` how many.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        Any graph; a graph without such matrices is returned as it is.
-
-    Returns
-    -------
-    PoseGraph
-        The same measurements, kappa and tau.
+    Measurements, kappa and tau stay; a graph without such matrices is returned as it is.
 
     Examples
     --------

@@ -100,11 +100,6 @@ def chi2(
     convention : Chi2Convention
         How the rotation is read.
 
-    Returns
-    -------
-    float
-        chi2, without a unit.
-
     Raises
     ------
     GraphError

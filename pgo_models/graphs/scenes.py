@@ -60,20 +60,10 @@ class NoiseModel:
         return self.translation_std**-2
 
     def kappa(self, d: int) -> float:
-        """Return the rotation precision.
+        """Return the rotation precision in the plane or in space, per radian^2.
 
         It is 1 / rotation_std^2 in the plane and 1 / (2 rotation_std^2) in space, as SE-Sync finds
         it in the information matrix I / rotation_std^2 of this noise.
-
-        Parameters
-        ----------
-        d : int
-            Dimension of space: 2 or 3.
-
-        Returns
-        -------
-        float
-            kappa, per radian^2.
         """
         return self.rotation_std**-2 / (d - 1)
 
@@ -88,16 +78,6 @@ def circle(rng: np.random.Generator | int) -> PoseGraph:
     The 300 directed edges join poses that are within 4.0 m. Truth rotations are uniform on SO(3),
     measurements and initial guess have `NoiseModel()`, and the weights are kappa = pi / 6, tau =
     0.5 on every edge. The edges are the same for every `rng`.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator or int
-        Source of the truth rotations and the noise.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with estimate and truth.
 
     References
     ----------
@@ -120,16 +100,6 @@ def grid(rng: np.random.Generator | int) -> PoseGraph:
     """Generate the paper's grid: 27 poses on a 3 x 3 x 3 lattice with a spacing of 1.66 m.
 
     The 108 directed edges join neighbours on the lattice; all else is as in `circle`.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator or int
-        Source of the truth rotations and the noise.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with estimate and truth.
 
     References
     ----------
@@ -156,16 +126,6 @@ def sphere(rng: np.random.Generator | int) -> PoseGraph:
     With all four there are 546 directed edges, with none 538. The published number of 544 is the
     result of double precision: the pair (0, 12) comes out one bit too long. That pair is left out
     by name here, and the others are in by a tolerance, so that no last bit decides.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator or int
-        Source of the truth rotations and the noise.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with estimate and truth.
 
     References
     ----------
@@ -210,11 +170,6 @@ def random_geometric(
     noise : NoiseModel
         Noise of the measurements and of the initial guess. The precisions are `noise.tau` and
         `noise.kappa(d)`.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with estimate and truth.
 
     Raises
     ------
@@ -280,11 +235,6 @@ def victoria_park(
         `noise.kappa(2)`.
     reach : float
         Distance within which a tree is seen, metres.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with landmarks, estimate and truth.
 
     Raises
     ------

@@ -73,7 +73,7 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
 
 
 def read_tum(path: Path | str, d: int = 3) -> Poses:
-    """Return the poses of a TUM file, in the order of its lines.
+    """Return the poses, world from body in metres, of a TUM file, in the order of its lines.
 
     A line is `timestamp tx ty tz qx qy qz qw`; `pgo_models.graphs.trajectories.read_times` reads
     the time stamps. Blank lines and comments (#) are skipped.
@@ -84,11 +84,6 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
         File to read.
     d : int
         Dimension of the poses: 3, or 2 for poses that lie in the x-y plane.
-
-    Returns
-    -------
-    Poses
-        World from body, metres.
 
     Raises
     ------

@@ -76,11 +76,6 @@ ALL_DIGITS = WrittenDigits(_ALL_DECIMALS, _ALL_SIGNIFICANT)
 def digits_of(numbers: Array) -> WrittenDigits:
     """The digits with which numbers are written, so many that they are enough for each of them.
 
-    Parameters
-    ----------
-    numbers : Array
-        All measured numbers of a file.
-
     Returns
     -------
     WrittenDigits
