@@ -37,12 +37,7 @@ _COMMON = (
     b'{"record": "Hello", "fields": {"revision": {"record": "Revision", "fields": {"num_lines": 1, '
     b'"digest": ""}}, "term": {"record": "Term", "fields": {"number": 1, "driver": ""}}, "known": '
     b'{"record": "Term", "fields": {"number": 0, "driver": ""}}, "computing": -1, "twins": '
-    b'{"items": []}}}{"record": "News", "fields": {"has": {"keys": ["a", "b"], "values": '
-    b'[{"record": "Revision", "fields": {"num_lines": 10, "digest": "0"}}, {"record": "Revision", '
-    b'"fields": {"num_lines": 100, "digest": "1"}}]}, "hears": {"items": ["a", "b"]}, "pieces": '
-    b'{"items": [{"record": "Piece", "fields": {"owner": "a", "before": {"record": "Revision", '
-    b'"fields": {"num_lines": 10, "digest": "0"}}, "text": {"array": 0}, "is_last": true}}]}, '
-    b'"takes_back": false, "twins": {"items": []}}}'
+    b'{"items": []}}}'
 )
 # A message may not unpack to more, nor its description, each byte of which may become an object:
 # whoever has the key could else fill the memory of the others.

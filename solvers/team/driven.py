@@ -25,12 +25,12 @@ from solvers.team.messages import (
     Hello,
     Letter,
     LetterLost,
-    News,
     Priority,
     Reply,
     Term,
     error_as_message,
 )
+from solvers.team.news import News
 from solvers.team.refusals import function_for_teams
 from solvers.team.talk import Talk
 

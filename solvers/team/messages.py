@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pgo_models import errors
 from pgo_models.errors import PGOError
 from solvers.carry.registry import record
 from solvers.carry.wire import Order, WireError
 from solvers.robots_solution import RobotsSolution
 from solvers.team.measurements import Revision
+from solvers.team.news import News
 
 _MOST = 1 << 62  # no number of a message is higher
 _PLAIN_ERRORS = {
@@ -55,41 +53,6 @@ class Hello:
     known: Term
     computing: int = -1
     twins: tuple[str, ...] = ()
-
-
-@record("Piece")
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """Lines of measurements of the robot `owner`, after those of the revision `before`.
-
-    `text` are the lines in UTF-8, compressed with the end of those before as a dictionary.
-    `is_last` says that there are no more.
-    """
-
-    owner: str
-    before: Revision
-    text: NDArray[np.uint8]
-    is_last: bool
-
-
-@record("News")
-@dataclass(frozen=True, eq=False)
-class News:
-    """A robot is there; it has measurements of these revisions, by robot, and gives pieces of some.
-
-    `hears` are robots that it has heard of lately, which send it what they measure themselves.
-    `takes_back` says that it comes from what was saved, and lacks what it has measured since;
-    `twins` are names that two robots have. `sent` is when pieces were sent, in milliseconds of the
-    sender's clock, and `answers` that number of those that have come last, or -1.
-    """
-
-    has: Mapping[str, Revision]
-    hears: tuple[str, ...]
-    pieces: tuple[Piece, ...] = ()
-    takes_back: bool = False
-    twins: tuple[str, ...] = ()
-    sent: int = -1
-    answers: int = -1
 
 
 @record("Ask")

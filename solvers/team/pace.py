@@ -42,7 +42,7 @@ class Pace:
     def pause(self, silence: float, retry: float) -> float:
         """Seconds until something that was sent is sent again, unless it is answered before.
 
-        They are twice the time of an answer, the shortest of the last ones. While nothing is heard
-        of the robot, they are at least half the time since.
+        They are one and a half times the longest of the last answers. While nothing is heard of the
+        robot, they are at least half the time since.
         """
-        return max(retry, 2 * min(self._seconds, default=retry), silence / 2)
+        return max(retry, 1.5 * max(self._seconds, default=0.0), silence / 2)

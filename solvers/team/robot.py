@@ -12,6 +12,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 from pgo_models.errors import PGOError, SettingError, door
 from pgo_models.files import replace_when_done
@@ -25,6 +26,7 @@ from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.robust.known import takes_odometry
+from solvers.solution import Solution
 from solvers.team.driven import DrivenTeam
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
@@ -264,14 +266,24 @@ class Robot:
         return None if self.outcome is None else self.outcome.solution
 
     @property
+    def map(self) -> Solution | None:
+        """The last solve of the measurements of all, in teams that share them; else None.
+
+        It has the graph and the poses of all robots that are `covered`, so that any robot can
+        compute the certificate again: `certify(robot.map.problem, robot.map.poses)`.
+        """
+        data = self._member.solution
+        return None if data is None else cast(Solution, pickle.loads(data))
+
+    @property
     def covariances(self) -> dict[int, Array]:
         """Covariance (p, p) of every pose of this robot, by id, of teams that share measurements.
 
         Where they are not known, there are none. They are computed when they are asked for.
         """
-        if self._member.solution is None:
+        solution = self.map
+        if solution is None:
             return {}
-        solution = pickle.loads(self._member.solution)
         try:
             covariances = dict(
                 zip(solution.problem.graph.pose_ids.tolist(), solution.marginals(), strict=True)

@@ -229,6 +229,9 @@ class Session:
 
     def send(self, to: str, message: object, priority: Priority) -> None:
         """Send a message to a robot."""
+        if isinstance(message, type(self.way.greeting())):
+            _, num_sent = self._greeted.get(to, (self.now, 0))
+            self._greeted[to] = (self.now, num_sent)
         self._send(to, message, priority, self._speakers.boot_of(to))
 
     def _send(self, to: str, message: object, priority: Priority, heard: bytes) -> None:

@@ -8,28 +8,26 @@ map. It stays when robots go, and lost messages are sent again.
 
 from __future__ import annotations
 
-import zlib
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError
-from solvers.carry.wire import WireError
 from solvers.team.beside import OTHER_PROCESS
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
-from solvers.team.messages import Ended, Hello, News, Piece, Priority, Term
+from solvers.team.messages import Ended, Hello, Priority, Term
+from solvers.team.news import News, Piece
 from solvers.team.pace import MOST_IN_A_PIECE, Pace
+from solvers.team.packed_lines import packed_lines, unpacked_lines
 from solvers.team.shared_solve import SharedAnswer
 from solvers.team.talk import Talk
 
 _FORGOTTEN = 10.0  # patiences without a sign, after which a robot is not waited for any more
-_DICTIONARY = 1 << 15  # bytes of the lines before, which deflate can refer to at most
 
 
 @dataclass(frozen=True)
@@ -173,9 +171,8 @@ class SharedMap:
         """Add lines to those of a robot; of its own that robot alone decides which stand."""
         if piece.owner == self.name:
             if self._takes_back and piece.before == self.saved:
-                self._member.measurements.end_at(
-                    piece.before.num_lines, _lines_of(piece, self._member.measurements)
-                )
+                own = self._member.measurements
+                own.end_at(piece.before.num_lines, _lines_of(piece, own))
                 self.saved = self._member.revision
             return
         log = self.logs.setdefault(piece.owner, Measurements())
@@ -208,7 +205,10 @@ class SharedMap:
         self._owed = {name: when for name, when in self._owed.items() if name in awake}
         for name, has in self._has.items():
             pieces = self._pieces_for(name, has, awake)
-            if pieces or self._owed.get(name, np.inf) <= self._talk.now:
+            # Where lines for the robot are being collected, they take the answer along.
+            is_coming = has.get(self.name) != self._member.revision
+            delay = self._talk.pause(1) / 2 if is_coming else 0.0
+            if pieces or self._owed.get(name, np.inf) + delay <= self._talk.now:
                 self._owed.pop(name, None)
                 priority = Priority.NORMAL if pieces else Priority.HELLO
                 self._talk.send(name, self._news(name, tuple(pieces)), priority)
@@ -272,8 +272,8 @@ class SharedMap:
             ends += 1
         is_last = ends == len(log.lines)
         self._flights[to, owner] = _Flight(begins, now, num_sent + 1, is_last)
-        text = _compressed(log.lines[begins:ends], log.lines[:begins])
-        return Piece(owner, log.revision_at(begins), text, is_last)
+        text, numbers = packed_lines(log.lines[begins:ends], log.lines[:begins])
+        return Piece(owner, log.revision_at(begins), text, numbers, is_last)
 
     # Solves
 
@@ -327,33 +327,7 @@ class SharedMap:
         self._member.solution = answer.solution
 
 
-def _dictionary(before: Sequence[str]) -> bytes:
-    """The end of lines, in UTF-8."""
-    parts: list[str] = []
-    num_letters = 0
-    for line in reversed(before):
-        if num_letters >= _DICTIONARY:
-            break
-        parts.append(line)
-        num_letters += len(line)
-    return "".join(reversed(parts)).encode("utf-8")[-_DICTIONARY:]
-
-
-def _compressed(lines: Sequence[str], before: Sequence[str]) -> NDArray[np.uint8]:
-    """Lines in UTF-8, compressed by what those before have in common with them."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, -15, zdict=_dictionary(before))
-    data = packer.compress("".join(lines).encode("utf-8")) + packer.flush()
-    return np.frombuffer(data, np.uint8)
-
-
 def _lines_of(piece: Piece, log: Measurements) -> list[str]:
     """The lines of a piece; a WireError for bytes that are none, or more than a robot sends."""
-    unpacker: Any = zlib.decompressobj(-15, _dictionary(log.lines[: piece.before.num_lines]))
-    try:
-        data: bytes = unpacker.decompress(piece.text.tobytes(), 4 * MOST_IN_A_PIECE)
-        text = data.decode("utf-8")
-    except (zlib.error, ValueError) as error:
-        raise WireError(f"lines that cannot be read: {error}") from error
-    if not unpacker.eof or (text and not text.endswith("\n")):
-        raise WireError("lines without an end")
-    return text.splitlines(keepends=True)
+    before = log.lines[: piece.before.num_lines]
+    return unpacked_lines(piece.text, piece.numbers, before, 4 * MOST_IN_A_PIECE)

@@ -16,11 +16,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from solvers.carry.wire import WireError, as_bytes, from_bytes
+from solvers.team.news import News
 
 _BOOT_BYTES = 8
 NO_BOOT = bytes(_BOOT_BYTES)  # before another robot was heard
 # Boots of the sender and of the receiver, number of the message, and lengths of the two names.
 _HEAD = struct.Struct(f"<{_BOOT_BYTES}s{_BOOT_BYTES}sIHH")
+_NEWS, _OTHER = b"N", b"O"  # kinds of content
 _WINDOW = 4096  # a message that comes later than so many after it counts as repeated
 
 
@@ -41,7 +43,8 @@ class Envelope:
     @property
     def message(self) -> Any:  # noqa: ANN401 - a message of any kind
         """The message; a WireError for bytes that are none."""
-        return from_bytes(self.content, object)
+        kind, content = self.content[:1], self.content[1:]
+        return News.from_bytes(content) if kind == _NEWS else from_bytes(content, object)
 
     def as_bytes(self) -> bytes:
         """Bytes of which `from_bytes` makes the envelope."""
@@ -119,7 +122,10 @@ class Speakers:
     def addressed(self, receiver: str, message: object, heard: bytes) -> Envelope:
         """A message to the run `heard` of a robot."""
         self._num_sent += 1
-        content = as_bytes(message)
+        if isinstance(message, News):
+            content = _NEWS + message.as_bytes()
+        else:
+            content = _OTHER + as_bytes(message)
         return Envelope(self.name, receiver, self.boot, heard, self._num_sent, content)
 
     def word_of(self, envelope: Envelope, now: float) -> Word:

@@ -22,7 +22,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models import PoseGraph
 from pgo_models.errors import GraphError
-from solvers.team.messages import News
+from solvers.team.news import News
 
 SHARED = solvers.Sharing.MEASUREMENTS
 
@@ -91,6 +91,21 @@ def test_lost_lines_are_sent_again_soon_while_the_others_are_heard(seed: int) ->
     for robot in robots.values():
         assert robot.outcome is not None
         assert robot.outcome.revisions == revisions
+
+
+def test_every_robot_can_compute_the_certificate_of_all_again() -> None:
+    graph = world()
+    robots = shared(graph, 3)
+    assert robots["r0"].map is None
+    Network(robots, np.random.default_rng(0)).run(30.0)
+    for robot in robots.values():
+        assert robot.map is not None
+        assert robot.map.problem.graph.num_edges == graph.num_edges
+        assert robot.map.problem.graph.pose_ids.tolist() == graph.pose_ids.tolist()
+        again = solvers.certify(robot.map.problem, robot.map.poses)
+        assert again.is_certified
+        assert robot.solution is not None
+        assert again.lower_bound == pytest.approx(robot.solution.lower_bound, rel=1e-9)
 
 
 # Who is not there.

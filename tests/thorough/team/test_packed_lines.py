@@ -1,0 +1,85 @@
+"""Lines of measurements come out of their bytes as they went in, and are few bytes."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from budget import examples
+
+import pgo_models as pgo
+from solvers.carry.wire import WireError
+from solvers.team.measurements import Revision
+from solvers.team.news import News, Piece
+from solvers.team.packed_lines import packed_lines, unpacked_lines
+
+MOST = 1 << 20
+WORDS = [
+    *("EDGE_SE2", "FIX", "#", "", "\0", "\0\0", "\1", "\0011", "\2", "\2\0", "-0.0", "1e-300"),
+    *("0", "00", "7", "-3", "9223372036854775807", "99999999999999999999", "\u0663", "\u2002x"),
+    *("0.1", "0.30000000000000004", "123456789012", "1234567890.12345", "1_000_000_000.5"),
+    *("nan", "infinity_and_beyond", "6.02214076e+23", "4294967295.9999995", "4294967296.000001"),
+    *("2.3283064365386963e-10", "-2.328306436538696e-10", "0.123456789012\r", "\u00e9" * 12),
+]
+
+
+@pytest.mark.parametrize("seed", range(examples(40)))
+def test_any_lines_come_out_as_they_went_in(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drawn = [repr(x) for x in rng.normal(size=20) * 2.0 ** rng.integers(-40, 40, 20)]
+    text = ""
+    for _ in range(100):
+        text += " ".join(rng.choice(WORDS + drawn, rng.integers(1, 9))) + rng.choice(["\n", "\r\n"])
+    lines = text.splitlines(keepends=True)
+    cut = int(rng.integers(0, len(lines)))
+    packed = packed_lines(lines[cut:], lines[:cut])
+    assert unpacked_lines(*packed, lines[:cut], MOST) == lines[cut:]
+
+
+def test_a_long_number_takes_59_bits_and_ids_take_nothing(tmp_path: object) -> None:
+    graph = pgo.grid_world(1, 200, 3)
+    pgo.write_g2o(graph, f"{tmp_path}/graph.g2o")
+    with open(f"{tmp_path}/graph.g2o", encoding="utf-8") as file:
+        lines = [line for line in file if line.startswith("EDGE")]
+    odometry = lines[:150]
+    text, numbers = packed_lines(odometry[100:], odometry[:100])
+    assert len(numbers) <= 50 * 7 * 59 / 8 + 1
+    assert len(text) <= 250
+
+
+@pytest.mark.parametrize("seed", range(examples(20)))
+def test_bytes_that_are_no_lines_are_refused(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    text, numbers = packed_lines(["EDGE_SE2 1 2 0.1234567890123 0.5 0.25\n"] * 30, [])
+    for wrong in (text[:-1], bytes(rng.integers(0, 256, 40, dtype=np.uint8))):
+        with pytest.raises(WireError):
+            unpacked_lines(wrong, numbers, [], MOST)
+    with pytest.raises(WireError):
+        unpacked_lines(text, b"", [], MOST)
+    with pytest.raises(WireError):
+        unpacked_lines(text, numbers, [], 100)
+    with pytest.raises(WireError):
+        unpacked_lines(text, bytes(MOST + 1), [], MOST)
+
+
+@pytest.mark.parametrize("seed", range(examples(20)))
+def test_messages_come_out_of_their_bytes_and_changed_bytes_are_messages_or_refused(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    before = Revision(200, "0123456789abcdef")
+    has = {"anna": before, "\u00e9": Revision(1 << 40, "00ff")}
+    pieces = (
+        Piece("ben", Revision(), b"\x00text", b"", True),
+        Piece("anna", before, b"", b"n", False),
+    )
+    news = News(has, ("ben", "dora"), pieces, True, ("anna",), 12345678, 0)
+    data = news.as_bytes()
+    assert vars(News.from_bytes(data)) | {"pieces": ()} == vars(news) | {"pieces": ()}
+    assert [vars(piece) for piece in News.from_bytes(data).pieces] == [*map(vars, pieces)]
+    for _ in range(100):
+        changed = bytearray(data)
+        changed[rng.integers(len(data))] = rng.integers(256)
+        with suppress(WireError):
+            News.from_bytes(bytes(changed[: rng.integers(len(data)) + 1]))
