@@ -359,11 +359,6 @@ class SplitProblem(ReadOnly):
     problem: OrthogonalProblem
     step: ConeStep | PosedStep
 
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """The terms of the problem."""
-        return self.problem.terms
-
     def at(self, rho: float) -> "SplitProblem":
         """The same: a new rho does not compile again."""
         return self

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
 
-from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem, Term
+from pgo_models.convex.orthogonality import OrthogonalPoint, OrthogonalProblem
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
@@ -43,11 +43,6 @@ class QuadraticSplit(ReadOnly):
     problem: OrthogonalProblem
     form: QuadraticForm
     factored: tuple[float, CholeskyFactor] | None = None
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """The terms of the problem."""
-        return self.problem.terms
 
     def solve(self, V: Sequence[Array], rho: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """As `SplitProblem.solve`."""
@@ -88,7 +83,7 @@ class QuadraticSplit(ReadOnly):
             normals.append(-entries.reshape(variable.shape, order="F"))
             start += variable.size
         values = form.values(u)
-        ordered = [term.variable for term in self.terms]
+        ordered = [term.variable for term in self.problem.terms]
         return OrthogonalPoint(
             tuple(values[place] for place in ordered), tuple(normals[place] for place in ordered)
         )

@@ -28,7 +28,7 @@ from pgo_models.convex.orthogonality import (
 )
 from pgo_models.convex.quadratic_form import NotQuadraticError, quadratic_form
 from pgo_models.convex.quadratic_split import QuadraticSplit
-from pgo_models.errors import check_settings
+from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
 from pgo_models.summaries import Summarised
 from solvers.convex.model_newton import ModelNewton
@@ -188,15 +188,17 @@ class OrthogonalSOC:
             start = problem.point([_identity(variable.shape) for variable in problem.variables])
         problem.check_point(start)
         split = self.split(problem)
-        rho, others = self._first_penalty(split, start)
+        rho = self._first_penalty(split, start)
         X = problem.values(start.copies)
         B = tuple(normal / rho for normal in start.normals)
+        V = [P - b for P, b in zip(start.copies, B, strict=True)]
+        _, others = split.solve(V, rho)
         return OrthogonalState(0, X, others, start.copies, B, rho, split.at(rho))
 
     def step(self, problem: OrthogonalProblem, state: OrthogonalState) -> OrthogonalState:
         """Make one iteration: (a), (b), (c)."""
         if self.newton is not None and state.k + 1 == _HANDED_OVER:
-            state = self._polished(self.newton, problem, state)
+            state = self._handed_over(self.newton, problem, state)
         state = self._with_due_penalty(problem, state)
         # One P, B, V and x for every term; x is the X of the term's variable.
         V = [P - B for P, B in zip(state.copies, state.B, strict=True)]
@@ -236,11 +238,12 @@ class OrthogonalSOC:
                     raise
         return problem.split(self.solver)
 
-    def _polished(
+    def _handed_over(
         self, newton: ModelNewton, problem: OrthogonalProblem, state: OrthogonalState
     ) -> OrthogonalState:
         """The state at which SOC begins from where Newton ends, with a penalty that holds it."""
-        assert isinstance(state.split, QuadraticSplit)
+        if not isinstance(state.split, QuadraticSplit):
+            raise SettingError("newton is for step (a) by matrices; leave x_step and solver alone")
         u = newton.polish(newton.form.u_of(problem.values(state.copies)))
         start = state.split.stationary_point(u)
         return replace(self.init(problem, start), k=state.k, scale=state.scale)
@@ -254,31 +257,21 @@ class OrthogonalSOC:
 
     # The penalty.
 
-    def _first_penalty(
-        self, split: AnySplit, point: OrthogonalPoint
-    ) -> tuple[float, tuple[Array, ...]]:
-        """The first rho, and the other variables at the start.
+    def _first_penalty(self, split: AnySplit, point: OrthogonalPoint) -> float:
+        """The first rho, from the norms of the gradient at the start, one a term.
 
-        rho is `penalty`, or `safeguard` times the norm of the gradient at the start, or what a rule
-        makes of it. The gradient is minus the multipliers of the start, if it has any.
+        The gradient is minus the multipliers of the start, if it has any. Of zero ones rho is 1.
         """
         if isinstance(self.penalty, float):
-            return self.penalty, _others_at(split, point, self.penalty)
+            return self.penalty
         norms = np.array([_spectral_norm(normal) for normal in point.normals])
-        if norms.any():
-            rho = self._rho_of(norms)
-            return rho, _others_at(split, point, rho)
-        norms, others = _probed_gradient(split, point)
-        return self._rho_of(norms), others
-
-    def _rho_of(self, norms: Array) -> float:
-        """The first rho, from the norms of the gradient, one a term; 1 where they are zero."""
+        if not norms.any():
+            norms = _probed_gradient(split, point)
         largest = float(norms.max())
         if largest == 0.0:
             return 1.0
         if self.penalty is None:
             return self.safeguard * largest
-        assert not isinstance(self.penalty, float)
         order = PenaltyOrder(*self.penalty.bounds(norms / largest))
         return float(order.rho(norms, np.full(len(norms), largest)).max())
 
@@ -316,14 +309,8 @@ class OrthogonalSOC:
         return max(state.rho, least)
 
 
-def _others_at(split: AnySplit, point: OrthogonalPoint, rho: float) -> tuple[Array, ...]:
-    """The other variables at a point with multipliers."""
-    V = [P - N / rho for P, N in zip(point.copies, point.normals, strict=True)]
-    return split.solve(V, rho)[1]
-
-
-def _probed_gradient(split: AnySplit, point: OrthogonalPoint) -> tuple[Array, tuple[Array, ...]]:
-    """Norms of the gradient at a start without multipliers, one a term, and the other variables.
+def _probed_gradient(split: AnySplit, point: OrthogonalPoint) -> Array:
+    """Norms of the gradient at a start without multipliers, one a term.
 
     Step (a) gives the gradient at its solution X. rho is moved by tens until X is near the start,
     where the gradients are alike, or comes no nearer.
@@ -334,8 +321,10 @@ def _probed_gradient(split: AnySplit, point: OrthogonalPoint) -> tuple[Array, tu
     norms = np.zeros(len(point.copies))
     distance = math.inf
     for _ in range(_MAX_PROBES):
-        X, others = split.solve(point.copies, rho)
-        moves = [P - X[term.variable] for P, term in zip(point.copies, split.terms, strict=True)]
+        X, _ = split.solve(point.copies, rho)
+        moves = [
+            P - X[term.variable] for P, term in zip(point.copies, split.problem.terms, strict=True)
+        ]
         distance_before = distance
         distance = norm_of_all(moves) / size
         if was_far and distance > 0.5 * distance_before:
@@ -348,7 +337,7 @@ def _probed_gradient(split: AnySplit, point: OrthogonalPoint) -> tuple[Array, tu
             break
         was_far = was_far or is_far
         rho *= 10.0 if is_far else 1e-3
-    return norms, others
+    return norms
 
 
 def _size_of(copies: Sequence[Array]) -> float:
