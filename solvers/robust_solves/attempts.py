@@ -80,6 +80,11 @@ class DoubtedProblem:
         return np.ones_like(self.known)
 
     @property
+    def has_landmarks(self) -> bool:
+        """Whether poses see landmarks: a map that odometry leads to is then mostly a wrong one."""
+        return len(self.problem.graph.landmarks) > 0
+
+    @property
     def is_cheap(self) -> bool:
         """Whether a factorisation is cheap, whatever poses the closures join."""
         num_coupled = min(self.problem.num_poses, self.num_closures)
@@ -146,8 +151,10 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     known_alone = Plan("known inliers", None, tree)
     least_squares = Plan("from least squares with every edge", settings, candidates, True)
     slow = Plan("smaller steps", with_smaller_steps(settings), candidates)
-    if not known.any():  # a tree of any edges is a poor start
-        first = [least_squares, as_set]
+    # A tree of any edges is a poor start, and odometry is one where there are landmarks.
+    least_squares_first = not known.any() or doubted.has_landmarks
+    if least_squares_first:
+        first = [least_squares, as_set, *([known_alone] if known.any() else [])]
         last = [slow, *tight]
     elif doubted.is_large:
         less_tight, tightest = tight
@@ -164,7 +171,7 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
             preselected = replace(settings, consistent=True)
             yield Plan("pairwise consistent edges", preselected, consistent)
     yield from last
-    if known.any():
+    if not least_squares_first:
         yield least_squares
     yield Plan(*_with_other_loss(settings), candidates)
 
@@ -300,12 +307,18 @@ class PlacesOfEdges:
         return replace(revised, attempt=attempt, before_revision=estimate.before_revision)
 
     def solution_nearby(self, kept: BoolArray, start: Poses | None) -> Solution:
-        """Solution with the kept edges, (m,), by Newton alone, from a start near it or its own."""
+        """Solution with the kept edges, (m,), by Newton alone, from a start near it or its own.
+
+        With landmarks its own may be a growing start: others lead to maps far from the right one.
+        """
         pipeline = self.request.pipeline
         newton = pipeline.newton
         if start is not None:
             newton = replace(newton, max_iterations=min(newton.max_iterations, LAST_STEPS))
-        return self._solved(kept, pipeline.with_newton_alone(newton), start)
+        newton_alone = pipeline.with_newton_alone(newton)
+        if start is None and self.doubted.has_landmarks:
+            newton_alone = replace(newton_alone, growing=pipeline.growing)
+        return self._solved(kept, newton_alone, start)
 
     def solution(self, kept: BoolArray, start: Poses | None) -> Solution:
         """Solution with the kept edges, (m,), by all steps, from a start near it or its own."""

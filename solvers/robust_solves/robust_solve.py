@@ -28,7 +28,7 @@ from solvers.robust.agreement_search import best_by_agreement
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.consistency import PCM, distances_from_odometry, pairwise_consistent
-from solvers.robust.edge_sets import EdgeSets
+from solvers.robust.edge_sets import EdgeSets, Effort
 from solvers.robust.gnc import GNC, LARGEST_SCALE
 from solvers.robust.known import KnownEdges
 from solvers.robust.rejection import Rejection
@@ -70,10 +70,11 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
     `Solution.robust` says which these are, what is proven of them, and what supports them.
 
     1. Least squares. Where factoring the matrix of all edges is cheap, or affordable and most
-       closures fit the chordal start, and no start is given, the solution with every edge comes
-       first. It is the answer if time has run out, or if nothing speaks against any edge: it is
-       certified, no edge but known inliers is improbable or contradicted, and all together cost no
-       more than they may. It is the answer, too, if all edges alike cost more than they may.
+       closures fit the chordal start or there are landmarks, and no start is given, the solution
+       with every edge comes first. It is the answer if time has run out, or if nothing speaks
+       against any edge: it is certified, no edge but known inliers is improbable or contradicted,
+       and all together cost no more than they may. It is the answer, too, if all edges alike cost
+       more than they may.
     2. Attempts (`plans_in_order`). Graduated non-convexity is run as set; then there are the known
        inliers alone; then it is run on the pairwise consistent edges; with more and smaller steps;
        with tight thresholds, which the edges kept then widen (first on a large graph); from the
@@ -81,8 +82,9 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        are added, removed and exchanged (`ClusterSearch`), then edges are dropped that all others
        contradict (`drop_contradicted`). It ends early when no further attempt is needed
        (`Choice.is_enough`). Without known edges, trees of edges whose cycles agree come first
-       (`best_by_agreement`). Odometry that nobody has named, and that cycles contradict, is not
-       known in further attempts (`with_odometry_doubted`).
+       (`best_by_agreement`), and with landmarks the least-squares solution does. All searches
+       together make a bounded number of maps (`Effort`). Odometry that nobody has named, and that
+       cycles contradict, is not known in further attempts (`with_odometry_doubted`).
     3. Choice. The attempt of the least truncated cost of all edges (`Choice`) is the answer,
        whether it is certified or not. Newton and all further steps of the pipeline
        (`solvers.plan`) solve for the edges kept.
@@ -136,7 +138,8 @@ class _RobustSolve:
     """A robust solve under way: what its stages share, and the estimates made so far.
 
     `least_squares` are the poses of the solution with every edge, once it was found. `failures` are
-    sentences on what failed that could only have improved the answer. `new` (m,) are the edges that
+    sentences on what failed that could only have improved the answer. `effort` is that of all
+    searches. `new` (m,) are the edges that
     were not there before, if the graph has grown. `is_doubting` says whether odometry that was
     claimed may be wrong.
     """
@@ -148,6 +151,7 @@ class _RobustSolve:
     least_squares: Poses | None = None
     estimates: list[Estimate] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
+    effort: Effort = field(default_factory=Effort)
     new: BoolArray | None = None
     is_doubting: bool = False
     began: float = field(default_factory=time.perf_counter)
@@ -177,10 +181,13 @@ class _RobustSolve:
     # Step 1: least squares; and pairwise consistency alone
 
     def seems_right(self) -> bool:
-        """Whether a plain solve is worth its time: affordable, and most closures fit its start."""
+        """Whether a plain solve is worth its time: affordable, and most closures fit its start.
+
+        With landmarks it is, whatever its start is, as its growing start is the best there is.
+        """
         doubted = self.doubted
-        if not doubted.is_affordable:
-            return False
+        if not doubted.is_affordable or doubted.has_landmarks:
+            return doubted.is_affordable
         costs = doubted.problem.edge_costs(chordal_start(doubted.problem))
         is_near = (costs <= _NEAR_AT_START * doubted.thresholds)[~doubted.known]
         return is_near.size == 0 or float(is_near.mean()) >= _NEAR_SHARE
@@ -374,6 +381,7 @@ class _RobustSolve:
             is_doubting=True,
             least_squares=self.least_squares,
             failures=self.failures,
+            effort=self.effort,
             began=self.began,
         )
         try:
@@ -430,7 +438,9 @@ class _RobustSolve:
         doubted = self.doubted
         scale = choice.threshold_scale
         allowed = scale * doubted.thresholds
-        sets = EdgeSets(doubted.problem, self.closure_pairs, allowed, scale, self._has_time)
+        self.effort.begin_search()
+        pairs = self.closure_pairs
+        sets = EdgeSets(doubted.problem, pairs, allowed, scale, self._has_time, self.effort)
         return ClusterSearch(sets, self.new)
 
     def _by_chance(self, solution: Solution, kept: BoolArray) -> float:
@@ -601,7 +611,11 @@ class _RobustSolve:
         ledgers = self.places.ledgers
         ledger = reduce(Ledger.joined, ledgers) if ledgers else None
         seconds = time.perf_counter() - self.began
-        note = joined_notes(solution.note, *self.failures)
+        notes = list(self.failures)
+        if self.effort.has_run_out:
+            number = self.effort.num_maps
+            notes.append(f"the search for wrong edges ended at its limit, after {number} maps")
+        note = joined_notes(solution.note, *notes)
         return replace(solution, robust=rejection, ledger=ledger, seconds=seconds, note=note)
 
 

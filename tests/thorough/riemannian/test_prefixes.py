@@ -187,6 +187,18 @@ def test_the_public_graph_of_victoria_park_is_certified(
 
 
 @pytest.mark.slow
+def test_a_robust_solve_of_victoria_park_ends_near_the_plain_one(benchmark_data: Path) -> None:
+    """From odometry it found clusters one after the other, near a map far from the right one."""
+    graph = read_g2o(benchmark_data / "victoriaPark.g2o")
+    solution = solvers.solve(graph, robust=solvers.GNC(), progress=False)
+    assert solution.certificate.verdict is Verdict.CERTIFIED
+    assert solution.robust is not None
+    assert solution.robust.rejected.sum() == 13
+    assert solution.robust.start.startswith("from least squares with every edge")
+    assert "limit" not in solution.note
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4, 5])
 def test_soc_ends_where_its_residuals_stop_falling(seed: int) -> None:
     """Of these graphs the chordal start is far from the optimum."""

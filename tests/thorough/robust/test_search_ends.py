@@ -17,7 +17,7 @@ import pgo_models as pgo
 from pgo_models import NoiseModel, PoseGraph
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs
-from solvers.robust.edge_sets import EdgeSets
+from solvers.robust.edge_sets import EdgeSets, Effort
 from solvers.robust.known import odometry
 
 CASES = Path(__file__).parents[2] / "cases"
@@ -85,3 +85,20 @@ def test_every_search_ends_on_loops_with_slips(first: int, keeps_all: bool) -> N
 def test_every_search_ends_in_small_worlds_with_slips(first: int, keeps_all: bool) -> None:
     for seed in range(first, first + 10):
         assert num_questions(slipped_world(seed), pgo.Weighting.OWN, keeps_all) < MOST, seed
+
+
+@pytest.mark.parametrize("total", [1000, 4000])
+def test_all_searches_of_a_solve_together_end_at_their_limit(total: int) -> None:
+    graph = slipped_world(3)
+    problem = pgo.PGOProblem(graph)
+    known = odometry(graph)
+    effort = Effort(total)
+    pairs = ClosurePairs.of(graph, known)
+    allowed = pgo.chi2_thresholds(problem)
+    for _ in range(3):
+        effort.begin_search()
+        sets = EdgeSets(problem, pairs, allowed, 1.0, lambda: True, effort)
+        ClusterSearch(sets).improved(known, pgo.odometry_start(graph))
+    # A trial that has begun is finished: by a few maps more.
+    assert effort.num_poses <= total + 10 * graph.num_poses
+    assert effort.has_run_out == (total == 1000)
