@@ -117,11 +117,11 @@ class Drive:
                 self.num_asked[name] = number + 1
                 members = self.members if number == 0 else ()
                 asks[name] = Ask(self.term, number, place, named, request, members)
-        if asks:
-            self.beside.hand_over(lambda: self._ask_others(asks))
-        answers = obey([self.agent], order, requests[:1])
         if not asks:
+            answers = obey([self.agent], order, requests[:1])
             return raise_first_error([*answers, *(None for _ in requests[1:])])
+        self.beside.hand_over(lambda: self._ask_others(asks))
+        answers = obey([self.agent], order, requests[:1])  # others may answer before this one
         self.beside.count(-1)
         arrived = self._arrived.get()
         if arrived is None:

@@ -86,6 +86,25 @@ def test_where_the_process_dies_the_next_solve_starts_another() -> None:
     assert np.all([np.isfinite(covariance).all() for covariance in robot.covariances.values()])
 
 
+def test_a_driver_may_take_longer_for_its_part_than_all_others() -> None:
+    graph = world(n=150)
+    names = ["r0", "r1"]
+    settings = {"weighting": pgo.Weighting.ISOTROPIC, "sharing": solvers.Sharing.INTERFACE}
+    robots = {name: solvers.Robot(name, names, KEY, **settings) for name in names}
+    for pose in range(graph.num_poses):
+        robots["r0" if pose < graph.num_poses - 3 else "r1"].add_pose(pose)
+    for e in range(graph.num_edges):
+        give_edge(robots["r0" if graph.i[e] < graph.num_poses - 3 else "r1"], graph, e)
+    while not all(robot.is_settled for robot in robots.values()):
+        for robot in robots.values():
+            robot.tick(time.monotonic())
+            for message in robot.outbox():
+                robots[message.to].receive(message.data, time.monotonic())
+        time.sleep(1e-4)
+    assert [robot.failure for robot in robots.values()] == ["", ""]
+    assert all(robot.is_certified for robot in robots.values())
+
+
 def compute(robot: solvers.Robot) -> None:
     """Call a robot until it has solved."""
     number = robot.last
