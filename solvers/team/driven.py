@@ -83,6 +83,7 @@ class DrivenTeam:
         self._unheard: dict[str, Ended] = {}  # robots that have not confirmed the outcome
         self._said: Revision | None = None
         self._share_more: set[str] = set()
+        self._awake: tuple[str, ...] = ()
 
     @property
     def others(self) -> dict[str, Measurements]:
@@ -116,12 +117,22 @@ class DrivenTeam:
 
     @property
     def problems(self) -> list[str]:
-        """Robots that share more than this one, a sentence each."""
-        return [
+        """Robots that share more than this one, and a driver out of reach, a sentence each."""
+        sentences = [
             f"{name} shares its measurements, and {self.name} its interface alone; give all robots "
             "the same sharing"
             for name in sorted(self._share_more)
         ]
+        driver = self.term.driver
+        outcome = self._member.outcome
+        is_in_it = outcome is not None and outcome.term == self.term
+        is_far = len(self._awake) > 1 and driver not in (*self._awake, "")
+        if is_far and not is_in_it and self._talk.is_complete(()):
+            sentences.append(
+                f"{driver} drives, and {self.name} hears of it through others alone; with "
+                "sharing=Sharing.MEASUREMENTS for all, these pass on what each has measured"
+            )
+        return sentences
 
     def greeting(self) -> Hello:
         """What tells others that this robot is there."""
@@ -164,6 +175,7 @@ class DrivenTeam:
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Begin a solve, repeat what was not answered, give up."""
+        self._awake = awake
         if self._said != self._revision:
             self._said = self._revision
             for name in awake:

@@ -110,4 +110,5 @@ def _path_of(name: str) -> Path:
 def _with_ways_out_of_teams(text: str) -> str:
     """A sentence on an error of robots with own files, with what a team can do about it."""
     text = text.replace(READ_HERE, "robots that share their measurements can")
-    return text.replace(SOLVE_PARTS, "an edge between them joins them")
+    way_out = "an edge between them joins them; with sharing=Sharing.MEASUREMENTS each has a map"
+    return text.replace(SOLVE_PARTS, way_out)

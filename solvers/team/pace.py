@@ -45,4 +45,4 @@ class Pace:
         They are one and a half times the longest of the last answers. While nothing is heard of the
         robot, they are at least half the time since.
         """
-        return max(retry, 1.5 * max(self._seconds, default=0.0), silence / 2)
+        return max(retry, 1.5 * max(self._seconds, default=retry), silence / 2)

@@ -650,10 +650,31 @@ def test_robots_without_a_common_edge_say_so() -> None:
         assert robot.outcome is None
         assert robot.failure == (
             "failed: team: the graph falls into 2 parts, no edge between; an edge between them "
-            "joins them"
+            "joins them; with sharing=Sharing.MEASUREMENTS each has a map"
         )
         assert robot.poses == {}
         assert robot.covered == ()
+
+
+def test_a_robot_that_does_not_hear_the_driver_proposes_to_share_measurements() -> None:
+    graph = world()
+    robots = robots_of(graph, 3)
+
+    def is_far(sender: str, receiver: str, data: bytes) -> bool:
+        return {sender, receiver} == {"r0", "r2"}
+
+    network = Network(robots, np.random.default_rng(0), is_lost=is_far)
+    network.wait(12.0)
+    assert robots["r0"].covered == robots["r1"].covered == ("r0", "r1")
+    assert robots["r0"].problems == robots["r1"].problems == []
+    assert robots["r2"].problems == [
+        "r0 drives, and r2 hears of it through others alone; with sharing=Sharing.MEASUREMENTS for "
+        "all, these pass on what each has measured"
+    ]
+    network.is_lost = lambda sender, receiver, data: False
+    network.run(60.0)
+    assert_is_the_optimum(robots, graph)
+    assert robots["r2"].problems == []
 
 
 @pytest.mark.parametrize(
