@@ -284,7 +284,8 @@ class DrivenTeam:
         error = error_as_message(
             EngineError(
                 f"it is there, and has not answered for {seconds:.0f} seconds; "
-                "see whether all robots have the same version, and what their ledgers have dropped"
+                "see whether it hears all its neighbours (with sharing=Sharing.MEASUREMENTS one is "
+                "enough), whether all have the same version, and what their ledgers have dropped"
             )
         )
         for name, ask in list(self._drive.waiting.items()):

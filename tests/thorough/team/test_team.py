@@ -656,6 +656,21 @@ def test_robots_without_a_common_edge_say_so() -> None:
         assert robot.covered == ()
 
 
+@pytest.mark.parametrize("pipeline", [None, PEERS], ids=["SUBSTRUCTURED", "CONSENSUS"])
+def test_neighbours_that_do_not_hear_each_other_end_with_a_way_out(
+    pipeline: solvers.Pipeline | None,
+) -> None:
+    robots = robots_of(world(), 3, pipeline=pipeline)
+
+    def is_far(sender: str, receiver: str, data: bytes) -> bool:
+        return {sender, receiver} == {"r1", "r2"}
+
+    network = Network(robots, np.random.default_rng(0), is_lost=is_far)
+    network.wait(70.0)
+    for robot in robots.values():
+        assert "it hears all its neighbours (with sharing=Sharing.MEASUREMENTS" in robot.failure
+
+
 def test_a_robot_that_does_not_hear_the_driver_proposes_to_share_measurements() -> None:
     graph = world()
     robots = robots_of(graph, 3)
