@@ -19,7 +19,6 @@ from pgo_models.problem.cholesky import factorize
 from pgo_models.problem.matrices import columns_of
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
-from solvers.carry.ledger import Ledger
 from solvers.pipeline import solution_for, warn_of_landmarks_seen_once
 from solvers.place import Attempt, Place, Step
 from solvers.plan import solve_at, unless_it_fails
@@ -130,7 +129,7 @@ def extend(
         start = extended_poses(inlier_problem(problem, kept), ids, solution.poses)
         request = SolveRequest(problem, pipeline, start, robots=shared)
         grown = go_on_robustly(robust, kept, new, request)
-    return replace(grown, ledger=_joined(solution.ledger, grown.ledger))
+    return replace(grown, ledger=solution.ledger.joined(grown.ledger))
 
 
 def _decided_before(solution: Solution, graph: PoseGraph) -> tuple[BoolArray, BoolArray]:
@@ -223,14 +222,6 @@ def update_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
         return place.better(best, solve_at(place, settings, start))
 
     return unless_it_fails(Step.AGAIN, solve_afresh, place, settings, update)
-
-
-def _joined(before: Ledger | None, after: Ledger | None) -> Ledger | None:
-    """The account of both solves; of one of them where the other was in one place."""
-    if before is None or after is None:
-        return after if after is not None else before
-    num_robots = max(before.num_robots, after.num_robots)
-    return replace(before, num_robots=num_robots).joined(replace(after, num_robots=num_robots))
 
 
 def extended_poses(problem: PGOProblem, ids: IntArray, poses: Poses) -> Poses:

@@ -16,7 +16,7 @@ from pgo_models.certificates.certificate import Certificate
 from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from solvers.carry.ledger import Ledger
+from solvers.carry.ledger import NOTHING_SENT, Ledger
 from solvers.handedness.complex_relaxation import ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch
@@ -207,9 +207,9 @@ class Place(ABC):
         """What the page asks about the graph and its cost."""
 
     @property
-    def ledger(self) -> Ledger | None:
-        """What has crossed the network so far; None in one process."""
-        return None
+    def ledger(self) -> Ledger:
+        """What has crossed the network so far: nothing in one process."""
+        return NOTHING_SENT
 
     @property
     def way_out(self) -> str:

@@ -24,7 +24,7 @@ from pgo_models.problem.initialization import spanning_tree_start
 from pgo_models.problem.marginals import Marginals, with_infinite_variances
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
-from solvers.carry.ledger import Ledger
+from solvers.carry.ledger import NOTHING_SENT, Ledger
 from solvers.reporting.edge_fit import fit_row
 from solvers.reporting.json_records import certificate_json, network_json, stage_json, write_json
 from solvers.reporting.notes import verdict_suffix
@@ -72,8 +72,8 @@ class Solution:
         Start and iterative stages, in order.
     seconds : float
         Wall time.
-    ledger : Ledger, optional
-        What crossed the network, of a solve by robots.
+    ledger : Ledger
+        What crossed the network: nothing, unless robots solved.
     robots : Partition, optional
         Which robot owned which pose, of a solve by robots.
     note : str, optional
@@ -106,7 +106,7 @@ class Solution:
     status: Status
     stages: tuple[Stage, ...]
     seconds: float
-    ledger: Ledger | None = None
+    ledger: Ledger = NOTHING_SENT
     robots: Partition | None = None
     note: str = ""
     frame: str = ""
@@ -348,7 +348,7 @@ class Solution:
         graph = self.problem.graph
         named = graph.in_files
         network = {}
-        if self.ledger is not None and self.robots is not None:
+        if self.robots is not None:
             network = network_json(self.ledger, self.robots)
         translations = {}
         if self.problem.has_translations:
@@ -459,7 +459,7 @@ class Solution:
 
     def _network_facts(self) -> Facts:
         """What is printed of robots and of what they sent."""
-        if self.ledger is None or self.robots is None:
+        if self.robots is None:
             return []
         sizes = self.robots.sizes
         range_of_sizes = f"{sizes.min()} to {sizes.max()} poses each"

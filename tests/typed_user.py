@@ -54,5 +54,6 @@ def main(folder: Path) -> tuple[pgo.Certificate, solvers.Solution, list[float]]:
     graph = pgo.grid(rng)
     assert_type(pgo.random_rotations(2, 3, rng), Array)
     assert_type(pgo.chi2(graph, pgo.chordal_start(pgo.PGOProblem(graph))), float)
-    assert graph.truth is not None
-    return judged(graph, graph.truth), solved(graph, folder), film(graph)
+    assert_type(solvers.solve(graph, robots=2).ledger.messages, int)
+    assert_type(solvers.certify(graph, graph.truth), pgo.Certificate)
+    return judged(graph, pgo.spanning_tree_start(graph)), solved(graph, folder), film(graph)

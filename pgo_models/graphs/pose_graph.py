@@ -6,7 +6,7 @@ equation (16); Rosen et al. 2019, equation 11).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -933,7 +933,12 @@ class PoseGraph(ReadOnly):
         return remaining.subgraph(self.in_files)
 
     def with_edges(
-        self, i: IntArray, j: IntArray, measured: Poses, kappa: Weights, tau: Weights
+        self,
+        i: IntArray | Sequence[int],
+        j: IntArray | Sequence[int],
+        measured: Poses,
+        kappa: Weights,
+        tau: Weights,
     ) -> PoseGraph:
         """Return the graph with additional edges, the new ones last.
 
@@ -941,7 +946,7 @@ class PoseGraph(ReadOnly):
 
         Parameters
         ----------
-        i, j : IntArray, (k,)
+        i, j : IntArray or sequence of int, (k,)
             First and second pose of every new edge.
         measured : Poses
             Measured x_i^-1 x_j of the k edges.

@@ -175,7 +175,7 @@ class Ledger(Summarised):
         Parameters
         ----------
         other : Ledger
-            Account of another run, of as many robots.
+            Account of another run; of the robots of both, those with the same number are one.
 
         Returns
         -------
@@ -186,7 +186,7 @@ class Ledger(Summarised):
         for traffic, times in other.counted:
             counted[traffic] = counted.get(traffic, 0) + times
         return Ledger(
-            self.num_robots,
+            max(self.num_robots, other.num_robots),
             rounds=self.rounds + other.rounds,
             all_reduces=self.all_reduces + other.all_reduces,
             all_reduce_bytes=self.all_reduce_bytes + other.all_reduce_bytes,
@@ -280,3 +280,6 @@ class Ledger(Summarised):
         reduced = f", {self.all_reduces} all-reduces" if self.all_reduces else ""
         sent = f"{self.messages} messages, {self.num_bytes} bytes"
         return f"Ledger({self.num_robots} robots, {self.rounds} rounds{reduced}, {sent})"
+
+
+NOTHING_SENT = Ledger(1)

@@ -246,7 +246,7 @@ def _robots(solution: Solved, robots: Partition) -> _Table:
         sentence = f"{num_robots} robots, {robots.method.value}."
     sentences = [sentence]
     ledger = solution.ledger
-    if ledger is not None:
+    if solution.robots is not None:
         sentences += _communication(ledger)
         if ledger.num_robots == num_robots:
             columns["bytes sent"] = ledger.bytes_sent

@@ -70,8 +70,8 @@ class Solved(Protocol):
         """What every stage did."""
 
     @property
-    def ledger(self) -> Ledger | None:
-        """What crossed the network, of a solve by robots."""
+    def ledger(self) -> Ledger:
+        """What crossed the network."""
 
     @property
     def robots(self) -> Partition | None:

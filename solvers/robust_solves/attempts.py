@@ -345,5 +345,4 @@ class PlacesOfEdges:
             try:
                 yield place
             finally:
-                if place.ledger is not None:
-                    self.ledgers.append(place.ledger)
+                self.ledgers.append(place.ledger)

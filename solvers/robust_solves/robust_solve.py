@@ -18,7 +18,7 @@ from pgo_models.geometry.rotations import BoolArray, tangent_dimension
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.thresholds import FALSE_ALARM, chi2_thresholds
-from solvers.carry.ledger import Ledger
+from solvers.carry.ledger import NOTHING_SENT, Ledger
 from solvers.place import is_open
 from solvers.reporting.notes import joined_notes
 from solvers.request import SolveRequest
@@ -608,8 +608,7 @@ class _RobustSolve:
             fit=solution.certificate.fit,
             why_known=self.known.reason,
         )
-        ledgers = self.places.ledgers
-        ledger = reduce(Ledger.joined, ledgers) if ledgers else None
+        ledger = reduce(Ledger.joined, self.places.ledgers, NOTHING_SENT)
         seconds = time.perf_counter() - self.began
         notes = list(self.failures)
         if self.effort.has_run_out:

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 @overload
 def certify(
-    problem: PGOProblem | PoseGraph, poses: Poses, gap: float = DEFAULT_GAP
+    problem: PGOProblem | PoseGraph, poses: Poses | None, gap: float = DEFAULT_GAP
 ) -> Certificate: ...
 @overload
 def certify(
@@ -62,7 +62,7 @@ def certify(
 ) -> "ModelCertificate": ...
 def certify(
     problem: "PGOProblem | PoseGraph | OrthogonalProblem",
-    poses: Poses | Sequence[Array],
+    poses: Poses | Sequence[Array] | None,
     gap: float = DEFAULT_GAP,
 ) -> "Certificate | ModelCertificate":
     """Judge anybody's poses, or values of a model, by a proven lower bound on the global optimum.
@@ -82,7 +82,8 @@ def certify(
     problem : PGOProblem, PoseGraph or OrthogonalProblem
         The problem; of a graph it is F, of a cvxpy model with rotations its objective.
     poses : Poses or sequence of arrays
-        The poses to judge; of a model the values of its constrained `variables`.
+        The poses to judge; of a model the values of its constrained `variables`. None, as `truth`
+        or `initial` of a graph that came without, is an error.
     gap : float
         The relative gap to certify.
 
@@ -113,7 +114,8 @@ def certify(
         return _certificate_of_model(problem, poses, gap)
     given: object = poses
     if not isinstance(given, Poses):
-        raise SettingError(f"poses is {given!r:.60}; give Poses, as solve returns them")
+        why = "the graph came without these" if given is None else f"poses is {given!r:.60}"
+        raise SettingError(f"{why}; give Poses, as solve returns them")
     problem = as_problem(problem)
     check_poses(problem.graph, given)
     poses = problem.graph.completed(given)  # a landmark has no rotation of its own
@@ -188,7 +190,7 @@ def _round_to(poses: Poses, given: Poses, written: WrittenDigits, graph: PoseGra
 
 
 def _certificate_of_model(
-    problem: object, values: Poses | Sequence[Array], gap: float
+    problem: object, values: Poses | Sequence[Array] | None, gap: float
 ) -> "ModelCertificate":
     # cvxpy is slow to import, and poses need none of it
     from pgo_models.convex.orthogonality import OrthogonalProblem

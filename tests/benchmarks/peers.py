@@ -152,7 +152,6 @@ def substructured(case: Case) -> dict[str, Any]:
                 watch.is_over(figures.objective, figures.rounds, figures.num_bytes)
     proof = None
     if solution.certificate.is_certified:
-        assert solution.ledger is not None
         proof = solution.ledger.rounds, solution.ledger.num_bytes
     return watch.row(proof=proof)
 

@@ -135,7 +135,6 @@ def test_the_ledger_counts_what_was_sent(
     solution, engine = solved(seed, n, d, partitioner, noise, Recording())
     ledger = solution.ledger
     number = len(engine.shares)
-    assert ledger is not None
     sent = np.zeros((2, number))
     received = np.zeros((2, number))
     links: dict[tuple[int, int], int] = {}
@@ -172,7 +171,6 @@ def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     soc = SOC(robots=parts, tolerance=2e-3)
     solution = solve(graph, Pipeline(soc=soc), robots=Robots(parts, engine=engine))
     _, stage, _ = solution.stages
-    assert solution.ledger is not None
     assert engine.times(begin_copies, Copies.back_at_best) == 1  # no refresh, no raise
     rounds = [record.measurement.rounds for record in stage.history.records]
     assert rounds == [4, *range(6, 5 + len(rounds))]

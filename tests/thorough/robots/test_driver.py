@@ -128,7 +128,6 @@ def test_the_ledger_counts_what_was_sent(
     solution, engine = solved(seed, n, d, partitioner, noise)
     ledger = solution.ledger
     number = len(engine.shares)
-    assert ledger is not None
     sent = np.zeros((2, number))
     received = np.zeros((2, number))
     messages = 0
@@ -173,7 +172,6 @@ def test_the_ledger_counts_what_was_sent(
 def test_rounds_of_a_whole_solve_are_as_documented() -> None:
     graph = grid(np.random.default_rng(0))
     solution = solve(graph, robots=partition(graph, 3))
-    assert solution.ledger is not None
     start, soc, newton = solution.stages
     assert start.name == "chordal start"
     # 2 to start, 1 for the penalty and 1 a step and 2 for the result of SOC, 2 a move of Newton, 2

@@ -48,7 +48,6 @@ def test_robots_find_what_one_place_finds(
         assert shared.certificate.verdict is Verdict.CERTIFIED
     for stage in shared.stages:
         assert stage.objective >= (1 - 1e-9) * central.objective - level
-    assert shared.ledger is not None
     assert shared.ledger.rounds > 0
 
 

@@ -132,7 +132,6 @@ def test_sums_go_along_a_tree_of_robots_and_nothing_to_a_driver() -> None:
     )
     ledger = solution.ledger
     order, parents = robot_tree(problem, parts)
-    assert ledger is not None
     # Poses, penalties and forces, three times: of the relaxation, of its translations, and of SOC;
     # one round before the first step of the former two, and one a step.
     assert (
@@ -195,8 +194,6 @@ def test_a_run_without_a_driver_goes_on_from_its_checkpoint(tmp_path: Path) -> N
     assert broken.status is Status.STOPPED
     resumed = solve(problem, pipeline, robots=alone(parts, checkpoint=file))
     assert resumed.stages[1].iterations == whole.stages[1].iterations
-    assert resumed.ledger is not None
-    assert whole.ledger is not None
     assert resumed.ledger.rounds == whole.ledger.rounds
     np.testing.assert_allclose(resumed.poses.R, whole.poses.R, rtol=0, atol=1e-9)
 
