@@ -525,6 +525,7 @@ class _RobustSolve:
             rejection,
             problem=problem,
             cost=noise * rejection.cost,
+            threshold_scale=noise * rejection.threshold_scale,
             attempts=tuple(replace(a, cost=noise * a.cost) for a in rejection.attempts),
             verdict=solution.certificate.verdict,
             fit=solution.certificate.fit,

@@ -485,6 +485,21 @@ def test_uncertain_edges_of_open3d_are_the_suspects_of_a_robust_solve(
     assert rejected[0] not in json.loads(out)["rejected"]
 
 
+@pytest.mark.filterwarnings("ignore:.*edges are uncertain")
+def test_closures_are_proven_wrong_at_the_scale_of_the_errors(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    record = json.loads((CASES / "b1_open3d_posegraph.json").read_text())
+    for e, edge in enumerate(record["edges"]):
+        edge["uncertain"] = e == 4 or e >= 9
+    (tmp_path / "scans.json").write_text(json.dumps(record))
+    options = ("--robust", "gnc", "--prove-outliers", "--json")
+    _, out, _ = pgo_command("solve", tmp_path / "scans.json", *options)
+    robust = json.loads(out)["robust"]
+    assert len(robust["known"]) == 8
+    assert robust["proven_wrong"] == [4, 18, 20]
+
+
 @pytest.mark.parametrize("is_of_cameras", [False, True])
 def test_the_rotations_of_view_graphs_are_read(
     is_of_cameras: bool, pgo_command: Call, tmp_path: Path
