@@ -26,6 +26,7 @@ from pgo_models.certificates.definiteness import (
     prove_stored,
     smallest_eta,
 )
+from pgo_models.certificates.lower_bound import MOST_MOVES, quadratic_loss
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.convex.set_equations import HullProduct, SetEquations
 from pgo_models.geometry.arrays import ReadOnly
@@ -34,7 +35,6 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import analyze
 from pgo_models.problem.floating_point import OUTWARD, exact_sum, gamma
 
-_MOST_MOVES = 3
 # A shift as a share of the largest diagonal entry: the first, and where the search ends.
 _FIRST_ETA = 1e-13
 _LAST_ETA = 1e2
@@ -167,7 +167,7 @@ def prove_model_bound(
     if proof is None:
         return None
     best = _bound_at(lagrangian, proof, u)
-    for _ in range(_MOST_MOVES):
+    for _ in range(MOST_MOVES):
         G, _ = lagrangian.gradient(best.u)
         bound = _bound_at(lagrangian, proof, best.u - proof.solve(G[:, None])[:, 0])
         if not bound.value > best.value:
@@ -180,7 +180,7 @@ def _bound_at(lagrangian: _Lagrangian, proof: DefiniteProof, u: Array) -> ModelB
     value, error = lagrangian.value(u)
     G, G_error = lagrangian.gradient(u)
     free = proof.free
-    loss = OUTWARD * np.sum((abs(G[free]) + G_error[free]) ** 2 / proof.slack[free])
+    loss = quadratic_loss(G[free, None], G_error[free, None], proof.slack[free])
     bound = np.nextafter(exact_sum([value, -error, -loss]), -np.inf)
     if lagrangian.form.is_sum_of_squares:
         bound = max(bound, 0.0)
