@@ -49,8 +49,10 @@ def hull_bound(record: dict[str, Any]) -> tuple[fmpq | None, str]:
         b = [arb(exact(float(value))) for value in record["b"]]
         if not len(rows) == len(y) == len(b):
             raise ValueError("y has another length than b")
-        bounded = {k for each in record["variables"] for k in entries_within(each, len(c))}
-        free = [k for k in range(len(c)) if k not in bounded]
+        bounded = [k for each in record["variables"] for k in entries_within(each, len(c))]
+        if len(set(bounded)) < len(bounded):
+            raise ValueError("an entry is of two variables")
+        free = sorted(set(range(len(c))) - set(bounded))
         moved = without_free_part(rows, y, c, free)
         if moved is None:
             return None, "the dual point: entries of no set are not determined"

@@ -163,6 +163,7 @@ def verify_proof(
 
     The proof of a cvxpy model has the numbers of the model, and is given alone. Whether these are
     those of a model is for its owner to say: `problem.get_problem_data(cvxpy.CLARABEL)` has them.
+    A bound by hulls is of those with `solver_opts={"use_quad_obj": False}`.
 
     Parameters
     ----------

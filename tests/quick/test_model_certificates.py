@@ -423,6 +423,7 @@ def test_proofs_by_hulls_are_verified_and_tampered_ones_rejected(kind, shape, lo
         variables = json.loads(json.dumps(record["variables"]))
         variables[0]["P"][0] = -1.0
         assert "P is not positive semidefinite" in failure(variables=variables)
-    for changes in ({"y": record["y"][:-1]}, {"A": [[-1, 0, 1.0]]}, {"cones": {}}):
+    twice = {"variables": record["variables"] * 2}
+    for changes in ({"y": record["y"][:-1]}, {"A": [[-1, 0, 1.0]]}, {"cones": {}}, twice):
         with pytest.raises(pgo.PGOError, match="not a proof of a model"):
             failure(**changes)
