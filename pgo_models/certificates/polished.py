@@ -14,6 +14,7 @@ from pgo_models.figures import rounded_up
 from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import log_map
+from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.gtsam_cost import gtsam_cost
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting, is_isotropic
@@ -33,7 +34,7 @@ class Polished:
         Whether the polished poses are certified.
     gtsam_cost : float
         Twice GTSAM's error of the poses given; nan where chi2 is not the cost, or the graph has
-        landmarks, which GTSAM measures otherwise.
+        landmarks or attitudes, which GTSAM measures otherwise.
     gtsam_decrease : float
         What a Gauss-Newton step should save of that, as a share.
     """
@@ -61,7 +62,7 @@ class Polished:
             float(block_norms(turns).max(initial=0.0)),
             is_certified,
         )
-        if len(graph.landmarks) or not _is_chi2(problem, given):
+        if len(graph.landmarks) or _has_attitudes(graph) or not _is_chi2(problem, given):
             return moved
         try:
             cost, decrease = gtsam_cost(graph, given)
@@ -100,6 +101,15 @@ class Polished:
             f"{self.gtsam_cost:.10g}, twice GTSAM's error; a step saves about "
             f"{self.gtsam_decrease:.2g} of it, and {stationarity:.2g} of {cost}: {why}"
         )
+
+
+def _has_attitudes(graph: PoseGraph) -> bool:
+    """Whether a prior measures a part of a rotation, as gravity does."""
+    if graph.information is None:
+        return False
+    blocks = graph.information[graph.is_prior][:, graph.d :, graph.d :]
+    ranks = np.linalg.matrix_rank(blocks, hermitian=True)
+    return bool(((ranks > 0) & (ranks < blocks.shape[1])).any())
 
 
 def _is_chi2(problem: PGOProblem, poses: Poses) -> bool:

@@ -307,6 +307,17 @@ def test_the_reason_of_a_gap_is_told_by_the_gradients_of_both_costs(
     assert polished.metres == pytest.approx(moves.max(), rel=1e-3)
 
 
+def test_nothing_is_said_of_its_cost_where_attitudes_have_another_residual() -> None:
+    factors, values = pose3_example()
+    up = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, 0.1)
+    factors.add(gtsam.AttitudeFactorPose3(1, up, noise, up))
+    graph = pgo.from_gtsam(factors, values)
+    polished = solvers.certify(graph, graph.initial).polished
+    assert polished is not None
+    assert np.isnan(polished.gtsam_cost)
+
+
 def test_a_file_of_gtsam_is_told_how_far_its_poses_move(tmp_path: Path) -> None:
     factors, values = pose3_example()
     gtsam.writeG2o(factors, optimised(factors, values), str(tmp_path / "answer.g2o"))
