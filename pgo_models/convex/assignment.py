@@ -31,7 +31,8 @@ def assignment_multipliers(
     form: QuadraticForm, equations: SetEquations
 ) -> tuple[SetEquations, Array] | None:
     """Multipliers of rows, all others 0, and the equations with W; None where there are none."""
-    if form.num_constrained < form.side - 1 or not form.is_free[:-1].all():
+    has_more = form.num_constrained < form.side - 1 or not form.is_free[:-1].all()
+    if has_more or form.limits_x:
         return None
     of_rows = []  # entries of the multipliers of square variables, and their values
     products = []

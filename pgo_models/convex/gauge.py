@@ -25,7 +25,7 @@ from pgo_models.graphs.pose_graph import IntArray
 
 def with_gauge_held(form: QuadraticForm) -> QuadraticForm:
     """The form with one variable held at the identity where that loses nothing, else itself."""
-    if form.E.shape[0] or not np.isnan(form.fixed[:-1]).all():
+    if form.E.shape[0] or form.G.shape[0] or not np.isnan(form.fixed[:-1]).all():
         return form
     for is_left in (True, False):
         block = _block_to_hold(form, is_left=is_left)

@@ -11,7 +11,7 @@ set:
 The Kronecker product of two such matrices, of two variables or twice of one, is positive
 semidefinite on the sets, too, and linear in u u^T: <P, H x H'> >= 0 is a quadratic inequality for
 every positive semidefinite P (Anstreicher, *Kronecker product constraints*, 2017). Two rotations of
-space give one of side 16, that of q x q'.
+space give one of side 16, that of q x q'. A linear inequality of the model is a matrix of side 1.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ import numpy as np
 
 from pgo_models.convex.constraint_sets import Orthonormal, Rotations, UnitRows
 from pgo_models.convex.quadratic_form import Block, QuadraticForm
-from pgo_models.convex.set_equations import ONE, SetEquations, Terms
+from pgo_models.convex.set_equations import INEQUALITY, ONE, SetEquations, Terms
 from pgo_models.graphs.pose_graph import IntArray
 
 # All products together have at most so many entries above and on their diagonals: those of six
@@ -53,9 +53,9 @@ class Hull:
     Parameters
     ----------
     block : int
-        Position of the variable.
+        Position of the variable; INEQUALITY, or ONE of the constant 1.
     part : int
-        Column or row, 0 where the variable is taken as a whole.
+        Column or row, 0 where the variable is taken as a whole; number of the inequality.
     side : int
         Of H.
     entries : dict
@@ -96,19 +96,44 @@ def hulls_of(position: int, block: Block) -> list[Hull]:
     ]
 
 
+_CONSTANT = Hull(ONE, 0, 1, {(0, 0): [(ONE, 1.0)]}, True)
+
+
+def with_inequalities(form: QuadraticForm, equations: SetEquations) -> SetEquations:
+    """The equations, and after them the inequalities of the model."""
+    pairs = [(inequality, _CONSTANT) for inequality in _inequalities(form)]
+    return _with_products(equations, pairs) if pairs else equations
+
+
 def with_hull_products(form: QuadraticForm, equations: SetEquations) -> SetEquations | None:
     """The equations, and after them the entries of products of hulls; None where there are none.
 
     Where all would be too many for a solver, they are those of the variables that J couples most;
-    a large model gets none.
+    a large model gets none. Inequalities are factors of products, too.
     """
     if form.num_constrained > _LARGEST:
         return None
-    pairs = _strongest(
-        form, _pairs([hull for k, block in enumerate(form.blocks) for hull in hulls_of(k, block)])
-    )
-    if not pairs:
-        return None
+    hulls = [hull for k, block in enumerate(form.blocks) for hull in hulls_of(k, block)]
+    # Numbers of two inequalities would be multiplied, and rounded.
+    mixed = [(hull, inequality) for hull in hulls for inequality in _inequalities(form)]
+    pairs = _strongest(form, [*_pairs(hulls), *mixed])
+    return _with_products(equations, pairs) if pairs else None
+
+
+def _inequalities(form: QuadraticForm) -> list[Hull]:
+    """G_r u >= 0 as matrices of side 1."""
+    last = form.side - 1
+    hulls = []
+    for row in range(form.G.shape[0]):
+        entries = slice(form.G.indptr[row], form.G.indptr[row + 1])
+        pairs = zip(form.G.indices[entries].tolist(), form.G.data[entries].tolist(), strict=True)
+        function = [(ONE if place == last else place, factor) for place, factor in pairs]
+        hulls.append(Hull(INEQUALITY, row, 1, {(0, 0): function}, True))
+    return hulls
+
+
+def _with_products(equations: SetEquations, pairs: list[tuple[Hull, Hull]]) -> SetEquations:
+    """The equations, and after them <P, H x H'> of pairs of matrices."""
     products = []
     for first, second in pairs:
         of = ((first.block, first.part), (second.block, second.part))
@@ -134,8 +159,7 @@ def _strongest(form: QuadraticForm, pairs: list[tuple[Hull, Hull]]) -> list[tupl
         Q[np.ix_(x, x)] = abs(form.reduction.T @ (form.Q @ form.reduction))[:-1, :-1]
     coupling = []
     for first, second in pairs:
-        of_first, of_second = (form.blocks[hull.block].coordinates for hull in (first, second))
-        coupling.append(float(Q[of_first, of_second].max()))
+        coupling.append(float(Q[np.ix_(_coordinates(first), _coordinates(second))].max()))
     kept = []
     num_entries = 0
     for place in np.argsort(-np.array(coupling), kind="stable"):
@@ -145,6 +169,12 @@ def _strongest(form: QuadraticForm, pairs: list[tuple[Hull, Hull]]) -> list[tupl
         if num_entries <= _MOST_ENTRIES and coupling[place] > 0.0:
             kept.append(pairs[place])
     return kept
+
+
+def _coordinates(hull: Hull) -> list[int]:
+    """The coordinates of u, but for the last, that a matrix has."""
+    of_all = {coordinate for terms in hull.entries.values() for coordinate, _ in terms}
+    return sorted(of_all - {ONE})
 
 
 def _product_terms(first: Hull, second: Hull) -> list[Terms]:

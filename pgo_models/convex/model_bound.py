@@ -28,7 +28,7 @@ from pgo_models.certificates.definiteness import (
 )
 from pgo_models.certificates.lower_bound import MOST_MOVES, quadratic_loss
 from pgo_models.convex.quadratic_form import QuadraticForm
-from pgo_models.convex.set_equations import HullProduct, SetEquations
+from pgo_models.convex.set_equations import SetEquations
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray
@@ -54,15 +54,15 @@ class ModelBound(ReadOnly):
         u', which with l is the proof.
     rounding : float
         What was subtracted for rounding and for the G_r that is left.
-    products : tuple of HullProduct
-        Whose matrices P are among the multipliers.
+    equations : SetEquations
+        What the multipliers are of.
     """
 
     value: float
     multipliers: Array
     u: Array
     rounding: float
-    products: tuple[HullProduct, ...] = ()
+    equations: SetEquations
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class _Lagrangian:
     def prove(self) -> DefiniteProof | None:
         """Proof that S_r is definite, or None; also where a P is not proven definite."""
         of_products = (each.matrix(self.multipliers) for each in self.equations.products)
-        if not all(is_proven_definite(P) for P in of_products):
+        if not all(is_proven_definite(P) for P in of_products if P.any()):
             return None
         stored_diagonal = np.where(self.is_free, self.S.diagonal(), 2.0)
         if not is_in_range(self.S.data, stored_diagonal):
@@ -184,8 +184,8 @@ def _bound_at(lagrangian: _Lagrangian, proof: DefiniteProof, u: Array) -> ModelB
     bound = np.nextafter(exact_sum([value, -error, -loss]), -np.inf)
     if lagrangian.form.is_sum_of_squares:
         bound = max(bound, 0.0)
-    products = lagrangian.equations.products
-    return ModelBound(float(bound), lagrangian.multipliers, u, float(error + loss), products)
+    rounding = float(error + loss)
+    return ModelBound(float(bound), lagrangian.multipliers, u, rounding, lagrangian.equations)
 
 
 def best_model_bound(

@@ -14,7 +14,6 @@ from pgo_models.convex.hull_bound import HullBound
 from pgo_models.convex.model_bound import ModelBound
 from pgo_models.convex.model_proof_file import write_hull_proof, write_model_proof
 from pgo_models.convex.quadratic_form import QuadraticForm
-from pgo_models.convex.set_equations import SetEquations
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.arrays import ReadOnly
@@ -160,7 +159,6 @@ def judge_by_hulls(
 
 def judge_values(
     form: QuadraticForm,
-    equations: SetEquations,
     u: Array,
     bound: ModelBound | None,
     gap: float = DEFAULT_GAP,
@@ -175,6 +173,9 @@ def judge_values(
     # x is in the sets to a few roundings alone
     gradient = 2.0 * (form.Q @ u)
     error += 64.0 * float(np.finfo(float).eps) * float(abs(gradient) @ abs(u))
+    if bound is not None:
+        # constraints hold to rounding; the multipliers say what J gains by it
+        error += max(0.0, -float(np.sum(bound.equations.terms(bound.multipliers, u))))
     level = form.rounding_level(u)
     is_exact = form.is_sum_of_squares and objective <= _ROUNDING_MULTIPLE * level
     if bound is not None and bound.value > objective + error:

@@ -38,11 +38,13 @@ def write_model_proof(form: QuadraticForm, bound: ModelBound, path: Path | str) 
         "c": form.c.tolist(),
         "A": _entries(coo_array(form.A)),
         "b": form.b.tolist(),
+        "H": _entries(coo_array(form.H)),
+        "h": form.h.tolist(),
         "constant": form.constant,
         "variables": variables,
         "products": [
             {"of": product.of, "P": bound.multipliers[product.entries].tolist()}
-            for product in bound.products
+            for product in bound.equations.products
         ],
         "lower_bound": bound.value,
     }

@@ -20,9 +20,10 @@ from scipy.sparse.linalg import splu
 
 from pgo_models.convex.convex_solver import COLD, ConvexSolver, solve_compiled
 from pgo_models.convex.quadratic_form import QuadraticForm
-from pgo_models.convex.set_equations import SetEquations
+from pgo_models.convex.set_equations import HullProduct, SetEquations
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
 
 LARGEST = 108  # coordinates of x, those of twelve rotations: half a minute of a solver
 _PENALTY = 100.0  # of equalities, as a multiple of the largest entry of Q
@@ -39,7 +40,8 @@ def closed_form_multipliers(
     For X^T X = I they are sym(X^T G) / 2, with the gradient G of J. Equalities have a multiplier,
     too, and a penalty.
     """
-    used = np.concatenate([np.arange(equations.num_basic), equations.of_equalities])
+    active = active_inequalities(equations, u)
+    used = np.concatenate([np.arange(equations.num_basic), equations.of_equalities, active])
     residual = form.Q @ u
     free = form.is_free
     columns = equations.times(u)[free][:, used]
@@ -60,7 +62,7 @@ def moved_multipliers(
     columns = equations.times(u)[form.is_free].toarray()
     bases = [eye_array(equations.num_equations, format="csc")]
     for product in equations.products:
-        N = _kernel(product.at(equations, u))
+        N = _kernel(product, equations, u)
         first[product.entries] = _triangle(N @ (N.T @ product.matrix(multipliers) @ N) @ N.T)
         bases.append(csc_array(_congruence(N)))
     basis = csc_array(block_diag(bases))
@@ -83,10 +85,20 @@ def _triangle(P: Array) -> Array:
     return P[np.triu_indices(len(P))]
 
 
-def _kernel(W: Array) -> Array:
-    """Basis of the directions in which W is zero."""
-    values, vectors = np.linalg.eigh(W)
+def _kernel(product: HullProduct, equations: SetEquations, u: Array) -> Array:
+    """Basis of the directions in which W(u) is zero."""
+    if product.side == 1:
+        is_active = product.start in active_inequalities(equations, u)
+        return np.ones((1, int(is_active)))
+    values, vectors = np.linalg.eigh(product.at(equations, u))
     return np.asarray(vectors[:, values < _ZERO * values[-1]])
+
+
+def active_inequalities(equations: SetEquations, u: Array) -> IntArray:
+    """The k of inequalities that hold as equalities at u, or do not hold."""
+    k = np.array([product.start for product in equations.products if product.side == 1], dtype=int)
+    is_active = equations.values(u)[k] <= _ZERO * equations.value_sizes(u)[k]
+    return np.asarray(k[is_active])
 
 
 def _congruence(N: Array) -> Array:
@@ -172,7 +184,7 @@ def solve_model_relaxation(
 
 def _reduction(form: QuadraticForm) -> Array:
     """D with u = D (free x, 1), or (free x, free y, 1) where equalities have multipliers."""
-    if form.reduction is not None and not form.E.shape[0]:
+    if form.reduction is not None and not form.E.shape[0] and not form.G.shape[0]:
         return form.reduction
     free = np.flatnonzero(form.is_free)
     D = np.zeros((form.side, len(free) + 1))

@@ -2,7 +2,7 @@
 
 cvxpy states a convex quadratic model as
 
-    minimise 1/2 z^T P z + c^T z + constant   subject to   A z = b,
+    minimise 1/2 z^T P z + c^T z + constant   subject to   A z = b,  H z <= h,
 
 where z holds the model's variables, and numbers of cvxpy's own, such as the residuals r of a sum of
 squares, with the equality r = A x - b. Two steps, both exact, lead to fewer numbers:
@@ -16,7 +16,8 @@ What remains is
 
     J = u^T Q u,   Q = spread^T T^T P T spread / 2 + sym(e (T spread)^T c) + constant e e^T,
 
-with e the last unit vector, equalities E u = 0, and coordinates of u that equalities fix.
+with e the last unit vector, equalities E u = 0, inequalities G u >= 0, and coordinates of u that
+equalities fix.
 """
 
 import math
@@ -52,7 +53,7 @@ _FLAT = 1e-3  # share of a random direction that is left where J is constant
 
 
 class NotQuadraticError(SettingError):
-    """A model is no quadratic form with linear equalities; a solver of cvxpy makes step (a)."""
+    """A model is no quadratic form with linear constraints."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class Gauge(ReadOnly):
 
 @dataclass(frozen=True, eq=False)
 class QuadraticForm(ReadOnly):
-    """J = u^T Q u with u = (x_1, .., x_m, y, 1), subject to E u = 0.
+    """J = u^T Q u with u = (x_1, .., x_m, y, 1), subject to E u = 0 and G u >= 0.
 
     x_k are the entries of `problem.variables[k]`, column by column (of a rotation of the plane its
     first column), y those of `problem.others` in their order, then numbers of cvxpy's own, if any.
@@ -142,14 +143,16 @@ class QuadraticForm(ReadOnly):
 
     Parameters
     ----------
-    P, c, A, b, constant
-        1/2 z^T P z + c^T z + constant and A z = b.
+    P, c, A, b, H, h, constant
+        1/2 z^T P z + c^T z + constant, A z = b and H z <= h.
     T : (len(c), k) sparse array
         z = T w, exactly.
     spread : (k, N) sparse array
         w = spread u, entries 0, 1 and -1.
     E : (rows, N) sparse array
         Equalities E u = 0 that are left.
+    G : (rows, N) sparse array
+        Inequalities G u >= 0.
     fixed : (N,) array
         The values that equalities give to coordinates, nan where they give none. The last is 1.
     blocks : tuple of Block
@@ -166,10 +169,13 @@ class QuadraticForm(ReadOnly):
     c: Array
     A: csc_array
     b: Array
+    H: csr_array
+    h: Array
     constant: float
     T: csc_array
     spread: csc_array
     E: csr_array
+    G: csr_array
     fixed: Array
     blocks: tuple[Block, ...]
     names: tuple[tuple[int, str], ...]
@@ -288,6 +294,14 @@ class QuadraticForm(ReadOnly):
             x = self.gauge.turned(self, u)[: len(x)]
         return self.u_of_entries(x)
 
+    def with_others(self, u: Array, others: Sequence[Array]) -> Array:
+        """U with given values of the variables without a set, where equalities do not fix them."""
+        entries = np.concatenate([np.zeros(0), *(np.ravel(y, order="F") for y in others)])
+        places = slice(self.num_constrained, self.num_constrained + len(entries))
+        changed = u.copy()
+        changed[places] = np.where(self.is_free[places], entries, u[places])
+        return changed
+
     def u_of_entries(self, x: Array) -> Array:
         """The u of the coordinates of x, with the best values of all others."""
         if self.reduction is not None:
@@ -301,6 +315,14 @@ class QuadraticForm(ReadOnly):
         """Coordinates of x that are not fixed."""
         return np.flatnonzero(self.is_free[: self.num_constrained])
 
+    @cached_property
+    def limits_x(self) -> bool:
+        """Whether inequalities, or equalities of x alone, are left beside the sets.
+
+        Step (a) then takes a convex solver, and points of the sets need not be feasible.
+        """
+        return bool(self.G.shape[0]) or len(self._rows_with_others) < self.E.shape[0]
+
     # Variables without a set.
 
     @cached_property
@@ -310,14 +332,14 @@ class QuadraticForm(ReadOnly):
         return positions[positions >= self.num_constrained]
 
     def with_best_others(self, u: Array) -> Array:
-        """U with the coordinates of y at which J is least, for its x.
+        """U with the coordinates of y at which J is least, for its x, without inequalities.
 
-        Raises a NotQuadraticError where equalities hold of x alone, and a SettingError where J has
-        no minimum over y.
+        Raises a NotQuadraticError where combinations of equalities hold of x alone, and a
+        SettingError where J has no minimum over y.
         """
         best = u.copy()
         y = self.free_others
-        if not len(y) and not self.E.shape[0]:
+        if not len(y):
             return best
         if self.side <= _LARGEST_DENSE:
             best[y] = self._others_of_constrained @ u
@@ -328,7 +350,13 @@ class QuadraticForm(ReadOnly):
 
     def _right_side(self, u: Array) -> Array:
         """Right side of `other_equations` at several u with y = 0."""
-        return np.concatenate([-2.0 * (self.Q @ u)[self.free_others], -(self.E @ u)])
+        of_equalities = self.E[self._rows_with_others] @ u
+        return np.concatenate([-2.0 * (self.Q @ u)[self.free_others], -of_equalities])
+
+    @cached_property
+    def _rows_with_others(self) -> IntArray:
+        """The equalities that have entries of y; others hold of x alone."""
+        return np.flatnonzero(np.diff(csr_array(self.E[:, self.free_others]).indptr))
 
     @cached_property
     def _others_of_constrained(self) -> Array:
@@ -342,7 +370,7 @@ class QuadraticForm(ReadOnly):
         """Optimality conditions of y, regularised for the factor that solves them."""
         y = self.free_others
         H = 2.0 * self.Q[y][:, y]
-        E = self.E[:, y]
+        E = self.E[self._rows_with_others][:, y]
         blocks: list[list[Any]] = [[H, E.T], [E, None]]
         equations = csc_array(block_array(blocks)) if E.shape[0] else csc_array(H)
         damping = np.full(equations.shape[0], _DAMPING * (abs(self.Q).max() or 1.0))
@@ -362,11 +390,13 @@ class QuadraticForm(ReadOnly):
         of_equalities = np.linalg.norm(residual[num_others:], axis=0)
         if (of_equalities > _INCONSISTENT * scale).any():
             raise NotQuadraticError(
-                "equalities hold of the constrained variables alone; "
-                "a bound takes those that fix single entries"
+                "a combination of equalities holds of the constrained variables alone; "
+                "write it as one equality without the other variables"
             )
         is_slope = abs(residual[:num_others]) > _INCONSISTENT * scale
         if is_slope.any():
+            if self.G.shape[0]:
+                raise NotQuadraticError("the objective is bounded below by inequalities alone")
             steepest = self.free_others[np.argmax(is_slope.any(axis=1))]
             raise SettingError(
                 f"the objective is not bounded below in {self.name_of(int(steepest))}; "
@@ -387,7 +417,7 @@ class QuadraticForm(ReadOnly):
         D[constrained, np.arange(len(constrained))] = 1.0
         D[:, -1] = np.where(self.is_free, 0.0, self.fixed)
         y = self.free_others
-        if len(y) or self.E.shape[0]:
+        if len(y):
             D[y] = self._others_of_constrained @ D
         return D
 
@@ -411,7 +441,7 @@ class QuadraticForm(ReadOnly):
         shifts = np.round(basis @ np.linalg.inv(basis[pivots]))
         seen = csr_array(self.from_u[:, y])
         with_weight = abs(self.P).sum(axis=0) + abs(self.c) > 0.0
-        of_all = [seen[np.flatnonzero(with_weight)], self.E[:, y]]
+        of_all = [seen[np.flatnonzero(with_weight)], self.E[:, y], self.G[:, y]]
         held = []
         for pivot, shift in zip(pivots, shifts.T, strict=True):
             is_plain = np.isin(shift, (-1.0, 0.0, 1.0)).all()
@@ -448,7 +478,7 @@ def _is_zero(rows: csr_array, shift: Array) -> bool:
 
 
 def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
-    """The quadratic form of a convex quadratic model with linear equalities.
+    """The quadratic form of a convex quadratic model with linear constraints.
 
     Parameters
     ----------
@@ -463,7 +493,7 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     Raises
     ------
     NotQuadraticError
-        If the objective is no convex quadratic, or there are other constraints than equalities.
+        If the objective is no convex quadratic, or constraints are not linear.
     SettingError
         If a Parameter has no value, or the data have nan or inf.
 
@@ -480,9 +510,14 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     data, columns, constant = _canonical_data(problem)
     c = np.asarray(data["c"], dtype=float)
     b = np.asarray(data["b"], dtype=float)
-    A = csc_array(data["A"])
+    num_equalities = data["dims"].zero
+    H = csr_array(data["A"])[num_equalities:]
+    h = b[num_equalities:]
+    A = csc_array(csr_array(data["A"])[:num_equalities])
+    b = b[:num_equalities]
     P = _symmetric_of_upper(data.get("P"), len(c))
-    for name, numbers in (("objective", P.data), ("objective", c), ("data", A.data), ("data", b)):
+    of_rows = (("data", numbers) for numbers in (A.data, b, H.data, h))
+    for name, numbers in (("objective", P.data), ("objective", c), *of_rows):
         if not np.isfinite(numbers).all():
             raise SettingError(f"the {name} of the model has nan or inf; check the data")
     w_columns, blocks, names, spread = _coordinates(problem, columns)
@@ -492,21 +527,21 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     corners: list[list[Any]] = [[spread, None], [None, eye_array(num_own + 1)]]
     spread = csc_array(block_array(corners))
     spread.sort_indices()
-    in_w = csc_array(A)[rows_left][:, w_columns]
-    equalities = block_array([[in_w, csc_array(-b[rows_left][:, None])]])
-    E = csr_array(csr_array(equalities) @ spread)
-    if E.nnz < equalities.nnz:  # two entries of a rotation of the plane are summed, and rounded
-        raise NotQuadraticError("an equality has entries of a rotation of the plane that are equal")
+    E = _in_u(csr_array(A[rows_left]), b[rows_left], w_columns, spread)
+    G = -_in_u(H, h, w_columns, spread)
     fixed, is_left = _fixed_coordinates(E)
     form = QuadraticForm(
         P=P,
         c=c,
         A=A,
         b=b,
+        H=H,
+        h=h,
         constant=constant,
         T=T,
         spread=spread,
         E=csr_array(E[is_left]),
+        G=csr_array(G),
         fixed=fixed,
         blocks=tuple(blocks),
         names=tuple(names),
@@ -525,13 +560,27 @@ def _canonical_data(problem: OrthogonalProblem) -> tuple[dict[str, Any], dict[in
         data, _, inverse = problem.minimisation.get_problem_data(cp.CLARABEL)
     except ValueError as error:  # cvxpy's of nan and inf in the data
         raise SettingError(f"the model has nan or inf: {error}") from error
-    if data["dims"].zero != data["A"].shape[0]:
-        raise NotQuadraticError("there are other constraints than linear equalities")
+    if data["dims"].zero + data["dims"].nonneg != data["A"].shape[0]:
+        raise NotQuadraticError("a constraint is not linear")
     columns = data["param_prob"].var_id_to_col
     for variable in (*problem.variables, *problem.others):
         if has_attributes(variable):
-            raise NotQuadraticError(f"{variable.name()} has attributes, which are constraints")
+            raise NotQuadraticError(
+                f"{variable.name()} has attributes; write them as constraints, as x >= 0"
+            )
     return data, columns, float(inverse[-1]["offset"])
+
+
+def _in_u(rows: csr_array, right: Array, w_columns: IntArray, spread: csc_array) -> csr_array:
+    """Rows z - right in the coordinates of u, which are the same numbers."""
+    in_w = csc_array(rows)[:, w_columns]
+    if in_w.nnz < rows.nnz:
+        raise NotQuadraticError("an inequality has a residual of the objective")
+    with_constant = csr_array(block_array([[in_w, csc_array(-right[:, None])]]))
+    in_u = csr_array(with_constant @ spread)
+    if in_u.nnz < with_constant.nnz:  # two entries are summed, and rounded
+        raise NotQuadraticError("a constraint has equal entries of a rotation of the plane")
+    return in_u
 
 
 def _symmetric_of_upper(P: csc_array | None, side: int) -> csc_array:

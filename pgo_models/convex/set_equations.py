@@ -3,12 +3,12 @@
 Columns are orthonormal, and rows, too, where X is square. In SO(3) every column is the cross
 product of the two others, which is linear beside quadratic and tells rotations from reflections
 (Briales & Gonzalez-Jimenez 2017). A rotation of the plane is (a, -b; b, a), so that only a^2 + b^2
-= 1 is left to say. An equality E_r u = 0 holds times every coordinate of u.
+= 1 is left to say. An equality E_r u = 0 holds times each of its coordinates.
 
 Multipliers l of these equations make the Lagrangian u^T S u, S = Q - sum_k l_k A_k, which is J
-wherever the equations hold. Products of hulls (`pgo_models.convex.hulls`) bring inequalities
-<P, W(u)> >= 0, with P positive semidefinite: their multipliers are the entries of P, and u^T S u is
-at most J on the sets.
+wherever the equations hold. Inequalities and hulls of the sets, and products of two of these
+(`pgo_models.convex.hulls`), say that <P, W(u)> >= 0 for every positive semidefinite P: their
+multipliers are the entries of P, and u^T S u is at most J on the sets.
 """
 
 from collections.abc import Sequence
@@ -26,6 +26,7 @@ from pgo_models.graphs.pose_graph import IntArray
 # An equation of one block: terms (a, b, value) of value u_a u_b; -1 stands for the last of u.
 Terms = list[tuple[int, int, float]]
 ONE = -1
+INEQUALITY = -2  # stands for an inequality among the positions of variables
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,9 @@ class HullProduct:
     Parameters
     ----------
     of : one or two of (int, int)
-        Of both hulls, the position of the variable and its column or row. One alone is that of
-        W = I - X X^T, of a variable X with orthonormal columns.
+        Of both factors, the position of the variable and its column or row; INEQUALITY and its
+        number; ONE and 0 of the factor 1. One alone is the position of a variable X with
+        orthonormal columns, of W = I - X X^T.
     start : int
         The k of the first entry of P. Those of its upper triangle follow, row by row, and the
         other triangle is counted with them.
@@ -61,10 +63,7 @@ class HullProduct:
 
     def at(self, equations: "SetEquations", u: Array) -> Array:
         """W(u)."""
-        k = equations.k - self.start
-        is_own = (k >= 0) & (equations.k < self.entries.stop)
-        terms = (equations.entries * u[equations.i] * u[equations.j])[is_own]
-        upper = np.bincount(k[is_own], terms, self.entries.stop - self.start)
+        upper = equations.values(u)[self.entries]
         rows, columns = np.triu_indices(self.side)
         W = np.zeros((self.side, self.side))
         W[rows, columns] = np.where(rows == columns, upper, 0.5 * upper)
@@ -93,7 +92,7 @@ class SetEquations(ReadOnly):
         Multipliers l, 0 and 1, with sum l_k u^T A_k u = ||x||^2 less the number of columns (or
         rows) of norm 1.
     products : tuple of HullProduct
-        Inequalities, whose A_k come last.
+        Matrices W, whose A_k come last.
     """
 
     side: int
@@ -150,6 +149,16 @@ class SetEquations(ReadOnly):
             norms=np.concatenate([self.norms, none]),
             products=(*self.products, *hull_products),
         )
+
+    def values(self, u: Array) -> Array:
+        """u^T A_k u, (number,)."""
+        terms = self.entries * u[self.i] * u[self.j]
+        return np.bincount(self.k, terms, self.number).astype(float)
+
+    def value_sizes(self, u: Array) -> Array:
+        """The sums of the absolute terms of u^T A_k u, (number,)."""
+        terms = abs(self.entries * u[self.i] * u[self.j])
+        return np.bincount(self.k, terms, self.number).astype(float)
 
     def terms(self, multipliers: Array, u: Array) -> Array:
         """The terms of sum l_k u^T A_k u, of at most four factors each."""

@@ -2,7 +2,7 @@
 
 **The problem** is that of the numbers in the proof file, which are doubles, and so rational:
 
-    minimise 1/2 z^T P z + c^T z + constant   subject to   A z = b,
+    minimise 1/2 z^T P z + c^T z + constant   subject to   A z = b,  H z <= h,
 
 and to the sets: the entries of a variable X, which are consecutive entries of z, column by column,
 have orthonormal columns, are a rotation, or have unit columns or rows.
@@ -14,11 +14,11 @@ square matrix, rows are orthonormal; in SO(3) a column is the cross product of t
     L(v) = objective - sum_k l_k q_k - sum_j <P_j, W_j>,
 
 is a quadratic function of the entries v that are left, and at most the objective on the sets. W is
-positive semidefinite on the sets: the Kronecker product of two matrices, affine in a variable, that
-are so (`hull`), or I - X X^T of X with orthonormal columns. P_j has to be, too, which is shown as
-the following is. The minimum of L over all v is a lower bound. The square is completed entry by
-entry: where all pivots are positive (or a whole row of zeros), the constant that remains is that
-minimum.
+positive semidefinite on the sets: the Kronecker product of two matrices, each of which is affine in
+a variable and semidefinite on its set (`hull`), or one of the numbers h - H z, or 1; or it is
+I - X X^T of X with orthonormal columns. P_j has to be, too, which is shown as the following is. The
+minimum of L over all v is a lower bound. The square is completed entry by entry: where all pivots
+are positive (or a whole row of zeros), the constant that remains is that minimum.
 
 **A variable that is held.** The objective and the sets may stay as they are when all variables are
 turned together. Then one of them may be taken to be the identity (`held_entries`).
@@ -32,7 +32,8 @@ from typing import Any
 
 from pgo_models.verification.balls import exact, fmpq
 
-ONE = -1  # stands for the constant among the entries of z
+ONE = -1  # stands for the constant among the entries of z, and for the factor 1
+INEQUALITY = -2  # stands for an inequality among the factors of a product
 Affine = dict[int, fmpq]
 Quadratic = dict[int, dict[int, fmpq]]
 # Side of a matrix W, and products of affine functions whose sum is an entry of it.
@@ -80,7 +81,7 @@ def lagrangian(record: dict[str, Any]) -> tuple[Quadratic, str]:
                 product = affine(solved, a), affine(solved, b)
                 add_product(L, *product, -exact(float(multiplier)) * value)
     for product_of_hulls in record.get("products", []):
-        if not subtract_product(L, solved, variables, product_of_hulls):
+        if not subtract_product(L, solved, record, product_of_hulls):
             return {}, "the products: a matrix P of a product of hulls is not positive semidefinite"
     return L, ""
 
@@ -106,6 +107,8 @@ def stays_when_turned(record: dict[str, Any], constrained: set[int]) -> bool:
     of a variable (every row, from the right) is such a vector.
     """
     held = record["held"]
+    if record.get("h"):
+        return False
     lists = [[int(entry) for entry in entries] for entries in held["entries"]]
     d = len(lists)
     places: dict[int, tuple[int, int]] = {}
@@ -178,26 +181,26 @@ def objective(record: dict[str, Any], solved: dict[int, Affine]) -> Quadratic:
 
 
 def subtract_product(
-    L: Quadratic, solved: dict[int, Affine], variables: list[dict[str, Any]], record: dict[str, Any]
+    L: Quadratic, solved: dict[int, Affine], record: dict[str, Any], product: dict[str, Any]
 ) -> bool:
     """Subtract <P, W>, and say whether P is positive semidefinite."""
-    side, W = outside(variables, record) if len(record["of"]) == 1 else hulls(variables, record)
-    entries = list(reversed(record["P"]))
+    side, W = outside(record, product) if len(product["of"]) == 1 else kronecker(record, product)
+    entries = list(reversed(product["P"]))
     P: Quadratic = {}
     for row in range(side):
         for column in range(row, side):
             value = exact(float(entries.pop()))
             P.setdefault(row, {})[column] = P.setdefault(column, {})[row] = value
             for first, second in W(row, column):
-                factor = -value * (1 if row == column else 2)
-                add_product(L, substituted(solved, first), substituted(solved, second), factor)
+                times = -value * (1 if row == column else 2)
+                add_product(L, substituted(solved, first), substituted(solved, second), times)
     return least_value(P) is not None
 
 
-def outside(variables: list[dict[str, Any]], record: dict[str, Any]) -> Products:
+def outside(record: dict[str, Any], product: dict[str, Any]) -> Products:
     """I - X X^T of a variable with orthonormal columns."""
-    ((place, _),) = record["of"]
-    variable = variables[place]
+    ((place, _),) = product["of"]
+    variable = record["variables"][place]
     if not set(variable["sets"]) <= {"rotation", "orthonormal"}:
         raise ValueError("a product of a variable whose columns are not orthonormal")
     n, p = (int(size) for size in variable["shape"])
@@ -211,11 +214,9 @@ def outside(variables: list[dict[str, Any]], record: dict[str, Any]) -> Products
     return n, entry
 
 
-def hulls(variables: list[dict[str, Any]], record: dict[str, Any]) -> Products:
-    """The Kronecker product of two hulls."""
-    (first, part), (second, other_part) = record["of"]
-    side, H = hull(variables[first], part)
-    other_side, other_H = hull(variables[second], other_part)
+def kronecker(record: dict[str, Any], product: dict[str, Any]) -> Products:
+    """The Kronecker product of two matrices."""
+    (side, H), (other_side, other_H) = (factor(record, *of) for of in product["of"])
 
     def entry(a: int, b: int) -> list[tuple[Affine, Affine]]:
         of_first = H.get((a // other_side, b // other_side), {})
@@ -226,12 +227,17 @@ def hulls(variables: list[dict[str, Any]], record: dict[str, Any]) -> Products:
 
 def equalities(record: dict[str, Any]) -> Iterable[Affine]:
     """The rows of A z - b."""
+    return rows_of(record["A"], record["b"], 1).values()
+
+
+def rows_of(matrix: list[Any], right: list[float], sign: int) -> dict[int, Affine]:
+    """The rows of a matrix times z, less the right side, times a sign."""
     rows: dict[int, Affine] = {}
-    for i, j, value in record["A"]:
-        rows.setdefault(int(i), {})[int(j)] = exact(float(value))
-    for i, value in enumerate(record["b"]):
-        rows.setdefault(i, {})[ONE] = -exact(float(value))
-    return rows.values()
+    for i, j, value in matrix:
+        rows.setdefault(int(i), {})[int(j)] = sign * exact(float(value))
+    for i, value in enumerate(right):
+        rows.setdefault(i, {})[ONE] = -sign * exact(float(value))
+    return rows
 
 
 def entries_of(variable: dict[str, Any]) -> int:
@@ -358,6 +364,17 @@ def cross(first: list[int], second: list[int], third: list[int]) -> list[Terms]:
         minus = (first[c], second[b], fmpq(-1))
         of_all.append([plus, minus, (third[a], ONE, fmpq(-1))])
     return of_all
+
+
+def factor(
+    record: dict[str, Any], position: int, part: int
+) -> tuple[int, dict[tuple[int, int], Affine]]:
+    """Side and entries of a matrix: of a variable's hull, an inequality, or the constant 1."""
+    if position == ONE:
+        return 1, {(0, 0): {ONE: fmpq(1)}}
+    if position == INEQUALITY:
+        return 1, {(0, 0): rows_of(record["H"], record["h"], -1)[part]}
+    return hull(record["variables"][position], part)
 
 
 def hull(variable: dict[str, Any], part: int) -> tuple[int, dict[tuple[int, int], Affine]]:

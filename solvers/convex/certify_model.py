@@ -16,7 +16,7 @@ from pgo_models.convex.assignment import assignment_multipliers
 from pgo_models.convex.convex_solver import solve_compiled
 from pgo_models.convex.gauge import with_gauge_held
 from pgo_models.convex.hull_bound import prove_hull_bound
-from pgo_models.convex.hulls import with_hull_products
+from pgo_models.convex.hulls import with_hull_products, with_inequalities
 from pgo_models.convex.model_bound import ModelBound, best_model_bound, prove_model_bound
 from pgo_models.convex.model_certificate import (
     ModelCertificate,
@@ -35,6 +35,7 @@ from pgo_models.convex.quadratic_form import NotQuadraticError, QuadraticForm, q
 from pgo_models.convex.set_equations import SetEquations, set_equations
 from pgo_models.errors import PGOError
 from pgo_models.geometry.rotations import Array
+from solvers.convex.constrained_newton import constrained_stationary_point, is_feasible
 from solvers.convex.model_newton import ModelNewton
 
 
@@ -45,13 +46,16 @@ def certify_model(
     projected = problem.values(problem.near_point(values).copies)
     try:
         form = with_gauge_held(quadratic_form(problem))
+        if form.limits_x:
+            objective, others = _with_best_others(problem, projected)
+            return certified_feasible(problem, form, projected, others, objective, gap)[0]
         equations = set_equations(form)
     except NotQuadraticError as error:
-        objective = _least_objective(problem, projected)
+        objective = _with_best_others(problem, projected)[0]
         return judge_by_hulls(objective, prove_hull_bound(problem), str(error), gap)
     u = form.u_of(projected)
     bound, _ = best_bound(form, equations, u, gap)
-    return judge_values(form, equations, u, bound, gap)
+    return judge_values(form, u, bound, gap)
 
 
 def certified_point(
@@ -61,19 +65,48 @@ def certified_point(
 
     A NotQuadraticError where sets have no equations.
     """
-    equations = set_equations(form)
-    bound, u = best_bound(form, equations, form.u_of(values), gap)
-    return judge_values(form, equations, u, bound, gap), u
+    bound, u = best_bound(form, set_equations(form), form.u_of(values), gap)
+    return judge_values(form, u, bound, gap), u
 
 
-def _least_objective(problem: OrthogonalProblem, values: Sequence[Array]) -> float:
-    """J of constrained variables with the best values of all others."""
+def certified_feasible(
+    problem: OrthogonalProblem,
+    form: QuadraticForm,
+    values: Sequence[Array],
+    others: Sequence[Array],
+    objective: float,
+    gap: float = DEFAULT_GAP,
+) -> tuple[ModelCertificate, Array | None]:
+    """As `certified_point`, of a model with constraints beside its sets, which values hold.
+
+    The point is None where none is found that holds them to rounding. The certificate then is of
+    the objective that is given. A bound by hulls takes its place where that is better.
+    """
+    equations = with_inequalities(form, set_equations(form))
+    bound, u = best_bound(form, equations, form.with_others(form.u_of(values), others), gap)
+    is_found = is_feasible(equations, u)
+    judged = ModelCertificate(objective, 0.0, bound, False, gap, form)
+    if is_found:
+        judged = judge_values(form, u, bound, gap)
+    if not judged.is_certified:
+        by_hulls = prove_hull_bound(problem)
+        if by_hulls is not None and by_hulls.value > judged.lower_bound:
+            reason = "constraints beside the sets leave a gap in the relaxation"
+            judged = judge_by_hulls(judged.objective, by_hulls, reason, gap)
+    return judged, u if is_found else None
+
+
+def _with_best_others(
+    problem: OrthogonalProblem, values: Sequence[Array]
+) -> tuple[float, list[Array]]:
+    """J of constrained variables with the best values of all others, and these."""
     if not problem.others and not problem.problem.constraints:
-        return problem.objective(values)
+        return problem.objective(values), []
     held = [X - value == 0 for X, value in zip(problem.variables, values, strict=True)]
     model = cp.Problem(cp.Minimize(problem.J), [*problem.problem.constraints, *held])
     solve_compiled(model, "model with its variables held", accepted=cp.OPTIMAL_INACCURATE)
-    return problem.objective(values, [variable.value for variable in problem.others])
+    others = [variable.value for variable in problem.others]
+    return problem.objective(values, others), others
 
 
 def best_bound(
@@ -81,7 +114,8 @@ def best_bound(
 ) -> tuple[ModelBound | None, Array]:
     """The best bound that is found, and the best point: the stationary one beside u or another."""
     newton = ModelNewton(form, equations)
-    search = _Search(newton, newton.polish(u) if newton.is_possible else u, gap)
+    search = _Search(newton, u, gap)
+    search.best = search.stationary(u)
     closed = closed_form_multipliers(form, equations, search.best)
     search.add(prove_model_bound(form, equations, closed, search.best))
     sorted_both = None if search.is_done else assignment_multipliers(form, equations)
@@ -115,8 +149,13 @@ class _Search:
     @property
     def is_done(self) -> bool:
         """Whether the gap between the two is the one asked for."""
-        form, equations = self.newton.form, self.newton.equations
-        return judge_values(form, equations, self.best, self.bound, self.gap).is_certified
+        return judge_values(self.newton.form, self.best, self.bound, self.gap).is_certified
+
+    def stationary(self, u: Array) -> Array:
+        """The stationary point beside u."""
+        if self.newton.is_possible:
+            return self.newton.polish(u)
+        return constrained_stationary_point(self.newton.form, self.newton.equations, u)
 
     def add(self, bound: ModelBound | None) -> None:
         if bound is not None and (self.bound is None or bound.value > self.bound.value):
@@ -129,8 +168,8 @@ class _Search:
             relaxed = solve_model_relaxation(form, equations)
         except PGOError:  # of the solver; the bounds that are known are what is left
             return
-        if self.newton.is_possible:
-            other = self.newton.polish(self.newton.on_sets(relaxed.u))
+        other = self.stationary(self.newton.on_sets(relaxed.u))
+        if self.newton.is_possible or is_feasible(self.newton.equations, other):
             self.best = min(self.best, other, key=form.objective)
         moved = moved_multipliers(form, equations, relaxed.multipliers, self.best)
         self.add(prove_model_bound(form, equations, moved, self.best))

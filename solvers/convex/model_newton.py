@@ -51,13 +51,13 @@ class ModelNewton(ReadOnly):
 
     @property
     def is_possible(self) -> bool:
-        """Whether every variable is in one set that has tangent spaces, and free or fixed."""
+        """Whether every variable is in one set with tangent spaces, free or fixed, and no more."""
         for block in self.form.blocks:
             has_one = len(block.sets) == 1 and isinstance(block.sets[0], _SMOOTH)
             free = self.form.is_free[block.coordinates]
             if not has_one or (free.any() and not free.all()):
                 return False
-        return not self.form.E.shape[0] or bool(len(self.form.free_others))
+        return not self.form.limits_x
 
     def polish(self, u: Array) -> Array:
         """The stationary point beside u, to rounding."""

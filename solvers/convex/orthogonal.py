@@ -26,7 +26,7 @@ from pgo_models.convex.orthogonality import (
     SplitProblem,
     norm_of_all,
 )
-from pgo_models.convex.quadratic_form import NotQuadraticError, quadratic_form
+from pgo_models.convex.quadratic_form import NotQuadraticError, QuadraticForm, quadratic_form
 from pgo_models.convex.quadratic_split import QuadraticSplit
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
@@ -58,7 +58,7 @@ class XStep(enum.Enum):
     """What makes step (a)."""
 
     AUTOMATIC = "matrices of a quadratic model, unless a solver is named; else the convex solver"
-    FACTORIZED = "matrices, factored once; for quadratic models with linear equalities"
+    FACTORIZED = "matrices, factored once; for quadratic models without constraints on the matrices"
     CONVEX_SOLVER = "the convex solver"
 
 
@@ -232,7 +232,7 @@ class OrthogonalSOC:
         is_solver_named = self.x_step is XStep.AUTOMATIC and self.solver is not COLD
         if not is_solver_named and self.x_step is not XStep.CONVEX_SOLVER:
             try:
-                return QuadraticSplit(problem, quadratic_form(problem))
+                return QuadraticSplit(problem, _form_of_step(problem))
             except NotQuadraticError:
                 if self.x_step is XStep.FACTORIZED:
                     raise
@@ -307,6 +307,14 @@ class OrthogonalSOC:
             if dual > _BALANCE_RATIO * primal:
                 return max(0.5 * state.rho, least)
         return max(state.rho, least)
+
+
+def _form_of_step(problem: OrthogonalProblem) -> QuadraticForm:
+    """The form of a model without constraints on its matrices."""
+    form = quadratic_form(problem)
+    if form.limits_x:
+        raise NotQuadraticError("constraints beside the sets are left to a convex solver")
+    return form
 
 
 def _probed_gradient(split: AnySplit, point: OrthogonalPoint) -> Array:

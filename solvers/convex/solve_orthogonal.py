@@ -22,7 +22,7 @@ from pgo_models.convex.quadratic_split import QuadraticSplit
 from pgo_models.errors import PGOError, SettingError
 from pgo_models.geometry.rotations import Array, as_generator
 from pgo_models.summaries import Summarised
-from solvers.convex.certify_model import certified_point
+from solvers.convex.certify_model import certified_feasible, certified_point
 from solvers.convex.determinants import random_points, reflections, with_free_determinants
 from solvers.convex.model_newton import ModelNewton
 from solvers.convex.orthogonal import AnySplit, OrthogonalSOC, OrthogonalState
@@ -135,7 +135,7 @@ def solve_orthogonal(
 
     Runs that converged come first, then the lowest J. Starts take all signs of determinants of
     variables in O(d) in turn; where there are more patterns of signs than starts, single variables
-    of the best point are reflected. Of a quadratic model with linear equalities
+    of the best point are reflected. Of a quadratic model with linear constraints
     (`pgo_models.convex.quadratic_form`) step (a) takes no convex solver, Newton moves an early
     iterate of every run to a stationary point, and a lower bound on J at all points of the sets is
     proven; where the relaxation that gives the bound leads to a better point, that one is returned.
@@ -284,12 +284,18 @@ def _certified(
     if not isinstance(split, QuadraticSplit):
         split = QuadraticSplit(problem, quadratic_form(problem))
     form = with_gauge_held(split.form)
-    certificate, u = certified_point(form, problem.values(state.copies))
+    values = problem.values(state.copies), state.others
     point = method.point(problem, state)
-    if _newton_for(split) is not None:
-        point = split.stationary_point(u)
-    values = tuple(form.values(u)), split.others(u)
-    return _solution(problem, best, ends, certificate, values, point, split)
+    if form.limits_x:
+        certificate, u = certified_feasible(problem, form, *values, best.objective)
+    else:
+        certificate, u = certified_point(form, values[0])
+        if _newton_for(split) is not None:
+            point = split.stationary_point(u)
+    if u is not None:
+        values = tuple(form.values(u)), split.others(u)
+    split_of_kkt = state.split if form.limits_x else split
+    return _solution(problem, best, ends, certificate, values, point, split_of_kkt)
 
 
 def _solution(

@@ -144,6 +144,8 @@ def _certificate_of_model(
     try:
         model = graph_model(request.problem, soc.changer)
         form = with_gauge_held(quadratic_form(model))
+        if form.limits_x:
+            return None
         judged, u = certified_point(form, list(poses.R), gap)
     except NotQuadraticError:
         return None

@@ -4,6 +4,7 @@
     python tests/benchmarks/any_model.py registration [draws of each size and noise, 5 unless given]
     python tests/benchmarks/any_model.py hand-eye [draws, 5 unless given]
     python tests/benchmarks/any_model.py hulls [draws of each loss, 5 unless given]
+    python tests/benchmarks/any_model.py constraints [draws of each kind, 8 unless given]
     python tests/benchmarks/any_model.py speed
 
 A random model is a sum of 9 m squares, of affine functions of m matrices with N(0, 1) entries: far
@@ -14,6 +15,9 @@ scene's size; `hand-eye` finds X of A X = X B from motions A and B of the hand a
 
 `hulls` fits ten points to points by losses that are not quadratic, two of the points wrong, and has
 the bound by hulls; its proof is written and verified.
+
+`constraints` adds linear constraints to sums of squares of one or two rotations and a translation,
+drawn as in `random`.
 
 `speed` runs five starts of five models by SOC with Newton, and by pymanopt's trust regions with the
 same starts, with the same matrix for the gradient and the Hessian, to the same gradient. pymanopt
@@ -141,6 +145,50 @@ def hand_eye(num_motions: int, degrees: float, seed: int) -> pgo.OrthogonalProbl
         terms.append((R_A[k] - np.eye(3)) @ t + t_A[k] - R @ t_B[k])
     squares = cp.sum_squares(cp.hstack(terms))
     return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(squares)), rotations=[R])
+
+
+CONSTRAINTS: dict[str, Callable[[list[Any], Any, Any], list[Any]]] = {
+    "a given column": lambda R, t, S: [R[0][:, 2] == S[:, 2]],
+    "an equality of entries": lambda R, t, S: [cp.sum(R[0][0]) == np.sum(S[0])],
+    "a shared column": lambda R, t, S: [R[0][:, 0] == R[1][:, 0]],
+    "a largest angle": lambda R, t, S: [cp.trace(R[0]) >= np.trace(S)],
+    "a large entry": lambda R, t, S: [R[0][0, 0] >= 0.9],
+    "a half space, and a box of t": lambda R, t, S: [R[0] @ S[0] + t >= 0.0, t <= 1.0],
+    "one angle below the other": lambda R, t, S: [cp.trace(R[0]) >= cp.trace(R[1])],
+}
+OF_TWO = ("a shared column", "one angle below the other")
+
+
+def constrained(kind: str, seed: int) -> pgo.OrthogonalProblem:
+    """Seven squares of affine functions with N(0, 1) entries, and linear constraints."""
+    rng = np.random.default_rng(seed)
+    R = [cp.Variable((3, 3)) for _ in range(2 if kind in OF_TWO else 1)]
+    t = cp.Variable(3)
+    entries = cp.hstack([*(cp.vec(X, order="F") for X in R), t])
+    misfits = rng.standard_normal((7, entries.size)) @ entries - rng.standard_normal(7)
+    J = cp.sum_squares(misfits) + 0.1 * cp.sum_squares(t)
+    constraints = CONSTRAINTS[kind](R, t, pgo.random_rotations(1, 3, rng)[0])
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), constraints), rotations=R)
+
+
+def with_constraints(draws: int) -> None:
+    """Print a row a kind of constraint: the share certified, other gaps, bounds above, seconds."""
+    print("| constraints | certified | other gaps | above | CPU s |")
+    print("|---|---|---|---|---|")
+    for kind in CONSTRAINTS:
+        gaps = []
+        seconds = []
+        above = 0
+        for seed in range(draws):
+            taken, solution = cpu_seconds(constrained(kind, seed), None)
+            seconds.append(taken)
+            if not solution.is_certified:
+                gaps.append(f"{solution.gap:.1e}")
+            other = solvers.solve_orthogonal(constrained(kind, seed), seed + 1, starts=20)
+            above += solution.lower_bound > other.objective * (1.0 + 1e-12)
+        certified = f"{draws - len(gaps)} of {draws}"
+        cells = kind, certified, ", ".join(gaps), str(above), f"{np.median(seconds):.2g}"
+        print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def certified_shares(
@@ -300,10 +348,13 @@ def main() -> None:
         certified_shares(hand_eye, MOTIONS, DEGREES, int(number or 5))
     elif what == "hulls":
         bounds_by_hulls(int(number or 5))
+    elif what == "constraints":
+        with_constraints(int(number or 8))
     elif what == "speed":
         speed()
     else:
-        sys.exit(f"any_model.py: {what!r} is none of random, registration, hand-eye, hulls, speed")
+        kinds = "random, registration, hand-eye, hulls, constraints, speed"
+        sys.exit(f"any_model.py: {what!r} is none of {kinds}")
 
 
 if __name__ == "__main__":

@@ -320,9 +320,10 @@ def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
     assert none.lower_bound == -np.inf
     assert "Sparse" in str(none)
     assert none.verdict is Verdict.TRIVIAL
+    of_norm = cp.norm(X - 2.0 * np.eye(3)[::-1])
     by_hulls = {
-        "there are other constraints": answer(squares, [X[0, 0] <= 0.5], rotations=[X]),
-        "is not quadratic": answer(cp.norm(X - 2.0 * np.eye(3)[::-1]), rotations=[X]),
+        "a constraint is not linear": answer(squares, [cp.norm(X[0] - 1.0) <= 1.5], rotations=[X]),
+        "is not quadratic": answer(of_norm, rotations=[X]),
     }
     for reason, solution in by_hulls.items():
         assert -np.inf < solution.lower_bound <= solution.objective

@@ -1,0 +1,105 @@
+"""Linear constraints beside the sets: equalities of rotations alone, and inequalities."""
+
+import json
+from pathlib import Path
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import pgo_models as pgo
+import solvers
+
+KINDS = {
+    "a column is given": lambda R, t, S: [R[0][:, 2] == S[:, 2]],
+    "an equality of entries": lambda R, t, S: [cp.sum(R[0][0]) == np.sum(S[0])],
+    "a shared column": lambda R, t, S: [R[0][:, 0] == R[-1][:, 0]],
+    "a largest angle": lambda R, t, S: [cp.trace(R[0]) >= np.trace(S)],
+    "an entry is large": lambda R, t, S: [R[0][0, 0] >= 0.9],
+    "of a translation, too": lambda R, t, S: [R[0] @ S[0] + t >= 0.0, t <= 1.0],
+    "nowhere active": lambda R, t, S: [t <= 1e3, cp.trace(R[0]) >= -1.5],
+}
+
+
+def model(kind: str, seed: int = 0) -> pgo.OrthogonalProblem:
+    """Squares of affine functions of one or two rotations and a translation."""
+    rng = np.random.default_rng(seed)
+    R = [cp.Variable((3, 3)) for _ in range(2 if kind == "a shared column" else 1)]
+    t = cp.Variable(3)
+    entries = cp.hstack([*(cp.vec(X, order="F") for X in R), t])
+    misfits = rng.standard_normal((7, entries.size)) @ entries - rng.standard_normal(7)
+    J = cp.sum_squares(misfits) + 0.1 * cp.sum_squares(t)
+    constraints = KINDS[kind](R, t, pgo.random_rotations(1, 3, rng)[0])
+    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), constraints), rotations=R)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_certified_is_feasible_proven_and_no_start_ends_lower(
+    kind: str, seed: int, tmp_path: Path
+) -> None:
+    pytest.importorskip("flint")
+    problem = model(kind, seed)
+    solution = solvers.solve_orthogonal(problem, seed, starts=3)
+    assert solution.is_certified
+    assert problem.problem.value == pytest.approx(solution.objective, rel=1e-9)
+    assert all(float(np.max(each.violation())) < 1e-9 for each in problem.problem.constraints)
+    solution.save_proof(tmp_path / "proof.json")
+    verified = pgo.verify_proof(tmp_path / "proof.json")
+    assert verified.is_verified, verified.failure
+    other = solvers.solve_orthogonal(problem, seed + 10, starts=4)
+    assert solution.lower_bound <= other.objective * (1.0 + 1e-12)
+    again = solvers.certify(problem, solution.values)
+    assert again.objective == pytest.approx(solution.objective, rel=1e-6)
+    assert again.lower_bound <= solution.objective
+
+
+def proof_of(kind: str, tmp_path: Path) -> dict:
+    path = tmp_path / "proof.json"
+    solvers.solve_orthogonal(model(kind), 0, starts=2).save_proof(path)
+    return json.loads(path.read_text())
+
+
+def failure_of(record: dict, tmp_path: Path) -> str:
+    path = tmp_path / "changed.json"
+    path.write_text(json.dumps(record))
+    return pgo.verify_proof(path).failure
+
+
+def test_proofs_with_inequalities_that_are_changed_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("flint")
+    record = proof_of("a largest angle", tmp_path)
+    assert not failure_of(record, tmp_path)
+    assert [-2, 0] in record["products"][0]["of"]
+    looser = record | {"h": [record["h"][0] + 0.1]}
+    assert "claim" in failure_of(looser, tmp_path)
+    assert failure_of(record | {"products": []}, tmp_path)
+    first, *further = record["products"]
+    negative = [{**first, "P": [-1.0]}, *further]
+    assert "semidefinite" in failure_of(record | {"products": negative}, tmp_path)
+
+
+def test_no_variable_is_held_where_inequalities_tell_directions_apart(tmp_path: Path) -> None:
+    pytest.importorskip("flint")
+    rng = np.random.default_rng(0)
+    R = [cp.Variable((3, 3)) for _ in range(3)]
+    A = pgo.random_rotations(3, 3, rng)
+    squares = sum(cp.sum_squares(R[j] - R[i] @ A[i]) for i, j in ((0, 1), (1, 2), (0, 2)))
+
+    def proof(constraints: list) -> dict:
+        problem = cp.Problem(cp.Minimize(squares), constraints)
+        solution = solvers.solve_orthogonal(pgo.OrthogonalProblem(problem, rotations=R), starts=1)
+        solution.save_proof(tmp_path / "proof.json")
+        return json.loads((tmp_path / "proof.json").read_text())
+
+    assert "held" in proof([])
+    assert "held" not in proof([R[0][0, 0] <= 0.5])
+    record = proof([])
+    limited = record | {"H": [[0, 0, 1.0]], "h": [0.5]}
+    assert "held" in failure_of(limited, tmp_path)
+
+
+def test_values_that_no_other_variable_makes_feasible_are_said_to_be_so() -> None:
+    problem = model("an entry is large")
+    with pytest.raises(pgo.PGOError, match="infeasible"):
+        solvers.certify(problem, [np.diag([-1.0, -1.0, 1.0])])
