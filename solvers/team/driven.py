@@ -32,7 +32,7 @@ from solvers.team.messages import (
 )
 from solvers.team.news import News
 from solvers.team.refusals import function_for_teams
-from solvers.team.talk import Talk
+from solvers.team.session import Session
 
 # Patiences after which a robot that is there, and has not answered, is waited for no more.
 _MOST_PATIENCES = 10.0
@@ -63,13 +63,13 @@ class DrivenTeam:
     `last` is how the last solve has ended, and `term` the last solve that is known of.
     """
 
-    def __init__(self, member: Member, talk: Talk) -> None:
+    def __init__(self, member: Member, session: Session) -> None:
         self.name = member.name
         self.term = Term(0, "")
         self.last: Ended | None = None
         self._member = member
-        self._talk = talk
-        self._beside = talk.beside
+        self._session = session
+        self._beside = session.beside
         # Of the others: the revisions of their measurements, and the terms of their outcomes.
         self._revisions: dict[str, Revision] = {}
         self._known: dict[str, Term] = {}
@@ -127,7 +127,7 @@ class DrivenTeam:
         outcome = self._member.outcome
         is_in_it = outcome is not None and outcome.term == self.term
         is_far = len(self._awake) > 1 and driver not in (*self._awake, "")
-        if is_far and not is_in_it and self._talk.is_complete(()):
+        if is_far and not is_in_it and self._session.is_complete(()):
             sentences.append(
                 f"{driver} drives, and {self.name} hears of it through others alone; with "
                 "sharing=Sharing.MEASUREMENTS for all, these pass on what each has measured"
@@ -141,7 +141,7 @@ class DrivenTeam:
         call = part.call + 1 if part is not None and is_computing else -1
         outcome = self._member.outcome
         known = Term(0, "") if outcome is None else outcome.term
-        return Hello(self._revision, self.term, known, call, self._talk.twins)
+        return Hello(self._revision, self.term, known, call, self._session.twins)
 
     def take(self, sender: str, message: object, is_latest: bool) -> None:
         """Update what is known of the team by a message, or obey the order in it."""
@@ -170,8 +170,8 @@ class DrivenTeam:
             self._known[sender] = hello.known
         self._learn_term(hello.term)
         if self._drive is not None and self._drive.is_computed(sender, hello):
-            self._waits_since = self._talk.now
-            self._sent_at[sender] = self._talk.now
+            self._waits_since = self._session.now
+            self._sent_at[sender] = self._session.now
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Begin a solve, repeat what was not answered, give up."""
@@ -180,7 +180,7 @@ class DrivenTeam:
             self._said = self._revision
             for name in awake:
                 if name != self.name:
-                    self._talk.say_hello(name)
+                    self._session.say_hello(name)
         if self._drive is not None:
             self._go_on_driving(awake)
         if self._drive is None:
@@ -192,10 +192,11 @@ class DrivenTeam:
         """Send what was not answered, by receiver, once and then ever more rarely."""
         for name, message in waiting.items():
             num_sent = self._num_sent.get(name, 0)
-            if self._talk.now - self._sent_at.get(name, -np.inf) >= self._talk.pause(num_sent):
-                self._sent_at[name] = self._talk.now
+            waited = self._session.now - self._sent_at.get(name, -np.inf)
+            if waited >= self._session.pause(num_sent):
+                self._sent_at[name] = self._session.now
                 self._num_sent[name] = num_sent + 1
-                self._talk.send(name, message, priority)
+                self._session.send(name, message, priority)
 
     def _learn_term(self, term: Term) -> None:
         """Give up a solve that another robot has overtaken, and solve again if this one drives."""
@@ -233,14 +234,14 @@ class DrivenTeam:
         lacks_map = False
         for name, revision in revisions.items():
             before = self._tried.get(name)
-            tried[name] = (revision, self._talk.boot_of(name))
+            tried[name] = (revision, self._session.boot_of(name))
             if before is not None and before[1] != tried[name][1]:  # it has begun anew
                 has_map = self.last is not None and self._known.get(name) == self.last.term
                 tried[name] = (revision, before[1] if has_map else tried[name][1])
                 lacks_map |= not has_map
         if self._member.has_more_than(revisions) and not lacks_map:
             return
-        if tried != self._tried and self._talk.is_complete(members):
+        if tried != self._tried and self._session.is_complete(members):
             self._begin_drive(members, tried)
 
     def _begin_drive(
@@ -268,10 +269,10 @@ class DrivenTeam:
         if not set(self._drive.members) <= set(awake):  # they wait for letters of each other
             self._give_up()
             return
-        now = self._talk.now
+        now = self._session.now
         if self._waits_since is None or not self._drive.waiting:
             self._waits_since = now
-        if now - self._waits_since > _MOST_PATIENCES * self._talk.patience:
+        if now - self._waits_since > _MOST_PATIENCES * self._session.patience:
             self._end_without_answers(now)
             return
         self._send_again(self._drive.waiting, Priority.URGENT)
@@ -296,7 +297,7 @@ class DrivenTeam:
 
     def _take_reply(self, sender: str, reply: Reply) -> None:
         if self._drive is not None and reply.term == self._drive.term:
-            self._tried[sender] = (reply.revision, self._talk.boot_of(sender))
+            self._tried[sender] = (reply.revision, self._session.boot_of(sender))
             self._drive.take(sender, reply)
 
     def _after_step(self, drive: Drive) -> None:
@@ -308,7 +309,7 @@ class DrivenTeam:
         if drive.outcome is None:
             return
         self._drive = None
-        absent = tuple(name for name in self._talk.team if name not in drive.members)
+        absent = tuple(name for name in self._session.team if name not in drive.members)
         revisions = {name: revision for name, (revision, _) in self._tried.items()}
         outcome = drive.ended(absent, revisions)
         self._end_with(outcome)
@@ -320,7 +321,7 @@ class DrivenTeam:
     def _obey(self, sender: str, ask: Ask) -> None:
         """Obey an order once, and answer it as often as it is asked."""
         if ask.term.driver != sender or ask.term < self.term:
-            self._talk.say_hello(sender)
+            self._session.say_hello(sender)
             return
         if ask.term > self.term:
             self._learn_term(ask.term)
@@ -338,21 +339,21 @@ class DrivenTeam:
     def _answer(self, part: Following, ask: Ask) -> None:
         """Begin to obey the next order, or send the last answer again."""
         if part.obeyed is not None:
-            self._talk.say_hello(ask.term.driver)
+            self._session.say_hello(ask.term.driver)
         elif ask.call == part.call + 1:
             lost = self._begin_answer(part, ask)
             if part.waiting is not None:  # asked again: the letters should be here by now
                 for name in lost:
                     message = LetterLost(ask.term, name.call, part.letters.place)
-                    self._talk.send(part.members[name.other], message, Priority.URGENT)
+                    self._session.send(part.members[name.other], message, Priority.URGENT)
             part.waiting = ask if lost else None
         elif ask.call == part.call and part.reply is not None:
-            self._talk.send(ask.term.driver, part.reply, Priority.URGENT)
+            self._session.send(ask.term.driver, part.reply, Priority.URGENT)
 
     def _have_all_begin_again(self, term: Term) -> None:
         """Tell the robot that drives that this one has begun anew and has lost its part."""
         self.term = Term(term.number + 1, self.name)
-        self._talk.say_hello(term.driver)
+        self._session.say_hello(term.driver)
 
     def _begin_answer(self, part: Following, ask: Ask) -> set[LetterName]:
         """Begin to obey an order, unless letters are missing."""
@@ -361,7 +362,7 @@ class DrivenTeam:
         except (LookupError, TypeError, PGOError) as error:
             part.reply = Reply(ask.term, ask.call, part.revision, None, _as_error(error))
             part.call = ask.call
-            self._talk.send(ask.term.driver, part.reply, Priority.URGENT)
+            self._session.send(ask.term.driver, part.reply, Priority.URGENT)
             return set()
         if missing:
             return {name for name in missing if 0 <= name.other < len(part.members)}
@@ -390,11 +391,11 @@ class DrivenTeam:
             return
         for name in letters:
             self._send_letter(part, ask.term, name)
-        self._talk.send(ask.term.driver, part.reply, Priority.URGENT)
+        self._session.send(ask.term.driver, part.reply, Priority.URGENT)
 
     def _send_letter(self, part: Following, term: Term, name: LetterName) -> None:
         letter = Letter(term, name.call, part.letters.place, part.letters.sent[name])
-        self._talk.send(part.members[name.other], letter, Priority.URGENT)
+        self._session.send(part.members[name.other], letter, Priority.URGENT)
 
     def _take_letter(self, letter: Letter) -> None:
         """Keep a letter, and obey the order that has waited for it."""
@@ -424,7 +425,7 @@ class DrivenTeam:
                     self._have_all_begin_again(outcome.term)  # its poses are lost
                     return
                 self._end_with(outcome)
-            self._talk.send(sender, Heard(outcome.term), Priority.NORMAL)
+            self._session.send(sender, Heard(outcome.term), Priority.NORMAL)
 
     def _end_with(self, outcome: Ended) -> None:
         """Remember how a solve has ended, and have the robot take what was found."""

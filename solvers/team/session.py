@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from solvers.carry.wire import MARK, WireError, opened, sealed
 from solvers.team.beside import Beside
 from solvers.team.messages import Priority, check_message
 from solvers.team.speakers import Envelope, Speakers, Word
-from solvers.team.talk import Way
 
 PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
 RETRY = 1.0  # seconds after which a message without an answer is sent again, at first
@@ -68,6 +67,27 @@ class TeamLedger:
 
 def _with_more(counts: Mapping[str, int], name: str, more: int) -> Mapping[str, int]:
     return {**counts, name: counts.get(name, 0) + more}
+
+
+class Way(Protocol):
+    """A way to solve together."""
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing is to be done."""
+
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong, a sentence each."""
+
+    def greeting(self) -> object:
+        """The message that tells others that this robot is there."""
+
+    def take(self, sender: str, message: object, is_latest: bool) -> None:
+        """Take a message; the latest one of its sender, or one that others have overtaken."""
+
+    def tick(self, awake: tuple[str, ...]) -> None:
+        """Do what is due, with the robots that are awake."""
 
 
 class Session:

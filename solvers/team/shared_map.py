@@ -24,8 +24,8 @@ from solvers.team.messages import Ended, Hello, Priority, Term
 from solvers.team.news import News, Piece
 from solvers.team.pace import MOST_IN_A_PIECE, Pace
 from solvers.team.packed_lines import packed_lines, unpacked_lines
+from solvers.team.session import Session
 from solvers.team.shared_solve import SharedAnswer
-from solvers.team.talk import Talk
 
 _FORGOTTEN = 10.0  # patiences without a sign, after which a robot is not waited for any more
 
@@ -54,7 +54,7 @@ class SharedMap:
     `last` is how the last solve has ended, and `term` its number.
     """
 
-    def __init__(self, member: Member, talk: Talk) -> None:
+    def __init__(self, member: Member, session: Session) -> None:
         self.name = member.name
         self.term = Term(0, "")
         self.last: Ended | None = None
@@ -63,7 +63,7 @@ class SharedMap:
         # back what others still have of it.
         self.saved: Revision | None = None
         self._member = member
-        self._talk = talk
+        self._session = session
         # What the others have last said, also those that are out of reach, and who is within it.
         self._said: dict[str, _Said] = {}
         self._near: set[str] = set()
@@ -97,7 +97,7 @@ class SharedMap:
         self.last = outcome
         self.saved = self._member.revision
         for name, saved in others.items():
-            if name in self._talk.team:
+            if name in self._session.team:
                 self.logs[name] = Measurements(list(saved.lines), saved.d)
 
     @property
@@ -125,19 +125,19 @@ class SharedMap:
         if outcome is None or outcome.absent or self._is_solving or self._owed:
             return False
         revisions = self.revisions
-        longest = _FORGOTTEN * self._talk.patience
-        waited_for = [said for said in self._said.values() if self._talk.now - said.when <= longest]
+        oldest = self._session.now - _FORGOTTEN * self._session.patience
+        waited_for = [said for said in self._said.values() if said.when >= oldest]
         return revisions == self._tried and all(said.has == revisions for said in waited_for)
 
     # Lines
 
     def greeting(self) -> News:
         """What tells others that this robot is there."""
-        return News(self.revisions, tuple(self._has), (), self._takes_back, self._talk.twins)
+        return News(self.revisions, tuple(self._has), (), self._takes_back, self._session.twins)
 
     def _news(self, to: str, pieces: tuple[Piece, ...]) -> News:
         """The greeting to a robot, with pieces, and as the answer to those that have come."""
-        sent = int(1000 * self._talk.now)
+        sent = int(1000 * self._session.now)
         answers, self._paces[to].heard = self._paces[to].heard, -1
         return replace(self.greeting(), pieces=pieces, sent=sent, answers=answers)
 
@@ -154,15 +154,15 @@ class SharedMap:
         pace = self._paces[sender]
         for piece in message.pieces:
             self._learn(sender, piece, is_latest)
-            pause = self._talk.pause(1) / 2 if piece.is_last else 0.0
-            when = min(self._talk.now + pause, self._owed.get(sender, np.inf))
+            pause = self._session.pause(1) / 2 if piece.is_last else 0.0
+            when = min(self._session.now + pause, self._owed.get(sender, np.inf))
             self._owed[sender] = when
         if is_latest:
             if message.pieces:
                 pace.heard = message.sent
             if message.answers >= 0:
-                pace.note_answer(message.answers, self._talk.now, self._talk.pause(1))
-            self._said[sender] = _Said(message.has, message.hears, self._talk.now)
+                pace.note_answer(message.answers, self._session.now, self._session.pause(1))
+            self._said[sender] = _Said(message.has, message.hears, self._session.now)
             self._near.add(sender)
             if message.takes_back:
                 self._give_back(sender, message.has.get(sender, Revision()))
@@ -197,7 +197,7 @@ class SharedMap:
         if log is not None and log.begins_with(saved) and len(log.lines) > saved.num_lines:
             piece = self._piece(owner, log, saved.num_lines, owner)
             if piece is not None:
-                self._talk.send(owner, self._news(owner, (piece,)), Priority.NORMAL)
+                self._session.send(owner, self._news(owner, (piece,)), Priority.NORMAL)
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Send what others lack, and solve where something is new."""
@@ -207,11 +207,11 @@ class SharedMap:
             pieces = self._pieces_for(name, has, awake)
             # Where lines for the robot are being collected, they take the answer along.
             is_coming = has.get(self.name) != self._member.revision
-            delay = self._talk.pause(1) / 2 if is_coming else 0.0
-            if pieces or self._owed.get(name, np.inf) + delay <= self._talk.now:
+            delay = self._session.pause(1) / 2 if is_coming else 0.0
+            if pieces or self._owed.get(name, np.inf) + delay <= self._session.now:
                 self._owed.pop(name, None)
                 priority = Priority.NORMAL if pieces else Priority.HELLO
-                self._talk.send(name, self._news(name, tuple(pieces)), priority)
+                self._session.send(name, self._news(name, tuple(pieces)), priority)
         self._solve_if_due()
 
     def _pieces_for(
@@ -243,24 +243,24 @@ class SharedMap:
         log = self.logs[owner]
         if owner in self._said[to].hears or known.num_lines >= len(log.lines):
             return False
-        since = self._lags.setdefault((to, owner), self._talk.now)
+        since = self._lags.setdefault((to, owner), self._session.now)
         rank = [name for name in awake if name not in (to, owner)].index(self.name)
         rank += owner in awake
-        is_due = self._talk.now - since >= rank * self._talk.patience / 2
+        is_due = self._session.now - since >= rank * self._session.patience / 2
         return is_due and log.begins_with(known)
 
     def _piece(self, to: str, log: Measurements, begins: int, owner: str) -> Piece | None:
         """Lines from one on, cut to a length; None where a robot is to answer first."""
         flight = self._flights.get((to, owner))
-        now = self._talk.now
+        now = self._session.now
         pace = self._paces[to]
         num_sent = 0
         if flight is not None:
             # After the last piece, lines are collected for a while.
-            pause = self._talk.pause(1) if flight.is_last else 0.0
+            pause = self._session.pause(1) if flight.is_last else 0.0
             if flight.begins == begins:
                 num_sent = flight.num_sent
-                pause = pace.pause(now - self._said[to].when, self._talk.pause(1))
+                pause = pace.pause(now - self._said[to].when, self._session.pause(1))
             if now - flight.when < pause:
                 return None
         if num_sent:
@@ -287,13 +287,13 @@ class SharedMap:
         if self._is_solving or self.name not in revisions or revisions == self._tried:
             return
         if self._changed_at is None:
-            self._changed_at = self._talk.now
+            self._changed_at = self._session.now
         is_first = self.last is None
-        pause = self._talk.patience if is_first else self._talk.pause(1)
-        is_waited_for = self._talk.now - self._changed_at >= pause
+        pause = self._session.patience if is_first else self._session.pause(1)
+        is_waited_for = self._session.now - self._changed_at >= pause
         announced = [has.get(name, Revision()) for name, has in self._has.items()]
         is_here = all(each in (Revision(), *revisions.values()) for each in announced)
-        if is_first and not self._talk.is_complete(revisions):
+        if is_first and not self._session.is_complete(revisions):
             return
         if is_here or is_waited_for:
             self._begin(revisions)
@@ -305,7 +305,7 @@ class SharedMap:
         self._is_solving = True
         lines = {name: "".join(self.logs[name].lines) for name in revisions}
         solve = partial(self._member.shared_solve.solved, lines, self._member.solution)
-        self._talk.beside.begin(
+        self._session.beside.begin(
             lambda: OTHER_PROCESS.result_of(solve),
             lambda answer: self._end(revisions, answer),
             "the measurements cannot be computed with",
@@ -320,7 +320,7 @@ class SharedMap:
             return
         self._problems = answer.problems
         covered = {name: revisions[name] for name in answer.covered}
-        absent = tuple(name for name in self._talk.team if name not in covered)
+        absent = tuple(name for name in self._session.team if name not in covered)
         self.last = Ended(self.term, covered, absent, answer.found)
         self._member.outcome = self.last
         self._member.known = answer.own
