@@ -87,7 +87,7 @@ def test_every_search_ends_in_small_worlds_with_slips(first: int, keeps_all: boo
         assert num_questions(slipped_world(seed), pgo.Weighting.OWN, keeps_all) < MOST, seed
 
 
-@pytest.mark.parametrize("total", [1000, 4000])
+@pytest.mark.parametrize("total", [1000, 100_000])
 def test_all_searches_of_a_solve_together_end_at_their_limit(total: int) -> None:
     graph = slipped_world(3)
     problem = pgo.PGOProblem(graph)
