@@ -46,13 +46,15 @@ def certify_model(
     projected = problem.values(problem.near_point(values).copies)
     try:
         form = with_gauge_held(quadratic_form(problem))
-        if form.limits_x:
-            objective, others = _with_best_others(problem, projected)
-            return certified_feasible(problem, form, projected, others, objective, gap)[0]
-        equations = set_equations(form)
+        equations = with_inequalities(form, set_equations(form))
     except NotQuadraticError as error:
         objective = _with_best_others(problem, projected)[0]
         return judge_by_hulls(objective, prove_hull_bound(problem), str(error), gap)
+    if form.limits_x:
+        objective, others = _with_best_others(problem, projected)
+        u = form.with_others(form.u_of(projected), others)
+        bound, _ = best_bound(form, equations, u, gap)
+        return _or_by_hulls(problem, ModelCertificate(objective, 0.0, bound, False, gap, form))
     u = form.u_of(projected)
     bound, _ = best_bound(form, equations, u, gap)
     return judge_values(form, u, bound, gap)
@@ -80,7 +82,7 @@ def certified_feasible(
     """As `certified_point`, of a model with constraints beside its sets, which values hold.
 
     The point is None where none is found that holds them to rounding. The certificate then is of
-    the objective that is given. A bound by hulls takes its place where that is better.
+    the objective that is given.
     """
     equations = with_inequalities(form, set_equations(form))
     bound, u = best_bound(form, equations, form.with_others(form.u_of(values), others), gap)
@@ -88,12 +90,16 @@ def certified_feasible(
     judged = ModelCertificate(objective, 0.0, bound, False, gap, form)
     if is_found:
         judged = judge_values(form, u, bound, gap)
-    if not judged.is_certified:
-        by_hulls = prove_hull_bound(problem)
-        if by_hulls is not None and by_hulls.value > judged.lower_bound:
-            reason = "constraints beside the sets leave a gap in the relaxation"
-            judged = judge_by_hulls(judged.objective, by_hulls, reason, gap)
-    return judged, u if is_found else None
+    return _or_by_hulls(problem, judged), u if is_found else None
+
+
+def _or_by_hulls(problem: OrthogonalProblem, certificate: ModelCertificate) -> ModelCertificate:
+    """The certificate, or that of a bound by hulls, where it is better."""
+    bound = None if certificate.is_certified else prove_hull_bound(problem)
+    if bound is None or bound.value <= certificate.lower_bound:
+        return certificate
+    reason = "constraints beside the sets leave a gap in the relaxation"
+    return judge_by_hulls(certificate.objective, bound, reason, certificate.wanted_gap)
 
 
 def _with_best_others(

@@ -54,6 +54,17 @@ def test_what_is_certified_is_feasible_proven_and_no_start_ends_lower(
     assert again.lower_bound <= solution.objective
 
 
+def test_values_that_are_feasible_and_not_the_best_are_not_certified() -> None:
+    problem = model("a largest angle")
+    least = solvers.solve_orthogonal(problem, 0, starts=2)
+    certificate = solvers.certify(problem, [np.eye(3)])
+    held = cp.Problem(problem.problem.objective, [problem.variables[0] == np.eye(3)])
+    assert certificate.objective == pytest.approx(held.solve(solver=cp.CLARABEL), rel=1e-6)
+    assert certificate.objective > 1.1 * least.objective
+    assert not certificate.is_certified
+    assert 0.0 < certificate.lower_bound <= least.objective
+
+
 def proof_of(kind: str, tmp_path: Path) -> dict:
     path = tmp_path / "proof.json"
     solvers.solve_orthogonal(model(kind), 0, starts=2).save_proof(path)
