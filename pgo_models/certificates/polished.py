@@ -62,7 +62,7 @@ class Polished:
             float(block_norms(turns).max(initial=0.0)),
             is_certified,
         )
-        if len(graph.landmarks) or _has_attitudes(graph) or not _is_chi2(problem, given):
+        if len(graph.landmarks) or _has_attitudes(graph) or not _is_chi2(problem):
             return moved
         try:
             cost, decrease = gtsam_cost(graph, given)
@@ -112,7 +112,7 @@ def _has_attitudes(graph: PoseGraph) -> bool:
     return bool(((ranks > 0) & (ranks < blocks.shape[1])).any())
 
 
-def _is_chi2(problem: PGOProblem, poses: Poses) -> bool:
+def _is_chi2(problem: PGOProblem) -> bool:
     """Whether the cost of a problem is that of whole information matrices, which GTSAM has."""
     graph = problem.graph
     if problem.weighting is Weighting.INFORMATION:

@@ -115,7 +115,8 @@ def with_hull_products(form: QuadraticForm, equations: SetEquations) -> SetEquat
         return None
     hulls = [hull for k, block in enumerate(form.blocks) for hull in hulls_of(k, block)]
     # Numbers of two inequalities would be multiplied, and rounded.
-    mixed = [(hull, inequality) for hull in hulls for inequality in _inequalities(form)]
+    inequalities = _inequalities(form)
+    mixed = [(hull, inequality) for hull in hulls for inequality in inequalities]
     pairs = _strongest(form, [*_pairs(hulls), *mixed])
     return _with_products(equations, pairs) if pairs else None
 

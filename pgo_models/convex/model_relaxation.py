@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 
 from pgo_models.convex.convex_solver import COLD, ConvexSolver, solve_compiled
 from pgo_models.convex.quadratic_form import QuadraticForm
-from pgo_models.convex.set_equations import HullProduct, SetEquations
+from pgo_models.convex.set_equations import SetEquations
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
@@ -61,8 +61,12 @@ def moved_multipliers(
     first = multipliers.copy()
     columns = equations.times(u)[form.is_free].toarray()
     bases = [eye_array(equations.num_equations, format="csc")]
+    active = active_inequalities(equations, u)
     for product in equations.products:
-        N = _kernel(product, equations, u)
+        if product.side == 1:
+            N = np.ones((1, int(product.start in active)))
+        else:
+            N = _kernel(product.at(equations, u))
         first[product.entries] = _triangle(N @ (N.T @ product.matrix(multipliers) @ N) @ N.T)
         bases.append(csc_array(_congruence(N)))
     basis = csc_array(block_diag(bases))
@@ -85,12 +89,9 @@ def _triangle(P: Array) -> Array:
     return P[np.triu_indices(len(P))]
 
 
-def _kernel(product: HullProduct, equations: SetEquations, u: Array) -> Array:
-    """Basis of the directions in which W(u) is zero."""
-    if product.side == 1:
-        is_active = product.start in active_inequalities(equations, u)
-        return np.ones((1, int(is_active)))
-    values, vectors = np.linalg.eigh(product.at(equations, u))
+def _kernel(W: Array) -> Array:
+    """Basis of the directions in which W is zero."""
+    values, vectors = np.linalg.eigh(W)
     return np.asarray(vectors[:, values < _ZERO * values[-1]])
 
 

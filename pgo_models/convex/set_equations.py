@@ -152,17 +152,18 @@ class SetEquations(ReadOnly):
 
     def values(self, u: Array) -> Array:
         """u^T A_k u, (number,)."""
-        terms = self.entries * u[self.i] * u[self.j]
-        return np.bincount(self.k, terms, self.number).astype(float)
+        return np.bincount(self.k, self._all_terms(u), self.number).astype(float)
 
     def value_sizes(self, u: Array) -> Array:
         """The sums of the absolute terms of u^T A_k u, (number,)."""
-        terms = abs(self.entries * u[self.i] * u[self.j])
-        return np.bincount(self.k, terms, self.number).astype(float)
+        return np.bincount(self.k, abs(self._all_terms(u)), self.number).astype(float)
 
     def terms(self, multipliers: Array, u: Array) -> Array:
         """The terms of sum l_k u^T A_k u, of at most four factors each."""
-        return multipliers[self.k] * self.entries * u[self.i] * u[self.j]
+        return multipliers[self.k] * self._all_terms(u)
+
+    def _all_terms(self, u: Array) -> Array:
+        return self.entries * u[self.i] * u[self.j]
 
 
 def set_equations(form: QuadraticForm) -> SetEquations:

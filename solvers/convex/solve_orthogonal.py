@@ -136,9 +136,10 @@ def solve_orthogonal(
     Runs that converged come first, then the lowest J. Starts take all signs of determinants of
     variables in O(d) in turn; where there are more patterns of signs than starts, single variables
     of the best point are reflected. Of a quadratic model with linear constraints
-    (`pgo_models.convex.quadratic_form`) step (a) takes no convex solver, Newton moves an early
-    iterate of every run to a stationary point, and a lower bound on J at all points of the sets is
-    proven; where the relaxation that gives the bound leads to a better point, that one is returned.
+    (`pgo_models.convex.quadratic_form`) a lower bound on J at all points of the sets is proven;
+    where the relaxation that gives the bound leads to a better point, that one is returned. Unless
+    inequalities or equalities limit the matrices, step (a) takes no convex solver then, and without
+    equalities Newton moves an early iterate of every run to a stationary point.
     Of other models the bound is the least J over the convex hulls of the sets, and mostly leaves a
     gap.
 
