@@ -74,74 +74,35 @@ class Step(enum.Enum):
 
 @dataclass(frozen=True)
 class Traits:
-    """What the page asks about a graph and its cost, whoever has the graph.
+    """What the page asks about a graph and its cost, whoever has the graph."""
 
-    Parameters
-    ----------
-    d : int
-        Dimension of the space, 2 or 3.
-    num_poses : int
-        Number of poses and landmarks.
-    num_bodies : int
-        Number of poses that are no landmarks.
-    has_translations : bool
-        False of rotations alone.
-    is_quadratic : bool
-        Whether SOC and the semidefinite relaxation are of the cost itself, and not of its convex
-        part.
-    is_chi2 : bool
-        Whether smaller information matrices may give a better bound.
-    averages : bool
-        Whether rotations of the plane can be averaged for a start.
-    has_landmarks : bool
-        Whether the graph has landmarks.
-    has_robots : bool
-        Whether robots run the attempts.
-    has_driver : bool
-        Whether Newton and the certificate can be run.
-    """
-
-    d: int
-    num_poses: int
-    num_bodies: int
-    has_translations: bool
+    d: int  # dimension of the space, 2 or 3
+    num_poses: int  # number of poses and landmarks
+    num_bodies: int  # number of poses that are no landmarks
+    has_translations: bool  # False of rotations alone
+    # whether SOC and the semidefinite relaxation are of the cost itself, and not of its convex part
     is_quadratic: bool
-    is_chi2: bool
-    averages: bool
+    is_chi2: bool  # whether smaller information matrices may give a better bound
+    averages: bool  # whether rotations of the plane can be averaged for a start
     has_landmarks: bool = False
-    has_robots: bool = False
-    has_driver: bool = True
+    has_robots: bool = False  # whether robots run the attempts
+    has_driver: bool = True  # whether Newton and the certificate can be run
 
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """The state of an attempt to solve a graph.
+    """The state of an attempt to solve a graph."""
 
-    Parameters
-    ----------
-    poses : Poses or None
-        The poses; None before the start, and while robots hold them.
-    status : Status
-        How the last run ended that looked for poses.
-    decrement : float
-        Half the squared Newton decrement over the cost at the poses; inf where it was not measured.
-    certificate : Certificate or None
-        That of the poses; None before the attempt has ended.
-    dual_bound : DualBound or None
-        Bound on the semidefinite relaxation that led to the poses, with its multipliers.
-    failures : tuple of str
-        A sentence on every step that failed. Such a step does not change the answer.
-    hulls : HullState or None
-        Where the relaxation with hulls of rotations was last solved.
-    """
-
-    poses: Poses | None = None
-    status: Status = Status.CONVERGED
+    poses: Poses | None = None  # the poses; None before the start, and while robots hold them
+    status: Status = Status.CONVERGED  # how the last run ended that looked for poses
+    # half the squared Newton decrement over the cost at the poses; inf where it was not measured
     decrement: float = math.inf
-    certificate: Certificate | None = None
+    certificate: Certificate | None = None  # that of the poses; None before the attempt has ended
+    # bound on the semidefinite relaxation that led to the poses, with its multipliers
     dual_bound: DualBound | None = None
+    # A sentence on every step that failed. Such a step does not change the answer.
     failures: tuple[str, ...] = ()
-    hulls: HullState | None = None
+    hulls: HullState | None = None  # where the relaxation with hulls of rotations was last solved
 
     @property
     def known_poses(self) -> Poses:
@@ -189,17 +150,10 @@ class Place(ABC):
     Each verb takes an attempt and returns the next one; none changes an attempt. Where robots hold
     the poses, an attempt goes on from those that they hold now. The verbs of the first attempt are
     abstract. A place may lack the verb of a later step, and then `lacks` says why.
-
-    Parameters
-    ----------
-    monitor : RunMonitor
-        Time limit, callback and progress of the solve.
-    table : StageTable
-        Where every stage is written down when it has ended.
     """
 
-    monitor: RunMonitor
-    table: StageTable
+    monitor: RunMonitor  # time limit, callback and progress of the solve
+    table: StageTable  # where every stage is written down when it has ended
 
     @property
     @abstractmethod

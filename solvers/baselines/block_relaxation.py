@@ -23,52 +23,25 @@ from solvers.carry.ledger import Ledger, Traffic
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Minimise sum_rows w ||J x + r||^2, every row of one edge and every unknown of one pose.
+    """Minimise sum_rows w ||J x + r||^2, every row of one edge and every unknown of one pose."""
 
-    Parameters
-    ----------
-    J : (rows, unknowns) sparse array
-        Jacobian.
-    w : (rows,) array
-        Weights.
-    r : (rows, columns) array
-        Residuals at x = 0.
-    edge : (rows,) array
-        Edge of every row.
-    pose : (unknowns,) array
-        Pose of every unknown.
-    """
-
-    J: csr_array
-    w: Array
-    r: Array
-    edge: IntArray
-    pose: IntArray
+    J: csr_array  # (rows, unknowns): Jacobian
+    w: Array  # (rows,)
+    r: Array  # (rows, columns): residuals at x = 0
+    edge: IntArray  # (rows,): edge of every row
+    pose: IntArray  # (unknowns,): pose of every unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """Robots that update at once.
+    """Robots that update at once."""
 
-    Parameters
-    ----------
-    rows : (rows,) array
-        Their unknowns.
-    H : (rows, unknowns) sparse array
-        Their rows of the normal matrix.
-    b : (rows, columns) array
-        Their rows of the right-hand side.
-    factor : CholeskyFactor or None
-        Of their diagonal blocks, all of the turn in one block-diagonal matrix; None without rows.
-    traffic : Traffic
-        What they send to their neighbours afterwards.
-    """
-
-    rows: IntArray
-    H: csr_array
-    b: Array
+    rows: IntArray  # (rows,): their unknowns
+    H: csr_array  # (rows, unknowns): their rows of the normal matrix
+    b: Array  # (rows, columns): their rows of the right-hand side
+    # of their diagonal blocks, all of the turn in one block-diagonal matrix; None without rows
     factor: CholeskyFactor | None
-    traffic: Traffic
+    traffic: Traffic  # what they send to their neighbours afterwards
 
 
 def take_turns(

@@ -50,46 +50,25 @@ class DGSStage(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class GaussSeidelState(Summarised):
-    """State after k sweeps.
+    """State after k sweeps."""
 
-    Parameters
-    ----------
-    k : int
-        Number of sweeps so far.
-    stage : DGSStage
-        Which linear problem is being solved.
-    R, t : (n, d, d) and (n, d) arrays
-        Poses at which the stage began: the start, then the point of linearisation. Of its
-        translations all but that of pose 0 are a first guess only.
-    x : (unknowns, columns) array
-        Iterate of the linear problem, without pose 0: the rows of every R_i^T; or v, then w.
-    turns : tuple of Turn
-        A sweep, factorisations included.
-    first : tuple of Turn
-        The flagged sweep that has to come first; empty when every robot has an estimate.
-    schedule : Schedule
-        Order of the robots.
-    is_flagged : bool
-        Whether the first linearised problem begins with a flagged sweep too.
-    ledger : Ledger
-        Rounds and messages so far.
-    gauss_newton_step : int
-        Number of linearisations so far.
-    change : float
-        Relative change of the last sweep; inf before the first sweep of a stage.
-    """
-
-    k: int
-    stage: DGSStage
+    k: int  # number of sweeps so far
+    stage: DGSStage  # which linear problem is being solved
+    # (n, d, d) and (n, d): poses at which the stage began: the start, then the point of
+    # linearisation. Of its translations all but that of pose 0 are a first guess only.
     R: Array
     t: Array
+    # (unknowns, columns): iterate of the linear problem, without pose 0: the rows of every R_i^T;
+    # or v, then w
     x: Array
-    turns: tuple[Turn, ...]
+    turns: tuple[Turn, ...]  # a sweep, factorisations included
+    # the flagged sweep that has to come first; empty when every robot has an estimate
     first: tuple[Turn, ...]
-    schedule: Schedule
-    is_flagged: bool
-    ledger: Ledger
-    gauss_newton_step: int = 0
+    schedule: Schedule  # order of the robots
+    is_flagged: bool  # whether the first linearised problem begins with a flagged sweep too
+    ledger: Ledger  # rounds and messages so far
+    gauss_newton_step: int = 0  # number of linearisations so far
+    # relative change of the last sweep; inf before the first sweep of a stage
     change: float = np.inf
 
 

@@ -36,45 +36,20 @@ _ROUNDING = 1e-14  # relative change of F that counts as none
 
 @dataclass(frozen=True, eq=False)
 class LevenbergMarquardtState(Summarised):
-    """Iterate k, and the next step.
-
-    Parameters
-    ----------
-    k : int
-        Number of the iterate.
-    poses : Poses
-        Current poses.
-    objective : float
-        F there.
-    level : float
-        Rounding level of F.
-    matrix : (side, side) sparse array
-        A, the Gauss-Newton matrix at the poses, pose 0 grounded.
-    gradient : (side,) array
-        g, the gradient of F.
-    analysis : SymbolicCholesky
-        Ordering and pattern of the factor.
-    damping : float
-        mu of the next step, which solves (A + mu diag(A)) h = -g.
-    growth : float
-        Factor on mu if that step is refused.
-    step : (side,) array
-        h, nan where the damped matrix has no Cholesky factor.
-    decrement : float
-        -<g, h> / 2, less the rounding level of F, over F.
-    """
+    """Iterate k, and the next step."""
 
     k: int
     poses: Poses
-    objective: float
-    level: float
-    matrix: csc_array
-    gradient: Array
-    analysis: SymbolicCholesky
-    damping: float
-    growth: float
+    objective: float  # F there
+    level: float  # rounding level of F
+    matrix: csc_array  # (side, side): A, the Gauss-Newton matrix at the poses, pose 0 grounded
+    gradient: Array  # (side,): g, the gradient of F
+    analysis: SymbolicCholesky  # ordering and pattern of the factor
+    damping: float  # mu of the next step, which solves (A + mu diag(A)) h = -g
+    growth: float  # factor on mu if that step is refused
+    # (side,): h, nan where the damped matrix has no Cholesky factor
     step: Array = field(default_factory=lambda: np.empty(0))
-    decrement: float = math.inf
+    decrement: float = math.inf  # -<g, h> / 2, less the rounding level of F, over F
 
 
 @dataclass(frozen=True)

@@ -18,27 +18,15 @@ from solvers.carry.ledger import BYTES_PER_NUMBER, Traffic
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """Turns of a sweep.
+    """Turns of a sweep."""
 
-    Parameters
-    ----------
-    robot : (n,) array
-        Owner of every pose.
-    group : (n,) array
-        In which turn of a sweep the pose is updated. Robots of one turn are no neighbours.
-    first : (n,) array
-        In which turn of the flagged first sweep the pose gets its first estimate.
-    sent : (q,) array
-        Separator poses, once for every robot that has an edge to them.
-    receiver : (q,) array
-        These robots.
-    """
-
-    robot: IntArray
+    robot: IntArray  # (n,): owner of every pose
+    # (n,): in which turn of a sweep the pose is updated. Robots of one turn are no neighbours.
     group: IntArray
+    # (n,): in which turn of the flagged first sweep the pose gets its first estimate
     first: IntArray
-    sent: IntArray
-    receiver: IntArray
+    sent: IntArray  # (q,): separator poses, once for every robot that has an edge to them
+    receiver: IntArray  # (q,): these robots
 
     @property
     def num_robots(self) -> int:

@@ -39,24 +39,16 @@ class EntryTree:
     A pose enters by its edge to the latest earlier pose that it shares one with, as odometry does.
     A landmark enters with the pose that saw it first, and the world pose with the first pose that
     has a prior of its rotation, or with the last pose if there is none.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        The graph.
-    rank : (n,) array of int
-        Position in the order of the poses, 0, 1, ..; that of the pose that they enter with for
-        landmarks and the world.
-    parent : (n,) array of int
-        The pose at the other end of that edge; -1 for the first pose, and for a world without one.
-    poses : Poses
-        The measurements of these edges composed, with the first pose at (I, 0).
     """
 
     graph: PoseGraph
+    # (n,): position in the order of the poses, 0, 1, ..; that of the pose that they enter with for
+    # landmarks and the world
     rank: IntArray
+    # (n,): the pose at the other end of that edge; -1 for the first pose, and for a world without
+    # one
     parent: IntArray
-    poses: Poses
+    poses: Poses  # the measurements of these edges composed, with the first pose at (I, 0)
 
     @property
     def num_ranks(self) -> int:

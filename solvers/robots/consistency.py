@@ -52,25 +52,14 @@ _QUARTILE = 0.25
 @record("Trajectory")
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of a robot along its chains of odometry, each seen from the first one of its chain.
+    """Poses of a robot along its chains of odometry, each seen from the first one of its chain."""
 
-    Parameters
-    ----------
-    numbers : (k,) array
-        Numbers of the poses in the whole graph, ascending.
-    chain : (k,) array
-        Chain of every pose.
-    R, t : (k, d, d) and (k, d) arrays
-        The motions.
-    covariance : (k, p, p) array
-        Covariances of the motions, as in `Chains`.
-    """
-
-    numbers: IntArray
-    chain: IntArray
+    numbers: IntArray  # (k,): numbers of the poses in the whole graph, ascending
+    chain: IntArray  # (k,): chain of every pose
+    # (k, d, d) and (k, d): the motions
     R: Array
     t: Array
-    covariance: Array
+    covariance: Array  # (k, p, p): covariances of the motions, as in `Chains`
 
 
 @record("AgreeingCounts")

@@ -169,53 +169,29 @@ class OwnGraph:
     """The graph of a robot with own lines: own poses, and those at the far end of its edges.
 
     The orders of a robust solve leave another one, with some of the edges.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        Its n_a poses and m_a edges.
-    numbers, owners : (n_a,) arrays
-        Numbers of the poses in the whole graph, which ascend, and which robot owns each.
-    given : Array
-        As in `Answer`.
-    rejected : (k, 2) array
-        Ids of the ends of edges that were left out.
-    everything : OwnGraph, optional
-        What was joined at first, with m edges; none if it is this.
-    edges : (m_a,) array
-        The edges of everything that are left; empty if this is everything.
-    agrees : (m,) array, optional
-        Of everything in a robust solve: whether an edge agrees pairwise.
-    before : OwnGraph, optional
-        During a robust solve: what to go back to.
-    thresholds : (m_a,) array, optional
-        During a robust solve: those of the edges.
-    solved : Poses, optional
-        Own poses that the solve before has found.
-    problem : PartProblem, optional
-        The cost that is solved, from `take_cost` to `place_cover`.
-    answer : Poses, optional
-        Poses that `keep_answer` kept.
-    within : (m_a,) array, optional
-        During a robust solve: edges within their thresholds, as far as this robot counts them.
-    near : (m,) array, optional
-        During a robust solve: edges of everything that are near the map.
     """
 
-    graph: PoseGraph
+    graph: PoseGraph  # its n_a poses and m_a edges
+    # (n_a,): numbers of the poses in the whole graph, which ascend, and which
+    # robot owns each
     numbers: IntArray
     owners: IntArray
-    given: Array
+    given: Array  # as in `Answer`
+    # (k, 2): ids of the ends of edges that were left out
     rejected: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
-    everything: OwnGraph | None = None
+    everything: OwnGraph | None = None  # what was joined at first, with m edges; none if it is this
+    # (m_a,): the edges of everything that are left; empty if this is everything
     edges: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    # (m,): of everything in a robust solve: whether an edge agrees pairwise
     agrees: BoolArray | None = None
-    before: OwnGraph | None = None
-    thresholds: Array | None = None
-    solved: Poses | None = None
-    problem: PartProblem | None = None
-    answer: Poses | None = None
+    before: OwnGraph | None = None  # during a robust solve: what to go back to
+    thresholds: Array | None = None  # (m_a,): during a robust solve: those of the edges
+    solved: Poses | None = None  # own poses that the solve before has found
+    problem: PartProblem | None = None  # the cost that is solved, from `take_cost` to `place_cover`
+    answer: Poses | None = None  # poses that `keep_answer` kept
+    # (m_a,): during a robust solve: edges within their thresholds, as far as this robot counts them
     within: BoolArray | None = None
+    # (m,): during a robust solve: edges of everything that are near the map
     near: BoolArray | None = None
 
     @property

@@ -46,41 +46,18 @@ from solvers.soc.r_step import RotationStep, RStep
 @record("PaperRobotsState")
 @dataclass(frozen=True, eq=False)
 class PaperRobotsState:
-    """Iterate k, whose rows the robots hold at a moment, and what is known of the next one.
-
-    Parameters
-    ----------
-    k : int
-        Number of the iterate.
-    penalty : CommonPenalty
-        rho of the next iterate, k + 1, whose steps the robots have done.
-    root : float
-        sqrt(n d).
-    scale : float
-        Mean diagonal of L.
-    squares : (3,) array
-        Of the iterate k + 1: the sums of `PaperReply`.
-    rows : sequence of mappings
-        R of the iterate k + 1, from the neighbours of every robot.
-    objective : float
-        <omega, L omega>, the rotations' part of F.
-    primal_residual : float
-        p_res.
-    dual_residual : float
-        That of `PaperState`.
-    moment : Moment or None
-        When the robots hold this.
-    """
+    """Iterate k, whose rows the robots hold at a moment, and what is known of the next one."""
 
     k: int
-    penalty: CommonPenalty
-    root: float
-    scale: float
-    squares: Array
-    rows: Sequence[Rows]
-    objective: float
-    primal_residual: float = math.inf
-    dual_residual: float = math.inf
+    penalty: CommonPenalty  # rho of the next iterate, k + 1, whose steps the robots have done
+    root: float  # sqrt(n d)
+    scale: float  # mean diagonal of L
+    squares: Array  # (3,): of the iterate k + 1: the sums of `PaperReply`
+    rows: Sequence[Rows]  # R of the iterate k + 1, from the neighbours of every robot
+    objective: float  # <omega, L omega>, the rotations' part of F
+    primal_residual: float = math.inf  # p_res
+    dual_residual: float = math.inf  # that of `PaperState`
+    # when the robots hold this
     moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
 
 
@@ -196,24 +173,12 @@ def begin_paper(agent: Agent, cover: Poses) -> Rows:
 @record("PaperUnits")
 @dataclass(frozen=True, eq=False)
 class PaperUnits:
-    """A robot's part of what rho and the residuals are measured in: sums over its own poses.
+    """A robot's part of what rho and the residuals are measured in: sums over its own poses."""
 
-    Parameters
-    ----------
-    rho : float
-        First penalties.
-    diagonal : float
-        Diagonal of L.
-    cost : float
-        <omega, L omega>, at the start.
-    num_poses : int
-        How many they are.
-    """
-
-    rho: float
-    diagonal: float
-    cost: float
-    num_poses: int
+    rho: float  # first penalties
+    diagonal: float  # diagonal of L
+    cost: float  # <omega, L omega>, at the start
+    num_poses: int  # how many they are
 
 
 @record("PaperPenalty")
@@ -228,57 +193,31 @@ class PaperPenalty:
 @record("PaperReply")
 @dataclass(frozen=True, eq=False)
 class PaperReply:
-    """What a robot tells after the steps (a) to (c).
+    """What a robot tells after the steps (a) to (c)."""
 
-    Parameters
-    ----------
-    squares : (3,) array
-        Those of `PaperIterate.squares`.
-    rows : mapping
-        R^T of the poses that a neighbour holds, for every neighbour.
-    """
-
-    squares: Array
-    rows: Rows
+    squares: Array  # (3,): those of `PaperIterate.squares`
+    rows: Rows  # R^T of the poses that a neighbour holds, for every neighbour
 
 
 @record("PaperLast")
 @dataclass(frozen=True, eq=False)
 class PaperLast:
-    """A robot's part of the iterate whose R the neighbours have just sent: sums of its own.
+    """A robot's part of the iterate whose R the neighbours have just sent: sums of its own."""
 
-    Parameters
-    ----------
-    gradient : float
-        ||2 L R + rho B||^2 over its own rows.
-    cost : float
-        <omega, L omega> over its own rows, which add up to the rotations' part of F.
-    """
-
-    gradient: float
-    cost: float
+    gradient: float  # ||2 L R + rho B||^2 over its own rows
+    cost: float  # <omega, L omega> over its own rows, which add up to the rotations' part of F
 
 
 @record("PaperCopies")
 @dataclass(frozen=True, eq=False)
 class PaperCopies:
-    """What orders leave with a robot.
+    """What orders leave with a robot."""
 
-    Parameters
-    ----------
-    X : (rows, d) array
-        Poses at the start, rows as in `CopyLayout`; own ones and those of neighbours.
-    penalty : PaperPenalty or None
-        rho of the iterate `ahead`, and who solves (a).
-    last : PaperIterate or None
-        The iterate of the robot's and its neighbours' poses, (n_a).
-    ahead : PaperIterate or None
-        The next one of its own poses, whose R is on its way to the neighbours.
-    """
-
+    # (rows, d): poses at the start, rows as in `CopyLayout`; own ones and those of neighbours
     X: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    penalty: PaperPenalty | None = None
-    last: PaperIterate | None = None
+    penalty: PaperPenalty | None = None  # rho of the iterate `ahead`, and who solves (a)
+    last: PaperIterate | None = None  # the iterate of the robot's and its neighbours' poses, (n_a)
+    # the next one of its own poses, whose R is on its way to the neighbours
     ahead: PaperIterate | None = None
 
     def robot(self, layout: CopyLayout) -> PaperRobot:

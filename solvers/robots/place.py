@@ -91,35 +91,22 @@ class AttemptWithFaults(Attempt):
 
 @dataclass(frozen=True, eq=False)
 class PlaceOfRobots(Place):
-    """A solve by robots and their driver.
+    """A solve by robots and their driver."""
 
-    Parameters
-    ----------
-    driver : Driver
-        The driver, with the network of its robots.
-    journal : Journal
-        Checkpoints. Where one is of a later stage, what comes before it is passed over.
-    holder : Here or AnswerAtRobots
-        Who holds the answer: this process, which has the graph of all robots, collects the poses
-        for a certificate, and takes the steps that robots lack (the names of their stages say so),
-        or the robots, of whose poses this process knows nothing.
-    owners : Partition, optional
-        Who owns which poses of the graph in this process.
-    faults : Faults, optional
-        What goes wrong between the robots of a CONSENSUS stage, which then does not wait.
-    begins_at : str, optional
-        Name of a start at poses that the robots have found before; their own start unless given.
-    is_on_the_way : bool
-        Whether the map is on the way to another one. Shifts of the bound that cost more than the
-        gap are then not tried.
-    """
-
-    driver: Driver
+    driver: Driver  # the driver, with the network of its robots
+    # Checkpoints. Where one is of a later stage, what comes before it is passed over.
     journal: Journal
+    # who holds the answer: this process, which has the graph of all robots, collects the poses for
+    # a certificate, and takes the steps that robots lack (the names of their stages say so), or the
+    # robots, of whose poses this process knows nothing
     holder: Here | AnswerAtRobots
-    owners: Partition | None = None
+    owners: Partition | None = None  # who owns which poses of the graph in this process
+    # what goes wrong between the robots of a CONSENSUS stage, which then does not wait
     faults: Faults | None = None
+    # name of a start at poses that the robots have found before; their own start unless given
     begins_at: str | None = None
+    # Whether the map is on the way to another one. Shifts of the bound that cost more than the gap
+    # are then not tried.
     is_on_the_way: bool = False
 
     @property

@@ -92,39 +92,18 @@ def _bytes_of_edges(graph: PoseGraph) -> int:
 
 @dataclass(frozen=True, eq=False)
 class OpenedFiles:
-    """Robots that have read their files, and what their driver knows of the graph.
+    """Robots that have read their files, and what their driver knows of the graph."""
 
-    Parameters
-    ----------
-    driver : Driver
-        The driver of the robots.
-    borders : sequence of Border
-        What the robots have told of their edges to others.
-    sizes : (2, num_robots) array
-        Number of poses with an edge, and of edges, of every robot.
-    folder : Path
-        Where the files are.
-    weighting : Weighting
-        The cost that is solved: ISOTROPIC or INFORMATION.
-    has_indefinite : bool
-        Whether the share of any edge in chi2 can be negative.
-    num_absent : int
-        Number of poses of robots without a file, as `PoseGraph.absent`.
-    num_rejected : int
-        Edges that robots have left out, as they do not agree with others.
-    threshold_scale : float
-        Factor on the thresholds of GNC, below 1 where the closures within robots have clearly
-        smaller errors than their files claim.
-    """
-
-    driver: Driver
-    borders: Sequence[Border]
-    sizes: IntArray
-    folder: Path
-    weighting: Weighting
-    has_indefinite: bool
-    num_absent: int
-    num_rejected: int = 0
+    driver: Driver  # the driver of the robots
+    borders: Sequence[Border]  # what the robots have told of their edges to others
+    sizes: IntArray  # (2, num_robots): number of poses with an edge, and of edges, of every robot
+    folder: Path  # where the files are
+    weighting: Weighting  # the cost that is solved: ISOTROPIC or INFORMATION
+    has_indefinite: bool  # whether the share of any edge in chi2 can be negative
+    num_absent: int  # number of poses of robots without a file, as `PoseGraph.absent`
+    num_rejected: int = 0  # edges that robots have left out, as they do not agree with others
+    # factor on the thresholds of GNC, below 1 where the closures within robots have clearly smaller
+    # errors than their files claim
     threshold_scale: float = 1.0
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:

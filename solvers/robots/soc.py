@@ -52,27 +52,15 @@ ENOUGH_NORMS = 2**12
 @record("SubstructuredState")
 @dataclass(frozen=True, eq=False)
 class SubstructuredState(SharedSteps):
-    """Iterate k: the driver's rows; those of the interiors are with the robots.
+    """Iterate k: the driver's rows; those of the interiors are with the robots."""
 
-    Parameters
-    ----------
-    block : RecursionBlock
-        Rows of the rotations of the cover.
-    right : sequence of RightHandSide
-        The robots' reduced right-hand sides of the next step (a).
-    moment : Moment or None
-        When the robots hold their rows of the iterate.
-    factor : InterfaceFactor or None
-        Of the driver's matrix of step (a), for this rho. A checkpoint has neither moment nor
-        factor.
-    objective : float
-        F at omega and the translations of step (a); nan where the step did not evaluate it.
-    """
-
-    block: RecursionBlock
-    right: Sequence[RightHandSide]
+    block: RecursionBlock  # rows of the rotations of the cover
+    right: Sequence[RightHandSide]  # the robots' reduced right-hand sides of the next step (a)
+    # when the robots hold their rows of the iterate
     moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
+    # Of the driver's matrix of step (a), for this rho. A checkpoint has neither moment nor factor.
     factor: InterfaceFactor | None = field(default=None, metadata=COMPUTED_AGAIN)
+    # F at omega and the translations of step (a); nan where the step did not evaluate it
     objective: float = math.nan
 
     @property

@@ -47,39 +47,22 @@ from solvers.soc.subgraph import PartProblem
 @record("OwnSupport")
 @dataclass(frozen=True, eq=False)
 class OwnSupport:
-    """What a robot reports of the edges that it has kept; those to others count with the first.
+    """What a robot reports of the edges that it has kept; those to others count with the first."""
 
-    Parameters
-    ----------
-    num_closures : (2,) array
-        How many edges that are no odometry are kept, and left out.
-    sums : (2,) array
-        Sums of w and w^2 over the edges kept, as in `RightCosts`.
-    rank : int
-        Number of the w that are not zero.
-    num_strained : int
-        Steps of odometry that cost more than chance explains.
-    num_against : int
-        By how many closures left out, which agree, outnumber those kept that span a step, at most.
-    rivals : (q, 2) array
-        Of the edges among own poses, and of those to each later neighbour: how many are left out
-        that agree pairwise, and how many are kept.
-    links : (l, 2) array
-        Own pieces of odometry that edges kept join; without odometry every pose is a piece.
-    num_pieces : int
-        How many pieces there are.
-    poses, pieces : (h,) arrays
-        Numbers of own poses with edges to other robots, ascending, and their pieces.
-    """
-
-    num_closures: IntArray
-    sums: Array
-    rank: int
-    num_strained: int
+    num_closures: IntArray  # (2,): how many edges that are no odometry are kept, and left out
+    sums: Array  # (2,): sums of w and w^2 over the edges kept, as in `RightCosts`
+    rank: int  # number of the w that are not zero
+    num_strained: int  # steps of odometry that cost more than chance explains
+    # by how many closures left out, which agree, outnumber those kept that span a step, at most
     num_against: int
+    # (q, 2): of the edges among own poses, and of those to each later neighbour: how many are left
+    # out that agree pairwise, and how many are kept
     rivals: IntArray
+    # (l, 2): own pieces of odometry that edges kept join; without odometry every pose is a piece
     links: IntArray
-    num_pieces: int
+    num_pieces: int  # how many pieces there are
+    # (h,): numbers of own poses with edges to other robots, ascending, and their
+    # pieces
     poses: IntArray
     pieces: IntArray
 
@@ -187,28 +170,15 @@ def _pieces(own: OwnGraph, robot: int) -> tuple[IntArray, int, IntArray, IntArra
 
 @dataclass(frozen=True, eq=False)
 class EdgesKept:
-    """The edges that all robots have kept, and what speaks against them.
+    """The edges that all robots have kept, and what speaks against them."""
 
-    Parameters
-    ----------
-    robots : sequence of OwnSupport
-        What the robots report.
-    num_poses, num_edges : int
-        Size of the map.
-    num_bridges : int
-        Number of edges kept that are the only ones between two parts of the map.
-    cost : float
-        Cost of the poses.
-    d : int
-        Dimension of the space.
-    """
-
-    robots: Sequence[OwnSupport]
+    robots: Sequence[OwnSupport]  # what the robots report
+    # size of the map
     num_poses: int
     num_edges: int
-    num_bridges: int
+    num_bridges: int  # number of edges kept that are the only ones between two parts of the map
     cost: float
-    d: int
+    d: int  # dimension of the space
 
     @property
     def num_cycles(self) -> int:

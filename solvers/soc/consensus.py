@@ -85,34 +85,16 @@ class ConsensusState(SharedSteps):
     """Iterate k: the sums that all robots know, and the robots, who have x, omega, B and rho.
 
     In one process its properties give x, omega, B and rho of all poses.
-
-    Parameters
-    ----------
-    separators : SeparatorPenalty
-        Penalties of the separators.
-    objective : float
-        F at the poses that the robots hold, omega and the translations agreed on.
-    gradient : float
-        Relative gradient of F there.
-    rotation_square : float
-        Sum of `rotation_squares`, to which the gradient is relative.
-    ahead : array or None
-        Sums of the next step (a), unless the penalties change before.
-    rows : sequence of RowMessages
-        Messages with the rows of the next step (a), by receiver.
-    robots : tuple of ConsensusRobot
-        The robots with their rows, in one process.
-    moment : Moment or None
-        When the robots hold their rows of the iterate, on a network.
     """
 
-    separators: SeparatorPenalty
-    objective: float
-    gradient: float
-    rotation_square: float
-    ahead: Array | None = None
-    rows: Sequence[RowMessages] = ()
-    robots: tuple[ConsensusRobot, ...] = ()
+    separators: SeparatorPenalty  # penalties of the separators
+    objective: float  # F at the poses that the robots hold, omega and the translations agreed on
+    gradient: float  # relative gradient of F there
+    rotation_square: float  # sum of `rotation_squares`, to which the gradient is relative
+    ahead: Array | None = None  # sums of the next step (a), unless the penalties change before
+    rows: Sequence[RowMessages] = ()  # messages with the rows of the next step (a), by receiver
+    robots: tuple[ConsensusRobot, ...] = ()  # the robots with their rows, in one process
+    # when the robots hold their rows of the iterate, on a network
     moment: Moment | None = field(default=None, metadata=COMPUTED_AGAIN)
 
     @property

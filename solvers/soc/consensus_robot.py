@@ -94,51 +94,27 @@ class ReceivedRows:
 @record("CopiesState")
 @dataclass(frozen=True, eq=False)
 class CopiesState:
-    """What orders leave with a robot; rows are those of `CopyLayout`.
+    """What orders leave with a robot; rows are those of `CopyLayout`."""
 
-    Parameters
-    ----------
-    X : (rows, d) array
-        The poses at the start, then x of the last step (a) with all translations.
-    rho : (n_a,) array
-        Penalties of the poses.
-    diagonal : (n_a, d + 1) array
-        Diagonal of M of every pose, its translation first.
-    Lambda : (n_a, d, d) array
-        Multipliers, right for own poses.
-    pull : (n_a, d^2) array
-        rho_i B_i of a stationary point.
-    force : (rows, d) array
-        -2 M_a X.
-    total_force : (rows, d) array
-        The same, summed over robots.
-    settings : StepSettings
-        Settings of the steps.
-    block : RecursionBlock or None
-        The robot's rows of the recursion.
-    origin : pair of (rows, d) arrays or None
-        omega and s when the penalties were set.
-    received : mapping from robots to ReceivedRows
-        Rows of the neighbours, which are extrapolated here as there.
-    ahead : pair or None
-        X and block after the next step (a).
-    waiting : Waiting or None
-        Of an asynchronous run.
-    """
-
+    # (rows, d): the poses at the start, then x of the last step (a) with all translations
     X: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    rho: Array = field(default_factory=lambda: np.zeros(0))
+    rho: Array = field(default_factory=lambda: np.zeros(0))  # (n_a,): penalties of the poses
+    # (n_a, d + 1): diagonal of M of every pose, its translation first
     diagonal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # (n_a, d, d): multipliers, right for own poses
     Lambda: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    # (n_a, d^2): rho_i B_i of a stationary point
     pull: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    force: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    force: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (rows, d): -2 M_a X
+    # (rows, d): the same, summed over robots
     total_force: Array = field(default_factory=lambda: np.zeros((0, 0)))
     settings: StepSettings = field(default_factory=StepSettings)
-    block: RecursionBlock | None = None
-    origin: tuple[Array, Array] | None = None
+    block: RecursionBlock | None = None  # the robot's rows of the recursion
+    origin: tuple[Array, Array] | None = None  # omega and s when the penalties were set
+    # rows of the neighbours, which are extrapolated here as there
     received: Mapping[int, ReceivedRows] = field(default_factory=dict)
-    ahead: tuple[Array, RecursionBlock] | None = None
-    waiting: Waiting | None = None
+    ahead: tuple[Array, RecursionBlock] | None = None  # X and block after the next step (a)
+    waiting: Waiting | None = None  # of an asynchronous run
 
     def robot(self, layout: copies.CopyLayout) -> ConsensusRobot:
         """The robot in this state."""

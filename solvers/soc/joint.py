@@ -51,34 +51,22 @@ class SOCState(Steps):
     """Iterate k of JOINT: x, omega, B and rho as above, acceleration and safeguard.
 
     The fields of `Steps` (k, residuals, merits) come on top of these.
-
-    Parameters
-    ----------
-    x : (n, d, d) array
-        Solution of step (a): matrices that need not be orthogonal. At k = 0 the rotations of the
-        start.
-    omega : (n, d, d) array
-        The rotations nearest to x_ahead + B: x_ahead is x after over-relaxation and acceleration, B
-        is that of iterate k - 1. At k = 0 the rotations of the start.
-    B : (n, d, d) array
-        Scaled multiplier of x = omega (Bregman variable); rho B is the unscaled one.
-    rho : (n,) array
-        Penalty of every pose.
-    r_step : JointStep
-        Back end of step (a), prepared for this rho.
-    memory : AndersonShare
-        Earlier steps, for the acceleration.
-    best : (n, d, d) array or None
-        The omega + B with the smallest merit, to which the safeguard returns; None before the first
-        step.
     """
 
+    # (n, d, d): solution of step (a): matrices that need not be orthogonal. At k = 0 the rotations
+    # of the start.
     x: Array
+    # (n, d, d): the rotations nearest to x_ahead + B: x_ahead is x after over-relaxation and
+    # acceleration, B is that of iterate k - 1. At k = 0 the rotations of the start.
     omega: Array
+    # (n, d, d): scaled multiplier of x = omega (Bregman variable); rho B is the unscaled one
     B: Array
-    rho: Array
-    r_step: JointStep
+    rho: Array  # (n,): penalty of every pose
+    r_step: JointStep  # back end of step (a), prepared for this rho
+    # earlier steps, for the acceleration
     memory: AndersonShare = field(default_factory=AndersonShare)
+    # (n, d, d): the omega + B with the smallest merit, to which the safeguard returns; None before
+    # the first step
     best: Array | None = None
 
 

@@ -103,35 +103,19 @@ class PaperIterate:
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """The rows of L that belong to some poses, split by robots: L = own + between.
+    """The rows of L that belong to some poses, split by robots: L = own + between."""
 
-    Parameters
-    ----------
-    A : (rows, dq) sparse array
-        Residuals of `own`: the edges within a robot, and one end at a time of the edges between
-        robots.
-    w : (rows,) array
-        Weights of these residuals.
-    own : (dq, dq) sparse array
-        A^T diag(w) A, a block for every robot: its edges, and kappa I for its ends of the edges
-        between robots.
-    between : (dq, dn) sparse array
-        L - own, which ties rotations to the frozen neighbours.
-    analysis : SymbolicCholesky
-        Ordering and pattern of the factor of `own`.
-    d : int
-        Dimension, 2 or 3.
-    backend : CholeskyBackend or None
-        Which library factors the matrix.
-    """
-
+    # (rows, dq): residuals of `own`: the edges within a robot, and one end at a time of the edges
+    # between robots
     A: csr_array
-    w: Array
+    w: Array  # (rows,): weights of these residuals
+    # (dq, dq): A^T diag(w) A, a block for every robot: its edges, and kappa I for its ends of the
+    # edges between robots
     own: csc_array
-    between: csr_array
-    analysis: SymbolicCholesky
-    d: int
-    backend: CholeskyBackend | None
+    between: csr_array  # (dq, dn): L - own, which ties rotations to the frozen neighbours
+    analysis: SymbolicCholesky  # ordering and pattern of the factor of `own`
+    d: int  # dimension, 2 or 3
+    backend: CholeskyBackend | None  # which library factors the matrix
 
     @classmethod
     def of(cls, problem: PGOProblem, is_cut: BoolArray, poses: IntArray) -> Self:
@@ -199,24 +183,13 @@ class Blocks:
 @record("CommonPenalty")
 @dataclass(frozen=True)
 class CommonPenalty:
-    """One rho for all poses, and what its rule remembers.
-
-    Parameters
-    ----------
-    rho : float
-        The penalty.
-    smallest_merit : float
-        For the safeguard: the smallest norm of (R - omega, omega - omega_last) since rho changed.
-    steps_since_smallest : int
-        How many steps ago that was.
-    may_fall : bool
-        Whether rho may still be lowered.
-    """
+    """One rho for all poses, and what its rule remembers."""
 
     rho: float
+    # for the safeguard: the smallest norm of (R - omega, omega - omega_last) since rho changed
     smallest_merit: float = np.inf
-    steps_since_smallest: int = 0
-    may_fall: bool = True
+    steps_since_smallest: int = 0  # how many steps ago that was
+    may_fall: bool = True  # whether rho may still be lowered
 
     def after(self, rule: PenaltyRule, primal: float, change: float) -> "CommonPenalty":
         """The penalty for the next step, from the norms of R - omega and omega - omega_last.
@@ -242,33 +215,16 @@ class CommonPenalty:
 
 @dataclass(frozen=True, eq=False)
 class PaperState(Summarised):
-    """Iterate k of the paper's recursion.
-
-    Parameters
-    ----------
-    k : int
-        Number of the iterate.
-    iterate : PaperIterate
-        R_i, omega_i and B_i of all poses.
-    penalty : CommonPenalty
-        One rho for all poses, as in the paper.
-    blocks : Blocks
-        The split matrix.
-    r_step : RotationStep
-        The back end, prepared for this rho.
-    scale : float
-        Mean diagonal of L, the unit of the dual residual.
-    dual_residual : float
-        Stationarity, ||2 L R + rho B||_F / scale over the root of n d, with the rows of R and B
-        stacked as those of L.
-    """
+    """Iterate k of the paper's recursion."""
 
     k: int
-    iterate: PaperIterate
-    penalty: CommonPenalty
-    blocks: Blocks
-    r_step: RotationStep
-    scale: float
+    iterate: PaperIterate  # R_i, omega_i and B_i of all poses
+    penalty: CommonPenalty  # one rho for all poses, as in the paper
+    blocks: Blocks  # the split matrix
+    r_step: RotationStep  # the back end, prepared for this rho
+    scale: float  # mean diagonal of L, the unit of the dual residual
+    # stationarity, ||2 L R + rho B||_F / scale over the root of n d, with the rows of R and B
+    # stacked as those of L
     dual_residual: float = np.inf
 
     @property

@@ -43,38 +43,20 @@ class RStep(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class RSubproblem(Summarised):
-    """The R-subproblem of one robot, or of the whole graph.
+    """The R-subproblem of one robot, or of the whole graph."""
 
-    Parameters
-    ----------
-    A : (rows, N) sparse array
-        Residuals of the edges concerned, linear in X.
-    w : (rows,) array
-        Weights of the residuals.
-    M : (N, N) sparse array
-        A^T diag(w) A, in the pattern of `analysis`.
-    d : int
-        Dimension, 2 or 3.
-    num_translations : int
-        Number of the first rows of X, which are translations; 0 for rotations only. The others are
-        rows of R_i^T.
-    rho : (N,) array
-        Diagonal of D: the penalty of every row of X. When no translation has a penalty, row 0 is
-        grounded: the minimiser with t_0 = 0 is taken.
-    analysis : SymbolicCholesky
-        Ordering and pattern of the factor.
-    backend : CholeskyBackend or None
-        Which library factors the matrix.
-    """
-
-    A: csr_array
-    w: Array
-    M: csc_array
-    d: int
+    A: csr_array  # (rows, N): residuals of the edges concerned, linear in X
+    w: Array  # (rows,): weights of the residuals
+    M: csc_array  # (N, N): A^T diag(w) A, in the pattern of `analysis`
+    d: int  # dimension, 2 or 3
+    # Number of the first rows of X, which are translations; 0 for rotations only. The others are
+    # rows of R_i^T.
     num_translations: int
+    # (N,): diagonal of D: the penalty of every row of X. When no translation has a penalty, row 0
+    # is grounded: the minimiser with t_0 = 0 is taken.
     rho: Array
-    analysis: SymbolicCholesky
-    backend: CholeskyBackend | None
+    analysis: SymbolicCholesky  # ordering and pattern of the factor
+    backend: CholeskyBackend | None  # which library factors the matrix
 
     @cached_property
     def needs_ground(self) -> bool:
@@ -144,20 +126,11 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
 
 @dataclass(frozen=True, eq=False)
 class JointStep:
-    """Step (a) of JOINT: the rotations of the minimiser over rotations and translations.
+    """Step (a) of JOINT: the rotations of the minimiser over rotations and translations."""
 
-    Parameters
-    ----------
-    back_end : RotationStep
-        What solves for rotations and translations.
-    num_poses : int
-        Number n of poses.
-    stiffness : (n, 1, d) array
-        max(1, rho_i / diagonal of M) for every row of R_i^T, for the dual residual.
-    """
-
-    back_end: RotationStep
-    num_poses: int
+    back_end: RotationStep  # what solves for rotations and translations
+    num_poses: int  # number n of poses
+    # (n, 1, d): max(1, rho_i / diagonal of M) for every row of R_i^T, for the dual residual
     stiffness: Array
 
     def solve(self, V: Array) -> Array:

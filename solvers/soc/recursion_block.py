@@ -69,36 +69,19 @@ class Agreement:
 @record("RecursionBlock")
 @dataclass(frozen=True, eq=False)
 class RecursionBlock:
-    """Rows of x, omega, B and rho: the rows of every R_i^T, and of separator translations.
+    """Rows of x, omega, B and rho: the rows of every R_i^T, and of separator translations."""
 
-    Parameters
-    ----------
-    rho : (rows,) array
-        Penalty of every row; zero for rows that have no part in the iterates.
-    diagonal : (rows,) array
-        Diagonal of M on these rows.
-    omega : (rows, d) array
-        What the parties have agreed on: rotations, and the translations of separators.
-    s : (rows, d) array
-        omega + B, the variable of the fixed-point map, which is accelerated; what (b) is applied
-        to. B itself is not summed up from step to step, so that nothing drifts.
-    x : (rows, d) array
-        Solution of the last step (a).
-    best : (rows, d) array
-        The s with the smallest merit.
-    settings : StepSettings
-        Settings of the steps.
-    anderson : AndersonShare
-        Rows of what the acceleration remembers.
-    """
-
-    rho: Array
-    diagonal: Array
+    rho: Array  # (rows,): penalty of every row; zero for rows that have no part in the iterates
+    diagonal: Array  # (rows,): diagonal of M on these rows
+    # (rows, d): what the parties have agreed on: rotations, and the translations of separators
     omega: Array
+    # (rows, d): omega + B, the variable of the fixed-point map, which is accelerated; what (b) is
+    # applied to. B itself is not summed up from step to step, so that nothing drifts.
     s: Array
-    x: Array
-    best: Array
+    x: Array  # (rows, d): solution of the last step (a)
+    best: Array  # (rows, d): the s with the smallest merit
     settings: StepSettings = field(default_factory=StepSettings)
+    # rows of what the acceleration remembers
     anderson: AndersonShare = field(default_factory=AndersonShare)
 
     @property

@@ -29,20 +29,12 @@ MOST_COUPLED = 8
 
 @dataclass(frozen=True, eq=False)
 class Subdomains:
-    """Connected pieces of an interior of i poses, and the g poses of the cover that they reach.
+    """Connected pieces of an interior of i poses, and the g poses of the cover that they reach."""
 
-    Parameters
-    ----------
-    label : (i,) array
-        Subdomain of every interior pose.
-    reached : (s, g) sparse array
-        Entries where a subdomain reaches a pose of the boundary.
-    joined : (g, g) sparse array
-        Entries where an edge of the robot joins two poses of the boundary, and on the diagonal.
-    """
-
-    label: IntArray
-    reached: csr_array
+    label: IntArray  # (i,): subdomain of every interior pose
+    reached: csr_array  # (s, g): entries where a subdomain reaches a pose of the boundary
+    # (g, g): entries where an edge of the robot joins two poses of the boundary, and on the
+    # diagonal
     joined: csr_array
 
     @property

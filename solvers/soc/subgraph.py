@@ -34,56 +34,30 @@ class PartProblem(PGOProblem):
 
 @dataclass(frozen=True, eq=False)
 class Subgraph:
-    """A robot's part of a graph: all that it learns of the graph before the first round.
-
-    Parameters
-    ----------
-    robot : int
-        Number of the robot.
-    graph : PoseGraph
-        Its poses and edges, renumbered: its own poses, and the poses of others at the far end of
-        its edges.
-    poses : (n_a,) array
-        Numbers of its poses in the whole graph, ascending.
-    owner : (n_a,) array
-        Which robot owns each pose.
-    is_separator : (n_a,) array
-        Whether the driver solves for a pose.
-    is_counted : (m_a,) array
-        Whether an edge is this robot's in sums over robots; every edge of the whole graph is
-        counted once. An edge to a pose that the driver does not solve for is counted by the owner
-        of that pose.
-    copies : (n_a,) array
-        How many robots hold each pose.
-    common : tuple of pairs
-        Every other robot that holds some of the same poses, and which of `poses` they are, (q,),
-        ascending.
-    edges : (m_a,) array
-        Numbers of its edges in the whole graph.
-    weights : EdgeCost
-        Weights of its edges in the cost that SOC is run on.
-    final : EdgeCost or None
-        Their weights in the cost that is solved, where that is another one
-        (`PGOProblem.convex_part`).
-    thresholds : (m_a,) array or None
-        What its edges may cost in a robust solve, inf for known inliers.
-    has_driver : bool
-        Whether there is a driver that solves for poses (`for_driver`).
-    """
+    """A robot's part of a graph: all that it learns of the graph before the first round."""
 
     robot: int
+    # its poses and edges, renumbered: its own poses, and the poses of others at the far end of its
+    # edges
     graph: PoseGraph
-    poses: IntArray
-    owner: IntArray
-    is_separator: BoolArray
+    poses: IntArray  # (n_a,): numbers of its poses in the whole graph, ascending
+    owner: IntArray  # (n_a,): which robot owns each pose
+    is_separator: BoolArray  # (n_a,): whether the driver solves for a pose
+    # (m_a,): whether an edge is this robot's in sums over robots; every edge of the whole graph is
+    # counted once. An edge to a pose that the driver does not solve for is counted by the owner of
+    # that pose.
     is_counted: BoolArray
-    copies: IntArray
+    copies: IntArray  # (n_a,): how many robots hold each pose
+    # every other robot that holds some of the same poses, and which of `poses` they are, (q,),
+    # ascending
     common: tuple[tuple[int, IntArray], ...]
-    edges: IntArray
-    weights: EdgeCost
+    edges: IntArray  # (m_a,): numbers of its edges in the whole graph
+    weights: EdgeCost  # weights of its edges in the cost that SOC is run on
+    # their weights in the cost that is solved, where that is another one (`PGOProblem.convex_part`)
     final: EdgeCost | None = None
+    # (m_a,): what its edges may cost in a robust solve, inf for known inliers
     thresholds: Array | None = None
-    has_driver: bool = False
+    has_driver: bool = False  # whether there is a driver that solves for poses (`for_driver`)
 
     @cached_property
     def is_own(self) -> BoolArray:
@@ -176,40 +150,24 @@ class Subgraph:
 @record("RobotSummary")
 @dataclass(frozen=True, eq=False)
 class RobotSummary:
-    """What a driver knows of a robot, whose poses in the cover are those the driver solves for.
-
-    Parameters
-    ----------
-    robot : int
-        Number of the robot.
-    d : int
-        Dimension.
-    cover : (h,) array
-        Numbers in the whole graph of the poses in the cover that the robot holds.
-    touched : array or None
-        Numbers of those that the robot's counted edges join; None if it counts none.
-    has_two_costs : bool
-        Whether SOC is run on another cost than the one that is solved.
-    has_translations : bool
-        Whether translations are among the unknowns (`PGOProblem.has_translations`).
-    part : (p,) array or None
-        Numbers of all poses that these edges join; None where only the robot may know them.
-    coupled : (k, 2) array or None
-        Pairs of positions in `touched`, the larger first, of poses that are coupled in the Schur
-        complement of the robot; None without one.
-    stiffness : float or None
-        Largest kappa / tau of the counted edges, see `largest_stiffness`; None where their
-        rotations cannot be averaged.
-    """
+    """What a driver knows of a robot, whose poses in the cover are those the driver solves for."""
 
     robot: int
     d: int
+    # (h,): numbers in the whole graph of the poses in the cover that the robot holds
     cover: IntArray
+    # numbers of those that the robot's counted edges join; None if it counts none
     touched: IntArray | None
-    has_two_costs: bool
+    has_two_costs: bool  # whether SOC is run on another cost than the one that is solved
+    # whether translations are among the unknowns (`PGOProblem.has_translations`)
     has_translations: bool
+    # (p,): numbers of all poses that these edges join; None where only the robot may know them
     part: IntArray | None
+    # (k, 2): pairs of positions in `touched`, the larger first, of poses that are coupled in the
+    # Schur complement of the robot; None without one
     coupled: IntArray | None = None
+    # largest kappa / tau of the counted edges, see `largest_stiffness`; None where their rotations
+    # cannot be averaged
     stiffness: float | None = None
 
 
@@ -265,30 +223,15 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The cost of the edges that one robot counts.
+    """The cost of the edges that one robot counts."""
 
-    Parameters
-    ----------
-    problem : PartProblem
-        The cost that SOC is run on.
-    poses : (p,) array
-        Numbers of its poses in the whole graph.
-    is_separator : (p,) array
-        Whether the driver solves for a pose; the others are the robot's interior.
-    final : PartProblem or None
-        The cost that is solved, where SOC is run on another one.
-    edges : (k,) array or None
-        Numbers of its edges in the whole graph.
-    thresholds : (k,) array or None
-        What its edges may cost in a robust solve.
-    """
-
-    problem: PartProblem
-    poses: IntArray
+    problem: PartProblem  # the cost that SOC is run on
+    poses: IntArray  # (p,): numbers of its poses in the whole graph
+    # (p,): whether the driver solves for a pose; the others are the robot's interior
     is_separator: BoolArray
-    final: PartProblem | None = None
-    edges: IntArray | None = None
-    thresholds: Array | None = None
+    final: PartProblem | None = None  # the cost that is solved, where SOC is run on another one
+    edges: IntArray | None = None  # (k,): numbers of its edges in the whole graph
+    thresholds: Array | None = None  # (k,): what its edges may cost in a robust solve
 
     def weighted(self, weights: Array) -> Part:
         """The part with the costs of its edges times weights, (k,)."""
