@@ -25,6 +25,7 @@ from pgo_models.graphs.precisions import (
     proper_information,
     uncoupled_share,
 )
+from pgo_models.problem.weighting import least_rotation_part
 
 _SHOWN = 2.0**-45  # smallest eigenvalue of a matrix with ones on its diagonal that is not rounding
 _SHARE_ROUNDING = 2.0**-20  # taken off the share that the coupling leaves, as it is rounded
@@ -80,20 +81,41 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
 
 
 def without_singular_blocks(information: Array, d: int) -> Array:
-    """Matrices, (m, k, k), with zeros for blocks that do not measure every direction.
+    """Matrices, (m, k, k), below the given ones, whose blocks measure every direction or none.
 
-    A coupling block goes with either.
+    A block that does not measure every direction goes, and the coupling with it. Of the other block
+    stays what is left once the residuals of the first are the best ones: the Schur complement.
     """
     singular_t = are_singular(information[:, :d, :d])
     singular_R = are_singular(information[:, d:, d:])
     if not (singular_t | singular_R).any():
         return information
     kept = information.copy()
+    rotations_first = np.roll(information, -d, axis=(1, 2))
+    p = information.shape[1] - d
+    kept[singular_t, d:, d:] = _least_of_second_block(information[singular_t], d)
+    kept[singular_R, :d, :d] = _least_of_second_block(rotations_first[singular_R], p)
     kept[singular_t, :d] = 0.0
     kept[singular_t, :, :d] = 0.0
     kept[singular_R, d:] = 0.0
     kept[singular_R, :, d:] = 0.0
     return kept
+
+
+def _least_of_second_block(information: Array, size: int) -> Array:
+    """Blocks B, (k, q, q), with diag(0, B) below matrices whose first block is singular.
+
+    It is zero where the second block leaves no direction measured on its own.
+    """
+    block = information[:, size:, size:].copy()
+    is_coupled = information[:, :size, size:].any(axis=(1, 2))
+    coupled = information[is_coupled]
+    rest = block[is_coupled] - least_rotation_part(coupled, size)
+    traces = np.einsum("kaa->k", block[is_coupled])
+    rest -= _MARGIN * traces[:, None, None] * np.eye(block.shape[1])
+    is_definite = are_definite(rest, LEAST_SCALED)
+    block[is_coupled] = np.where(is_definite[:, None, None], rest, 0.0)
+    return block
 
 
 def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:

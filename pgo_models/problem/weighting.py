@@ -30,7 +30,6 @@ from pgo_models.graphs.precisions import (
     is_semidefinite_exactly,
     smallest_eigenvalues,
     uncoupled_share,
-    with_empty_axes_filled,
 )
 from pgo_models.problem.costs import EdgeCost, ExcessCost, rotation_cost
 from pgo_models.problem.excess import CoupledExcess, Excess
@@ -206,7 +205,7 @@ def _coupled_cost(graph: PoseGraph, information: Array, blocks: _Information) ->
     share = 0.5 + 4.0 * margin_t[:, 0] / smallest + _MARGIN
     J_ss = share[:, None, None] * (schur + np.swapaxes(schur, 1, 2))
     J_ss = J_ss + 2.0 * margin_R[:, None, None] * np.eye(p)
-    J_ss[is_singular] = _rotation_part_of_excess(information[is_singular], d)
+    J_ss[is_singular] = least_rotation_part(information[is_singular], d)
     J_ss[~is_coupled] = 0.0
     upper = np.concatenate([J_tt, blocks.I_tr], axis=2)
     lower = np.concatenate([np.swapaxes(blocks.I_tr, 1, 2), J_ss], axis=2)
@@ -245,18 +244,16 @@ def _coupled_tau(information: Array, blocks: _Information) -> Array:
     return np.where(is_coupled, coupled_tau, blocks.uncoupled_tau)
 
 
-def _rotation_part_of_excess(information: Array, d: int) -> Array:
+def least_rotation_part(information: Array, d: int) -> Array:
     """J_ss, (k, p, p), of matrices with a singular I_tt: (I_tt, I_tr; ., J_ss) is semidefinite.
 
-    It is just above the Schur complement where exact arithmetic agrees, and I_rr itself elsewhere:
-    then all of the edge is excess, and W' = 0.
+    It is just above the Schur complement where exact arithmetic agrees, and I_rr itself elsewhere.
     """
     J_ss = information[:, d:, d:].copy()
-    filled_axes = with_empty_axes_filled(information[:, :d])
-    is_regular = are_definite(filled_axes[:, :, :d], LEAST_SCALED)
-    for k in np.flatnonzero(is_regular & information[:, :d, d:].any(axis=(1, 2))):
+    for k in np.flatnonzero(information[:, :d, d:].any(axis=(1, 2))):
         I_tr = information[k, :d, d:]
-        schur = I_tr.T @ np.linalg.solve(filled_axes[k, :, :d], I_tr)
+        I_tt_inverse = np.linalg.pinv(information[k, :d, :d], LEAST_SCALED, hermitian=True)
+        schur = I_tr.T @ I_tt_inverse @ I_tr
         margin = _MARGIN * np.diag(np.diag(schur))
         matrix = information[k].copy()
         matrix[d:, d:] = 0.5 * (schur + schur.T) + margin

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -394,6 +395,54 @@ def test_smaller_matrices_leave_semidefinite_ones_out(d: int) -> None:
     softer = shrink_information(replace(graph, information=information), 3.0)
     assert softer.num_edges == graph.num_edges - 1
     np.testing.assert_array_equal(softer.i, graph.i[1:])
+
+
+def without_axis(information: Array, axis: Array, d: int) -> Array:
+    """Matrices A^T I A, semidefinite, for A that takes a translation along an axis to zero."""
+    A = np.eye(information.shape[1])
+    A[:d, :d] -= np.outer(axis, axis)
+    flat = A @ information @ A
+    return np.asarray(0.5 * (flat + np.swapaxes(flat, 1, 2)))
+
+
+def is_semidefinite(matrix: Array) -> bool:
+    """Whether no pivot of a matrix of fractions is negative, or zero beside other entries."""
+    rows = [[Fraction(entry) for entry in row] for row in matrix]
+    while rows:
+        pivot, *first = rows.pop(0)
+        if pivot < 0 or (pivot == 0 and any(first)):
+            return False
+        rows = [
+            [
+                entry - (row[0] * above / pivot if pivot else 0)
+                for entry, above in zip(row[1:], first, strict=True)
+            ]
+            for row in rows
+        ]
+    return True
+
+
+@pytest.mark.parametrize("is_rotated", [False, True])
+@pytest.mark.parametrize("d", [2, 3])
+def test_smaller_matrices_of_half_known_edges_are_below_in_exact_arithmetic(
+    d: int, is_rotated: bool
+) -> None:
+    graph = informed(3, 8, d, coupled=True, spread=1.0)
+    assert graph.information is not None
+    axis = random_poses(1, d, 5).R[0, 0] if is_rotated else np.eye(d)[0]
+    information = graph.information.copy()
+    information[2:] = without_axis(information[2:], axis, d)
+    graph = replace(graph, information=information)
+    softer = shrink_information(graph, 3.0)
+    assert softer.information is not None
+    # What is known of rotations when translations are the best ones stays.
+    assert softer.num_edges == graph.num_edges
+    assert (softer.information[2:, d:, d:].any(axis=(1, 2))).all()
+    assert not softer.information[2:, :d].any()
+    whole = proper_information(graph)
+    for matrix, smaller in zip(whole, softer.information, strict=True):
+        difference = np.vectorize(Fraction)(matrix) - np.vectorize(Fraction)(smaller)
+        assert is_semidefinite(difference)
 
 
 def test_coupling_that_leaves_nothing_gives_no_softened_bound() -> None:
