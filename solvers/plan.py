@@ -64,7 +64,7 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     """Solve at a place, from a start or the place's own: all steps in their order."""
     newton = _first_newton(place.traits, settings)
     try:
-        first = attempt(place, settings.soc, newton, start)  # steps 1 to 4
+        first = attempt(place, settings.first_stage, newton, start)  # steps 1 to 4
     except KeyboardInterrupt:
         if not place.has_poses:
             raise
@@ -223,7 +223,7 @@ def with_last_steps(first: Attempt, place: Place, settings: Pipeline, best: Atte
 def from_second_start(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Step 6: the better of the answer and an attempt by a finer SOC, or from another start."""
     start = place.start_again()
-    soc = finer(settings.soc) if start is None else None
+    soc = finer(settings.first_stage) if start is None else None
     return place.better(best, attempt(place, soc, settings.newton, start))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from pgo_models.certificates.certificate import (
     DEFAULT_GAP,
@@ -40,6 +40,7 @@ from solvers.soc.soc import SOC
 from solvers.solution import Solution
 
 if TYPE_CHECKING:  # what a solve in one place does not need
+    from solvers.convex.extended_soc import ExtendedSOC
     from solvers.robust.consistency import PCM
     from solvers.robust.gnc import GNC
 
@@ -88,7 +89,7 @@ class Pipeline:
 
     _way_out = "give Pipeline(soc=SOC(..)), or run(SOC(..))"
 
-    soc: FirstStage = AUTO
+    soc: FirstStage | ExtendedSOC = AUTO
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     growing: GrowingStart | None = field(default_factory=GrowingStart)
@@ -161,6 +162,11 @@ class Pipeline:
         """Whether the first stage is an ExtendedSOC, which adds terms and constraints to F."""
         return getattr(self.soc, "changer", None) is not None
 
+    @property
+    def first_stage(self) -> FirstStage:
+        """`soc` of a solve without added terms."""
+        return cast(FirstStage, self.soc)
+
 
 @dataclass(frozen=True, eq=False)
 class SolveRequest:
@@ -196,7 +202,7 @@ class SolveRequest:
             return self
         from solvers.robots.chosen_robots import robots_of_solve
 
-        owners = robots_of_solve(self.pipeline.soc, self.robots.owners, self.problem.graph)
+        owners = robots_of_solve(self.pipeline.first_stage, self.robots.owners, self.problem.graph)
         return replace(self, robots=self.robots.with_owners(owners))
 
     @contextmanager

@@ -14,7 +14,7 @@ from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, MaybeNone
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.plots.graph_plots import compare_poses
@@ -107,12 +107,12 @@ class Solution:
     stages: tuple[Stage, ...]
     seconds: float
     ledger: Ledger = NOTHING_SENT
-    robots: Partition | None = None
+    robots: Partition | MaybeNone = None
     note: str = ""
     frame: str = ""
     anchor: int = 0
-    covariances: Array | None = None
-    robust: Rejection | None = None
+    covariances: Array | MaybeNone = None
+    robust: Rejection | MaybeNone = None
 
     @property
     def lower_bound(self) -> float:

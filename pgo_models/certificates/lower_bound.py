@@ -84,7 +84,7 @@ from pgo_models.certificates.unknowns import ComplexUnknowns, RowUnknowns, Unkno
 from pgo_models.errors import SettingError
 from pgo_models.geometry.arrays import block_norms
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, orthogonality_error
+from pgo_models.geometry.rotations import Array, MaybeNone, orthogonality_error
 from pgo_models.graphs.pose_graph import IntArray, middle_pose
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum
 from pgo_models.problem.matrices import inner, rotation_columns
@@ -141,7 +141,7 @@ class LowerBound(Summarised):
     rounding: float
     cap: float = math.inf
     is_definite: bool = False
-    terms: HandednessTerms | None = None
+    terms: HandednessTerms | MaybeNone = None
     is_complex: bool = False
 
 

@@ -3,6 +3,8 @@
 The projection is step (b) of the paper's Algorithm 1, with det = +1 enforced.
 """
 
+from typing import Any, TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,8 @@ from pgo_models.errors import SettingError
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+# In a union: None is possible, as the docstring says, and type checkers do not ask for a test.
+MaybeNone: TypeAlias = Any
 
 # The polar iteration converges quadratically: a last change below this leaves an error below 1e-15.
 # Where so many iterations are not enough, the SVD is used.

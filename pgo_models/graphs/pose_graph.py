@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from pgo_models.errors import GraphError, check_settings, door
 from pgo_models.geometry.arrays import ReadOnly, read_only, real_array, whole_array, whole_number
 from pgo_models.geometry.poses import Poses, rotations_to_rounding
-from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.geometry.rotations import Array, BoolArray, MaybeNone
 from pgo_models.graphs.origin import far_middle, is_exact_difference
 from pgo_models.html_tables import facts_table
 
@@ -178,8 +178,8 @@ class PoseGraph(ReadOnly):
     information: Array | None = None
     ids: IntArray | None = None
     robot: IntArray | None = None
-    initial: Poses | None = None
-    truth: Poses | None = None
+    initial: Poses | MaybeNone = None
+    truth: Poses | MaybeNone = None
     fixed: IntArray = field(default_factory=_no_poses)
     times: Array | None = None
     name: str = "graph"

@@ -34,10 +34,10 @@ _POINTS_ACROSS = 1000  # coordinates are rounded to this part of the extent
 
 
 def animate(
-    frames: Sequence[Sequence[Trace]],
+    frames: Sequence[Sequence[Mapping[str, object]]],
     labels: Sequence[str],
     *,
-    still: Sequence[Trace] = (),
+    still: Sequence[Mapping[str, object]] = (),
     layout: Mapping[str, object] | None = None,
     title: str = "",
     description: str = "",
@@ -111,7 +111,7 @@ def animate(
     return figure
 
 
-def _check_frames(frames: Sequence[Sequence[Trace]], labels: Sequence[str]) -> None:
+def _check_frames(frames: Sequence[Sequence[object]], labels: Sequence[str]) -> None:
     if not frames:
         raise SettingError("a film has no frames; give at least one")
     if len(labels) != len(frames):

@@ -109,7 +109,6 @@ def _write_scene(graph: PoseGraph, out: Path, truth: Path) -> None:
         # Symbols have 52 letters. Poses of more robots are numbered, and the files alone say whose
         # they are.
         write_g2o_folder(graph, out)
-    assert graph.truth is not None
     write_tum(graph.truth, truth)
 
 

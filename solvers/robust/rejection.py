@@ -11,7 +11,7 @@ import numpy as np
 from pgo_models.certificates.certificate import Verdict
 from pgo_models.certificates.fit import NO_FIT, Fit
 from pgo_models.figures import rounded_up
-from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.geometry.rotations import Array, BoolArray, MaybeNone
 from pgo_models.graphs.bridges import unchecked_bridges
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.summaries import Summarised
@@ -122,7 +122,7 @@ class Rejection(Summarised):
     why_known: str = ""
     places: tuple[str, ...] = ()
     fit: Fit = NO_FIT
-    proof: OutlierProof | None = None
+    proof: OutlierProof | MaybeNone = None
 
     @property
     def rejected(self) -> BoolArray:

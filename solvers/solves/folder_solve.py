@@ -124,7 +124,7 @@ def solve_folder(
     pipeline = pipeline if pipeline is not None else Pipeline()
     robots = robots if robots is not None else Robots()
     folder = locate(folder).absolute()
-    _check_first_stage(pipeline.soc)
+    _check_first_stage(pipeline.first_stage)
     _check_robots(robots)
     _check_robust(robust)
     if weighting is Weighting.ROTATIONS:

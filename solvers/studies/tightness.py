@@ -89,7 +89,6 @@ def noisy_scene(scene: SweptScene, rotation_std: float, rng: np.random.Generator
     Geometry, weights and translation noise are those of the paper.
     """
     network = circle(rng) if scene is SweptScene.CIRCLE else grid(rng)
-    assert network.truth is not None
     noise = NoiseModel(rotation_std=rotation_std)
     return observe(
         scene.value, network.truth, network.i, network.j, noise, NETWORK_KAPPA, NETWORK_TAU, rng
