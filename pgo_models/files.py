@@ -3,6 +3,7 @@
 import gzip
 import io
 import os
+import re
 import secrets
 import stat
 import warnings
@@ -21,7 +22,8 @@ LARGEST = 1e100  # beyond it squares and determinants would overflow; no measure
 FARTHEST = 1e15  # metres: beyond it neighbouring doubles are more than 0.1 m apart
 LONGEST = 10_000  # characters of a line of numbers; an edge in space with all its digits has 750
 LONGEST_OF_ALL = 2**16  # bytes of any line, comments included
-_EQUAL_LINES = 3  # with the same problem, each of which is named
+_EQUAL_LINES = 3  # with a problem of one kind, each of which is named
+_NUMBER = re.compile(r"(?<!\w)[-+]?\d[\w.,+-]*")  # of a problem, which is of a kind without it
 _NAMED_LINES = 20  # wrong lines of a file that an error names
 _ZERO_QUATERNION = 1e-9  # a norm below this gives no direction: files hold about six digits
 BLOCK = 2**24  # bytes of a file that are split into lines at a time
@@ -145,31 +147,35 @@ def check_lines(
 ) -> None:
     """Raise a FileFormatError when there are problems in the lines of a file.
 
-    It has `file:line: problem` for each of the first 20 wrong lines, and their number. Where more
-    than three lines all have the same problem, it is said of the first, with a count. Of several
-    problems of a line the first is named. `unit` is what is counted in place of lines, and `hint`
-    ends the message.
+    It has `file:line: problem` for each of the first 20 wrong lines, and their number. Problems
+    that differ in their numbers alone are of one kind, and where more than three lines have one,
+    it is said of the first, with a count. Of several problems of a line the first is named. `unit`
+    is what is counted in place of lines, and `hint` ends the message.
     """
     if not problems:
         return
     problem_of_line: dict[int, str] = {}
     for line, problem in problems:
         problem_of_line.setdefault(line, problem)
-    lines = sorted(problem_of_line)
+    lines_of_kind: dict[str, list[int]] = {}
+    for line in sorted(problem_of_line):
+        kind = _NUMBER.sub("", problem_of_line[line])
+        lines_of_kind.setdefault(kind, []).append(line)
     place = printable(str(path))
-    if len(lines) > _EQUAL_LINES and len(set(problem_of_line.values())) == 1:
-        # One systematic error, said once.
-        text = f"{problem_of_line[lines[0]]}{hint}\nso are {len(lines) - 1} more {unit}, "
-        raise FileFormatError(path, lines[0], f"{text}up to {place}:{lines[-1]}")
-    named = lines[:_NAMED_LINES]
-    texts = [f"{place}:{line}: {problem_of_line[line]}" for line in named]
-    if len(lines) > len(named):
-        texts.append(f"{len(lines)} {unit} are wrong; the first {len(named)} are named")
-    elif len(lines) > 1:
-        texts.append(f"{len(lines)} {unit} are wrong")
-    texts[0] = problem_of_line[named[0]]  # FileFormatError names the place of the first
-    texts[-1] += hint
-    raise FileFormatError(path, named[0], "\n".join(texts))
+    text_of_line: dict[int, str] = {}
+    for lines in lines_of_kind.values():
+        if len(lines) > _EQUAL_LINES:
+            text = f"{problem_of_line[lines[0]]}\nso are {len(lines) - 1} more {unit}, "
+            text_of_line[lines[0]] = f"{text}up to {place}:{lines[-1]}"
+        else:
+            text_of_line |= {line: problem_of_line[line] for line in lines}
+    first, *named = sorted(text_of_line)[:_NAMED_LINES]
+    texts = [text_of_line[first], *(f"{place}:{line}: {text_of_line[line]}" for line in named)]
+    if len(text_of_line) > _NAMED_LINES:
+        texts.append(f"{len(problem_of_line)} {unit} are wrong; the first {len(texts)} are named")
+    elif named:
+        texts.append(f"{len(problem_of_line)} {unit} are wrong")
+    raise FileFormatError(path, first, "\n".join(texts) + hint)
 
 
 def check_length(path: Path | str, line: int, text: str) -> None:

@@ -1,13 +1,13 @@
 """Files of other programs as lines of g2o: Open3D's pose graphs, view graphs, and tables.
 
-What a file is follows from its first line. A table and a view graph become a file with the same
+What a file is follows from its first lines. A table and a view graph become a file with the same
 number of lines, so that messages name the lines of the file itself.
 """
 
 import json
+import re
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from pgo_models.geometry.rotations import (
     quaternions_from_rotations,
     rotations_from_quaternions,
 )
+from pgo_models.graphs.tables import COMMENT_SIGNS, UNIT_ROTATION, lines_of_table, table_of
 
 # Words on a line of a view graph: i j, a quaternion or a rotation by rows, perhaps a translation.
 _QUATERNION_WORDS = (6, 9)
@@ -28,14 +29,6 @@ _VIEW_WORDS = (*_QUATERNION_WORDS, 11, 14)
 _CLEARLY = 0.7  # share of a misfit that is better not only by chance
 _FAR = 1.0  # misfit of a cycle that has a wrong edge, or is read in the wrong order
 _NOT_UNIT = 1e-3  # of a quaternion or matrix that is no rotation
-_UNIT_ROTATION = " ".join(["0"] * 15 + ["1 0 0 1 0 1"])  # information of a rotation alone
-_NAMES_OF_FIRST = {"i", "from", "id1", "id_1", "id_a", "source", "src", "start", "pose_i"}
-_NAMES_OF_SECOND = {"j", "to", "id2", "id_2", "id_b", "target", "dst", "end", "pose_j"}
-_ALIASES = {"dx": "x", "dy": "y", "dz": "z", "tx": "x", "ty": "y", "tz": "z"}
-_ALIASES |= {"dtheta": "theta", "yaw": "theta", "heading": "theta", "angle": "theta"}
-_ALIASES |= {"th": "theta", "t": "theta"}
-_PLANE = ["x", "y", "theta"]
-_SPACE = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 _FEW_TRIANGLES = 2000  # of views that are compared
 # Files that are no text of measurements, and what exports them.
 _EXPORTED_BY = {
@@ -50,42 +43,54 @@ _EXPORTED_BY = {
 }
 
 
-@dataclass
-class _Table:
-    """Columns of a table with a header."""
-
-    separator: str | None
-    first: int
-    second: int
-    measured: list[int]
-    matrix: list[int] = field(default_factory=list)
-
-    @property
-    def tag(self) -> str:
-        """Tag of its edges."""
-        return "EDGE_SE2" if len(self.measured) == 3 else "EDGE_SE3:QUAT"
-
-
 def as_g2o(path: Path, blocks: Iterable[str]) -> Iterator[str]:
     """Blocks of lines of g2o, of a file of another program or of g2o itself."""
-    if path.suffix in _EXPORTED_BY:
-        raise FileFormatError(path, None, _EXPORTED_BY[path.suffix])
+    suffix = path.with_suffix("").suffix if path.suffix.lower() == ".gz" else path.suffix
+    if suffix.lower() in _EXPORTED_BY:
+        raise FileFormatError(path, None, _EXPORTED_BY[suffix.lower()])
     stream = iter(blocks)
     opening = next(stream, "")
-    first = next((line for line in opening.split("\n") if _has_words(line)), "")
     rest = chain([opening], stream)
+    line, first, second = _first_lines(opening)
     if first.lstrip().startswith("{"):
         return iter([_of_open3d(path, "".join(rest))])
-    if _view(first.split()) is not None:
+    if _view(first) is not None or (_is_count(first) and _view(second) is not None):
         return iter([_of_views(path, "".join(rest))])
-    table = _table_of(first)
+    if _has_names_for_ids(first.split()):
+        raise FileFormatError(path, line, _EXPORTED_BY[".pyfg"])
+    table = table_of(path, line, first)
+    if table is None and line > 1 and first.lstrip("\"' ")[:1].isdigit():
+        # The header of numbers may be the last comment.
+        before = opening.split("\n")[line - 2]
+        table = table_of(path, line - 1, before)
     if table is not None:
-        return iter([_of_table(path, table, "".join(rest))])
+        return iter([lines_of_table(path, table, "".join(rest))])
     return rest
 
 
+def _first_lines(text: str) -> tuple[int, str, str]:
+    """The first two lines with words that are no comments, and the number of the first."""
+    numbered = ((number, line) for number, line in enumerate(text.split("\n"), 1))
+    with_words = (pair for pair in numbered if _has_words(pair[1]))
+    number, first = next(with_words, (1, ""))
+    _, second = next(with_words, (number, ""))
+    return number, first, second
+
+
 def _has_words(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith(("#", "//", "%"))
+    return bool(line.strip()) and not line.lstrip().startswith(COMMENT_SIGNS)
+
+
+def _is_count(line: str) -> bool:
+    """Whether a line has numbers of views and pairs, as some view graphs open with."""
+    words = line.split()
+    return len(words) <= 2 and all(map(str.isdigit, words))
+
+
+def _has_names_for_ids(words: list[str]) -> bool:
+    """Whether words are a line of PyFG: behind the tag a time and a name such as A0."""
+    is_tag = bool(words) and words[0].startswith(("VERTEX_", "EDGE_"))
+    return is_tag and len(words) > 2 and re.fullmatch(r"[A-Z][0-9]+", words[2]) is not None
 
 
 # Open3D
@@ -157,12 +162,13 @@ def _words(numbers: Array) -> str:
 # View graphs
 
 
-def _view(words: list[str]) -> Array | None:
+def _view(line: str) -> Array | None:
     """Rotation, (3, 3), between two views with ids or names; None if a line has no such thing.
 
     It is given by rows, as in EGs.txt, or as a quaternion, its w first, as GLOMAP reads it. A
     translation may follow.
     """
+    words = _words_of(line)
     are_numbers = [word.isdigit() for word in words[:2]]
     if len(words) not in _VIEW_WORDS or are_numbers[0] is not are_numbers[1]:
         return None
@@ -179,6 +185,10 @@ def _view(words: list[str]) -> Array | None:
     return R if is_rotation else None
 
 
+def _words_of(line: str) -> list[str]:
+    return line.replace(",", " ").split()
+
+
 def _of_views(path: Path, text: str) -> str:
     """Lines of g2o of a view graph: rotations alone, as the translations have no length.
 
@@ -186,11 +196,13 @@ def _of_views(path: Path, text: str) -> str:
     of three views tell.
     """
     lines = text.split("\n")
-    rotations = {}
+    rotations: dict[int, Array] = {}
     for place, line in enumerate(lines):
         if not _has_words(line):
             continue
-        R = _view(line.split())
+        if not rotations and _is_count(line):
+            continue
+        R = _view(line)
         if R is None:
             problem = (
                 "no view: give two ids or names, a rotation by rows or as qw qx qy qz, and a "
@@ -198,7 +210,7 @@ def _of_views(path: Path, text: str) -> str:
             )
             raise FileFormatError(path, place + 1, problem)
         rotations[place] = R
-    ends = {place: lines[place].split()[:2] for place in rotations}
+    ends = {place: _words_of(lines[place])[:2] for place in rotations}
     names = sorted({name for pair in ends.values() for name in pair})
     are_named = not names[0].isdigit()
     number_of = {name: k if are_named else int(name) for k, name in enumerate(names)}
@@ -208,7 +220,7 @@ def _of_views(path: Path, text: str) -> str:
     for place, R in rotations.items():
         i, j = pairs[place]
         pose = _words_of_pose(R.T if are_transposed else R, np.zeros(3))
-        written[place] = f"EDGE_SE3:QUAT {i} {j} {pose} {_UNIT_ROTATION}"
+        written[place] = f"EDGE_SE3:QUAT {i} {j} {pose} {UNIT_ROTATION}"
     note = "R_j R_i^T of R_i, from the world to camera i" if are_transposed else "R_i^T R_j"
     if are_named:
         note += f"; views have the numbers 0 ({names[0]}) to {len(names) - 1} ({names[-1]}), sorted"
@@ -245,57 +257,3 @@ def _are_transposed(rotations: dict[tuple[int, int], Array], by_default: bool) -
     if by_default:
         return not bool(of_direct < _CLEARLY * of_transposed)
     return bool(of_transposed < _CLEARLY * of_direct)
-
-
-# Tables
-
-
-def _table_of(line: str) -> _Table | None:
-    """Columns of a table that has this header; None where it is none."""
-    separator = next((mark for mark in (",", ";", "\t") if mark in line), None)
-    names = [word.strip().strip('"').lower() for word in line.split(separator)]
-    places = {_ALIASES.get(name, name): place for place, name in reversed(list(enumerate(names)))}
-    first = [place for name, place in places.items() if name in _NAMES_OF_FIRST]
-    second = [place for name, place in places.items() if name in _NAMES_OF_SECOND]
-    if not first or not second:
-        return None
-    in_space = [places[name] for name in _SPACE if name in places]
-    in_plane = [places[name] for name in _PLANE if name in places]
-    if len(in_space) == len(_SPACE):
-        columns, side = in_space, 6
-    elif len(in_plane) == len(_PLANE):
-        columns, side = in_plane, 3
-    else:
-        return None
-    table = _Table(separator, first[0], second[0], columns)
-    used = {table.first, table.second, *columns}
-    others = [place for place in range(len(names)) if place not in used]
-    if len(others) == side * (side + 1) // 2:
-        table.matrix = others
-    return table
-
-
-def _of_table(path: Path, table: _Table, text: str) -> str:
-    """Lines of g2o of a table, whose header becomes an empty line."""
-    lines = text.split("\n")
-    written = [""] * len(lines)
-    is_header = True
-    for place, line in enumerate(lines):
-        if not _has_words(line):
-            continue
-        if is_header:
-            is_header = False
-            continue
-        words = [word.strip() for word in line.split(table.separator)]
-        columns = [table.first, table.second, *table.measured, *table.matrix]
-        if len(words) <= max(columns):
-            problem = f"{len(words)} columns, and the header has {max(columns) + 1} or more"
-            raise FileFormatError(path, place + 1, f"{problem}; complete the line")
-        written[place] = " ".join([table.tag, *(words[column] for column in columns)])
-    matrix = "the upper triangle of information matrices" if table.matrix else "no matrices"
-    warnings.warn(
-        f"{printable(str(path))}: a table of {table.tag} measurements, with {matrix}",
-        GraphWarning,
-        stacklevel=2,
-    )
-    return "\n".join(written)

@@ -29,10 +29,10 @@ from pgo_models.graphs.g2o_tags import (
 )
 from pgo_models.graphs.origin import remainder_of
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
+from pgo_models.graphs.tables import COMMENT_SIGNS
 
 _LONG_RUN = 16  # lines of one tag in a row, from which on they need not be sorted by tag
 _SHOWN = 40  # characters of a wrong word that a message shows
-_COMMENT_SIGNS = ("#", "//", "%")
 _COMMENT = re.compile(r"(#|//|%).*")
 # Fortran writes 1.5e-3 as 1.5D-03.
 _FORTRAN_EXPONENT = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
@@ -113,7 +113,7 @@ class Source:
             tag = ALIASES.get(written_tag, written_tag)
             if tag in TAGS:
                 self._take_measurements(tag, written_tag, numbers_of_tag, lines_of_tag)
-            elif not written_tag.startswith(_COMMENT_SIGNS):
+            elif not written_tag.startswith(COMMENT_SIGNS):
                 plain_lines = [_without_comment(line) for line in lines_of_tag]
                 self._take_others(tag, numbers_of_tag.tolist(), plain_lines)
 

@@ -427,8 +427,17 @@ def _with_variants() -> list[str]:
 # What such a line is. The blanks keep these names apart from all tags in files.
 SHORT_TAGS = {name: f"{name} without a matrix" for name in _with_variants()}
 COMPLETE_TAGS = {name: f"{name} with a complete matrix" for name in _with_variants()}
+# Tags of the lines of tables that have covariance matrices.
+COVARIANCE_TAGS = {
+    "EDGE_SE2": "EDGE_SE2:COVARIANCE",
+    "EDGE_SE3:QUAT": "EDGE_SE3:QUAT:COVARIANCE",
+    "EDGE_SE3:EULER": "EDGE_SE3:EULER:COVARIANCE",
+}
 TAGS = {
     **_PLAIN_TAGS,
+    "EDGE_SE2:COVARIANCE": Tag(2, 2, noise=Noise.COVARIANCE),
+    "EDGE_SE3:QUAT:COVARIANCE": Tag(3, 2, noise=Noise.COVARIANCE),
+    "EDGE_SE3:EULER:COVARIANCE": Tag(3, 2, is_toro=True, noise=Noise.COVARIANCE),
     **{SHORT_TAGS[name]: replace(_PLAIN_TAGS[name], noise=Noise.MISSING) for name in SHORT_TAGS},
     **{COMPLETE_TAGS[name]: replace(_PLAIN_TAGS[name], is_complete=True) for name in COMPLETE_TAGS},
 }

@@ -180,6 +180,10 @@ def exported_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, li
     edges = [line.split()[1:] for line in plane if line.startswith("EDGE")]
     header = "i,j,x,y,theta,xx,xy,xt,yy,yt,tt"
     yield "table", [header, *(",".join(words) for words in edges)]
+    yield (
+        "table_with_deviations",
+        ["# stamp from to dx dy yaw sigma_x sigma_y sigma_yaw", *map(with_deviations, edges)],
+    )
     cameras = changed(changed(space, with_rotation_first), as_camera)
     yield "cameras", [line.replace("VERTEX_SE3:QUAT", "VERTEX_SE3:EXPMAP") for line in cameras]
     yield "similarities", changed(space, as_similarity)
@@ -195,6 +199,12 @@ def exported_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, li
             lambda words: [words[0], words[2], words[1], *words[3:]],
         ),
     )
+
+
+def with_deviations(words: list[str]) -> str:
+    """A row of a table: a time, the two poses, the measurement and its standard deviations."""
+    precisions = np.array([words[5], words[8], words[10]], dtype=float)
+    return " ".join(["0.1", *words[:5], *map(repr, (precisions**-0.5).tolist())])
 
 
 def named_by_labels(words: list[str], key: int) -> list[str]:

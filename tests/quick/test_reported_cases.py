@@ -441,8 +441,8 @@ def test_measurements_without_a_cycle_are_said_to_check_nothing(
 def test_an_indefinite_matrix_is_refused_with_its_line_and_eigenvalue(
     pgo_command: Call, tmp_path: Path
 ) -> None:
-    line = "EDGE_SE2 {} {} 1 0 0 4 5 0 4 0 9"
-    lines = [line.format(k, k + 1) for k in range(6)]
+    line = "EDGE_SE2 {} {} 1 0 0 4 {} 0 4 0 9"
+    lines = [line.format(k, k + 1, k + 5) for k in range(6)]
     (tmp_path / "bad.g2o").write_text("\n".join(lines))
     code, _, err = pgo_command("solve", tmp_path / "bad.g2o")
     assert code == 1
@@ -569,19 +569,70 @@ def test_views_may_have_names_and_quaternions(
     [
         ("i,j,x,y,theta,xx,xy,xt,yy,yt,tt", "{},{},1,0,2,100,0,0,100,0,400"),
         ("from to dx dy yaw xx xy xt yy yt tt", "{} {} 1 0 2 100 0 0 100 0 400"),
+        ("# i j x y theta I11 I22 I33 I12 I13 I23", "{} {} 1 0 2 100 100 400 0 0 0"),
+        ("stamp;From ID;To ID;x;y;th;info1;info2;info3;info4;info5;info6", "{2};{0};{1};1;0;2;{3}"),
+        (
+            '"key1","key2","x","y","theta","cov_xx","cov_yy","cov_tt"',
+            '"{}","{}",1,0,2,.01,.01,.0025',
+        ),
+        ("type,id_a,id_b,rel_x,rel_y,rel_yaw,std_x,std_y,std_yaw", "odom,{},{},1,0,2,0.1,0.1,0.05"),
     ],
 )
 def test_tables_with_a_header_are_read(header: str, line: str, tmp_path: Path) -> None:
     ends = [(0, 1), (1, 2), (2, 0)]
-    rows = [line.format(*pair) for pair in ends]
+    rows = [line.format(*pair, 0.5, "100;0;0;100;0;400") for pair in ends]
     (tmp_path / "table.csv").write_text("\n".join([header, *rows]))
-    with pytest.warns(GraphWarning, match="a table of EDGE_SE2 measurements, with the upper"):
+    with pytest.warns(GraphWarning, match="a table of EDGE_SE2 measurements, with "):
         graph = read_g2o(tmp_path / "table.csv")
     np.testing.assert_array_equal(np.stack([graph.i, graph.j], axis=1), ends)
-    np.testing.assert_array_equal(graph.information[0], np.diag([100.0, 100.0, 400.0]))
+    expected = np.diag([100.0, 100.0, 400.0])
+    np.testing.assert_allclose(graph.information[0], expected, rtol=1e-15, atol=0)
     (tmp_path / "table.csv").write_text("\n".join([header, rows[0], "1,2", rows[2]]))
     with pytest.raises(FileFormatError, match=r"table.csv:3: .* columns"):
         read_g2o(tmp_path / "table.csv")
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("i,j,x,y,z,roll,pitch,yaw", "1,2,3,0.1,-0.2,0.3"),
+        ("src,dst,qw,qx,qy,qz,tx,ty,tz", "{3!r},{0!r},{1!r},{2!r},1,2,3"),
+        ("image_id1,image_id2,qw,qx,qy,qz", "{3!r},{0!r},{1!r},{2!r}"),
+    ],
+)
+def test_tables_in_space_have_quaternions_or_angles(header: str, row: str, tmp_path: Path) -> None:
+    roll, pitch, yaw = exp_map(np.diag([0.1, -0.2, 0.3]))
+    R = yaw @ pitch @ roll
+    quaternion = quaternions_from_rotations(R[None])[0].tolist()
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join([header, "0,1," + row.format(*quaternion)]))
+    with pytest.warns(GraphWarning, match="a table of|EDGE3 lines have no matrix"):
+        graph = read_g2o(path, unit_weights=True)
+    np.testing.assert_allclose(graph.R_ij[0], R, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(graph.t_ij[0], [1, 2, 3] if "1,2,3" in row else 0)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("i,j,x,y", "a table needs columns x, y and theta"),
+        ("i,j,x,y,z,yaw", "roll, pitch and yaw"),
+        ("i,j,x,y,theta_deg", "this one has i,j,x,y,theta_deg"),
+        ("i,j,x,y,theta,info_xx,info_yy", "lack an entry on the diagonal"),
+        ("i,j,x,y,theta,cov_xx,cov_yy,cov_tt,info_xx,info_yy,info_tt", "leave one of them out"),
+    ],
+)
+def test_tables_that_lack_something_are_refused(header: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(f"{header}\n0,1,1,0,0,1,1,1,1,1,1\n")
+    with pytest.raises(FileFormatError, match=rf"table.csv:1: .*{words}"):
+        read_g2o(path)
+
+
+def test_a_comment_on_the_columns_of_g2o_is_no_header(tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_text("# EDGE_SE2 i j x y theta xx xy xt yy yt tt\nEDGE_SE2 0 1 1 0 2 4 0 0 4 0 9\n")
+    assert read_g2o(path).num_edges == 1
 
 
 def test_files_that_are_no_text_of_measurements_are_named(
