@@ -4,7 +4,7 @@ import math
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import cvxpy as cp
@@ -34,6 +34,7 @@ _PRODUCT = (
 _LAST_NUMBER = "last number of a variable"
 _MAX_SHOWN = 120  # characters of an expression in a message
 _FIRST_ORDER = (cp.SCS, cp.OSQP)
+_SHORTER_STEPS = 0.9  # share of the way to the boundary that a step takes; Clarabel's is 0.99
 _WHY = {
     cp.INFEASIBLE: "its constraints contradict each other",
     cp.UNBOUNDED: "its objective has no minimum: bound it",
@@ -242,6 +243,12 @@ class ConvexSolver:
             options[time_limit_name] = time_limit
         return {**options, **self.options}
 
+    def with_shorter_steps(self) -> "ConvexSolver":
+        """The solver for a second try: Clarabel's longest steps can go round in a circle."""
+        if self.name != cp.CLARABEL:
+            return self
+        return replace(self, options={"max_step_fraction": _SHORTER_STEPS, **self.options})
+
 
 def _solver_error() -> type[Exception]:
     """The error of a solve: cvxpy's, or MOSEK's own, which it raises for a missing licence."""
@@ -268,9 +275,10 @@ def solve_compiled(
     """Solve a compiled problem; its variables hold the solution afterwards.
 
     The tolerance is on the gap and on feasibility, absolute and relative. Where rounding does not
-    allow it, 100 times as much is tried, and so on up to LOOSEST_TOLERANCE. At the last of these
-    the status `accepted` is accepted beside optimal. A PGOError when the solver ends without a
-    solution; the message has the `name` of the problem, the status and what it means.
+    allow it, 100 times as much is tried with shorter steps, and so on up to LOOSEST_TOLERANCE. At
+    the last of these the status `accepted` is accepted beside optimal. A PGOError when the solver
+    ends without a solution; the message has the `name` of the problem, the status and what it
+    means.
     """
     solver = as_solver(solver)
     while True:
@@ -289,6 +297,7 @@ def solve_compiled(
         if status in _WHY or is_last:
             check_solved(status, solver, name, why)
         tolerance = min(100.0 * tolerance, LOOSEST_TOLERANCE)
+        solver = solver.with_shorter_steps()
 
 
 def check_solved(status: str, solver: ConvexSolver, name: str, why: str) -> None:

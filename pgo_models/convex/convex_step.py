@@ -93,13 +93,15 @@ class ConeStep(ReadOnly):
             c[columns] -= rho * total
         P = csc_array(self.data["P"] + diags_array(rho * self.weights))
         data = {**self.data, "P": P, "c": c}
+        solver = self.solver
         for tolerance in _TOLERANCES:
             almost = min(100.0 * tolerance, LOOSEST_TOLERANCE)
-            options = dict.fromkeys(_ALMOST, almost) | self.solver.all_options(tolerance)
+            options = dict.fromkeys(_ALMOST, almost) | solver.all_options(tolerance)
             raw = CLARABEL().solve_via_data(data, False, False, options)
             status = _STATUSES.get(str(raw.status), cp.SOLVER_ERROR)
             if status in (cp.OPTIMAL, cp.INFEASIBLE, cp.UNBOUNDED):
                 break
+            solver = solver.with_shorter_steps()
         check_solved(status, self.solver, _NAME, "check its scaling")
         x = np.asarray(raw.x)
         return tuple(x[columns] for columns in self.entries)

@@ -321,7 +321,7 @@ class QuadraticForm(ReadOnly):
 
         Step (a) then takes a convex solver, and points of the sets need not be feasible.
         """
-        return bool(self.G.shape[0]) or len(self._rows_with_others) < self.E.shape[0]
+        return bool(self.G.shape[0]) or self._equalities_of_others.shape[0] < self.E.shape[0]
 
     # Variables without a set.
 
@@ -350,13 +350,15 @@ class QuadraticForm(ReadOnly):
 
     def _right_side(self, u: Array) -> Array:
         """Right side of `other_equations` at several u with y = 0."""
-        of_equalities = self.E[self._rows_with_others] @ u
+        of_equalities = self._equalities_of_others @ u
         return np.concatenate([-2.0 * (self.Q @ u)[self.free_others], -of_equalities])
 
     @cached_property
-    def _rows_with_others(self) -> IntArray:
-        """The equalities that have entries of y; others hold of x alone."""
-        return np.flatnonzero(np.diff(csr_array(self.E[:, self.free_others]).indptr))
+    def _equalities_of_others(self) -> csr_array:
+        """The equalities that have entries of y, each as large as Q; others hold of x alone."""
+        rows = self.E[np.flatnonzero(np.diff(csr_array(self.E[:, self.free_others]).indptr))]
+        sizes = abs(rows).max(axis=1).toarray().ravel()
+        return csr_array(diags_array((abs(self.Q).max() or 1.0) / sizes) @ rows)
 
     @cached_property
     def _others_of_constrained(self) -> Array:
@@ -370,7 +372,7 @@ class QuadraticForm(ReadOnly):
         """Optimality conditions of y, regularised for the factor that solves them."""
         y = self.free_others
         H = 2.0 * self.Q[y][:, y]
-        E = self.E[self._rows_with_others][:, y]
+        E = self._equalities_of_others[:, y]
         blocks: list[list[Any]] = [[H, E.T], [E, None]]
         equations = csc_array(block_array(blocks)) if E.shape[0] else csc_array(H)
         damping = np.full(equations.shape[0], _DAMPING * (abs(self.Q).max() or 1.0))
@@ -578,8 +580,19 @@ def _in_u(rows: csr_array, right: Array, w_columns: IntArray, spread: csc_array)
         raise NotQuadraticError("an inequality has a residual of the objective")
     with_constant = csr_array(block_array([[in_w, csc_array(-right[:, None])]]))
     in_u = csr_array(with_constant @ spread)
-    if in_u.nnz < with_constant.nnz:  # two entries are summed, and rounded
-        raise NotQuadraticError("a constraint has equal entries of a rotation of the plane")
+    # The two equal entries of a rotation of the plane are added. A sum is exact where both
+    # differences are (Dekker 1971).
+    equal = np.flatnonzero(np.diff(spread.indptr) == 2)
+    first, second = (
+        csc_array(with_constant)[:, spread.indices[of_both]] @ diags_array(spread.data[of_both])
+        for of_both in (spread.indptr[equal], spread.indptr[equal] + 1)
+    )
+    added = csc_array(in_u)[:, equal]
+    if (added - first != second).nnz or (added - second != first).nnz:
+        raise NotQuadraticError(
+            "a constraint adds factors of equal entries of a rotation of the plane, and rounds; "
+            "write it with its first column alone"
+        )
     return in_u
 
 

@@ -51,7 +51,7 @@ class OrthogonalSolution(Summarised):
     outcome : Outcome
         The best run: status, history, state.
     objectives : tuple of floats
-        J of every start, nan where a run did not converge.
+        J of every start, nan where a run did not converge or the solver of step (a) failed.
     certificate : ModelCertificate
         The proven bound beside J, or why there is none.
     """
@@ -173,7 +173,7 @@ def solve_orthogonal(
     SettingError
         If `starts` is below 1.
     PGOError
-        If the convex subproblem has no solution.
+        If the convex subproblem has no solution from any start.
 
     Examples
     --------
@@ -194,20 +194,27 @@ def solve_orthogonal(
     split = method.split(problem)
     prepared = replace(method, x_step=split, newton=_newton_for(split))
     outcomes = list[Outcome[OrthogonalState]]()
+    ends = list[float]()
     for start in itertools.islice(random_points(problem, rng), starts):
-        outcomes.append(run(prepared, problem, start, verbose=verbose))
-        if outcomes[-1].status is Status.INTERRUPTED:
+        try:
+            outcome = run(prepared, problem, start, verbose=verbose)
+        except PGOError as error:  # the solver could not make a step (a); other runs may end
+            failure = error
+            ends.append(math.nan)
+            continue
+        outcomes.append(outcome)
+        ends.append(outcome.objective if outcome.status.is_success else math.nan)
+        if outcome.status is Status.INTERRUPTED:
             break
+    if not outcomes:
+        raise failure
     best = min(outcomes, key=_rank)
     if 2 ** len(with_free_determinants(problem)) > starts:
         best = _lowered_by_reflections(prepared, problem, best, verbose=verbose)
-    ends = tuple(
-        outcome.objective if outcome.status.is_success else math.nan for outcome in outcomes
-    )
     try:
-        return _certified(problem, prepared, best, ends)
+        return _certified(problem, prepared, best, tuple(ends))
     except NotQuadraticError as error:
-        return _bounded_by_hulls(problem, prepared, best, ends, str(error))
+        return _bounded_by_hulls(problem, prepared, best, tuple(ends), str(error))
 
 
 def _newton_for(split: AnySplit) -> ModelNewton | None:

@@ -19,27 +19,30 @@ KINDS = {
     "of a translation, too": lambda R, t, S: [R[0] @ S[0] + t >= 0.0, t <= 1.0],
     "nowhere active": lambda R, t, S: [t <= 1e3, cp.trace(R[0]) >= -1.5],
 }
+OF_THE_PLANE = list(KINDS)[3:]
 
 
-def model(kind: str, seed: int = 0) -> pgo.OrthogonalProblem:
+def model(kind: str, seed: int = 0, d: int = 3) -> pgo.OrthogonalProblem:
     """Squares of affine functions of one or two rotations and a translation."""
     rng = np.random.default_rng(seed)
-    R = [cp.Variable((3, 3)) for _ in range(2 if kind == "a shared column" else 1)]
-    t = cp.Variable(3)
+    R = [cp.Variable((d, d)) for _ in range(2 if kind == "a shared column" else 1)]
+    t = cp.Variable(d)
     entries = cp.hstack([*(cp.vec(X, order="F") for X in R), t])
     misfits = rng.standard_normal((7, entries.size)) @ entries - rng.standard_normal(7)
     J = cp.sum_squares(misfits) + 0.1 * cp.sum_squares(t)
-    constraints = KINDS[kind](R, t, pgo.random_rotations(1, 3, rng)[0])
+    constraints = KINDS[kind](R, t, pgo.random_rotations(1, d, rng)[0])
     return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), constraints), rotations=R)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "d"), [*((kind, 3) for kind in KINDS), *((kind, 2) for kind in OF_THE_PLANE)]
+)
 def test_what_is_certified_is_feasible_proven_and_no_start_ends_lower(
-    kind: str, seed: int, tmp_path: Path
+    kind: str, d: int, seed: int, tmp_path: Path
 ) -> None:
     pytest.importorskip("flint")
-    problem = model(kind, seed)
+    problem = model(kind, seed, d)
     solution = solvers.solve_orthogonal(problem, seed, starts=3)
     assert solution.is_certified
     assert problem.problem.value == pytest.approx(solution.objective, rel=1e-9)
@@ -52,6 +55,22 @@ def test_what_is_certified_is_feasible_proven_and_no_start_ends_lower(
     again = solvers.certify(problem, solution.values)
     assert again.objective == pytest.approx(solution.objective, rel=1e-6)
     assert again.lower_bound <= solution.objective
+
+
+def test_factors_of_equal_entries_are_added_where_the_sum_is_exact() -> None:
+    R = cp.Variable((2, 2))
+    J = cp.sum_squares(R - np.array([[0.0, 1.0], [-1.0, 0.0]]))  # 4 less 4 times the sine
+
+    def at_least_one(a: float, b: float) -> pgo.OrthogonalProblem:
+        limited = cp.Problem(cp.Minimize(J), [a * R[0, 0] + b * R[1, 1] >= 1.0])
+        return pgo.OrthogonalProblem(limited, rotations=[R])
+
+    for a, b in ((1.0, 1.0), (-1.0, 3.0), (0.75, 1.25)):  # the cosine is at least 1 / 2
+        solution = solvers.solve_orthogonal(at_least_one(a, b), starts=2)
+        assert solution.is_certified
+        assert solution.lower_bound == pytest.approx(4.0 - 12.0**0.5, rel=1e-9)
+    with pytest.raises(pgo.PGOError, match="write it with its first column alone"):
+        pgo.quadratic_form(at_least_one(0.1, 1.9))
 
 
 def test_values_that_are_feasible_and_not_the_best_are_not_certified() -> None:
