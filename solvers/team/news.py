@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from solvers.carry.wire import WireError
 from solvers.team.measurements import Revision
+from solvers.team.packed_lines import PackedLines
 
 _MOST_BITS = 63  # of a number
 
@@ -20,13 +21,12 @@ _MOST_BITS = 63  # of a number
 class Piece:
     """Lines of measurements of the robot `owner`, after those of the revision `before`.
 
-    `text` and `numbers` are those of `packed_lines`. `is_last` says that there are no more.
+    `is_last` says that there are no more.
     """
 
     owner: str
     before: Revision
-    text: bytes
-    numbers: bytes
+    lines: PackedLines
     is_last: bool
 
 
@@ -59,7 +59,7 @@ class News:
         parts += map(_number, (self.takes_back, self.sent + 1, self.answers + 1, len(owners)))
         for piece in self.pieces:
             parts += [_number(names.index(piece.owner)), _revision(piece.before)]
-            parts += [_text(piece.text), _text(piece.numbers)]
+            parts += [_number(piece.lines.num_lines), *map(_text, piece.lines[1:])]
             parts.append(_number(piece.is_last))
         return b"".join(parts)
 
@@ -75,8 +75,8 @@ class News:
             pieces = []
             for _ in reader.items():
                 owner, before = names[reader.number()], reader.revision()
-                text, numbers = reader.text(), reader.text()
-                pieces.append(Piece(owner, before, text, numbers, bool(reader.number())))
+                lines = PackedLines(reader.number(), *(reader.text() for _ in range(3)))
+                pieces.append(Piece(owner, before, lines, bool(reader.number())))
         except (IndexError, ValueError) as error:
             raise WireError(f"a message that cannot be read: {error}") from error
         has = {name: revision for name, revision in known.items() if revision.num_lines}

@@ -1,133 +1,270 @@
-"""Lines of measurements as few bytes, of which the same lines come again.
+"""Lines of measurements as few bytes, of which lines of the same form come again.
 
-Numbers of many digits are taken out, and packed in 59 bits each: a double without exponents that no
-measurement has. Ids are written as the difference to the one before. What is left of a line is that
-of many others, and compressed (RFC 1951) with the lines before as a dictionary.
+A line is its form, in which marks stand for ids and for numbers of many digits, and these. Forms
+that have come before, changes of ids, and sign and exponent of a number are symbols. They are as
+probable as they were so far, and one integer has them all (asymmetric numeral systems, Duda 2013).
+The mantissa of a number follows as it is. The last number of a unit quaternion is the root that the
+other three leave, up to a few units in its last place. Other forms are compressed (RFC 1951) with
+those before as a dictionary.
 """
 
 from __future__ import annotations
 
+import math
 import re
+import struct
 import zlib
-from collections.abc import Iterator, Sequence
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from solvers.carry.wire import WireError
 
-_BEFORE = 64  # how many lines before are the dictionary
+MOST_LINES = 1024  # that are packed at once: the integer is divided for every symbol
+_BEFORE = 64  # how many lines before tell what is probable
 _FEWEST_LETTERS = 12  # of a number that is taken out: text has about half a byte a digit
 _NUMBER, _ID, _TEXT = "\0", "\1", "\2"  # begin words in place of numbers and ids, and any like them
-_ID_PLACES = (2, 4)  # of words and spaces in a line
+_FIRST_ID, _SECOND_ID = 2, 4  # places of words and spaces in a line
 _LONGEST_ID = 19  # digits
 _SPACE = re.compile(r"(\s)")
-# Exponents of doubles from 2^-32 to 2^32, of 6 bits.
-_LEAST_EXPONENT, _EXPONENT_BITS = 1023 - 32, 6
-_MANTISSA_BITS = 52
-_BITS = 1 + _EXPONENT_BITS + _MANTISSA_BITS
+_DOUBLE, _BITS = struct.Struct("<d"), struct.Struct("<Q")
+_MANTISSA_BITS, _MANTISSA_DIGITS = 52, 13  # the digits are of base 16
+_NEGATIVE = 1 << 63
+_ROOT = 1 << 12  # in place of sign and exponent
+_MOST_UNITS = 1 << 24  # in the last place, between a number and a root
+_MOST_BITS = 128  # of a symbol
 
 
-def packed_lines(lines: Sequence[str], before: Sequence[str]) -> tuple[bytes, bytes]:
-    """Lines as two bytes, what is left of them, and numbers; those before help."""
-    writer = _Writer()
-    dictionary = writer.text_of(before[-_BEFORE:])
-    num_before = len(writer.numbers)
-    text = writer.text_of(lines)
+class PackedLines(NamedTuple):
+    """How many lines, their symbols, forms that have not come before, and mantissas."""
+
+    num_lines: int
+    symbols: bytes
+    forms: bytes
+    mantissas: bytes
+
+
+def packed_lines(lines: Sequence[str], before: Sequence[str]) -> PackedLines:
+    """Lines as bytes; those before, which the receiver has, help."""
+    coder = _Coder(before)
+    dictionary = coder.text_of_forms(0)
+    num_forms = len(coder.forms)
+    for line in lines:
+        coder.write(line)
     packer = zlib.compressobj(9, zlib.DEFLATED, -15, zdict=dictionary)
-    return packer.compress(text) + packer.flush(), _packed(writer.numbers[num_before:])
+    text = coder.text_of_forms(num_forms)
+    forms = packer.compress(text) + packer.flush() if text else b""
+    digits = "".join(coder.mantissas)
+    mantissas = bytes.fromhex(digits + "0" * (len(digits) % 2))
+    return PackedLines(len(lines), coder.symbols.as_bytes(), forms, mantissas)
 
 
-def unpacked_lines(
-    text: bytes, numbers: bytes, before: Sequence[str], most_bytes: int
-) -> list[str]:
+def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) -> list[str]:
     """The lines that were packed; a WireError for bytes that are none, or more than so many."""
-    writer = _Writer()
-    if len(numbers) > most_bytes:
-        raise WireError(f"{len(numbers)} bytes of numbers")
-    unpacker: Any = zlib.decompressobj(-15, writer.text_of(before[-_BEFORE:]))
+    if packed.num_lines > MOST_LINES or max(map(len, packed[1:])) > most_bytes:
+        raise WireError(f"{packed.num_lines} lines of {sum(map(len, packed[1:]))} bytes")
+    coder = _Coder(before)
+    digits = packed.mantissas.hex()
+    ends = range(_MANTISSA_DIGITS, len(digits) + 1, _MANTISSA_DIGITS)
+    coder.mantissas = [digits[end - _MANTISSA_DIGITS : end] for end in reversed(ends)]
+    coder.symbols.state = int.from_bytes(packed.symbols, "little")
+    lines: list[str] = []
     try:
-        plain = unpacker.decompress(text, most_bytes).decode("utf-8")
-        rest = iter(_unpacked(numbers))
-        words = [_word(word, rest, writer) for word in _SPACE.split(plain)]
-    except (zlib.error, ValueError, StopIteration) as error:
+        new_forms = _forms(packed.forms, coder.text_of_forms(0), most_bytes)
+        for _ in range(packed.num_lines):
+            lines.append(coder.read(new_forms))
+            most_bytes -= len(lines[-1])
+            if most_bytes < 0:
+                raise WireError("lines of too many bytes")
+    except (zlib.error, struct.error, ValueError, LookupError, StopIteration) as error:
         raise WireError(f"lines that cannot be read: {error}") from error
-    if not unpacker.eof or (plain and not plain.endswith("\n")):
+    if coder.symbols.state != 1:
+        raise WireError("lines that go on after their end")
+    return lines
+
+
+def _forms(data: bytes, dictionary: bytes, most_bytes: int) -> Iterator[str]:
+    """New forms, which were compressed."""
+    if not data:
+        return iter(())
+    unpacker: Any = zlib.decompressobj(-15, dictionary)
+    text = unpacker.decompress(data, most_bytes).decode("utf-8")
+    if not unpacker.eof or not text.endswith("\n"):
         raise WireError("lines without an end")
-    return "".join(words).splitlines(keepends=True)
+    return iter(text.splitlines(keepends=True))
 
 
-def _word(word: str, numbers: Iterator[float], writer: _Writer) -> str:
-    """The word that one stands for."""
-    if word == _NUMBER:
-        return repr(next(numbers))
-    if word.startswith(_ID):
-        writer.last_id += int(word[1:])
-        return str(writer.last_id)
-    return word.removeprefix(_TEXT)
+class _Symbols:
+    """Natural numbers in an integer, each with its probability among those before in a context.
 
-
-class _Writer:
-    """Takes numbers and ids out of lines, one after the other.
-
-    Numbers that have come before stay, as the dictionary has them.
+    One that is new in its context has the probability of an escape, which grows with the number of
+    different ones, and its bits follow. What is read leaves the integer `state`.
     """
 
     def __init__(self) -> None:
-        self.numbers: list[float] = []
-        self.last_id = 0
+        self.state = 1
+        self.steps: list[tuple[int, int, int]] = []  # intervals: begin, width, and width of all
+        self._counts: defaultdict[Hashable, dict[int, int]] = defaultdict(dict)
+
+    def as_bytes(self) -> bytes:
+        """The integer of what was written."""
+        state = 1
+        for begins, width, total in reversed(self.steps):
+            state = state // width * total + begins + state % width
+        return state.to_bytes((state.bit_length() + 7) // 8, "little")
+
+    def code(self, context: Hashable, symbol: int | None) -> int:
+        """Write a symbol, or read it where there is None."""
+        counts = self._counts[context]
+        coded = self._among(counts, symbol)
+        if coded is None:
+            sizes = self._counts["bits", context]
+            size = None if symbol is None else symbol.bit_length()
+            num_bits = self._among(sizes, size)
+            if num_bits is None:
+                num_bits = self._plain(size, _MOST_BITS)
+            sizes[num_bits] = sizes.get(num_bits, 0) + 1
+            least = 1 << num_bits >> 1
+            more = self._plain(None if symbol is None else symbol - least, max(1, least))
+            coded = least + more
+        counts[coded] = counts.get(coded, 0) + 1
+        return coded
+
+    def _among(self, counts: Mapping[int, int], symbol: int | None) -> int | None:
+        """Code a symbol that has come before; else an escape, which is None."""
+        total = sum(counts.values()) + max(1, len(counts))
+        place = total if symbol is not None else self.state % total
+        begins = 0
+        for known, count in counts.items():
+            if known == symbol or place < begins + count:
+                self._pass(begins, count, total, symbol is None)
+                return known
+            begins += count
+        self._pass(begins, total - begins, total, symbol is None)
+        return None
+
+    def _plain(self, number: int | None, total: int) -> int:
+        """Code a number below `total`, all of which are as probable."""
+        coded = self.state % total if number is None else number
+        self._pass(coded, 1, total, number is None)
+        return coded
+
+    def _pass(self, begins: int, width: int, total: int, is_read: bool) -> None:
+        """Write an interval, or leave it behind."""
+        if is_read:
+            self.state = self.state // total * width + self.state % total - begins
+        else:
+            self.steps.append((begins, width, total))
+
+
+class _Coder:
+    """Writes lines as symbols and mantissas, and reads them, after lines that both sides have."""
+
+    def __init__(self, before: Sequence[str]) -> None:
+        self.symbols = _Symbols()
+        self.mantissas: list[str] = []  # those to be read are in reverse order
+        self.forms: dict[str, int] = {}
+        self._last_form = 0
+        self._last_id = 0
+        self._first_ids: dict[str, int] = {}  # of the last line, by its first word
         self._seen: set[str] = set()
+        for line in before[-_BEFORE:]:
+            self.write(line)
+        self.symbols.steps.clear()
+        self.mantissas.clear()
 
-    def text_of(self, lines: Sequence[str]) -> bytes:
-        """What is left of lines, in UTF-8."""
-        words = []
-        for line in lines:
-            for place, word in enumerate(_SPACE.split(line)):
-                words.append(self._word_for(word, place in _ID_PLACES))
-        return "".join(words).encode("utf-8")
+    def text_of_forms(self, first: int) -> bytes:
+        """Forms from a number on, in UTF-8."""
+        return "".join([*self.forms][first:]).encode("utf-8")
 
-    def _word_for(self, word: str, may_be_id: bool) -> str:
+    def write(self, line: str) -> None:
+        """Write a line."""
+        words = _SPACE.split(line)
+        marks = words.copy()
+        for place in range(0, len(words), 2):  # spaces are between them
+            marks[place] = self._mark(words[place], place in (_FIRST_ID, _SECOND_ID))
+        form = "".join(marks)
+        self.symbols.code(("form", self._last_form), self.forms.get(form, 0))
+        self._fill(form, marks, words)
+
+    def read(self, new_forms: Iterator[str]) -> str:
+        """Read a line, which may have the next new form."""
+        number = self.symbols.code(("form", self._last_form), None)
+        form = [*self.forms][number - 1] if number else next(new_forms)
+        words = _SPACE.split(form)
+        self._fill(form, words, None)
+        return "".join(words)
+
+    def _mark(self, word: str, may_be_id: bool) -> str:
+        """What stands for a word in a form; numbers that have come before stay."""
         if may_be_id and len(word) <= _LONGEST_ID and word.isdecimal() and str(int(word)) == word:
-            before, self.last_id = self.last_id, int(word)
-            return f"{_ID}{self.last_id - before}"
+            return _ID
         if len(word) >= _FEWEST_LETTERS and word not in self._seen:
             self._seen.add(word)
             if _is_number(word):
-                self.numbers.append(float(word))
                 return _NUMBER
         return _TEXT + word if word.startswith((_NUMBER, _ID, _TEXT)) else word
 
+    def _fill(self, form: str, words: list[str], written: Sequence[str] | None) -> None:
+        """Put words in place of marks: those that are written, or else those that are read."""
+        self._last_form = self.forms.setdefault(form, len(self.forms) + 1)
+        for place in range(0, len(words), 2):
+            word = None if written is None else written[place]
+            if words[place] == _ID:
+                words[place] = self._id(words[0], place, word)
+            elif words[place] == _NUMBER:
+                before = words[max(0, place - 6) : place : 2]
+                words[place] = self._number((words[0], place), word, _root(before))
+            else:
+                words[place] = words[place].removeprefix(_TEXT)
+
+    def _id(self, tag: str, place: int, word: str | None) -> str:
+        """An id as its change: a second one from the first, that from the line before."""
+        before = self._last_id if place == _SECOND_ID else self._first_ids.get(tag, 0)
+        change = None if word is None else int(word) - before
+        symbol = None if change is None else 2 * abs(change) + (change < 0)
+        coded = self.symbols.code((tag, place), symbol)
+        self._last_id = before + (-(coded // 2) if coded % 2 else coded // 2)
+        if place == _FIRST_ID:
+            self._first_ids[tag] = self._last_id
+        return str(self._last_id)
+
+    def _number(self, context: Hashable, word: str | None, root: int) -> str:
+        """A number as sign, exponent and mantissa, or as its distance to the bits of a root."""
+        head = distance = None
+        if word is not None:
+            (bits,) = _BITS.unpack(_DOUBLE.pack(float(word)))
+            units = bits % _NEGATIVE - root
+            distance = 4 * abs(units) + 2 * (units < 0) + bits // _NEGATIVE
+            head = _ROOT if abs(units) < _MOST_UNITS else bits >> _MANTISSA_BITS
+        head = self.symbols.code(context, head)
+        if head == _ROOT:
+            distance = self.symbols.code(("units", root >> _MANTISSA_BITS), distance)
+            units = -(distance // 4) if distance & 2 else distance // 4
+            bits = root + units + (distance & 1) * _NEGATIVE
+        elif word is None:
+            bits = head << _MANTISSA_BITS | int(self.mantissas.pop(), 16)
+        else:
+            digits = bits % (1 << _MANTISSA_BITS)
+            self.mantissas.append(f"{digits:0{_MANTISSA_DIGITS}x}")
+        return word if word is not None else repr(_DOUBLE.unpack(_BITS.pack(bits))[0])
+
+
+def _root(words: Sequence[str]) -> int:
+    """Bits of the number whose square and those of three others are one; 0 where there is none."""
+    try:
+        a, b, c = map(float, words)
+    except ValueError:
+        return 0
+    rest = 1.0 - (a * a + b * b + c * c)
+    (bits,) = _BITS.unpack(_DOUBLE.pack(math.sqrt(rest) if rest > 0.0 else 0.0))
+    return int(bits)
+
 
 def _is_number(word: str) -> bool:
-    """Whether a word is that which Python writes for a double of usual size."""
+    """Whether a word is that which Python writes for a finite double."""
     try:
         number = float(word)
     except ValueError:
         return False
-    return 2.0**-32 <= abs(number) < 2.0**32 and repr(number) == word
-
-
-def _packed(numbers: Sequence[float]) -> bytes:
-    """Doubles of usual size in 59 bits each."""
-    bits = np.array(numbers, dtype=np.float64).view(np.uint64)
-    sign = bits >> np.uint64(63)
-    size = (bits << np.uint64(1)) >> np.uint64(1)
-    size -= np.uint64(_LEAST_EXPONENT << _MANTISSA_BITS)
-    codes = sign << np.uint64(_BITS - 1) | size
-    columns = np.unpackbits(codes.astype(">u8").view(np.uint8)).reshape(-1, 64)[:, -_BITS:]
-    return np.packbits(columns).tobytes()
-
-
-def _unpacked(data: bytes) -> list[float]:
-    """The doubles in bytes."""
-    count = 8 * len(data) // _BITS
-    bits = np.unpackbits(np.frombuffer(data, np.uint8), count=count * _BITS)
-    columns: NDArray[np.uint8] = np.zeros((count, 64), dtype=np.uint8)
-    columns[:, -_BITS:] = bits.reshape(count, _BITS)
-    codes = np.packbits(columns).view(">u8").astype(np.uint64)
-    sign = codes >> np.uint64(_BITS - 1)
-    size = codes & np.uint64((1 << (_BITS - 1)) - 1)
-    size += np.uint64(_LEAST_EXPONENT << _MANTISSA_BITS)
-    numbers: list[float] = (sign << np.uint64(63) | size).view(np.float64).tolist()
-    return numbers
+    return math.isfinite(number) and repr(number) == word

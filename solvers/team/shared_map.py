@@ -23,7 +23,7 @@ from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, Priority, Term
 from solvers.team.news import News, Piece
 from solvers.team.pace import MOST_IN_A_PIECE, Pace
-from solvers.team.packed_lines import packed_lines, unpacked_lines
+from solvers.team.packed_lines import MOST_LINES, packed_lines, unpacked_lines
 from solvers.team.session import Session
 from solvers.team.shared_solve import SharedAnswer
 
@@ -267,13 +267,14 @@ class SharedMap:
             pace.shorten()
         ends = begins
         num_bytes = 0
-        while ends < len(log.lines) and num_bytes < pace.num_bytes:
+        most = min(len(log.lines), begins + MOST_LINES)
+        while ends < most and num_bytes < pace.num_bytes:
             num_bytes += len(log.lines[ends])
             ends += 1
         is_last = ends == len(log.lines)
         self._flights[to, owner] = _Flight(begins, now, num_sent + 1, is_last)
-        text, numbers = packed_lines(log.lines[begins:ends], log.lines[:begins])
-        return Piece(owner, log.revision_at(begins), text, numbers, is_last)
+        lines = packed_lines(log.lines[begins:ends], log.lines[:begins])
+        return Piece(owner, log.revision_at(begins), lines, is_last)
 
     # Solves
 
@@ -330,4 +331,4 @@ class SharedMap:
 def _lines_of(piece: Piece, log: Measurements) -> list[str]:
     """The lines of a piece; a WireError for bytes that are none, or more than a robot sends."""
     before = log.lines[: piece.before.num_lines]
-    return unpacked_lines(piece.text, piece.numbers, before, 4 * MOST_IN_A_PIECE)
+    return unpacked_lines(piece.lines, before, 4 * MOST_IN_A_PIECE)

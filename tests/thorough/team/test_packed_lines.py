@@ -12,7 +12,7 @@ import pgo_models as pgo
 from solvers.carry.wire import WireError
 from solvers.team.measurements import Revision
 from solvers.team.news import News, Piece
-from solvers.team.packed_lines import packed_lines, unpacked_lines
+from solvers.team.packed_lines import PackedLines, packed_lines, unpacked_lines
 
 MOST = 1 << 20
 WORDS = [
@@ -34,33 +34,41 @@ def test_any_lines_come_out_as_they_went_in(seed: int) -> None:
     lines = text.splitlines(keepends=True)
     cut = int(rng.integers(0, len(lines)))
     packed = packed_lines(lines[cut:], lines[:cut])
-    assert unpacked_lines(*packed, lines[:cut], MOST) == lines[cut:]
+    assert unpacked_lines(packed, lines[:cut], MOST) == lines[cut:]
 
 
-def test_a_long_number_takes_59_bits_and_ids_take_nothing(tmp_path: object) -> None:
+def test_an_edge_takes_the_mantissas_of_six_numbers_and_little_else(tmp_path: object) -> None:
     graph = pgo.grid_world(1, 200, 3)
     pgo.write_g2o(graph, f"{tmp_path}/graph.g2o")
     with open(f"{tmp_path}/graph.g2o", encoding="utf-8") as file:
         lines = [line for line in file if line.startswith("EDGE")]
     odometry = lines[:150]
-    text, numbers = packed_lines(odometry[100:], odometry[:100])
-    assert len(numbers) <= 50 * 7 * 59 / 8 + 1
-    assert len(text) <= 250
+    packed = packed_lines(odometry[100:], odometry[:100])
+    assert len(packed.mantissas) <= 50 * 6 * 52 / 8 + 1
+    assert len(packed.symbols) <= 50 * 6
+    assert packed.forms == b""
 
 
 @pytest.mark.parametrize("seed", range(examples(20)))
 def test_bytes_that_are_no_lines_are_refused(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    text, numbers = packed_lines(["EDGE_SE2 1 2 0.1234567890123 0.5 0.25\n"] * 30, [])
-    for wrong in (text[:-1], bytes(rng.integers(0, 256, 40, dtype=np.uint8))):
+    right = packed_lines(["EDGE_SE2 1 2 0.1234567890123 0.5 0.25\n"] * 30, [])
+    noise = bytes(rng.integers(0, 256, 40, dtype=np.uint8))
+    wrong = [
+        right._replace(symbols=noise),
+        right._replace(symbols=right.symbols[:-1]),
+        right._replace(forms=noise),
+        right._replace(forms=right.forms[:-1]),
+        right._replace(mantissas=b""),
+        right._replace(mantissas=bytes(MOST + 1)),
+        right._replace(num_lines=29),
+        right._replace(num_lines=1 << 20),
+    ]
+    for packed in wrong:
         with pytest.raises(WireError):
-            unpacked_lines(wrong, numbers, [], MOST)
+            unpacked_lines(packed, [], MOST)
     with pytest.raises(WireError):
-        unpacked_lines(text, b"", [], MOST)
-    with pytest.raises(WireError):
-        unpacked_lines(text, numbers, [], 100)
-    with pytest.raises(WireError):
-        unpacked_lines(text, bytes(MOST + 1), [], MOST)
+        unpacked_lines(right, [], 100)
 
 
 @pytest.mark.parametrize("seed", range(examples(20)))
@@ -71,8 +79,8 @@ def test_messages_come_out_of_their_bytes_and_changed_bytes_are_messages_or_refu
     before = Revision(200, "0123456789abcdef")
     has = {"anna": before, "\u00e9": Revision(1 << 40, "00ff")}
     pieces = (
-        Piece("ben", Revision(), b"\x00text", b"", True),
-        Piece("anna", before, b"", b"n", False),
+        Piece("ben", Revision(), PackedLines(2, b"\x00symbols", b"", b"n"), True),
+        Piece("anna", before, PackedLines(0, b"", b"f", b""), False),
     )
     news = News(has, ("ben", "dora"), pieces, True, ("anna",), 12345678, 0)
     data = news.as_bytes()
