@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import os
 import re
 import secrets
@@ -140,6 +141,26 @@ def _count_lines(data: bytes) -> int:
     if b"\r" in data:  # to look for both in a row takes ten times as long
         num_lines += data.count(b"\r") - data.count(b"\r\n")
     return num_lines
+
+
+def json_of(path: Path | str, text: str | None, what: str) -> Any:  # noqa: ANN401
+    """Value of JSON text, of the file unless given, whose lines may be of any length.
+
+    A FileFormatError where the file cannot be read or is no JSON; `what` it should be ends it.
+    """
+    path = Path(path)
+    try:
+        return json.loads(path.read_bytes() if text is None else text)
+    except FileNotFoundError:
+        raise FileFormatError(path, None, "no such file; check the path") from None
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror}; give a readable file"
+        raise FileFormatError(path, None, problem) from error
+    except UnicodeDecodeError:
+        raise FileFormatError(path, None, f"bytes that are no text; give {what}") from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        line = error.lineno if isinstance(error, json.JSONDecodeError) else None
+        raise FileFormatError(path, line, f"no JSON ({error}); give {what}") from None
 
 
 def check_lines(

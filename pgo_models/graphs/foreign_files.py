@@ -4,16 +4,17 @@ What a file is follows from its first lines. A table and a view graph become a f
 number of lines, so that messages name the lines of the file itself.
 """
 
-import json
 import re
 import warnings
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphWarning, printable
+from pgo_models.files import Problem, check_lines, json_of
 from pgo_models.geometry.rotations import (
     Array,
     BoolArray,
@@ -30,6 +31,7 @@ _CLEARLY = 0.7  # share of a misfit that is better not only by chance
 _FAR = 1.0  # misfit of a cycle that has a wrong edge, or is read in the wrong order
 _NOT_UNIT = 1e-3  # of a quaternion or matrix that is no rotation
 _FEW_TRIANGLES = 2000  # of views that are compared
+_OPEN3D = "what its write_pose_graph writes"
 # Files that are no text of measurements, and what exports them.
 _EXPORTED_BY = {
     ".pbstream": "a state of Cartographer; its constraints are printed by cartographer_pbstream "
@@ -48,6 +50,8 @@ def as_g2o(path: Path, blocks: Iterable[str]) -> Iterator[str]:
     suffix = path.with_suffix("").suffix if path.suffix.lower() == ".gz" else path.suffix
     if suffix.lower() in _EXPORTED_BY:
         raise FileFormatError(path, None, _EXPORTED_BY[suffix.lower()])
+    if path.suffix.lower() == ".json" and path.is_file():
+        return iter([_of_open3d(path)])
     stream = iter(blocks)
     opening = next(stream, "")
     rest = chain([opening], stream)
@@ -96,21 +100,28 @@ def _has_names_for_ids(words: list[str]) -> bool:
 # Open3D
 
 
-def _of_open3d(path: Path, text: str) -> str:
-    """Lines of g2o of Open3D's PoseGraph.
+def _of_open3d(path: Path, text: str | None = None) -> str:
+    """Lines of g2o of Open3D's PoseGraph, in a file or a text, on the lines where they begin.
 
     An edge has the transformation X from source to target, which is x_target^-1 x_source, and the
     information of its error, the rotation first. Both are stored by columns.
     """
-    try:
-        record = json.loads(text)
-        nodes = record["nodes"]
-        edges = record["edges"]
-        lines = [_vertex_line(k, node) for k, node in enumerate(nodes)]
-        lines += [_edge_line(edge) for edge in edges]
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        problem = "JSON, but no PoseGraph of Open3D; give what write_pose_graph writes"
-        raise FileFormatError(path, None, problem) from error
+    record = json_of(path, text, _OPEN3D)
+    nodes, edges = _nodes_and_edges(record)
+    if not edges:
+        raise FileFormatError(path, None, f"no PoseGraph of Open3D with edges; give {_OPEN3D}")
+    entries = [*((_vertex_line, node) for node in nodes), *((_edge_line, edge) for edge in edges)]
+    places = _places_in_json(path.read_text() if text is None else text, len(entries))
+    written = [""] * (max(places) + 1)
+    problems: list[Problem] = []
+    for k, (line_of, entry) in enumerate(entries):
+        try:
+            written[places[k]] = line_of(k, entry)
+        except (KeyError, TypeError, ValueError) as error:
+            name = f"edge {k - len(nodes)}" if k >= len(nodes) else f"node {k}"
+            problem = f"{name} of Open3D's PoseGraph cannot be read ({error}); correct it"
+            problems.append((places[k] + 1, problem))
+    check_lines(path, problems)
     num_uncertain = sum(bool(edge.get("uncertain")) for edge in edges)
     if num_uncertain:
         warnings.warn(
@@ -119,7 +130,23 @@ def _of_open3d(path: Path, text: str) -> str:
             GraphWarning,
             stacklevel=2,
         )
-    return "\n".join(lines) + "\n"
+    return "\n".join(written) + "\n"
+
+
+def _nodes_and_edges(record: Any) -> tuple[list[Any], list[Any]]:  # noqa: ANN401
+    """Nodes and edges of Open3D's PoseGraph; none where a record is no such graph."""
+    lists = [record.get(name) if isinstance(record, dict) else None for name in ("nodes", "edges")]
+    nodes, edges = (entries if isinstance(entries, list) else [] for entries in lists)
+    return nodes, edges
+
+
+def _places_in_json(text: str, count: int) -> list[int]:
+    """Lines, from 0, on which so many nodes and edges stand, where the text has lines for them."""
+    places = []
+    for line, words in enumerate(text.split("\n")):
+        if '"pose"' in words or '"transformation"' in words:
+            places.append(line)
+    return places if len(places) == count else list(range(count))
 
 
 def certain_edges(path: Path) -> BoolArray | None:
@@ -127,12 +154,10 @@ def certain_edges(path: Path) -> BoolArray | None:
 
     Uncertain edges, mostly loop closures, are the suspects of its own robust optimisation.
     """
-    if not path.is_file() or path.suffix != ".json":
+    if not path.is_file() or path.suffix.lower() != ".json":
         return None
-    record = json.loads(path.read_text())
-    if not isinstance(record, dict) or "edges" not in record:
-        return None
-    return np.array([not edge.get("uncertain") for edge in record["edges"]], dtype=bool)
+    _, edges = _nodes_and_edges(json_of(path, None, _OPEN3D))
+    return np.array([not edge.get("uncertain") for edge in edges], dtype=bool)
 
 
 def _vertex_line(number: int, node: dict[str, list[float]]) -> str:
@@ -140,7 +165,7 @@ def _vertex_line(number: int, node: dict[str, list[float]]) -> str:
     return f"VERTEX_SE3:QUAT {number} {_words_of_pose(pose[:3, :3], pose[:3, 3])}"
 
 
-def _edge_line(edge: dict[str, list[float]]) -> str:
+def _edge_line(_: int, edge: dict[str, list[float]]) -> str:
     X = np.array(edge["transformation"], dtype=float).reshape(4, 4).T
     information = np.array(edge["information"], dtype=float).reshape(6, 6)
     translation_first = np.roll(information, 3, axis=(0, 1))

@@ -532,12 +532,15 @@ def pose_names(graph: PoseGraph) -> list[str]:
     names = [graph.pose_name(pose) for pose in range(graph.num_poses)]
     poses = graph.in_files.tolist()
     ids = np.array([int(names[pose]) for pose in poses], dtype=np.int64)
-    letters, num_bits = robot_letters(ids)
-    if not np.isin(letters, LETTER_CODES).all():
+    if not np.isin(ids >> LETTER_SHIFT, LETTER_CODES).all():
         return names
-    index_bits = (1 << num_bits) - 1
-    for pose, letter, symbol in zip(poses, letters.tolist(), ids.tolist(), strict=True):
-        names[pose] = f"{chr(letter)}{symbol & index_bits}"
+    is_landmark = np.isin(poses, graph.landmarks)
+    _, num_bits = robot_letters(ids[~is_landmark])
+    bits = np.where(is_landmark, LETTER_SHIFT, num_bits)
+    letters = (ids >> bits) & 0xFF
+    numbers = ids & ((1 << bits) - 1)
+    for pose, letter, number in zip(poses, letters.tolist(), numbers.tolist(), strict=True):
+        names[pose] = f"{chr(letter)}{number}"
     return names
 
 
@@ -772,9 +775,9 @@ def _robots(
 
 def _letters_of_owners(ids: IntArray, files: list[G2OLines]) -> IntArray:
     """Codes of the letters of ids; a landmark that shares none with a pose has its observer's."""
-    letters, _ = robot_letters(ids)
     is_landmark = np.isin(ids, np.concatenate([file.landmarks for file in files]))
-    of_poses = letters[~is_landmark]
+    of_poses, num_bits = robot_letters(ids[~is_landmark])
+    letters = (ids >> num_bits) & 0xFF
     nameless = np.flatnonzero(is_landmark & ~np.isin(letters, of_poses))
     if not len(nameless) or not len(of_poses):
         return letters

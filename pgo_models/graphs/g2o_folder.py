@@ -22,7 +22,7 @@ from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, edge_counts
 from pgo_models.graphs.written_digits import WrittenDigits, within_printing
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
-LETTER_CODES = [ord(letter) for letter in LETTERS]
+LETTER_CODES = [ord(letter) for letter in LETTERS + "0123456789"]  # digits, too, name robots
 LETTER_SHIFT = 56  # a GTSAM symbol is a letter in the top byte and an index below it
 # A GTSAM LabeledSymbol has the label of its robot in the second byte. Symbols have no index so
 # large.
@@ -167,7 +167,7 @@ def _check_kinds(files: Sequence[G2OLines]) -> None:
 
 
 def robot_letters(ids: IntArray) -> tuple[IntArray, int]:
-    """Codes of the letters that may name robots in ids, and how many bits the index below has.
+    """Codes of the letters that may name robots in ids of poses, and how many bits are below them.
 
     They are the labels where all ids are LabeledSymbols, and else the top bytes.
     """

@@ -247,7 +247,7 @@ class _Assembly:
         self.notes: list[str] = []
         self.weights_error = 0.0
         self._source = source
-        self._poses: IntArray = np.zeros(0, dtype=np.int64)  # ids of VERTEX lines of poses alone
+        self._poses: IntArray = np.zeros(0, dtype=np.int64)  # ids of poses, and of no landmark
         self._d = d
         self._reading = reading
 
@@ -259,10 +259,8 @@ class _Assembly:
         self._settle_edge_se2()
         self._note_noise()
         digits = self._digits()
+        self._poses = self._ids_of_poses()
         vertices = self._without_repetitions(self._joined(is_edge=False))
-        self._poses = np.setdiff1d(
-            vertices.ids[~vertices.is_point, 1], vertices.ids[vertices.is_point, 1]
-        )
         edges = self._joined(is_edge=True)
         edge_ids, edge_rows = edges_as(
             self._reading, edges.ids, edges.numbers, self._d, edges.is_point
@@ -288,6 +286,25 @@ class _Assembly:
         if vertices.is_point.any() or edges.is_point.any():
             return self._with_landmarks(file, vertices.is_point, edges.is_point)
         return file
+
+    def _ids_of_poses(self) -> IntArray:
+        """Ids that lines name as those of poses, and none as that of a landmark.
+
+        Priors of points are no such lines. Where there are none of these, nothing asks for the ids.
+        """
+        kinds = {tag: kind for tag, kind in TAGS.items() if self._source.parsed[tag]}
+        if not any(kind.to_landmark and kind.is_position for kind in kinds.values()):
+            return np.zeros(0, dtype=np.int64)
+        poses: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+        landmarks = poses.copy()
+        for tag, kind in kinds.items():
+            if kind.to_landmark and kind.is_position:
+                continue
+            for part in self._source.parsed[tag]:
+                num_poses = kind.num_ids - kind.to_landmark
+                poses.append(part.ids[:, :num_poses].ravel())
+                landmarks.append(part.ids[:, num_poses : kind.num_ids].ravel())
+        return np.setdiff1d(np.concatenate(poses), np.concatenate(landmarks))
 
     def _remainders(self, edges: _Rows) -> Array | None:
         """What the positions of priors have in decimals beyond the numbers of the edges, (m, d)."""
@@ -591,7 +608,7 @@ class _Assembly:
 
         0 is then a sensor at its pose, and g2o measures the position of the pose itself.
         """
-        if offset_id == 0 and (kind.to_landmark or kind.num_offsets == 2):
+        if offset_id == 0 and not kind.is_position:
             self.notes.append(
                 f"{len(lines)} lines name sensor 0 (the first is line {lines[0]}), and no "
                 f"{OFFSET_TAGS[self._d]} line says where it is: it is taken to be at the pose; "

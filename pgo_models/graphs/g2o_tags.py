@@ -49,6 +49,7 @@ from pgo_models.graphs.weight_errors import (
 
 # Difference of two entries, beside the largest, by which a complete matrix is not symmetric.
 _ASYMMETRY = 1e-6
+_SCALE = 1e-6  # logarithm of a scale that is 1 to the digits that programs write
 # Of the squares and products of measured directions of length one, which are scaled to it.
 _DIRECTION_ERROR = 2.0**-44
 
@@ -132,7 +133,7 @@ class Tag:
             is_wrong = np.asarray(~numbers[:, :3].any(axis=1) | ~numbers[:, 3:6].any(axis=1))
             return is_wrong, "a direction of length zero is none; correct or remove it"
         if self.is_similarity:
-            is_scaled = np.asarray(numbers[:, 6] != 0.0)
+            is_scaled = np.abs(numbers[:, 6]) > _SCALE
             return is_scaled, "a similarity with a scale other than 1; give the poses without scale"
         if self.noise is Noise.COVARIANCE:
             covariances = numbers[:, self.num_measured + triangle_places(self._side)]

@@ -18,6 +18,7 @@ from pgo_models.files import Problem, check_lines
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, log_map, project_to_rotations
 from pgo_models.graphs.g2o import graph_of_files
+from pgo_models.graphs.g2o_folder import robot_letters
 from pgo_models.graphs.g2o_parser import problems_of
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.jrl import (
@@ -422,10 +423,9 @@ def _report_unreadable(unreadable: dict[str, list[int]], skip_unknown: bool) -> 
 
 
 def _letters(ids: IntArray, landmarks: IntArray) -> list[int]:
-    """Codes of the letters in the top bytes of the keys of poses. Each letter names a robot."""
-    named = ids[(ids != WORLD_ID) & ~np.isin(ids, landmarks)]
-    codes = np.unique(named >> 56).tolist()
-    return [int(code) for code in codes if code > 0]
+    """Codes of the letters in the keys of poses. Each letter names a robot."""
+    letters, _ = robot_letters(ids[(ids != WORLD_ID) & ~np.isin(ids, landmarks)])
+    return [int(code) for code in np.unique(letters) if code > 0]
 
 
 def _poses_of_values(

@@ -4,7 +4,6 @@ The format of MESA, iMESA and COSMO-Bench (McGann, Potokar & Kaess), as its page
 define it: keys are GTSAM's, covariances are stored whole and in GTSAM's order of the tangent space.
 """
 
-import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from pgo_models.errors import FileFormatError, GraphWarning, printable
-from pgo_models.files import LARGEST, Problem, check_lines, far_lines, zero_quaternion_lines
+from pgo_models.files import (
+    LARGEST,
+    Problem,
+    check_lines,
+    far_lines,
+    json_of,
+    zero_quaternion_lines,
+)
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import edge_rows_to_keep, graph_of_files
 from pgo_models.graphs.g2o_parser import (
@@ -108,7 +114,7 @@ def read_jrl(
 
     Examples
     --------
-    >>> import tempfile
+    >>> import json, tempfile
     >>> pose = {"type": "Pose2", "x": 1.0, "y": 0.0, "theta": 0.5}
     >>> covariance = [0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.01]
     >>> a0 = ord("a") << 56
@@ -146,20 +152,7 @@ def jrl_edge_places(path: Path | str) -> list[str]:
 
 def _read_json(path: Path) -> Mapping[str, Any]:
     """The object in a JSON file."""
-    try:
-        log = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise FileFormatError(path, None, "no such file; check the path") from None
-    except OSError as error:
-        problem = f"cannot be read: {error.strerror}; give a readable file"
-        raise FileFormatError(path, None, problem) from error
-    except UnicodeDecodeError:
-        problem = "bytes that are no text; give JRL as JSON, not as CBOR"
-        raise FileFormatError(path, None, problem) from None
-    except (json.JSONDecodeError, RecursionError) as error:
-        line = error.lineno if isinstance(error, json.JSONDecodeError) else None
-        problem = f"no JSON ({error}); give a JSON robot log"
-        raise FileFormatError(path, line, problem) from None
+    log = json_of(path, None, "a JSON robot log, as JSON and not as CBOR")
     if not isinstance(log, dict) or not isinstance(log.get("measurements"), dict):
         problem = "no robot log: it has no object `measurements` with a list for each robot"
         raise FileFormatError(path, None, problem)

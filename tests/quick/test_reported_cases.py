@@ -4,6 +4,7 @@ import json
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import solvers
 from pgo_models import PoseGraph, Reading
 from pgo_models.errors import FileFormatError, GraphWarning
 from pgo_models.geometry.rotations import exp_map, quaternions_from_rotations
-from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models.graphs.g2o import pose_names, read_g2o, write_g2o
 
 pytest.importorskip("flint")
 CASES = Path(__file__).parents[1] / "cases"
@@ -333,6 +334,34 @@ def test_fixes_of_rtabmap_are_positions_of_poses(pgo_command: Call, tmp_path: Pa
     assert pgo_command("verify", case, proof)[0] == 0
 
 
+@pytest.mark.filterwarnings("ignore:.*name poses, as RTAB-Map writes GPS")
+def test_fixes_are_positions_of_poses_that_edges_alone_name(tmp_path: Path) -> None:
+    """Ids without a VERTEX line are those of poses; what an edge to a landmark sees is none."""
+    case = CASES / "c1_rtabmap_gps_pointxyz_prior.g2o"
+    edges = [line for line in case.read_text().splitlines() if line.startswith("EDGE")]
+    (tmp_path / "edges.g2o").write_text("\n".join(edges))
+    graph = read_g2o(tmp_path / "edges.g2o")
+    assert (len(graph.landmarks), graph.is_prior.sum()) == (0, 7)
+    seen = "EDGE_SE3_TRACKXYZ {} 900 0 1 0 0 1 0 0 1 0 1"
+    prior = "EDGE_POINTXYZ_PRIOR 900 1 1 1 9 0 0 9 0 9"
+    lines = [*edges, *(seen.format(k) for k in range(3)), prior, "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"]
+    (tmp_path / "landmark.g2o").write_text("\n".join(lines))
+    graph = read_g2o(tmp_path / "landmark.g2o")
+    np.testing.assert_array_equal(graph.pose_ids[graph.landmarks], [900])
+
+
+@pytest.mark.parametrize("labels", ["012", "ABC", "xyz"])
+def test_labels_name_robots_also_beside_landmarks_without_them(labels: str, tmp_path: Path) -> None:
+    keys = [ord("g") << 56 | ord(labels[k // 2]) << 48 | k for k in range(6)]
+    landmark = ord("l") << 56
+    lines = [f"EDGE_SE2 {a} {b} 1 0 0 4 0 0 4 0 9" for a, b in pairwise(keys)]
+    lines += [f"EDGE_SE2_XY {key} {landmark} 1 0 4 0 4" for key in keys[1:3]]
+    (tmp_path / "team.g2o").write_text("\n".join(lines))
+    graph = read_g2o(tmp_path / "team.g2o")
+    np.testing.assert_array_equal(graph.robots[graph.bodies], [0, 0, 1, 1, 2, 2])
+    assert pose_names(graph) == [*(f"{labels[k // 2]}{k}" for k in range(6)), "l0"]
+
+
 def test_labels_of_symbols_name_robots(pgo_command: Call, tmp_path: Path) -> None:
     case = CASES / "f1_swarm_labeledsymbol.g2o"
     assert read_g2o(case).num_robots == 3
@@ -347,6 +376,15 @@ def test_a_sensor_without_a_place_is_said_to_be_at_its_pose(pgo_command: Call) -
     for arguments in (("solve", case), ("certify", case, "--estimate", case)):
         _, _, err = said(pgo_command, *arguments)
         assert err.count("no PARAMS_SE3OFFSET line says where it is") == 1
+
+
+def test_so_is_the_sensor_of_a_prior(tmp_path: Path) -> None:
+    path = tmp_path / "prior.g2o"
+    unit = " ".join(["1", *["0"] * 5, "1", *["0"] * 4, "1 0 0 0 1 0 0 1 0 1"])
+    edge = f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {unit}"
+    path.write_text(f"{edge}\nEDGE_SE3_PRIOR 1 0 1 0 0 0 0 0 1 {unit}\n")
+    with pytest.warns(GraphWarning, match="line 2.*no PARAMS_SE3OFFSET line"):
+        read_g2o(path)
 
 
 @pytest.mark.parametrize(
@@ -463,6 +501,26 @@ def test_pose_graphs_of_open3d_are_read() -> None:
     np.testing.assert_allclose(there_and_back, 0.0, rtol=0, atol=1e-4)
     diagonal = np.diagonal(graph.information[0])
     np.testing.assert_array_equal(diagonal, [5000.0] * 3 + [200000.0] * 3)
+
+
+@pytest.mark.filterwarnings("ignore:.*edges are uncertain")
+@pytest.mark.parametrize("indent", [None, 1])
+def test_what_is_wrong_in_a_graph_of_open3d_is_named(indent: int | None, tmp_path: Path) -> None:
+    record = json.loads((CASES / "b1_open3d_posegraph.json").read_text())
+    record["camera"] = "x" * 70_000  # as long as a line of a large graph
+    path = tmp_path / "graph.json"
+    path.write_text(json.dumps(record, indent=indent))
+    assert read_g2o(path).num_edges == len(record["edges"])
+    record["edges"][2]["transformation"].pop()
+    text = json.dumps(record, indent=indent)
+    path.write_text(text)
+    begins = [k for k, line in enumerate(text.split("\n"), 1) if '"transformation"' in line]
+    place = f":{begins[2]}" if indent else ""
+    with pytest.raises(FileFormatError, match=f"graph.json{place}.*: edge 2 of Open3D's PoseGraph"):
+        read_g2o(path)
+    path.write_text(text[:-100])
+    with pytest.raises(FileFormatError, match=r"graph.json:\d+: no JSON"):
+        read_g2o(path)
 
 
 @pytest.mark.filterwarnings("ignore:.*edges are uncertain")
@@ -638,10 +696,16 @@ def test_a_comment_on_the_columns_of_g2o_is_no_header(tmp_path: Path) -> None:
 def test_files_that_are_no_text_of_measurements_are_named(
     pgo_command: Call, tmp_path: Path
 ) -> None:
-    (tmp_path / "map.db").write_text("SQLite format 3")
-    code, _, err = pgo_command("solve", tmp_path / "map.db")
-    assert code == 1
-    assert "rtabmap-export --poses --poses_format 4" in err
+    for name, text, words in (
+        ("map.db", "SQLite format 3", "rtabmap-export --poses --poses_format 4"),
+        ("MAP.PBSTREAM", "\0", "cartographer_pbstream"),
+        ("map.posegraph", "\0", "slam_toolbox"),
+        ("graph.txt", "VERTEX_SE2 0.0 A0 0 0 0", "graph.txt:1: a factor graph of PyFG"),
+    ):
+        (tmp_path / name).write_text(text)
+        code, _, err = pgo_command("solve", tmp_path / name)
+        assert code == 1
+        assert words in err
 
 
 @pytest.mark.filterwarnings("ignore:.*negative eigenvalues are taken for zero")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -384,3 +385,11 @@ def test_empty_slots_are_skipped_and_the_world_is_the_last_pose() -> None:
     assert sorted(keys.tolist()) == sorted(values.keys())
     assert graph.in_files.tolist() == list(range(len(keys)))
     assert solution.verdict is pgo.Verdict.EXACT
+
+
+def test_the_labels_of_its_keys_name_robots() -> None:
+    keys = [ord("x") << 56 | ord("AB"[k // 3]) << 48 | k for k in range(6)]
+    factors = gtsam.NonlinearFactorGraph()
+    for a, b in pairwise(keys):
+        factors.add(gtsam.BetweenFactorPose2(a, b, gtsam.Pose2(1, 0, 0), sigmas(0.1, 0.1, 0.1)))
+    np.testing.assert_array_equal(pgo.from_gtsam(factors).robots, [0, 0, 0, 1, 1, 1])

@@ -232,6 +232,9 @@ def test_similarities_are_read_where_their_scale_is_one(tmp_path: Path) -> None:
     np.testing.assert_allclose(graph.t_ij[0], pose.translation(), atol=1e-14, rtol=0)
     np.testing.assert_allclose(graph.initial.t[1], pose.translation(), atol=1e-14, rtol=0)
     np.testing.assert_array_equal(graph.information[0], np.diag([1, 2, 3, 4, 5, 6]))
+    rounded = [lines[0], lines[1], lines[2].replace(f"{words} 0", f"{words} 2.2e-16")]
+    with pytest.warns(GraphWarning, match=CAMERAS):
+        assert_same(read(tmp_path, rounded), graph)
     lines[2] = lines[2].replace(f"{words} 0", f"{words} 0.1")
     with pytest.raises(FileFormatError, match=":3: a similarity with a scale other than 1"):
         read(tmp_path, lines)
