@@ -111,7 +111,14 @@ def _of_open3d(path: Path, text: str | None = None) -> str:
     if not edges:
         raise FileFormatError(path, None, f"no PoseGraph of Open3D with edges; give {_OPEN3D}")
     entries = [*((_vertex_line, node) for node in nodes), *((_edge_line, edge) for edge in edges)]
-    places = _places_in_json(path.read_text() if text is None else text, len(entries))
+    lines = (path.read_text() if text is None else text).split("\n")
+    of_nodes, of_edges = (
+        [place for place, line in enumerate(lines) if key in line]
+        for key in ('"pose"', '"transformation"')
+    )
+    places = [*of_nodes, *of_edges]
+    if len(of_nodes) != len(nodes) or len(set(places)) != len(entries):  # not one a line
+        places = list(range(len(entries)))
     written = [""] * (max(places) + 1)
     problems: list[Problem] = []
     for k, (line_of, entry) in enumerate(entries):
@@ -138,15 +145,6 @@ def _nodes_and_edges(record: Any) -> tuple[list[Any], list[Any]]:  # noqa: ANN40
     lists = [record.get(name) if isinstance(record, dict) else None for name in ("nodes", "edges")]
     nodes, edges = (entries if isinstance(entries, list) else [] for entries in lists)
     return nodes, edges
-
-
-def _places_in_json(text: str, count: int) -> list[int]:
-    """Lines, from 0, on which so many nodes and edges stand, where the text has lines for them."""
-    places = []
-    for line, words in enumerate(text.split("\n")):
-        if '"pose"' in words or '"transformation"' in words:
-            places.append(line)
-    return places if len(places) == count else list(range(count))
 
 
 def certain_edges(path: Path) -> BoolArray | None:
