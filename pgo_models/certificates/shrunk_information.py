@@ -14,12 +14,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from pgo_models.errors import GraphError
-from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.geometry.rotations import Array, BoolArray
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, least_tree
 from pgo_models.graphs.precisions import (
     LEAST_SCALED,
+    UNMEASURED_SHARE,
     are_definite,
     are_singular,
     proper_information,
@@ -43,16 +45,79 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
     1 - ||C||, since I >= (1 - ||C||) blockdiag(I_tt, I_rr). Rounding may ask for a smaller share.
     An edge whose coupled matrix is only semidefinite has a share of zero. Such an edge costs zero
     or more, and is removed; so is a singular block. A GraphError is raised if rounding hides the
-    inequality for every share, or if the other edges do not connect the graph.
+    inequality for every share, or if no edge is left.
     """
+    return _without_empty_edges(graph, _smaller_information(graph, cap))
+
+
+def shrink_and_join(graph: PoseGraph, cap: float, by_positions: bool = True) -> PoseGraph:
+    """The graph of `shrink_information`, with its parts joined by edges that cost nothing.
+
+    Parts that no edge joins can be moved, each as a whole, and those that no translation joins can
+    be shifted. So edges that join them, without a cycle, fit at the least cost, which they leave as
+    it is, whatever they measure and weigh. They make the minimum a single one. What all but leaves
+    directions out joins nothing, and is dropped between parts. So are positions that alone join
+    parts, unless `by_positions`: too few of them leave the turn of a part free.
+    """
+    d = graph.d
+    information = proper_information(graph)
+    smaller = _smaller_information(graph, cap)
+    tau, joins_t = _joining_weights(information[:, :d, :d], smaller[:, :d, :d])
+    kappa, joins_R = _joining_weights(information[:, d:, d:], smaller[:, d:, d:])
+    to_landmark = np.isin(graph.j, graph.landmarks)
+    usual = np.diag(np.repeat([tau, kappa], [d, smaller.shape[1] - d]))
+    joins = joins_R | (joins_t if by_positions else joins_t & to_landmark)
+    is_between, tree = _between_parts(graph, joins)
+    smaller[is_between] = 0.0
+    smaller[tree] = usual
+    joins_t &= ~is_between
+    joins_t[tree] = True
+    is_between, tree = _between_parts(graph, joins_t)
+    smaller[is_between, :d, :d] = 0.0
+    smaller[tree, :d, :d] = usual[:d, :d]
+    smaller[to_landmark, d:, d:] = 0.0
+    return _without_empty_edges(graph, smaller)
+
+
+def _without_empty_edges(graph: PoseGraph, information: Array) -> PoseGraph:
+    """The graph with other matrices, (m, k, k), without edges that have zeros."""
+    is_empty: BoolArray = np.all(information == 0.0, axis=(1, 2))
+    changed = replace(graph, information=information)
+    return changed.without_edges(is_empty) if is_empty.any() else changed
+
+
+def _joining_weights(blocks: Array, smaller: Array) -> tuple[float, BoolArray]:
+    """A usual weight of smaller blocks, and which edges, (m,), measure every direction enough.
+
+    Their smallest eigenvalue is not below `UNMEASURED_SHARE` of the trace of the block itself.
+    """
+    least = np.linalg.eigvalsh(smaller)[:, 0]
+    joins = (least > 0.0) & (least >= UNMEASURED_SHARE * np.einsum("mkk->m", blocks))
+    usual = float(np.median(least[joins])) if joins.any() else 1.0
+    return usual, joins
+
+
+def _between_parts(graph: PoseGraph, joins: BoolArray) -> tuple[BoolArray, IntArray]:
+    """Which edges, (m,), are between parts that other edges join, and some of them, a tree."""
+    links = edge_counts(graph.i[joins], graph.j[joins], graph.num_poses)
+    count, part = connected_components(links, directed=False)
+    ends_i = part[graph.i]
+    ends_j = part[graph.j]
+    # A landmark has no rotation, so that an edge to it leaves a part free to turn.
+    to_landmark = np.isin(graph.j, graph.landmarks).astype(float)
+    return ends_i != ends_j, least_tree(ends_i, ends_j, count, to_landmark)
+
+
+def _smaller_information(graph: PoseGraph, cap: float) -> Array:
+    """Matrices, (m, k, k), of `shrink_information`; zeros of edges that it removes."""
     information = without_singular_blocks(proper_information(graph), graph.d)
     d = graph.d
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]
     is_coupled = I_tr.any(axis=(1, 2))
-    is_singular = is_coupled & ~are_definite(information, LEAST_SCALED)
-    is_singular |= ~information.any(axis=(1, 2))
+    is_empty = is_coupled & ~are_definite(information, LEAST_SCALED)
+    is_empty |= ~information.any(axis=(1, 2))
     # Weights of the two smallest eigenvalues of I_rr in the limit of the largest: W is convex if
     # the largest is at most the second and half the smallest.
     limit_weights = np.array([0.5, 1.0]) if d == 3 else np.ones(1)
@@ -65,16 +130,16 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
 
     coupled_share = uncoupled_share(information, d) - _SHARE_ROUNDING
     share = np.where(is_coupled, np.maximum(coupled_share, 0.0), 1.0)
-    is_below = ~is_coupled
+    is_below = ~is_coupled | is_empty
     for _ in range(_HALVINGS):
         shares = share[:, None, None]
         smaller = np.zeros_like(information)
         smaller[:, :d, :d] = _clipped(shares * I_tt, largest_of_tt)
         smaller[:, d:, d:] = _clipped(shares * I_rr, largest_of_rr)
-        is_below = is_below | are_definite(information - smaller, _SHOWN) | is_singular
+        is_below = is_below | are_definite(information - smaller, _SHOWN)
         if is_below.all():
-            shrunk = replace(graph, information=smaller)
-            return shrunk.without_edges(is_singular) if is_singular.any() else shrunk
+            smaller[is_empty] = 0.0
+            return smaller
         # Rounding hides that the others are below; half of them is tried.
         share = np.where(is_below, share, 0.5 * share)
     raise GraphError("rounding hides that smaller information matrices are below the graph's own")
@@ -119,12 +184,16 @@ def _least_of_second_block(information: Array, size: int) -> Array:
 
 
 def _clipped(block: Array, limit: Callable[[Array], Array]) -> Array:
-    """Blocks with their eigenvalues, ascending, cut to a limit; below them for all rounding."""
+    """Blocks with their eigenvalues, ascending, cut to a limit; below them for all rounding.
+
+    They are zero where rounding hides the smallest eigenvalue.
+    """
     values, axes = np.linalg.eigh(block)
     traces = np.einsum("mkk->m", block)
     margin = _MARGIN * traces[:, None]
     largest = limit(values)[:, None]
     smaller = np.minimum(values, largest) - margin
+    smaller = np.where(smaller[:, :1] > 0.0, smaller, 0.0)
     scaled_axes = axes * smaller[:, None, :]
     product = scaled_axes @ np.swapaxes(axes, 1, 2)
     return np.asarray(0.5 * (product + np.swapaxes(product, 1, 2)))

@@ -20,7 +20,7 @@ from pgo_models.certificates.lower_bound import (
 )
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
 from pgo_models.certificates.shrunk_information import (
-    shrink_information,
+    shrink_and_join,
     without_singular_blocks,
 )
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
@@ -54,12 +54,16 @@ def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
     I_tt = filled(information[:, :d, :d])
     low = 0.0
     high = math.log(1.0 + float(np.linalg.cond(I_tt).max()))
-    has_bound, best = _try_cap(problem, math.exp(low), best)
+    by_positions = True
+    has_bound, best = _try_cap(problem, math.exp(low), best, by_positions)
+    if not has_bound:
+        by_positions = False
+        has_bound, best = _try_cap(problem, math.exp(low), best, by_positions)
     if not has_bound:
         return best
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        has_bound, best = _try_cap(problem, math.exp(middle), best)
+        has_bound, best = _try_cap(problem, math.exp(middle), best, by_positions)
         if has_bound:
             low = middle
         else:
@@ -67,12 +71,13 @@ def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
     return best
 
 
-def _try_cap(problem: PGOProblem, cap: float, best: ShrunkBound) -> tuple[bool, ShrunkBound]:
+def _try_cap(
+    problem: PGOProblem, cap: float, best: ShrunkBound, by_positions: bool
+) -> tuple[bool, ShrunkBound]:
     """Whether a cap gives a bound without a shift, and the better one of it and the best so far."""
     try:
-        smaller = PGOProblem(
-            shrink_information(problem.graph, cap), problem.backend, problem.weighting
-        )
+        graph = shrink_and_join(problem.graph, cap, by_positions)
+        smaller = PGOProblem(graph, problem.backend, problem.weighting)
         minimum = polish(smaller, best.poses)
     except (GraphError, NotPositiveDefiniteError):
         return False, best

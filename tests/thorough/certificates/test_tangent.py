@@ -15,7 +15,16 @@ from hypothesis import assume, example, given, settings, strategies as st
 from roads import Shape, road
 
 import solvers
-from pgo_models import Chi2Convention, NoiseModel, PGOProblem, PoseGraph, Poses, Weighting
+from pgo_models import (
+    Chi2Convention,
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Weighting,
+    exp_map,
+    project_to_rotations,
+)
 from pgo_models.certificates.certificate import BoundSource, certify_at
 from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.dual_variables import multipliers
@@ -26,7 +35,7 @@ from pgo_models.certificates.rounding_errors import (
     objective_rounding,
 )
 from pgo_models.certificates.shrunk_information import shrink_information
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.precisions import are_definite, proper_information, uncoupled_share
@@ -443,6 +452,83 @@ def test_smaller_matrices_of_half_known_edges_are_below_in_exact_arithmetic(
     for matrix, smaller in zip(whole, softer.information, strict=True):
         difference = np.vectorize(Fraction)(matrix) - np.vectorize(Fraction)(smaller)
         assert is_semidefinite(difference)
+
+
+def half_known(seed: int, d: int, share: float) -> tuple[PoseGraph, Poses]:
+    """A graph whose edges are off where their matrices measure nothing, and its true poses.
+
+    Elsewhere the errors are a share of what the matrices say. There are priors of poses, and
+    landmarks in some graphs.
+    """
+    rng = np.random.default_rng(seed)
+    graph = informed(seed, int(rng.integers(4, 15)), d, coupled=True, spread=0.5)
+    of_bodies = graph.truth
+    assert of_bodies is not None
+    if rng.random() < 0.5:
+        chosen = rng.permutation(graph.num_poses)[:3]
+        graph = graph.with_prior(chosen, of_bodies[chosen], np.ones(3), np.ones(3))
+    if rng.random() < 0.3:
+        graph = graph.with_landmark(np.array([0, 1]), rng.standard_normal((2, d)), tau=10.0)
+    R = np.tile(np.eye(d), (graph.num_poses, 1, 1))
+    t = np.ones((graph.num_poses, d))
+    R[graph.bodies] = of_bodies.R
+    t[graph.bodies] = of_bodies.t
+    truth = Poses(R, t)
+    size = 3 * d - 3
+    information = np.zeros((graph.num_edges, size, size))
+    R_ij = graph.R_ij.copy()
+    t_ij = graph.t_ij.copy()
+    for e in range(graph.num_edges):
+        half = rng.standard_normal((int(rng.integers(1, size + 3)), size))
+        kind = rng.integers(4)
+        if kind:  # all columns, only those of either block, or all but one of a translation
+            half[:, {1: slice(d, None), 2: slice(0, d), 3: slice(0, 1)}[int(kind)]] = 0.0
+        is_point = graph.j[e] in graph.landmarks
+        if is_point:
+            half = half[:, :d] @ np.eye(d, size)
+        information[e] = 100.0 * half.T @ half
+        values, axes = np.linalg.eigh(information[e])
+        is_known = values > 1e-9 * values[-1]
+        errors = share / np.sqrt(np.where(is_known, values, 1.0))
+        errors = axes @ np.where(is_known, errors, 0.5) * rng.standard_normal(size)
+        errors[d:] = 0.0 if is_point else errors[d:]
+        R_i, R_j = truth.R[graph.i[e]], truth.R[graph.j[e]]
+        E = exp_map(errors[None, d:])[0]
+        R_ij[e] = np.eye(d) if is_point else project_to_rotations((R_i.T @ R_j @ E.T)[None])[0]
+        between = R_i.T @ (truth.t[graph.j[e]] - truth.t[graph.i[e]])
+        t_ij[e] = between - R_ij[e] @ errors[:d]
+    return replace(graph, information=information, R_ij=R_ij, t_ij=t_ij), truth
+
+
+@settings(max_examples=examples(12))
+@given(seed=SEEDS, d=DIMENSIONS, share=st.sampled_from([0.0, 0.1, 1.0]))
+def test_no_bound_of_half_known_edges_is_above_chi2(seed: int, d: int, share: float) -> None:
+    graph, truth = half_known(seed, d, share)
+    problem = of_file(graph)
+    try:
+        shrunk = bound_by_shrinking(problem, truth)
+        start = polish(problem, truth, max_steps=30)
+    except (GraphError, NotPositiveDefiniteError):
+        assume(False)
+    for poses in (truth, start):
+        most = problem.objective(poses) + objective_rounding(problem, poses).error
+        assert shrunk.bound.value <= most
+
+
+def test_what_half_known_edges_say_of_rotations_is_proven() -> None:
+    """Planar scans leave the cycle of rotations, and each of them is half known."""
+    graph = informed(3, 12, 3, coupled=False)
+    assert graph.information is not None
+    information = graph.information.copy()
+    information[:, 2] = information[:, :, 2] = 0.0
+    information[:, 3:, 3:] = 100.0 * np.eye(3)
+    problem = of_file(replace(graph, information=information))
+    poses = polish(problem, chordal_start(problem.convex_part))
+    bound = bound_by_shrinking(problem, poses).bound.value
+    information[:, :3] = 0.0
+    alone = of_file(replace(graph, information=information))
+    least = alone.objective(polish(alone, Poses(poses.R, np.zeros_like(poses.t))))
+    assert bound == pytest.approx(least, rel=1e-6)
 
 
 def test_coupling_that_leaves_nothing_gives_no_softened_bound() -> None:
