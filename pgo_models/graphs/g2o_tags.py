@@ -121,7 +121,7 @@ class Tag:
     @property
     def is_position(self) -> bool:
         """Whether a line measures a position in the frame of the world."""
-        return self.is_point and self.num_ids == 1
+        return self.is_edge and self.is_point and self.num_ids == 1
 
     def problem(self, numbers: Array) -> tuple[BoolArray, str]:
         """Return which lines, (n, num_numbers), have a noise that is none, (n,), and why."""

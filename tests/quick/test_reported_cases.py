@@ -348,6 +348,12 @@ def test_fixes_are_positions_of_poses_that_edges_alone_name(tmp_path: Path) -> N
     (tmp_path / "landmark.g2o").write_text("\n".join(lines))
     graph = read_g2o(tmp_path / "landmark.g2o")
     np.testing.assert_array_equal(graph.pose_ids[graph.landmarks], [900])
+    # A landmark with a line of its own and the id of a pose stays one.
+    vertex = "VERTEX_TRACKXYZ 1 1 1 1"
+    lines = [vertex, *(line.replace(" 900 ", " 1 ") for line in lines)]
+    (tmp_path / "same_id.g2o").write_text("\n".join(lines))
+    with pytest.warns(GraphWarning, match="have ids in common|no VERTEX line"):
+        assert len(read_g2o(tmp_path / "same_id.g2o").landmarks) == 1
 
 
 @pytest.mark.parametrize("labels", ["012", "ABC", "xyz"])
