@@ -1,16 +1,16 @@
-"""Computations beside the calls of a robot, each in a thread of its own.
+"""Computations beside the calls of a robot, in another process.
 
-A robot answers at once, also while it computes. What a computation has found waits in a queue until
-the robot is called again: so all that the robot knows is changed by the thread of its caller alone,
-and computations change nothing but what they were given.
-
-Compiled code may hold Python's lock for seconds, and with it the calls. A thread can therefore have
-another process compute for it (`OTHER_PROCESS`), and wait.
+A robot answers at once, also while it computes. Compiled code may hold Python's lock for seconds,
+and with it all calls: so one other process computes for all robots of this one. What a computation
+tells waits in a queue until the robot is called again: so all that the robot knows is changed by
+the thread of its caller alone.
 """
 
 from __future__ import annotations
 
 import atexit
+import enum
+import itertools
 import os
 import pickle
 import queue
@@ -18,74 +18,227 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-import weakref
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any, TypeVar
 
 from pgo_models.errors import EngineError, PGOError
 
 T = TypeVar("T")
-_PAUSE = 0.01  # seconds
 _SECONDS_TO_END = 1.0  # of a process whose output has ended
-_NEEDED = "solvers.team.shared_solve"  # what it computes with
-_ALL: weakref.WeakSet[Beside] = weakref.WeakSet()
+_NEEDED = "solvers.team.robot"  # what it computes with
+_CANNOT_BEGIN = (
+    "settings of a robot are to be in a module, as the process that computes does not run the main "
+    "script"
+)
+_COMPUTING = threading.Lock()  # of the computation of the other process that does not wait
 
 
 class Beside:
-    """Threads that compute, and what is to be done with their results."""
+    """The computations of a robot, and what is to be done with what they tell."""
 
     def __init__(self) -> None:
-        self._results: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._num_busy = 0
-        self._lock = threading.Lock()  # of the count
-        _ALL.add(self)
+        self._talks: list[Talk] = []
+        self._to_do: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
 
     def __reduce__(self) -> tuple[type[Beside], tuple[()]]:
-        """A copy has no computations: threads are not copied."""
+        """A copy has no computations: they belong to one robot."""
         return Beside, ()
 
     @property
     def is_busy(self) -> bool:
-        """Whether a thread computes; one that waits for others does not."""
-        return self._num_busy > 0
+        """Whether something is computed; what waits for other robots is not."""
+        return any(talk.is_busy for talk in self._talks)
 
     def begin(
-        self, compute: Callable[[], T], act: Callable[[T | PGOError], None], failure: str
-    ) -> None:
-        """Compute in a thread, and have the caller of the robot act on the result, or on an error.
+        self,
+        compute: Callable[[Line], Any],
+        end: Callable[[Any], None],
+        failure: str,
+        take: Callable[[Any], None] = lambda _: None,
+    ) -> Talk:
+        """Compute in the other process, and act on the result (`end`), or on a PGOError.
 
-        What other robots have sent may be anything: an error that is no PGOError becomes one whose
-        text begins with `failure`.
+        What other robots have sent may be anything: an error of another kind becomes a PGOError
+        whose text begins with `failure`. `take` acts on what the computation tells before its end.
+        Function, messages and result are pickled.
         """
-        self.count(1)
-
-        def run() -> None:
-            try:
-                result = _result_or_error(compute, failure)
-                self.hand_over(lambda: act(result))
-            finally:
-                self.count(-1)
-
-        threading.Thread(target=run, daemon=True).start()
-
-    def count(self, more: int) -> None:
-        """Count threads that begin to compute, also after waiting, or cease to."""
-        with self._lock:
-            self._num_busy += more
-
-    def hand_over(self, act: Callable[[], None]) -> None:
-        """Have the caller of the robot act on a result, when it calls the next time."""
-        self._results.put(act)
+        talk = Talk(take, end, self._to_do)
+        self._talks = [each for each in self._talks if not each.is_over]
+        self._talks.append(talk)
+        OTHER_PROCESS.begin(talk, compute, failure)
+        return talk
 
     def act(self) -> None:
-        """Act on all results that there are."""
-        while not self._results.empty():
-            self._results.get_nowait()()
+        """Act on all that was told."""
+        while not self._to_do.empty():
+            self._to_do.get_nowait()()
 
 
-def _result_or_error(compute: Callable[[], T], failure: str) -> T | PGOError:
+class Talk:
+    """A computation in the other process, as the robot that has begun it sees it."""
+
+    def __init__(
+        self,
+        take: Callable[[Any], None],
+        end: Callable[[Any], None],
+        to_do: queue.SimpleQueue[Callable[[], None]],
+    ) -> None:
+        self.is_over = False
+        self.send: Callable[[bytes], None] = lambda _: None
+        self._take = take
+        self._end = end
+        self._to_do = to_do
+        self._num_told = 1  # with its function
+        self._num_waits = 0
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it computes: it was told more often than it has waited."""
+        return not self.is_over and self._num_told > self._num_waits
+
+    def tell(self, message: object) -> None:
+        """Tell the computation what it waits for; None ends it."""
+        self._num_told += 1
+        self.send(pickle.dumps(message))
+
+    def give_up(self) -> None:
+        """End the computation where it waits next; nothing that it tells is acted on any more."""
+        self._take = self._end = lambda _: None
+        self.tell(None)
+
+    def hear(self, kind: Kind, message: object) -> None:
+        """Note what the computation tells, in the thread that reads it."""
+        if kind is Kind.WAITS:
+            self._num_waits += 1
+        elif kind is Kind.TELLS:
+            self._to_do.put(lambda: self._take(message))
+        else:
+            self._to_do.put(lambda: self._end(message))
+            self.is_over = True
+
+
+class Kind(enum.Enum):
+    """What a computation tells."""
+
+    TELLS = "a message"
+    WAITS = "it waits for one"
+    ENDS = "its result, or a PGOError"
+
+
+class OtherProcess:
+    """The process that computes for all robots of this one, one computation at a time.
+
+    It starts when it is first needed, and anew after it has died. It never runs the main script of
+    this process. It ends with this process, however that ends, as its input does.
+    """
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Be without a process: a fork has none."""
+        self._lock = threading.Lock()  # of what follows
+        self._process: subprocess.Popen[bytes] | None = None
+        self._reader: threading.Thread | None = None
+        self._talks: dict[int, Talk] = {}
+        self._to_write: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
+        self._numbers = itertools.count()
+
+    def start(self) -> None:
+        """Start it, so that it has all that it needs when it is asked; that takes seconds."""
+        with self._lock, suppress(OSError):  # which is raised again when it is asked
+            self._start()
+
+    def _start(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            return
+        code = f"import sys; sys.path[:] = {sys.path!r}; import {_NEEDED}, {__name__} as beside"
+        process = subprocess.Popen(
+            [sys.executable, "-c", f"{code}; beside.compute_all()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for the process that the person has started
+        )
+        self._process = process
+        talks: dict[int, Talk] = {}
+        to_write: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
+        self._talks = talks
+        self._to_write = to_write
+        threading.Thread(target=_write, args=(process, to_write), daemon=True).start()
+        self._reader = threading.Thread(
+            target=self._read, args=(process, talks, to_write), daemon=True
+        )
+        self._reader.start()
+
+    def begin(self, talk: Talk, compute: Callable[[Line], Any], failure: str) -> None:
+        """Begin a computation; where that cannot be, it ends with an error."""
+        job = pickle.dumps((compute, failure))
+        with self._lock:
+            try:
+                self._start()
+            except OSError as error:
+                sentence = f"no process that computes can be started: {error}"
+                talk.hear(Kind.ENDS, EngineError(sentence))
+                return
+            number = next(self._numbers)
+            to_write = self._to_write
+            self._talks[number] = talk
+            talk.send = lambda data: to_write.put((number, data))
+            talk.send(job)
+
+    def _read(
+        self,
+        process: subprocess.Popen[bytes],
+        talks: dict[int, Talk],
+        to_write: queue.SimpleQueue[tuple[int, bytes] | None],
+    ) -> None:
+        """Hand on what a process tells, until it ends; that ends its computations."""
+        assert process.stdout is not None
+        with suppress(OSError, EOFError, pickle.UnpicklingError), process.stdout:
+            while True:
+                number, kind, data = pickle.load(process.stdout)
+                message = result_or_error(partial(pickle.loads, data), "an odd answer")
+                talks[number].hear(kind, message)
+                if kind is Kind.ENDS:
+                    del talks[number]
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_SECONDS_TO_END)
+        process.kill()
+        to_write.put(None)
+        code = process.wait()
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        error = EngineError(
+            f"the process that computes has ended ({how}); the next solve starts another"
+        )
+        with self._lock:
+            if self._process is process:
+                self._process = None
+            ended = list(talks.values())
+            talks.clear()
+        for talk in ended:
+            talk.hear(Kind.ENDS, error)
+
+    def close(self) -> None:
+        """End it, also while it computes."""
+        if self._process is not None and self._reader is not None:
+            self._process.kill()
+            self._reader.join(_SECONDS_TO_END)
+
+
+def _write(
+    process: subprocess.Popen[bytes], to_write: queue.SimpleQueue[tuple[int, bytes] | None]
+) -> None:
+    """Write to a process what it is told, in a thread: it reads nothing while it is busy."""
+    assert process.stdin is not None
+    with suppress(OSError), process.stdin:
+        for message in iter(to_write.get, None):
+            pickle.dump(message, process.stdin)
+            process.stdin.flush()
+
+
+def result_or_error(compute: Callable[[], T], failure: str) -> T | PGOError:
     """The result, or the error, as one whose text begins with `failure` if it is no PGOError."""
     try:
         return compute()
@@ -95,94 +248,49 @@ def _result_or_error(compute: Callable[[], T], failure: str) -> T | PGOError:
         return PGOError(f"{failure}: {error!r:.200}")
 
 
-class OtherProcess:
-    """A process that computes for all robots of this one, one computation after the other.
-
-    It starts when it is first needed, and anew after it has died. It never runs the main script of
-    this process. Functions and results are pickles, over its standard input and output. It ends
-    with this process, however that ends, as its input does.
-    """
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Be without a process: a fork has none."""
-        self._lock = threading.Lock()  # of the one who waits for a result
-        self._process: subprocess.Popen[bytes] | None = None
-        self._is_closed = False
-
-    def start(self) -> None:
-        """Start it, so that it has all that it needs when it is asked; that takes seconds."""
-        if not self._is_there:
-            with self._lock, suppress(OSError):  # which is raised when it is asked
-                self._begin()
-
-    @property
-    def _is_there(self) -> bool:
-        return self._process is not None and self._process.poll() is None
-
-    def _begin(self) -> None:
-        if self._is_there:
-            return
-        code = f"import sys; sys.path[:] = {sys.path!r}; import {_NEEDED}, {__name__} as beside"
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", f"{code}; beside.compute_all()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for the process that the person has started
-        )
-
-    def result_of(self, compute: Callable[[], T]) -> T:
-        """The result of a function that can be pickled, or the PGOError that it raises.
-
-        An EngineError where the process cannot start, or dies before it has the result.
-        """
-        job = pickle.dumps(compute)
-        with self._lock:
-            if self._is_closed:
-                raise EngineError("this process ends")
-            try:
-                self._begin()
-                result = self._answer_to(job)
-            except (OSError, EOFError, pickle.UnpicklingError) as error:
-                raise EngineError(f"{self._death(error)}; the next solve starts another") from error
-        if isinstance(result, PGOError):
-            raise result
-        return result  # type: ignore[no-any-return] # of that function
-
-    def _answer_to(self, job: bytes) -> Any:  # noqa: ANN401 - the function chooses
-        assert self._process is not None
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        pickle.dump(job, self._process.stdin)
-        self._process.stdin.flush()
-        return pickle.load(self._process.stdout)
-
-    def _death(self, error: Exception) -> str:
-        """How it has ended, or why there is none."""
-        process, self._process = self._process, None
-        if process is None:
-            return f"no process that computes can be started: {error}"
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(_SECONDS_TO_END)
-        code = _ended(process)
-        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        return f"the process that computes has ended ({how})"
-
-    def close(self) -> None:
-        """End it, also while it computes."""
-        self._is_closed = True
-        if self._process is not None:
-            _ended(self._process)
+# In the other process
 
 
-def _ended(process: subprocess.Popen[bytes]) -> int:
-    """End a process; its exit code."""
-    process.kill()
-    with suppress(OSError), process:  # what was not written is lost
-        pass
-    return process.wait()
+class _GivenUpError(BaseException):
+    """Raised in a computation that is given up; nothing in it catches this."""
+
+
+class Line:
+    """What a computation is told, and tells."""
+
+    def __init__(self, number: int, send: Callable[[int, Kind, bytes], None]) -> None:
+        self.told: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._number = number
+        self._send = send
+
+    def tell(self, message: object) -> None:
+        """Tell the robot a message."""
+        self._send(self._number, Kind.TELLS, pickle.dumps(message))
+
+    def wait(self) -> Any:  # noqa: ANN401 - of any kind
+        """Wait for the next message of the robot, while others compute."""
+        self._send(self._number, Kind.WAITS, pickle.dumps(None))
+        _COMPUTING.release()
+        data = self.told.get()
+        _COMPUTING.acquire()
+        message = pickle.loads(data)
+        if message is None:
+            raise _GivenUpError
+        return message
+
+    def run(self) -> None:
+        """Compute what the first message says."""
+        with _COMPUTING:
+            data: bytes | PGOError = pickle.dumps(None)
+            with suppress(_GivenUpError):
+                data = result_or_error(self._result, _CANNOT_BEGIN)
+            if isinstance(data, PGOError):
+                data = pickle.dumps(data)
+            self._send(self._number, Kind.ENDS, data)
+
+    def _result(self) -> bytes:
+        compute, failure = pickle.loads(self.told.get())
+        return pickle.dumps(result_or_error(lambda: compute(self), failure))
 
 
 def compute_all() -> None:
@@ -190,31 +298,33 @@ def compute_all() -> None:
 
     What else prints, prints to standard error.
     """
-    jobs: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     results = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
+    lines: dict[int, Line] = {}
+    writing = threading.Lock()
 
-    def read() -> None:
-        with suppress(EOFError, OSError, pickle.UnpicklingError):
-            while True:
-                jobs.put(pickle.load(sys.stdin.buffer))
-        os._exit(0)  # nobody waits for what is computed now
+    def send(number: int, kind: Kind, data: bytes) -> None:
+        with writing:
+            pickle.dump((number, kind, data), results)
+            results.flush()
+        if kind is Kind.ENDS:
+            lines.pop(number)
 
-    threading.Thread(target=read, daemon=True).start()
-    while True:
-        result = _result_or_error(lambda: pickle.loads(jobs.get())(), "in another process")
-        pickle.dump(result, results)
-        results.flush()
+    highest = -1
+    with suppress(EOFError, OSError, pickle.UnpicklingError):
+        while True:
+            number, data = pickle.load(sys.stdin.buffer)
+            if number > highest:
+                highest = number
+                lines[number] = Line(number, send)
+                threading.Thread(target=lines[number].run, daemon=True).start()
+            known = lines.get(number)
+            if known is not None:
+                known.told.put(data)
+    os._exit(0)  # nobody waits for what is computed now
 
 
 OTHER_PROCESS = OtherProcess()
+atexit.register(OTHER_PROCESS.close)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=OTHER_PROCESS.forget)
-
-
-@atexit.register
-def _wait_for_all() -> None:
-    """Let threads end before the process does: what they call may not survive to be ended."""
-    OTHER_PROCESS.close()
-    while any(beside.is_busy for beside in _ALL):
-        time.sleep(_PAUSE)

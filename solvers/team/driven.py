@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pgo_models.errors import EngineError, PGOError
 from solvers.carry.letters import LetterName, Letters
-from solvers.robots.agent import Agent
+from solvers.team.beside import Talk
+from solvers.team.driven_solve import UNKNOWN, obey_orders
 from solvers.team.driving import Drive
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
@@ -31,23 +33,23 @@ from solvers.team.messages import (
     error_as_message,
 )
 from solvers.team.news import News
-from solvers.team.refusals import function_for_teams
 from solvers.team.session import Session
+from solvers.team.sharing import OwnAnswer
 
 # Patiences after which a robot that is there, and has not answered, is waited for no more.
 _MOST_PATIENCES = 10.0
-_UNKNOWN = "it cannot compute what it was asked"
 
 
 @dataclass(eq=False)
 class Following:
-    """What a robot does in a solve: its agent obeys each order once. The last answer may be lost.
+    """What a robot does in a solve: it obeys each order once. The last answer may be lost.
 
     `waiting` is an order that waits for letters of other robots, and `obeyed` one that the robot
-    computes the answer to; `members` are all by their places.
+    computes the answer to (`talk`); `members` are all by their places, and `own` is what the solve
+    has found of the robot's poses.
     """
 
-    agent: Agent
+    talk: Talk
     revision: Revision
     letters: Letters
     members: tuple[str, ...]
@@ -55,6 +57,7 @@ class Following:
     reply: Reply | None = None
     waiting: Ask | None = None
     obeyed: Ask | None = None
+    own: OwnAnswer | None = None
 
 
 class DrivenTeam:
@@ -202,10 +205,16 @@ class DrivenTeam:
         """Give up a solve that another robot has overtaken, and solve again if this one drives."""
         if term > self.term:
             self.term = term
+            self._stop_following()
             self._following = None
             self._tried = {}
             self._unheard.clear()
             self._give_up()
+
+    def _stop_following(self) -> None:
+        """End the computation of this robot's part; its last answer can be sent again."""
+        if self._following is not None:
+            self._following.talk.give_up()
 
     def _give_up(self) -> None:
         if self._drive is not None:
@@ -247,17 +256,20 @@ class DrivenTeam:
     def _begin_drive(
         self, members: tuple[str, ...], tried: dict[str, tuple[Revision, bytes]]
     ) -> None:
-        own_revision = self._revision
         self._tried = tried
         self._unheard.clear()  # of the last outcome: there will be another one
         self.term = Term(self.term.number + 1, self.name)
-        agent = self._member.new_agent(0)
-        assert agent is not None  # as it has measurements
-        self._following = Following(agent, own_revision, Letters(0), members)
+        self._stop_following()
+        self._following = None
+        member = self._member
         self._drive = Drive(
-            self.term, members, agent, self._member.solve, self._beside, self._after_step
+            self.term,
+            members,
+            member.measurements,
+            member.driven_solve,
+            self._beside,
+            self._after_step,
         )
-        self._drive.begin()
 
     def _go_on_driving(self, awake: tuple[str, ...]) -> None:
         """Ask again where no answer came, and give up where a robot has gone.
@@ -312,7 +324,7 @@ class DrivenTeam:
         absent = tuple(name for name in self._session.team if name not in drive.members)
         revisions = {name: revision for name, (revision, _) in self._tried.items()}
         outcome = drive.ended(absent, revisions)
-        self._end_with(outcome)
+        self._end_with(outcome, drive.own)
         self._unheard = dict.fromkeys(drive.members[1:], outcome)
         self._send_again(self._unheard, Priority.NORMAL)
 
@@ -329,12 +341,29 @@ class DrivenTeam:
             self._have_all_begin_again(ask.term)
             return
         if self._following is None:
-            agent = self._member.new_agent(ask.place)
-            if agent is None:
+            if self._member.measurements.d is None:
                 return
-            letters = Letters(ask.place)
-            self._following = Following(agent, self._revision, letters, ask.members)
+            self._follow(ask)
+        assert self._following is not None
         self._answer(self._following, ask)
+
+    def _follow(self, ask: Ask) -> None:
+        """Begin to take part in a solve."""
+        talk = self._beside.begin(
+            partial(obey_orders, ask.place, self.name, self._member.measurements),
+            lambda error: self._lose_part(part, error),
+            UNKNOWN,
+            lambda told: self._end_answer(part, *told),
+        )
+        part = Following(talk, self._revision, Letters(ask.place), ask.members)
+        self._following = part
+
+    def _lose_part(self, part: Following, error: PGOError) -> None:
+        """Answer that the process has died that computes, or begin anew with the next order."""
+        if part.obeyed is not None:
+            self._end_answer(part, error, None)
+        elif part is self._following:
+            self._following = None
 
     def _answer(self, part: Following, ask: Ask) -> None:
         """Begin to obey the next order, or send the last answer again."""
@@ -360,27 +389,29 @@ class DrivenTeam:
         try:
             request, missing = part.letters.put_in(ask.request)
         except (LookupError, TypeError, PGOError) as error:
-            part.reply = Reply(ask.term, ask.call, part.revision, None, _as_error(error))
+            if not isinstance(error, PGOError):
+                error = PGOError(f"{UNKNOWN}: {error!r:.200}")
+            failure = error_as_message(error)
+            part.reply = Reply(ask.term, ask.call, part.revision, None, failure)
             part.call = ask.call
             self._session.send(ask.term.driver, part.reply, Priority.URGENT)
             return set()
         if missing:
             return {name for name in missing if 0 <= name.other < len(part.members)}
         part.obeyed = ask
-
-        def compute() -> Any:  # noqa: ANN401 - the order chooses
-            return function_for_teams(ask.order)(part.agent, request)
-
-        self._beside.begin(compute, lambda found: self._end_answer(part, ask, found), _UNKNOWN)
+        part.talk.tell((ask.order, request))
         return missing
 
     def _end_answer(
         self,
         part: Following,
-        ask: Ask,
         found: Any,  # noqa: ANN401 - the order chooses
+        own: OwnAnswer | None,
     ) -> None:
         """Send an answer or an error, and letters with it, unless the solve is given up."""
+        ask = part.obeyed
+        assert ask is not None
+        part.own = own
         part.obeyed = None
         part.call = ask.call
         is_error = isinstance(found, PGOError)
@@ -424,17 +455,11 @@ class DrivenTeam:
                 if self._following is None and outcome.solution is not None:
                     self._have_all_begin_again(outcome.term)  # its poses are lost
                     return
-                self._end_with(outcome)
+                self._end_with(outcome, None if self._following is None else self._following.own)
+                self._stop_following()
             self._session.send(sender, Heard(outcome.term), Priority.NORMAL)
 
-    def _end_with(self, outcome: Ended) -> None:
+    def _end_with(self, outcome: Ended, own: OwnAnswer | None) -> None:
         """Remember how a solve has ended, and have the robot take what was found."""
         self.last = outcome
-        self._member.end_with(outcome, None if self._following is None else self._following.agent)
-
-
-def _as_error(error: Exception) -> tuple[str, str]:
-    """An error as a message: what is no PGOError comes of what another robot has sent."""
-    if isinstance(error, PGOError):
-        return error_as_message(error)
-    return error_as_message(PGOError(f"{_UNKNOWN}: {error!r:.200}"))
+        self._member.end_with(outcome, own)

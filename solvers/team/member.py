@@ -8,25 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from pgo_models.errors import PGOError
 from pgo_models.problem.weighting import Weighting
-from solvers.carry.process import DEFAULT_MEMORY
-from solvers.loop import RunMonitor
 from solvers.request import Pipeline
-from solvers.robots.agent import Agent, OwnLines
-from solvers.robots.own_file import READ_HERE
-from solvers.robots.setup import SOLVE_PARTS
-from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
-from solvers.solves.folder_solve import FilesOfRobots
-from solvers.team.driving import Drive
+from solvers.team.driven_solve import DrivenSolve
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.messages import Ended
 from solvers.team.shared_solve import SharedSolve
-from solvers.team.sharing import OwnAnswer, answer_of
+from solvers.team.sharing import OwnAnswer
 
 
 @dataclass(eq=False)
@@ -53,29 +44,10 @@ class Member:
         """Which measurements it has, so that others notice when they change."""
         return self.measurements.revision
 
-    def new_agent(self, place: int) -> Agent | None:
-        """Its part in a solve, with its measurements as they are now; None where it has none."""
-        if self.measurements.d is None:
-            return None
-        path = Path(f"{self.name}.g2o")
-        return Agent(OwnLines(place, path, self.measurements.text()))
-
-    def solve(self, drive: Drive) -> RobotsSolution:
-        """Solve with the robots of a drive, which have files of their own."""
-        files = [OwnLines(place, _path_of(name)) for place, name in enumerate(drive.members)]
-        job = FilesOfRobots(
-            "team",
-            files,
-            drive,
-            DEFAULT_MEMORY,
-            self.weighting,
-            trust_folder=self.trust_folder,
-            robust=self.robust,
-        )
-        try:
-            return job.solved(self.pipeline, RunMonitor(progress=False))
-        except PGOError as error:
-            raise PGOError(_with_ways_out_of_teams(str(error))) from error
+    @property
+    def driven_solve(self) -> DrivenSolve:
+        """How it solves when it drives a team whose robots keep their measurements."""
+        return DrivenSolve(self.pipeline, self.weighting, self.robust, self.trust_folder)
 
     @property
     def shared_solve(self) -> SharedSolve:
@@ -89,26 +61,13 @@ class Member:
             return False
         return outcome.revisions.items() > revisions.items()
 
-    def end_with(self, ended: Ended, agent: Agent | None) -> None:
+    def end_with(self, ended: Ended, own: OwnAnswer | None) -> None:
         """Keep an outcome and the poses with it, unless what was certified before holds for more.
 
-        Where a solve has failed, those before it stay. The agent was its part in the solve.
+        Where a solve has failed, those before it stay.
         """
-        answer = None if agent is None else answer_of(agent)
         if self.has_more_than(ended.revisions):
             return
-        if ended.solution is not None and answer is not None:
+        if ended.solution is not None and own is not None:
             self.outcome = ended
-            self.known = answer
-
-
-def _path_of(name: str) -> Path:
-    """Name of the lines of a robot, as of a file in a folder."""
-    return Path("team") / f"{name}.g2o"
-
-
-def _with_ways_out_of_teams(text: str) -> str:
-    """A sentence on an error of robots with own files, with what a team can do about it."""
-    text = text.replace(READ_HERE, "robots that share their measurements can")
-    way_out = "an edge between them joins them; with sharing=Sharing.MEASUREMENTS each has a map"
-    return text.replace(SOLVE_PARTS, way_out)
+            self.known = own

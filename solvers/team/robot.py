@@ -89,7 +89,8 @@ class Robot:
     ------
     SettingError
         For a name that is not in the team, a name twice, a short key, times that are not positive,
-        or known inliers of robots that do not share their measurements.
+        settings that cannot be pickled, or known inliers of robots that do not share their
+        measurements.
 
     Examples
     --------
@@ -142,6 +143,12 @@ class Robot:
                 "other known edges need sharing=Sharing.MEASUREMENTS"
             )
         pipeline = pipeline if pipeline is not None else Pipeline()
+        try:
+            pickle.dumps((pipeline, robust))
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise SettingError(
+                f"{error}; a robot computes in another process, which has copies of its settings"
+            ) from error
         self._sharing = sharing
         self._member = Member(name, pipeline, weighting, robust, trust_folder)
         self._session = Session(name, self.team, key, patience, retry)

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from solvers.carry.wire import MARK, WireError, opened, sealed
-from solvers.team.beside import Beside
+from solvers.team.beside import OTHER_PROCESS, Beside
 from solvers.team.messages import Priority, check_message
 from solvers.team.speakers import Envelope, Speakers, Word
 
@@ -119,6 +119,7 @@ class Session:
         self._out: list[Message] = []
         self._speakers = Speakers(name, patience)
         self._strangers: dict[str, None] = {}  # sentences on messages of nobody in the team
+        OTHER_PROCESS.start()
 
     @property
     def heard(self) -> tuple[str, ...]:

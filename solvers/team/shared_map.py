@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pgo_models.errors import PGOError
-from solvers.team.beside import OTHER_PROCESS
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, Priority, Term
@@ -77,7 +76,6 @@ class SharedMap:
         self._changed_at: float | None = None
         self._is_solving = False
         self._problems: tuple[str, ...] = ()
-        OTHER_PROCESS.start()
 
     @property
     def _has(self) -> dict[str, Mapping[str, Revision]]:
@@ -307,7 +305,7 @@ class SharedMap:
         lines = {name: "".join(self.logs[name].lines) for name in revisions}
         solve = partial(self._member.shared_solve.solved, lines, self._member.solution)
         self._session.beside.begin(
-            lambda: OTHER_PROCESS.result_of(solve),
+            solve,
             lambda answer: self._end(revisions, answer),
             "the measurements cannot be computed with",
         )

@@ -30,6 +30,7 @@ from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.solution import Solution
+from solvers.team.beside import Line
 from solvers.team.measurements import Measurements
 from solvers.team.sharing import OwnAnswer
 
@@ -59,7 +60,7 @@ class SharedSolve:
     robust: GNC | PCM | None
     trust_folder: bool
 
-    def solved(self, lines: Mapping[str, str], before: bytes | None) -> SharedAnswer:
+    def solved(self, lines: Mapping[str, str], before: bytes | None, _: Line) -> SharedAnswer:
         """The solution of the part that the robot is in, of the lines that each robot has measured.
 
         What cannot be read, or does not fit to the robot's own, is left out. A PGOError where it

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from networks import KEY, give_edge, world
+from networks import KEY, give_edge, robots_of, world
 
 import pgo_models as pgo
 import solvers
+from pgo_models.errors import SettingError
+from solvers.soc.r_step import RotationStep, RStep, RSubproblem, prepare
 
 SECONDS = 120.0
 CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"
@@ -67,8 +69,7 @@ def test_where_the_process_dies_the_next_solve_starts_another() -> None:
     compute(robot)
     assert robot.is_certified
     cost = robot.solution.objective
-    children = [int(pid) for pid in CHILDREN.read_text().split()]
-    pids = [pid for pid in children if b"compute_all" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    pids = pids_that_compute()
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     give_edge(robot, graph, graph.num_edges - 1)
@@ -87,6 +88,43 @@ def test_where_the_process_dies_the_next_solve_starts_another() -> None:
     assert np.all([np.isfinite(covariance).all() for covariance in robot.covariances.values()])
 
 
+@pytest.mark.skipif(not CHILDREN.exists(), reason="/proc names the children of a process")
+@pytest.mark.parametrize("num_messages", [8, 12, 30, 31, 32])
+def test_a_team_whose_computations_die_solves_anew_or_says_so_until_something_is_new(
+    num_messages: int,
+) -> None:
+    graph = world(n=30)
+    robots = robots_of(graph, 3)
+    count = 0
+    while count < num_messages:
+        count += step(robots)
+    for pid in pids_that_compute():
+        os.kill(pid, signal.SIGKILL)
+    while not all(robot.is_settled or robot.failure for robot in robots.values()):
+        step(robots)
+    for robot in robots.values():
+        assert robot.is_certified or "has ended (SIGKILL)" in robot.failure
+    i, j = np.flatnonzero(pgo.partition(graph, 3).robot == 1)[:2].tolist()
+    robots["r1"].add_edge(i, j, np.eye(2), np.zeros(2), kappa=1e-3, tau=1e-3)
+    revision = robots["r1"].revision
+    while not all(
+        robot.outcome is not None and robot.outcome.revisions["r1"] == revision
+        for robot in robots.values()
+    ):
+        step(robots)
+    assert all(robot.is_certified for robot in robots.values())
+
+
+def test_settings_that_cannot_be_given_to_another_process_are_refused() -> None:
+    class OwnRStep:  # of this function alone
+        def prepare(self, subproblem: RSubproblem) -> RotationStep:
+            return prepare(subproblem, RStep.FACTORIZED)
+
+    pipeline = solvers.Pipeline(soc=solvers.SOC(r_step=OwnRStep()))
+    with pytest.raises(SettingError, match="a robot computes in another process"):
+        solvers.Robot("a", ["a"], KEY, pipeline=pipeline)
+
+
 def test_a_driver_may_take_longer_for_its_part_than_all_others() -> None:
     graph = world(n=150)
     names = ["r0", "r1"]
@@ -97,11 +135,7 @@ def test_a_driver_may_take_longer_for_its_part_than_all_others() -> None:
     for e in range(graph.num_edges):
         give_edge(robots["r0" if graph.i[e] < graph.num_poses - 3 else "r1"], graph, e)
     while not all(robot.is_settled for robot in robots.values()):
-        for robot in robots.values():
-            robot.tick(time.monotonic())
-            for message in robot.outbox():
-                robots[message.to].receive(message.data, time.monotonic())
-        time.sleep(1e-4)
+        step(robots)
     assert [robot.failure for robot in robots.values()] == ["", ""]
     assert all(robot.is_certified for robot in robots.values())
 
@@ -112,3 +146,21 @@ def compute(robot: solvers.Robot) -> None:
     while robot.last is number:
         robot.tick(time.monotonic())
         time.sleep(1e-3)
+
+
+def step(robots: dict[str, solvers.Robot]) -> int:
+    """Let all robots speak once, and be heard at once; how many messages there were."""
+    count = 0
+    for robot in robots.values():
+        robot.tick(time.monotonic())
+        for message in robot.outbox():
+            robots[message.to].receive(message.data, time.monotonic())
+            count += 1
+    time.sleep(1e-4)
+    return count
+
+
+def pids_that_compute() -> list[int]:
+    """The processes that compute for robots of this one."""
+    children = [int(pid) for pid in CHILDREN.read_text().split()]
+    return [pid for pid in children if b"compute_all" in Path(f"/proc/{pid}/cmdline").read_bytes()]
