@@ -29,7 +29,7 @@ from solvers.handedness.complex_relaxation import (
     certificates_of_relaxation,
 )
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
-from solvers.handedness.search import HandednessSearch, stage_of_search
+from solvers.handedness.search import HandednessSearch, stage_of_search, terms_can_help
 from solvers.place import (
     BROKEN_OFF,
     Attempt,
@@ -265,6 +265,11 @@ class Here(Place):
             rounded = Attempt(certificate.poses, best.status, certificate=certificate)
             best = self.better(best, rounded)
         return after_search(best, best.proof, stage)
+
+    def terms_can_help(self, best: Attempt) -> bool:
+        """Whether terms may raise the bound, of chi2 by the Hessian of its tangent."""
+        ground = self.problem.at_best_translations(best.known_poses)
+        return terms_can_help(self.problem, ground, best.proof.lower_bound)
 
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None

@@ -268,6 +268,10 @@ class Place(ABC):
         """
         raise self._refusal(Step.TERMS.value)
 
+    def terms_can_help(self, best: Attempt) -> bool:
+        """Whether `bound_by_terms` may raise the bound."""
+        raise self._refusal(Step.TERMS.value)
+
     def solve_hulls(self, best: Attempt, method: HullLagrangian) -> Attempt:
         """Solve the relaxation with hulls of rotations, from where it was last solved.
 

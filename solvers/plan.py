@@ -21,7 +21,8 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
    solves. For chi2, bounds by smaller information matrices, whose cost is below chi2.
 8. In space, handedness terms, which are never negative on rotations and tell them from reflections:
    the cost less these terms has a better bound. If need be they begin where the relaxation with
-   convex hulls of rotations is solved.
+   convex hulls of rotations is solved. They are left out where the Hessian of the tangent of chi2
+   says that no terms raise the bound.
 
 Steps 5 to 8 are taken while the answer is open, where the settings ask for them and nothing stands
 against them (`improved`). A Newton that was cut short goes on in any case. They can only improve
@@ -161,7 +162,10 @@ def obstacle(step: Step, place: Place, settings: Pipeline, best: Attempt) -> str
         has_few_steps = step is Step.GROWING and _was_cut_short(place, settings, best)
         if not has_few_steps:
             return f"the attempt before it ended with {best.status.name}"
-    return place.lacks(step) or _misfit(step, place, settings)
+    reason = place.lacks(step) or _misfit(step, place, settings)
+    if not reason and step is Step.TERMS and not place.terms_can_help(best):
+        return "turns of the poses lower the tangent of chi2, with any terms"
+    return reason
 
 
 def _misfit(step: Step, place: Place, settings: Pipeline) -> str:

@@ -47,11 +47,16 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
     or more, and is removed; so is a singular block. A GraphError is raised if rounding hides the
     inequality for every share, or if no edge is left.
     """
-    return _without_empty_edges(graph, _smaller_information(graph, cap))
+    whole = without_singular_blocks(proper_information(graph), graph.d)
+    return _without_empty_edges(graph, _smaller_information(whole, graph.d, cap))
 
 
-def shrink_and_join(graph: PoseGraph, cap: float, by_positions: bool = True) -> PoseGraph:
+def shrink_and_join(
+    graph: PoseGraph, whole: Array, cap: float, by_positions: bool = True
+) -> PoseGraph:
     """The graph of `shrink_information`, with its parts joined by edges that cost nothing.
+
+    `whole`, (m, k, k), are the matrices of the graph without singular blocks.
 
     Parts that no edge joins can be moved, each as a whole, and those that no translation joins can
     be shifted. So edges that join them, without a cycle, fit at the least cost, which they leave as
@@ -60,10 +65,9 @@ def shrink_and_join(graph: PoseGraph, cap: float, by_positions: bool = True) -> 
     parts, unless `by_positions`: too few of them leave the turn of a part free.
     """
     d = graph.d
-    information = proper_information(graph)
-    smaller = _smaller_information(graph, cap)
-    tau, joins_t = _joining_weights(information[:, :d, :d], smaller[:, :d, :d])
-    kappa, joins_R = _joining_weights(information[:, d:, d:], smaller[:, d:, d:])
+    smaller = _smaller_information(whole, d, cap)
+    tau, joins_t = _joining_weights(whole[:, :d, :d], smaller[:, :d, :d])
+    kappa, joins_R = _joining_weights(whole[:, d:, d:], smaller[:, d:, d:])
     to_landmark = np.isin(graph.j, graph.landmarks)
     usual = np.diag(np.repeat([tau, kappa], [d, smaller.shape[1] - d]))
     joins = joins_R | (joins_t if by_positions else joins_t & to_landmark)
@@ -108,10 +112,8 @@ def _between_parts(graph: PoseGraph, joins: BoolArray) -> tuple[BoolArray, IntAr
     return ends_i != ends_j, least_tree(ends_i, ends_j, count, to_landmark)
 
 
-def _smaller_information(graph: PoseGraph, cap: float) -> Array:
+def _smaller_information(information: Array, d: int, cap: float) -> Array:
     """Matrices, (m, k, k), of `shrink_information`; zeros of edges that it removes."""
-    information = without_singular_blocks(proper_information(graph), graph.d)
-    d = graph.d
     I_tt = information[:, :d, :d]
     I_tr = information[:, :d, d:]
     I_rr = information[:, d:, d:]

@@ -3,11 +3,17 @@
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
+import numpy as np
+from scipy.sparse import csc_array
+
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms, distinct_pairs
-from pgo_models.errors import check_settings
+from pgo_models.errors import NotPositiveDefiniteError, check_settings
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import middle_pose
+from pgo_models.problem.cholesky import factorize
+from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.rotation_hull import matrices_at
 from solvers.handedness.ascent import AscentState, HandednessAscent
@@ -18,6 +24,8 @@ from solvers.loop import RunMonitor
 from solvers.result import Outcome, Stage
 
 S = TypeVar("S")
+
+_ROUNDING = 2.0**-40  # share of a diagonal, above the rounding of a factorisation
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,38 @@ class HandednessSearch:
         first = HandedPoint.first(matrix, P, self.ascent.num_eigenvalues)
         ascent: Outcome[AscentState[HandedPoint]] = monitor.run(self.ascent, first)
         return HandednessTerms.at(poses, i, j, ascent.state.point.P), stage_of_search(ascent)
+
+
+def terms_can_help(problem: PGOProblem, poses: Poses, lower_bound: float) -> bool:
+    """Whether handedness terms that are zero at stationary poses may raise a bound.
+
+    Along moves of the poses by rotations and shifts, terms that are zero there are zero or more to
+    second order. So they leave no more of S there than the second derivative of the cost. A bound
+    above the given one needs S definite with an eta that costs less than the gap: it needs the
+    Hessian to be so, of chi2 that of its tangent. A cost that is quadratic has a minimum there.
+    """
+    if problem.is_quadratic:
+        return True
+    n = problem.num_poses
+    d = problem.d
+    num_rotations = n - len(problem.graph.landmarks)
+    gap = problem.objective(poses) - lower_bound
+    eta = np.full(n, max(gap, 0.0) / (d * num_rotations))
+    eta[problem.graph.landmarks] = 0.0
+    Lambda = multipliers(problem, poses) - eta[:, None, None] * np.eye(d)
+    tangent = problem.tangent_at(poses)
+    ground = np.array([middle_pose(problem.graph)])
+    layout = TangentLayout(n, d)
+    of_ground = np.concatenate([layout.translations(ground)[0], layout.rotations(ground)[0]])
+    free = np.delete(np.arange(layout.side), of_ground)
+    hessian = csc_array(riemannian_hessian(tangent.at(poses), Lambda)[free][:, free])
+    # A pivot that is zero but for rounding counts as zero.
+    hessian.setdiag((1.0 - _ROUNDING) * hessian.diagonal())
+    try:
+        factorize(hessian, problem.backend)
+    except NotPositiveDefiniteError:
+        return False
+    return True
 
 
 def stage_of_search(outcome: Outcome[S]) -> Stage:

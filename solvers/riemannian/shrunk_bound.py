@@ -26,7 +26,7 @@ from pgo_models.certificates.shrunk_information import (
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.precisions import filled, proper_information
+from pgo_models.graphs.precisions import filled
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
@@ -50,20 +50,20 @@ def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
     """
     best = ShrunkBound(NO_BOUND, poses, np.zeros_like(poses.R))
     d = problem.d
-    information = without_singular_blocks(proper_information(problem.graph), d)
-    I_tt = filled(information[:, :d, :d])
+    whole = without_singular_blocks(problem.information, d)
+    I_tt = filled(whole[:, :d, :d])
     low = 0.0
     high = math.log(1.0 + float(np.linalg.cond(I_tt).max()))
     by_positions = True
-    has_bound, best = _try_cap(problem, math.exp(low), best, by_positions)
+    has_bound, best = _try_cap(problem, whole, math.exp(low), best, by_positions)
     if not has_bound:
         by_positions = False
-        has_bound, best = _try_cap(problem, math.exp(low), best, by_positions)
+        has_bound, best = _try_cap(problem, whole, math.exp(low), best, by_positions)
     if not has_bound:
         return best
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        has_bound, best = _try_cap(problem, math.exp(middle), best, by_positions)
+        has_bound, best = _try_cap(problem, whole, math.exp(middle), best, by_positions)
         if has_bound:
             low = middle
         else:
@@ -72,11 +72,11 @@ def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
 
 
 def _try_cap(
-    problem: PGOProblem, cap: float, best: ShrunkBound, by_positions: bool
+    problem: PGOProblem, whole: Array, cap: float, best: ShrunkBound, by_positions: bool
 ) -> tuple[bool, ShrunkBound]:
     """Whether a cap gives a bound without a shift, and the better one of it and the best so far."""
     try:
-        graph = shrink_and_join(problem.graph, cap, by_positions)
+        graph = shrink_and_join(problem.graph, whole, cap, by_positions)
         smaller = PGOProblem(graph, problem.backend, problem.weighting)
         minimum = polish(smaller, best.poses)
     except (GraphError, NotPositiveDefiniteError):

@@ -376,6 +376,10 @@ class PlaceOfRobots(Place):
         """Solve the relaxation with hulls in one place."""
         return self.known_here.solve_hulls(best, method)
 
+    def terms_can_help(self, best: Attempt) -> bool:
+        """Ask the one place that has the graph."""
+        return self.known_here.terms_can_help(best)
+
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
     ) -> Attempt:

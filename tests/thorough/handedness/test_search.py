@@ -1,24 +1,27 @@
 """The search for handedness terms: its derivatives, its two spectra, and what it proves."""
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 import pytest
 from budget import examples
-from graphs import LOUD_NOISE, SEEDS, restarts, varied_graph
+from graphs import LOUD_NOISE, SEEDS, informed, restarts, varied_graph
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models import PGOProblem, RelaxationForm
+from pgo_models import NoiseModel, PGOProblem, RelaxationForm, Weighting
+from pgo_models.certificates.certificate import certify_at, with_terms
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import distinct_pairs
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.graphs.scenes import victoria_park
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.relaxations.solve_sdp import solve_relaxation
 from solvers import Pipeline, Status, SweptScene
 from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
-from solvers.handedness.search import HandednessSearch
+from solvers.handedness.search import HandednessSearch, terms_can_help
 from solvers.loop import RunMonitor, iterate, run
 from solvers.pipeline import solve
 from solvers.riemannian.polish import polish
@@ -182,6 +185,30 @@ def test_landmarks_have_no_pairs() -> None:
     graph = victoria_park(np.random.default_rng(0))
     i, j = distinct_pairs(graph).T
     assert not np.isin(graph.landmarks, np.concatenate([i, j])).any()
+
+
+def test_terms_are_not_sought_where_moves_of_rotations_lower_the_tangent() -> None:
+    gains = set()
+    for seed, share in ((0, 0.0), (5, 0.0), (7, 0.3), (3, 0.7), (11, 0.3)):
+        graph = informed(seed, 12, 3, False, 2.0, NoiseModel(0.1, 0.1))
+        assert graph.information is not None
+        information = graph.information.copy()
+        half_known = np.random.default_rng(seed).random(graph.num_edges) < share
+        information[half_known, 2] = information[half_known, :, 2] = 0.0
+        problem = PGOProblem(
+            replace(graph, information=information), weighting=Weighting.INFORMATION
+        )
+        poses = problem.at_best_translations(polish(problem, chordal_start(problem.convex_part)))
+        before = certify_at(problem, poses)
+        can_help = terms_can_help(problem, poses, before.lower_bound)
+        try:
+            terms, _ = HandednessSearch().run(problem, poses, RunMonitor(progress=False))
+        except NotPositiveDefiniteError:  # translations without a best value
+            gains.add((can_help, False))
+            continue
+        after = with_terms(problem, before, terms, poses)
+        gains.add((can_help, after.lower_bound > before.lower_bound))
+    assert gains == {(False, False), (True, False), (True, True)}
 
 
 def test_in_the_plane_nothing_is_sought() -> None:
