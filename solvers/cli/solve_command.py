@@ -296,11 +296,7 @@ def solve_command(
         raise typer.Exit(_solve_graph(loaded, source, stages, network, outputs, display, anchor))
     if largest_component:
         raise SettingError("--largest-component takes one component, and --all-components each")
-    codes = []
-    for number, component in enumerate(components_of(loaded), 1):
-        named = outputs if number == 1 else outputs.numbered(number)
-        codes.append(_solve_graph(component, source, stages, network, named, display, anchor))
-    raise typer.Exit(max(codes))
+    raise typer.Exit(_solve_components(loaded, source, stages, network, outputs, display, anchor))
 
 
 @dataclass(frozen=True)
@@ -585,6 +581,33 @@ def _solve_graph(
     warn_of_weights(source.graph, problem, solution.certificate, source.drop_edge)
     num_absent = len(problem.graph.absent)
     return _exit_code(solution.status, solution.is_certified, num_absent)
+
+
+def _solve_components(
+    loaded: PoseGraph,
+    source: GraphOptions,
+    stages: StageOptions,
+    network: RobotOptions,
+    outputs: Outputs,
+    display: Display,
+    anchor: int | None,
+) -> int:
+    """Solve every component of a graph as `_solve_graph` does; the largest exit code.
+
+    JSON is a list of their records.
+    """
+    if anchor is not None:
+        pose_named(loaded, anchor)
+    codes = []
+    for number, component in enumerate(components_of(loaded), 1):
+        named = outputs if number == 1 else outputs.numbered(number)
+        held = anchor if anchor in component.pose_ids else None
+        if display.as_json:
+            typer.echo("[" if number == 1 else ",")
+        codes.append(_solve_graph(component, source, stages, network, named, display, held))
+    if display.as_json:
+        typer.echo("]")
+    return max(codes)
 
 
 def _given_options(arguments: dict[str, object]) -> set[str]:

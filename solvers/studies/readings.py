@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pgo_models.errors import FAILURES, FileFormatError
+from pgo_models.errors import FAILURES, FileFormatError, GraphWarning
 from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import g2o_files
@@ -188,9 +188,13 @@ class ReadingComparison(Summarised):
         return text
 
     def __str__(self) -> str:
-        lines = [f"{'reading':<26}{self.cost_name:>12}{'times expected':>16}"]
-        for fit in (self.written, *self.others):
-            lines.append(f"{fit.reading.value:<26}{fit.cost:>12.4g}{fit.times_expected:>16.3g}")
+        fits = (self.written, *self.others)
+        width = max(26, *(len(fit.reading.value) for fit in fits))
+        lines = [f"{'reading':<{width}}{self.cost_name:>12}{'times expected':>16}"]
+        for fit in fits:
+            lines.append(
+                f"{fit.reading.value:<{width}}{fit.cost:>12.4g}{fit.times_expected:>16.3g}"
+            )
         return "\n".join(lines)
 
 
@@ -206,7 +210,7 @@ def compare_readings(
     Each reading is solved once, by Newton's method from its usual start. Where none of them fits
     better and the cost is far off, pairs of readings are tried.
     Nothing is claimed of a file whose edges all fit as closely as its numbers can tell, and nothing
-    that chance could explain.
+    that chance could explain. Of a graph in parts the largest component is compared.
 
     Parameters
     ----------
@@ -233,13 +237,19 @@ def compare_readings(
     """
 
     def read(reading: Reading) -> PoseGraph:
-        return load(
+        graph = load(
             name_or_path,
             reading=reading,
             unit_weights=unit_weights,
             skip_unknown=skip_unknown,
             trust_folder=trust_folder,
         )
+        largest, *others = graph.parts()
+        if not others:
+            return graph
+        text = f"{graph.name} has {len(others) + 1} components, of which the largest is compared"
+        warnings.warn(text, GraphWarning, stacklevel=3)
+        return graph.subgraph(largest)
 
     try:
         graph = read(Reading.AS_WRITTEN)

@@ -447,6 +447,15 @@ def test_every_component_is_solved_when_asked(pgo_command: Call, tmp_path: Path)
     assert "component 1 of 2: 3 poses, 3 edges" in out
     assert "component 2 of 2: 3 poses, 4 edges" in out
     assert read_g2o(tmp_path / "map.2.g2o").pose_ids.tolist() == [7, 8, 9]
+    options = ("--all-components", "--anchor", 8, "--json")
+    _, out, _ = pgo_command("solve", tmp_path / "parts.g2o", *options)
+    assert [record["graph"]["edges"] for record in json.loads(out)] == [3, 4]
+    code, _, err = pgo_command("solve", tmp_path / "parts.g2o", "--all-components", "--anchor", 5)
+    assert code == 1
+    assert "no pose 5 to anchor" in err
+    code, out, err = said(pgo_command, "doctor", tmp_path / "parts.g2o")
+    assert code == 0
+    assert err.count("2 components, of which the largest is compared") == 1
 
 
 def test_parts_with_headings_alone_are_solved_apart(pgo_command: Call, tmp_path: Path) -> None:
