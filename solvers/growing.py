@@ -109,7 +109,7 @@ def extend(
     has_owners = shared is not None and shared.owners is not None
     if not has_owners and solution.robots is not None:
         owners = extended_partition(solution.robots, solution.problem.graph.pose_ids, graph)
-        shared = (shared or Robots()).with_owners(owners)
+        shared = replace(shared or Robots(), owners=owners)
     _check_grown(solution.problem.graph, graph)
     pipeline = pipeline if pipeline is not None else Pipeline()
     weighting = solution.problem.weighting

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from pgo_models.certificates.certificate import Certificate
-from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.carry.ledger import NOTHING_SENT, Ledger
@@ -148,8 +147,8 @@ class Place(ABC):
     """Where a solve runs.
 
     Each verb takes an attempt and returns the next one; none changes an attempt. Where robots hold
-    the poses, an attempt goes on from those that they hold now. The verbs of the first attempt are
-    abstract. A place may lack the verb of a later step, and then `lacks` says why.
+    the poses, an attempt goes on from those that they hold now. `lacks` says which steps cannot be
+    taken at a place, and why.
     """
 
     monitor: RunMonitor  # time limit, callback and progress of the solve
@@ -224,41 +223,42 @@ class Place(ABC):
         """Put away what would only serve to go on with a solve that was broken off."""
         return  # nothing was put aside
 
+    @abstractmethod
     def run_gnc(self, gnc: GNC, start: Poses | None) -> Inliers:
         """Find wrong edges by graduated non-convexity, from a start or along known inliers."""
-        raise self._refusal("graduated non-convexity")
 
+    @abstractmethod
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the cheaper poses with the best bound that either has: after any other step."""
-        raise self._refusal(Step.SECOND.value)
 
+    @abstractmethod
     def start_grown(self, growing: GrowingStart) -> Attempt:
         """Start at poses that prefixes of the graph lead to."""
-        raise self._refusal(Step.GROWING.value)
 
+    @abstractmethod
     def start_again(self) -> Poses | None:
         """Return where a second attempt starts without SOC; None where it runs SOC once more."""
-        raise self._refusal(Step.SECOND.value)
 
+    @abstractmethod
     def try_other_starts(self, best: Attempt, newton: Newton) -> Attempt:
         """Return the better of the answer and an attempt from the best of some other starts."""
-        raise self._refusal(Step.STARTS.value)
 
+    @abstractmethod
     def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Solve the semidefinite relaxation from the best poses, and round its solution."""
-        raise self._refusal(Step.STAIRCASE.value)
 
+    @abstractmethod
     def bound_by_smaller_matrices(self, best: Attempt) -> Attempt:
         """Return the same poses, with the bound of smaller information matrices if it is better."""
-        raise self._refusal(Step.SMALLER_MATRICES.value)
 
+    @abstractmethod
     def solve_in_complex_numbers(self, best: Attempt, method: ComplexRelaxation) -> Attempt:
         """Solve the relaxation with planar rotations as complex numbers.
 
         Returned are the better poses and the better bound.
         """
-        raise self._refusal(Step.COMPLEX.value)
 
+    @abstractmethod
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
     ) -> Attempt:
@@ -266,19 +266,15 @@ class Place(ABC):
 
         The ascent begins with the terms of the multipliers Pi, (pairs, 4, 4), or with none.
         """
-        raise self._refusal(Step.TERMS.value)
 
+    @abstractmethod
     def terms_can_help(self, best: Attempt) -> bool:
         """Whether `bound_by_terms` may raise the bound."""
-        raise self._refusal(Step.TERMS.value)
 
+    @abstractmethod
     def solve_hulls(self, best: Attempt, method: HullLagrangian) -> Attempt:
         """Solve the relaxation with hulls of rotations, from where it was last solved.
 
         The first time it begins at the best poses. Returned are the better poses and the better
         bound, with the state that the method ends at.
         """
-        raise self._refusal(Step.HULLS.value)
-
-    def _refusal(self, step: str) -> SettingError:
-        return SettingError(f"{step} cannot be taken here; {self.way_out}")

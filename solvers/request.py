@@ -73,11 +73,6 @@ class Pipeline:
         What tells rotations from reflections: step 8 and, in the plane, the relaxation of step 7.
         None leaves both out.
 
-    Raises
-    ------
-    SettingError
-        When a setting is out of its range.
-
     Examples
     --------
     >>> from pgo_models import load
@@ -203,7 +198,7 @@ class SolveRequest:
         from solvers.robots.chosen_robots import robots_of_solve
 
         owners = robots_of_solve(self.pipeline.first_stage, self.robots.owners, self.problem.graph)
-        return replace(self, robots=self.robots.with_owners(owners))
+        return replace(self, robots=replace(self.robots, owners=owners))
 
     @contextmanager
     def with_checkpoint(self) -> Iterator[SolveRequest]:

@@ -106,11 +106,6 @@ class GaussSeidel:
     max_iterations : int
         Sweeps of all stages together, at most.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     References
     ----------
     Choudhary et al., Distributed mapping with privacy and communication constraints, 2017.
@@ -191,13 +186,9 @@ class GaussSeidel:
         return Measurement(objective, distance, state.change, all_reduces=all_reduces)
 
     def poses(self, problem: PGOProblem, state: GaussSeidelState) -> Poses:
-        """Return the poses that a state stands for.
+        """Poses with rotations projected to SO(d).
 
-        Returns
-        -------
-        Poses
-            With rotations projected to SO(d). In the first stage translations are the best ones for
-            them, which no robot knows yet.
+        In the first stage translations are the best ones for them, which no robot knows yet.
         """
         if state.stage is DGSStage.POSES:
             return _moved(problem, state)

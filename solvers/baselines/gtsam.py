@@ -56,11 +56,6 @@ class Gtsam:
         On the relative change of its cost in one iteration; the default is GTSAM's.
     max_iterations : int
         Iterations at most.
-
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
     """
 
     method: GtsamMethod = GtsamMethod.LEVENBERG_MARQUARDT

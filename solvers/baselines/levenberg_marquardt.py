@@ -68,11 +68,6 @@ class LevenbergMarquardt:
     damping : float
         First mu, relative to the diagonal of the Gauss-Newton matrix.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     References
     ----------
     Madsen, Nielsen & Tingleff, Methods for non-linear least squares problems, 2004.

@@ -50,11 +50,6 @@ class Newton:
         Whether moves with one factorisation learn from those before (L-BFGS). Robots do without, as
         each learned one would cost them a reduction.
 
-    Raises
-    ------
-    SettingError
-        If the tolerance is not positive, or `max_iterations` is negative.
-
     References
     ----------
     P.-A. Absil, R. Mahony and R. Sepulchre, Optimization Algorithms on Matrix Manifolds, 2008,
@@ -98,13 +93,7 @@ class Newton:
         return Measurement(state.polish.objective, 0.0, state.polish.decrement)
 
     def poses(self, problem: PGOProblem, state: NewtonState) -> Poses:
-        """Return the poses of a state.
-
-        Returns
-        -------
-        Poses
-            Those whose F `measure` reports.
-        """
+        """The poses of a state, whose F `measure` reports."""
         return state.polish.poses
 
     def converged(self, state: NewtonState, measurement: Measurement) -> Status | None:

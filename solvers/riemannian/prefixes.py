@@ -182,11 +182,6 @@ class GrowingStart:
     max_iterations : int
         Most prefixes.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     Examples
     --------
     >>> import numpy as np
@@ -255,13 +250,7 @@ class GrowingStart:
         return Measurement(problem.objective(state.poses), 0.0, unsolved)
 
     def poses(self, problem: PGOProblem, state: PrefixState) -> Poses:
-        """Return the poses of a state.
-
-        Returns
-        -------
-        Poses
-            Those whose F `measure` reports.
-        """
+        """The poses of a state, whose F `measure` reports."""
         return state.poses
 
     def converged(self, state: PrefixState, measurement: Measurement) -> Status | None:

@@ -83,11 +83,6 @@ class Staircase:
     max_iterations : int
         Most steps.
 
-    Raises
-    ------
-    SettingError
-        If tolerance or gap is not positive, or `max_iterations` is negative.
-
     References
     ----------
     D. Rosen, L. Carlone, A. Bandeira and J. Leonard, SE-Sync: A certifiably correct algorithm for
@@ -139,13 +134,7 @@ class Staircase:
         return Measurement(objective, lost, state.decrement)
 
     def poses(self, problem: PGOProblem, state: StaircaseState) -> Poses:
-        """Round Y to rotations, with the best translations for them.
-
-        Returns
-        -------
-        Poses
-            Those whose F `measure` reports.
-        """
+        """Y rounded to rotations, with the best translations for them."""
         return round_factor(problem, state.point.Y)[0]
 
     def converged(self, state: StaircaseState, measurement: Measurement) -> Status | None:

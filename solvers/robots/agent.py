@@ -211,6 +211,17 @@ def _states(held: Held) -> HeldStates:
 # Orders are functions of an agent and a request, some of them once their first argument is given.
 
 
+@order("robot.order_interior")
+def order_interior(
+    order: Callable[[Interior, Q], tuple[Interior, A]], agent: Agent, request: Q
+) -> A | None:
+    """Give the interior an order; None if the robot counts no edge."""
+    if agent.interior is None:
+        return None
+    agent.interior, answer = order(agent.interior, request)
+    return answer
+
+
 @order("robot.order_copies")
 def order_copies(order: Callable[[C, Q], tuple[C, A]], agent: Agent, request: Q) -> A:
     """Give the copies an order, which is of their kind: a method began with these."""

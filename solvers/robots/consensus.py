@@ -2,7 +2,7 @@
 
 `ConsensusSOC` waits: an iteration is one exchange and one all-reduce. `AsynchronousSOC` does not
 wait: every robot continues with the newest rows that it has received. The fixed-point map is the
-same, over-relaxed, and damped where values are old (Peng et al. 2016, ARock).
+same, over-relaxed (Peng et al. 2016, ARock).
 """
 
 import math
@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pgo_models.errors import SettingError, check_settings
+from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from solvers.carry.counted_pool import Count
@@ -31,7 +31,7 @@ from solvers.soc.consensus import (
     objective_and_gradient,
 )
 from solvers.soc.consensus_robot import ConsensusRobot, CopiesState
-from solvers.soc.copies import Rows, TurnSettings
+from solvers.soc.copies import Rows
 from solvers.soc.recursion_block import Rotations
 from solvers.soc.soc import SOC
 
@@ -187,15 +187,8 @@ class AsynchronousSOC:
     # not, since it needs sums over all robots.
     soc: SOC = field(default_factory=SOC)
     faults: Faults = field(default_factory=Faults)
-    alpha: float = 1.8  # over-relaxation, in (0, 2)
-    damping: float = 1.0  # fraction of a step that is taken, in (0, 1]
     has_driver: bool = True  # as in `ConsensusSOC`
     goes_on: bool = False  # as in `ConsensusSOC`
-
-    def __post_init__(self) -> None:
-        check_settings(self, relaxation=["alpha"])
-        if not 0 < self.damping <= 1:
-            raise SettingError(f"damping must be in (0, 1], got {self.damping}")
 
     @property
     def max_iterations(self) -> int:
@@ -212,8 +205,7 @@ class AsynchronousSOC:
         if silent is not None and silent >= robots.num_robots:
             raise SettingError(f"silent_robot is {silent}; give 0 to {robots.num_robots - 1}")
         state = Consensus(self.soc).init(robots)
-        settings = TurnSettings(self.alpha, self.damping)
-        sent = ask_all(robots, ConsensusRobot.announce, settings, Count.PIGGYBACKED)
+        sent = ask_all(robots, ConsensusRobot.announce, None, Count.PIGGYBACKED)
         rows = robots.exchange(sent)
         return AsynchronousState(
             k=0,

@@ -46,7 +46,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol, TypeVar, cast
+from typing import TypeVar, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -69,10 +69,11 @@ from solvers.carry.ledger import Ledger
 from solvers.carry.messages import Snapshot, restore, take_snapshot
 from solvers.carry.moments import Moment
 from solvers.carry.process import DEFAULT_MEMORY, WorkerPool
-from solvers.carry.registry import order, record
+from solvers.carry.registry import record
 from solvers.carry.serialization import deserialize
 from solvers.result import Measurement
 from solvers.robots import poses as pose_orders
+from solvers.robots.agent import order_interior
 from solvers.robots.interface import Interface, InterfaceFactor, Separators
 from solvers.robots.part import CostParts, Interior, ReducedTranslations, Reweighed
 from solvers.robots.subdomain_blocks import Widths
@@ -563,20 +564,3 @@ def collect(driver: Driver) -> tuple[Poses, Array]:
         t[answer.poses] = answer.t
         Lambda[answer.poses] = answer.Lambda
     return poses_from(R, t), Lambda
-
-
-class HoldsInterior(Protocol):
-    """A robot as the driver gives it orders: `solvers.robots.agent.Agent`."""
-
-    interior: Interior | None
-
-
-@order("robot.order_interior")
-def order_interior(
-    order: Callable[[Interior, Q], tuple[Interior, A]], agent: HoldsInterior, request: Q
-) -> A | None:
-    """Give the interior an order; None if the robot counts no edge."""
-    if agent.interior is None:
-        return None
-    agent.interior, answer = order(agent.interior, request)
-    return answer

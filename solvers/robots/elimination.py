@@ -71,10 +71,6 @@ class Elimination:
             x[self.cut.interior] = self.factor.solve(b_I - self.K_IG @ x_G)
         return x
 
-    def schur_row_sums(self, scale: Array) -> Array:
-        """`row_sums` of the Schur complement."""
-        return row_sums(self.cut.blocks.symmetric(self.schur), scale)
-
 
 def eliminate(
     K: csc_array, cut: Cut, backend: CholeskyBackend | None, is_verified: bool = False
@@ -290,7 +286,3 @@ class FactoredPart:
         """Elimination of the matrix of the translations, of `with_laplacian`."""
         assert self.known_laplacian is not None
         return self.known_laplacian
-
-    def with_weights_of(self, part: Part) -> FactoredPart:
-        """The factors of a part with other weights, whose matrices have the same patterns."""
-        return replace(self, part=part, known_laplacian=None)

@@ -310,7 +310,8 @@ def find_derivative(robot: Interior, order: Array) -> tuple[Interior, float]:
     i, j = _pairs(robot).T
     vectors = ascent.X @ order
     z = vectors[robot.part.problem.num_poses :].reshape(-1, 3, vectors.shape[1])
-    moves = z[j] - np.swapaxes(_turns(robot.poses, i, j), 1, 2) @ z[i]
+    R = robot.poses.R
+    moves = z[j] - np.swapaxes(np.swapaxes(R[i], 1, 2) @ R[j], 1, 2) @ z[i]
     derivative = derivative_of_minimum(moves, np.ones(vectors.shape[1]))
     following = _with_ascent(robot, replace(ascent, derivative=derivative))
     return following, inner(derivative, derivative)
@@ -354,8 +355,3 @@ def _ascent(robot: Interior) -> RobotAscent:
 def _pairs(robot: Interior) -> IntArray:
     """Pairs of poses that the robot's edges join, (k, 2)."""
     return distinct_pairs(robot.part.problem.graph)
-
-
-def _turns(poses: Poses, i: IntArray, j: IntArray) -> Array:
-    """R_i^T R_j of pairs, (k, 3, 3)."""
-    return np.asarray(np.swapaxes(poses.R[i], 1, 2) @ poses.R[j])

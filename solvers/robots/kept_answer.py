@@ -71,20 +71,16 @@ class AnswerAtRobots:
             bound = dual.bound
             source = BoundSource.RELAXATION
         if self.kept is None or driver.current.objective < self.kept.objective:
-            self._keep(driver, attempt)
+            robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
+            self.kept = KeptAnswer(
+                driver.current.objective,
+                attempt.decrement,
+                _sum_of_roundings([robot.rounding for robot in robots]),
+                robots,
+                driver.current,
+                attempt.status,
+            )
         return replace(attempt, certificate=self._certificate(bound, source))
-
-    def _keep(self, driver: Driver, attempt: Attempt) -> None:
-        """Have the robots keep the current poses."""
-        robots = driver.network.ask(keep_answer, driver.poses_of_cover(), Count.ROUND)
-        self.kept = KeptAnswer(
-            driver.current.objective,
-            attempt.decrement,
-            _sum_of_roundings([robot.rounding for robot in robots]),
-            robots,
-            driver.current,
-            attempt.status,
-        )
 
     def _certificate(self, bound: LowerBound, source: BoundSource) -> Certificate:
         """Certificate of the poses that the robots keep."""

@@ -50,8 +50,7 @@ from pgo_models.problem.weighting import (
 )
 from solvers.carry.messages import Messages
 from solvers.carry.registry import order, record
-from solvers.robots.agent import Agent, held_poses
-from solvers.robots.driver import order_interior
+from solvers.robots.agent import Agent, held_poses, order_interior
 from solvers.robots.part import Interior
 from solvers.robots.poses import set_poses
 from solvers.soc.subgraph import PartProblem, Placement, RobotSummary
@@ -199,12 +198,6 @@ class OwnGraph:
         """The poses that `keep_answer` kept."""
         assert self.answer is not None
         return self.answer
-
-    def to_go_back_to(self, solved: Poses) -> OwnGraph:
-        """The same edges, at own poses that were found, before anything was done with them."""
-        return replace(
-            self, solved=solved, before=None, problem=None, answer=None, within=None, near=None
-        )
 
 
 @order("files.read_file")

@@ -228,7 +228,8 @@ class Interior:
     def in_state_of(self, state: InteriorState) -> Interior:
         """The robot in a state of a snapshot, or with other weights, and the factors there."""
         part = self.whole if state.weights is None else self.whole.weighted(state.weights)
-        factored = self.factored.with_weights_of(part)
+        # The patterns stay, and with them the analyses; the matrix of the translations does not.
+        factored = replace(self.factored, part=part, known_laplacian=None)
         session = state.session
         if session is not None and session.system is not None:
             session = replace(session, system=factored.eliminated_again(session.system))

@@ -45,7 +45,7 @@ from pgo_models.problem.problem import PGOProblem
 from solvers.carry.counted_pool import Count
 from solvers.carry.registry import order, record
 from solvers.robots.driver import Driver
-from solvers.robots.elimination import Cut, Elimination, RightHandSide, System, eliminate
+from solvers.robots.elimination import Cut, Elimination, RightHandSide, System, eliminate, row_sums
 from solvers.robots.interface import Interface, InterfaceFactor
 from solvers.robots.part import Interior, Session
 from solvers.soc.subgraph import Part
@@ -201,11 +201,10 @@ def prove_grounded(
     free = np.ones(len(X), dtype=bool)
     free[driver.rows_left_out(position)] = False
     steps = [answer.step for answer in proof.answers if answer.step is not None]
-    first = CoverProof(X, steps, _sum_up(driver, proof, X, steps, free))
+    first = _sum_up(driver, proof, X, steps, free)
     moved = central.move_until_settled(first, partial(_moved, driver, proof, free))
-    sums = moved.sums
-    distances = sums.squared_distances + squared_distances(moved.X[g:], X[g:])
-    return central.grounded_bound(sums.value, sums.value_error, sums.quadratic, eta, distances)
+    distances = moved.squared_distances + squared_distances(moved.X[g:], X[g:])
+    return central.grounded_bound(moved.value, moved.value_error, moved.quadratic, eta, distances)
 
 
 def _grounded_point(driver: Driver) -> Array:
@@ -223,38 +222,13 @@ def _grounded_point(driver: Driver) -> Array:
     return X
 
 
-@dataclass(frozen=True, eq=False)
-class CoverProof:
-    """`certificates.lower_bound.ProofPoint`: X on the cover, the robots' steps there, and sums."""
-
-    X: Array
-    steps: Sequence[ProofStep]
-    sums: ProofSums
-
-    @property
-    def value(self) -> float:
-        """Value of the certificate at X."""
-        return self.sums.value
-
-    @property
-    def estimated_loss(self) -> float:
-        """About what is lost to G = S X."""
-        return self.sums.estimated_loss
-
-    @property
-    def quadratic(self) -> float:
-        """Bound on the loss to G = S X, with the error of G."""
-        return self.sums.quadratic
-
-
 def _moved(
     driver: Driver, proof: InterfaceProof, free: Array, point: CoverProof
 ) -> tuple[CoverProof, float]:
     """Proof at X - S_r^-1 S X, and the gain: one round."""
     g = len(driver.cover)
-    product_on_cover = np.where(
-        free[:, None], point.sums.product, 0.0
-    )  # as robots leave out the fixed rows
+    # as robots leave out the fixed rows
+    product_on_cover = np.where(free[:, None], point.product, 0.0)
     rights = [step.right for step in point.steps]
     move, parts, energy = proof.factor.solve([right.b for right in rights], product_on_cover)
     steps = driver.ask_each(move_proof, parts)
@@ -262,16 +236,13 @@ def _moved(
     # the translations matter in the residuals alone, which the robots have
     X[g:] -= move[g:]
     gain = energy + exact_sum(right.energy for right in rights)
-    return CoverProof(X, steps, _sum_up(driver, proof, X, steps, free)), gain
+    return _sum_up(driver, proof, X, steps, free), gain
 
 
 def _sum_up(
     driver: Driver, proof: InterfaceProof, X: Array, steps: Sequence[ProofStep], free: Array
-) -> ProofSums:
-    """Sum the parts of the bound at X over robots and driver.
-
-    Of S X the sums have the driver's own part, and the error of the whole.
-    """
+) -> CoverProof:
+    """Sum the parts of the bound at X over robots and driver."""
     g = len(driver.cover)
     d = driver.d
     space = driver.interface(1, d)
@@ -293,7 +264,9 @@ def _sum_up(
     loss += quadratic_loss(product[free], 0.0, slack)
     quadratic = exact_sum(part.quadratic for part in parts)
     quadratic += quadratic_loss(product[free], error[free], slack)
-    return ProofSums(
+    return CoverProof(
+        X=X,
+        steps=steps,
         value=value,
         value_error=OUTWARD * value_error,
         estimated_loss=loss,
@@ -432,6 +405,17 @@ class ProofSums:
     error: Array
 
 
+@dataclass(frozen=True, eq=False)
+class CoverProof(ProofSums):
+    """`certificates.lower_bound.ProofPoint`: sums over robots and driver at X on the cover.
+
+    Of S X they have the driver's own part, and the error of the whole.
+    """
+
+    X: Array
+    steps: Sequence[ProofStep]  # of the robots
+
+
 @record("ProofOrder")
 @dataclass(frozen=True, eq=False)
 class ProofOrder:
@@ -506,7 +490,7 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     system = System.of(matrix, robot.widths, no_right, elimination)
     session = ProofSession(system=system)
     following = replace(robot, factored=factored).in_session(session)
-    sizes = elimination.schur_row_sums(order.diagonal)
+    sizes = row_sums(cut.blocks.symmetric(elimination.schur), order.diagonal)
     if order.point is None:
         return following, ProofAnswer(elimination.schur, sizes, trace, None)
     proof = begin_proof(

@@ -38,7 +38,7 @@ from solvers.loop import RunMonitor
 from solvers.place import BROKEN_OFF
 from solvers.result import Stage, Status
 from solvers.robots import poses as pose_orders
-from solvers.robots.agent import Agent, held_poses
+from solvers.robots.agent import Agent, held_poses, order_interior
 from solvers.robots.consistency import (
     ConsistentPart,
     edges_between,
@@ -48,7 +48,7 @@ from solvers.robots.consistency import (
     own_odometry,
     with_edges,
 )
-from solvers.robots.driver import Driver, order_interior
+from solvers.robots.driver import Driver
 from solvers.robots.own_file import Border, OwnGraph, border_of
 from solvers.robots.reweigh import SharedGNC, stage_of, sum_truncated
 from solvers.robots.setup import OpenedFiles
@@ -302,12 +302,16 @@ def take_back(agent: Agent, request: TakenBack) -> Border:
     if request.is_first:
         before = with_edges(everything, robot, everything.agrees)
     joined = with_edges(everything, robot, candidates)
+    # The edges before, at the poses found, as if nothing had been done with them.
+    before = replace(
+        before, solved=solved, before=None, problem=None, answer=None, within=None, near=None
+    )
     graph = joined.graph
     thresholds = chi2_thresholds(PartProblem(graph, weighting=request.weighting), request.quantile)
     known = own_odometry(graph, joined.owners == robot) & is_whole(graph)
     joined = replace(
         joined,
-        before=before.to_go_back_to(solved),
+        before=before,
         thresholds=np.where(known, np.inf, thresholds),
         solved=solved,
     )

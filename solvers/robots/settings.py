@@ -5,7 +5,7 @@ A solve by robots may be broken off and go on later, from the file of a `Checkpo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from pgo_models.errors import SettingError, check_settings
@@ -32,11 +32,6 @@ class Checkpoint:
     rounds : int
         Rounds of communication after which one is written; at least 1. There is also one when SOC
         and when Newton begins.
-
-    Raises
-    ------
-    SettingError
-        When `rounds` is below 1.
 
     Examples
     --------
@@ -83,11 +78,6 @@ class Robots:
         File to which the solve writes what it needs to go on after it was broken off, and from
         which it goes on.
 
-    Raises
-    ------
-    SettingError
-        When a setting is of another type or out of its range.
-
     Examples
     --------
     >>> from pgo_models import load
@@ -108,33 +98,12 @@ class Robots:
 
     @classmethod
     def of(cls, robots: Robots | Partition | int) -> Robots:
-        """Robots as they are given to `solve`, where owners alone will do.
-
-        Parameters
-        ----------
-        robots : Robots, Partition or int
-            Robots, or owners of the poses.
-        """
+        """Robots as they are given to `solve`, where owners alone will do."""
         if isinstance(robots, Robots):
             return robots
         if isinstance(robots, Partition):
             return cls(robots)
         return cls(whole_number(robots, "robots", SettingError))
-
-    def with_owners(self, owners: Partition) -> Robots:
-        """The robots with the owners that a number of them stands for.
-
-        Parameters
-        ----------
-        owners : Partition
-            Owners of the poses.
-
-        Returns
-        -------
-        Robots
-            All else is as it was.
-        """
-        return replace(self, owners=owners)
 
     @property
     def partition(self) -> Partition:

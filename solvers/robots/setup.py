@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -27,7 +26,7 @@ from pgo_models.errors import FileFormatError, GraphError, GraphWarning, printab
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_folder import copies_within_printing
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, least_tree
+from pgo_models.graphs.pose_graph import IntArray, edge_counts, least_tree
 from pgo_models.graphs.written_digits import most_digits
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -80,14 +79,11 @@ def open_driver(
     summaries = [subgraph.summary for subgraph in subgraphs]
     start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
     driver = Driver(summaries, problem.num_poses, start, memory, problem.backend)
-    ledger = driver.network.ledger
-    driver.network.ledger = replace(ledger, graph_bytes=_bytes_of_edges(problem.graph))
+    # A list of all edges has of each a relative pose and the two precisions of F.
+    numbers_of_edge = problem.d * (problem.d + 1) // 2 + 2
+    graph_bytes = BYTES_PER_NUMBER * problem.graph.num_edges * numbers_of_edge
+    driver.network.ledger = replace(driver.network.ledger, graph_bytes=graph_bytes)
     return driver
-
-
-def _bytes_of_edges(graph: PoseGraph) -> int:
-    """Bytes of a list of all edges, each a relative pose and the two precisions of F."""
-    return BYTES_PER_NUMBER * graph.num_edges * (graph.d * (graph.d + 1) // 2 + 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,9 +146,8 @@ def open_files(
     network = CountedPool(engine.open(Agent, files), len(files))
     try:
         claims = network.ask(read_file, [None] * len(files), Count.ROUND)
-        numbered = number_ids(claims, files)
-        num_poses = numbered.num_poses
-        sent = network.ask(number_poses, numbered.runs, Count.PIGGYBACKED)
+        runs, num_poses, num_absent = number_ids(claims, files)
+        sent = network.ask(number_poses, runs, Count.PIGGYBACKED)
         received = [(lines, trust_folder) for lines in network.exchange(sent)]
         joined = network.ask(join_neighbours, received, Count.PIGGYBACKED)
         borders = [border for border, _ in joined]
@@ -177,7 +172,7 @@ def open_files(
                 folder,
                 weighting,
                 has_indefinite,
-                numbered.num_absent,
+                num_absent,
                 num_rejected,
                 threshold_scale(scale),
             )
@@ -281,20 +276,12 @@ def _own_weighting(borders: Sequence[Border]) -> Weighting:
     return Weighting.INFORMATION
 
 
-class NumberedIds(NamedTuple):
+def number_ids(
+    claims: Sequence[Claim], files: Sequence[OwnLines]
+) -> tuple[list[OwnedRuns], int, int]:
     """Numbers and owners of the ids that every file names.
 
-    Of the `num_poses` different ids `num_absent` are poses of robots without a file.
-    """
-
-    runs: list[OwnedRuns]
-    num_poses: int
-    num_absent: int
-
-
-def number_ids(claims: Sequence[Claim], files: Sequence[OwnLines]) -> NumberedIds:
-    """Numbers and owners of the ids that every file names.
-
+    Beside them stand how many different ids there are, and how many of robots without a file.
     The ends of all runs cut the ids into intervals. All ids of an interval are named by the same
     files, or by none.
     """
@@ -318,7 +305,7 @@ def number_ids(claims: Sequence[Claim], files: Sequence[OwnLines]) -> NumberedId
     is_file_placed = np.array([len(vertices) > 0 for _, vertices, _, _ in claims])
     is_placed = (has_vertex | (is_named & ~is_file_placed[:, None])).any(axis=0)
     num_absent = int(known_size[~is_placed].sum())
-    return NumberedIds(owned, int(known_size.sum()), num_absent)
+    return owned, int(known_size.sum()), num_absent
 
 
 def _covers(runs: IntArray, bounds: IntArray) -> BoolArray:

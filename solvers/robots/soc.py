@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -42,7 +43,7 @@ from solvers.robots.poses import reduce_translations
 from solvers.soc.copies import Norms, subsampled
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import Agreement, RecursionBlock
-from solvers.soc.safeguard import Due, SharedSteps, next_penalty
+from solvers.soc.safeguard import Due, SharedSteps, with_due_penalty
 from solvers.soc.soc import SOC
 
 # Poses that are enough to estimate the penalty's quantile, where robots have files of their own.
@@ -180,19 +181,17 @@ class SubstructuredSOC:
         )
 
     def _with_due_penalty(self, driver: Driver, state: SubstructuredState) -> SubstructuredState:
-        """State with the penalty that the rule or the safeguard asks for, see `Joint`."""
-        due, factor = next_penalty(self.soc.penalty, state)
-        if due is Due.RAISE:
-            rescaled = self._rescaled(driver, state, factor, from_best=True)
-            return replace(rescaled, raises=state.raises + 1)
-        if due is Due.REFRESH:
-            _finish(driver, state)
-            fresh = self._penalized(driver, is_stationary=True)
-            return fresh.in_place_of(state)
-        if due is Due.RESCALE:
-            rescaled = self._rescaled(driver, state, factor, from_best=False)
-            return replace(rescaled, refreshes=state.refreshes + 1)
-        return state
+        """State with the penalty that the rule or the safeguard asks for."""
+        rescaled = partial(self._rescaled, driver)
+        refreshed = partial(self._refreshed, driver)
+        return with_due_penalty(self.soc.penalty, state, rescaled, refreshed)
+
+    def _refreshed(self, driver: Driver, state: SubstructuredState, due: Due) -> SubstructuredState:
+        """State with rho and B chosen anew; RECHECK is as in `Joint`."""
+        if due is Due.RECHECK:
+            return state
+        _finish(driver, state)
+        return self._penalized(driver, is_stationary=True).in_place_of(state)
 
     def _rescaled(
         self, driver: Driver, state: SubstructuredState, factor: float, from_best: bool

@@ -44,11 +44,6 @@ class Anderson:
         The differences are forgotten when the residual exceeds this many times the smallest one
         since they last were.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     References
     ----------
     Fang & Saad, Two classes of multisecant methods for nonlinear acceleration, 2009.

@@ -18,6 +18,7 @@ be in one process (`LocalRobots`) or on a network (`solvers.robots.consensus`).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -46,7 +47,7 @@ from solvers.soc.copies import (
 from solvers.soc.penalty import MultiplierPenalty, PenaltyOrder
 from solvers.soc.recursion_block import Agreement, Rotations
 from solvers.soc.rounding import WHOLE, ShortNumbers
-from solvers.soc.safeguard import Due, SharedSteps, next_penalty
+from solvers.soc.safeguard import Due, SharedSteps, with_due_penalty
 from solvers.soc.separator_stiffness import TRANSLATION_PENALTY, adapted_penalty, fell_most
 from solvers.soc.settings import SOCSettings
 from solvers.soc.subgraph import split_graph
@@ -146,8 +147,10 @@ class Consensus:
         stiffness = robots.ask(ConsensusRobot.stiffness, received_penalties, Count.GATHER)
         if before is not None:
             separators = before.separators
+        elif self.soc.translation_penalty is not None:
+            separators = self._separators(self.soc.translation_penalty)
         else:
-            separators = self._separators_of_stiffness(float(np.median(stiffness)))
+            separators = self._separators(TRANSLATION_PENALTY * float(np.median(stiffness)))
         replies = ask_all(robots, ConsensusRobot.start, separators, Count.ALL_REDUCE)
         return _first_state(separators, replies)
 
@@ -199,19 +202,16 @@ class Consensus:
         """
         if self.rotations is not Rotations.PROJECTED:
             return state
-        due, factor = next_penalty(self.soc.penalty, state)
-        if due is Due.RAISE:
-            rescaled = self._rescaled(robots, state, factor, from_best=True)
-            return replace(rescaled, raises=state.raises + 1)
-        if due is Due.RESCALE:
-            rescaled = self._rescaled(robots, state, factor, from_best=False)
-            return replace(rescaled, refreshes=state.refreshes + 1)
-        if due in (Due.REFRESH, Due.RECHECK):
-            adapted = self._adapted(robots, state)
-            penalty_before = state.separators.translation
-            penalty_after = adapted.separators.translation
-            if due is Due.REFRESH or fell_most(penalty_before, penalty_after):
-                return self.init(robots, adapted).in_place_of(state)
+        rescaled = partial(self._rescaled, robots)
+        refreshed = partial(self._refreshed, robots)
+        return with_due_penalty(self.soc.penalty, state, rescaled, refreshed)
+
+    def _refreshed(self, robots: AskedRobots, state: ConsensusState, due: Due) -> ConsensusState:
+        """State with all penalties chosen anew; to RECHECK, where the translations' fell most."""
+        adapted = self._adapted(robots, state)
+        fell = fell_most(state.separators.translation, adapted.separators.translation)
+        if due is Due.REFRESH or fell:
+            return self.init(robots, adapted).in_place_of(state)
         return state
 
     def _penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:
@@ -222,11 +222,6 @@ class Consensus:
         per_scale = _PENALTY_OF_RELAXED if self.rotations is Rotations.RELAXED else 1.0
         settings = replace(order.settings, rotations=self.rotations)
         return PenaltyOrder(0.0, per_scale, 0.0, settings=settings)
-
-    def _separators_of_stiffness(self, stiffness: float) -> SeparatorPenalty:
-        if self.soc.translation_penalty is not None:
-            return self._separators(self.soc.translation_penalty)
-        return self._separators(TRANSLATION_PENALTY * stiffness)
 
     def _separators(self, translation: float) -> SeparatorPenalty:
         has_multipliers = isinstance(self.soc.penalty, MultiplierPenalty)

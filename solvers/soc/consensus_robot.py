@@ -44,7 +44,8 @@ from solvers.soc.recursion_block import (
 from solvers.soc.rounding import WHOLE, PartOfSums, RowChange
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
-# An asynchronous run makes progress when a merit falls to this share of the smallest so far; it
+_OVER_RELAXATION = 1.8  # of an asynchronous run
+# Such a run makes progress when a merit falls to this share of the smallest so far; it
 # stagnates when that has not happened for so many turns.
 _PROGRESS = 0.9
 _PATIENCE = 20
@@ -55,7 +56,6 @@ _PATIENCE = 20
 class Waiting:
     """What a robot of an asynchronous run has received, and how far it relaxes."""
 
-    settings: copies.TurnSettings
     newest: Mapping[int, Array]  # the newest rows from every neighbour
     waited: Mapping[int, int]  # how many turns ago they arrived
     excess: float = 1.0  # share of the over-relaxation that is left
@@ -327,18 +327,18 @@ class ConsensusRobot:
         return self._with(X=X, block=block, received=received), rows
 
     @order("consensus.announce")
-    def announce(self, settings: copies.TurnSettings) -> tuple[ConsensusRobot, copies.Rows]:
+    def announce(self, _: None) -> tuple[ConsensusRobot, copies.Rows]:
         """Send the robot's rows to every neighbour, before the first turn."""
-        waiting = Waiting(settings, {}, dict.fromkeys(self.layout.common, 0))
+        waiting = Waiting({}, dict.fromkeys(self.layout.common, 0))
         return self._with(waiting=waiting)._sending(self.block)
 
     @order("consensus.turn")
     def turn(self, rows: copies.Rows) -> tuple[ConsensusRobot, copies.TurnAnswer]:
-        """Make one turn, (b), (c) and (a), with the newest rows that have arrived, damped.
+        """Make one turn, (b), (c) and (a), with the newest rows that have arrived.
 
-        s <- s + damping (T(s) - s) with T the map of the synchronous recursion, and the neighbours'
-        rows as old as they are: an asynchronous fixed-point iteration (Peng et al. 2016). The
-        answer has rows for every neighbour.
+        s <- T(s) with T the map of the synchronous recursion, and the neighbours' rows as old as
+        they are: an asynchronous fixed-point iteration (Peng et al. 2016). The answer has rows for
+        every neighbour.
         """
         before = self.block
         waiting = self.state.waiting
@@ -349,13 +349,13 @@ class ConsensusRobot:
         if has_all:
             block = replace(before, omega=self._agreed_omega(waiting.newest))  # (b), (c)
         X, local = self._with(block=block)._solved_after_local_passes()  # (a)
-        alpha = 1.0 + waiting.excess * (waiting.settings.alpha - 1.0)
+        alpha = 1.0 + waiting.excess * (_OVER_RELAXATION - 1.0)
         change = block.step_of_map(np.where(self.layout.held, X, 0.0), local, alpha)
         weight = np.sqrt(block.rho)[:, None]
         primal = weight * change
         dual = weight * (block.omega - before.omega)
         sums = np.array([inner(primal, primal), inner(dual, dual)])
-        block = replace(block, s=block.s + waiting.settings.damping * change)
+        block = replace(block, s=block.s + change)
         waiting = waiting.after(math.sqrt(sums[0]))
         robot, sent = self._with(X=X, waiting=waiting)._sending(block)
         stationarity = robot.stationarity(None)[1]

@@ -108,15 +108,6 @@ class StepReply:
     solved: SolveReply
 
 
-@record("TurnSettings")
-@dataclass(frozen=True)
-class TurnSettings:
-    """Over-relaxation and damping of an asynchronous run."""
-
-    alpha: float
-    damping: float
-
-
 @record("TurnAnswer")
 @dataclass(frozen=True, eq=False)
 class TurnAnswer:

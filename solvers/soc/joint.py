@@ -30,6 +30,7 @@ Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014.
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -42,7 +43,7 @@ from solvers.result import Measurement, Status
 from solvers.soc.anderson import AndersonShare, AndersonSums, extrapolate, over_relax
 from solvers.soc.r_step import JointStep, prepare_joint
 from solvers.soc.recursion_block import squared_residuals, stationary_B
-from solvers.soc.safeguard import Due, Steps, next_penalty
+from solvers.soc.safeguard import Due, Steps, with_due_penalty
 from solvers.soc.settings import SOCSettings
 
 
@@ -172,33 +173,34 @@ class Joint:
         return SOCState(x=poses.R, omega=poses.R, B=B, rho=rho, r_step=r_step)
 
     def _with_due_penalty(self, problem: PGOProblem, state: SOCState) -> SOCState:
-        """State with the penalty that the rule or the safeguard asks for; usually unchanged.
+        """State with the penalty that the rule or the safeguard asks for; usually unchanged."""
+        rescaled = partial(self._rescaled, problem)
+        refreshed = partial(self._refreshed, problem)
+        return with_due_penalty(self.soc.penalty, state, rescaled, refreshed)
 
-        RAISE, from the safeguard, returns to the best iterate and multiplies rho by the factor. It
-        follows at least two steps, the first of which has set `best`. REFRESH and RESCALE come from
-        the rule of the penalty, whose changes `refreshes` counts: REFRESH chooses rho and B anew
-        from the multipliers at omega, RESCALE multiplies rho by the factor. RECHECK concerns the
-        translation penalty, which JOINT does not have.
+    def _refreshed(self, problem: PGOProblem, state: SOCState, due: Due) -> SOCState:
+        """State with rho and B chosen anew, from the multipliers at omega.
+
+        RECHECK concerns the translation penalty, which JOINT does not have.
         """
-        due, factor = next_penalty(self.soc.penalty, state)
-        if due is Due.RAISE and state.best is not None:
-            omega = project_to_rotations(state.best)
-            at_best = replace(state, omega=omega, B=state.best - omega)
-            return replace(self._rescaled(problem, at_best, factor), raises=state.raises + 1)
-        if due is Due.REFRESH:
-            poses = problem.with_best_translations(state.omega)
-            return self._state_at(problem, poses, treat_as_stationary=True).in_place_of(state)
-        if due is Due.RESCALE:
-            return replace(self._rescaled(problem, state, factor), refreshes=state.refreshes + 1)
-        return state
+        if due is Due.RECHECK:
+            return state
+        poses = problem.with_best_translations(state.omega)
+        return self._state_at(problem, poses, treat_as_stationary=True).in_place_of(state)
 
-    def _rescaled(self, problem: PGOProblem, state: SOCState, factor: float) -> SOCState:
+    def _rescaled(
+        self, problem: PGOProblem, state: SOCState, factor: float, from_best: bool
+    ) -> SOCState:
         """State with factor * rho and the same rho B; its acceleration starts anew.
 
-        The list of merits is emptied, because merits of different rho cannot be compared. `best`
-        still belongs to the old rho; the next step is the best one of an empty list, and replaces
-        it.
+        From the best iterate on it goes to omega + B there, which the first step has set. The list
+        of merits is emptied, because merits of different rho cannot be compared. `best` still
+        belongs to the old rho; the next step is the best one of an empty list, and replaces it.
         """
+        if from_best:
+            assert state.best is not None
+            omega = project_to_rotations(state.best)
+            state = replace(state, omega=omega, B=state.best - omega)
         rho = factor * state.rho
         return replace(
             state,

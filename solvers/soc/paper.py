@@ -282,11 +282,6 @@ class PaperSOC:
     stop : PaperStop
         Which residuals have to be small. The paper's own is `PaperStop.PRIMAL_RESIDUAL`.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     Notes
     -----
     Steps (a), (b), (c), the frozen neighbours, omega^0 = R^0 and B^0 = 0 are the algorithm's. The
@@ -413,20 +408,7 @@ class PaperSOC:
         return Measurement(problem.objective(poses), p_res, state.dual_residual)
 
     def poses(self, problem: PGOProblem, state: PaperState) -> Poses:
-        """Return the poses that a state stands for.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : PaperState
-            A state of this solver.
-
-        Returns
-        -------
-        Poses
-            Omega with the best translations for it.
-        """
+        """Omega with the best translations for it."""
         return problem.with_best_translations(state.omega)
 
     def converged(self, state: PaperState, measurement: Measurement) -> Status | None:

@@ -134,11 +134,6 @@ class MultiplierPenalty(PenaltyRule):
     max_refreshes : int
         How often the multipliers are taken anew.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     Examples
     --------
     >>> from solvers import SOC
@@ -177,11 +172,6 @@ class FixedPenalty(PenaltyRule):
     ----------
     rho : float
         The penalty, in the unit of kappa.
-
-    Raises
-    ------
-    SettingError
-        Unless rho is positive.
 
     Examples
     --------
@@ -222,11 +212,6 @@ class BalancedPenalty(PenaltyRule):
     refactor_ratio : float above 1
         By what factor rho moves.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
-
     References
     ----------
     Stellato et al., OSQP: an operator splitting solver for quadratic programs, 2020, section 5.2.
@@ -265,11 +250,6 @@ class BoydPenalty(PenaltyRule):
         Ratio of the residuals from which on rho moves; Boyd's mu.
     growth : float above 1
         Factor by which rho moves; Boyd's tau.
-
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range.
 
     References
     ----------

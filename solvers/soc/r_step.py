@@ -6,9 +6,8 @@ With M = A^T diag(w) A this is the solution of (M + D/2) X = D/2 V.
 """
 
 import enum
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -117,11 +116,9 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
     if back_end is RStep.FACTORIZED:
         factor = subproblem.analysis.factorize(subproblem.matrix)
         return _Factorized(factor, 0.5 * subproblem.rho[:, None])
-    if back_end is RStep.FISTA:
-        return _Fista(subproblem)
-    if back_end is RStep.NESTEROV:
-        return _Nesterov(subproblem)
-    return CvxpyStep().prepare(subproblem)
+    if back_end is RStep.CLARABEL:
+        return CvxpyStep().prepare(subproblem)
+    return _Gradients(subproblem, back_end)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +192,7 @@ class _Factorized:
         return self.factor.solve(self.half_penalty * V)
 
 
-class _Gradients(ABC):
+class _Gradients:
     """Accelerated gradients on the rotations alone.
 
     With P = M + D/2 in blocks, the best translations of rotations R are P_tt^-1 (b_t - P_tR R), by
@@ -205,7 +202,7 @@ class _Gradients(ABC):
     largest of them.
     """
 
-    def __init__(self, subproblem: RSubproblem) -> None:
+    def __init__(self, subproblem: RSubproblem, method: RStep) -> None:
         P = subproblem.matrix
         count = subproblem.num_translations
         self._subproblem = subproblem
@@ -217,7 +214,14 @@ class _Gradients(ABC):
         self._scale = scale[:, None]
         self._H_RR = (diags_array(scale) @ P[count:, count:] @ diags_array(scale)).tocsr()
         # The correction P_Rt P_tt^-1 P_tR only lowers the eigenvalues of H.
-        self._lipschitz = _largest_eigenvalue_bound(self._H_RR)
+        lipschitz = _largest_eigenvalue_bound(self._H_RR)
+        if method is RStep.FISTA:
+            self._minimize = partial(minimize_with_fista, self._apply, lipschitz=lipschitz)
+        else:
+            # H is half the identity and a positive semidefinite matrix.
+            self._minimize = partial(
+                minimize_with_nesterov, self._apply, lipschitz=lipschitz, strong_convexity=0.5
+            )
 
     def solve(self, V: Array) -> Array:
         count = self._subproblem.num_translations
@@ -225,12 +229,8 @@ class _Gradients(ABC):
         b_t = b[:count]
         reduced = self._scale * (b[count:] - self._P_tR.T @ self._solve_tt(b_t))
         start = V[count:] / self._scale
-        R = self._scale * self._minimize(reduced, start)
+        R = self._scale * self._minimize(b=reduced, start=start)
         return np.concatenate([self._solve_tt(b_t - self._P_tR @ R), R])
-
-    @abstractmethod
-    def _minimize(self, b: Array, start: Array) -> Array:
-        """Y with H Y = b."""
 
     def _apply(self, Y: Array) -> Array:
         t = self._solve_tt(self._P_tR @ (self._scale * Y))
@@ -238,17 +238,6 @@ class _Gradients(ABC):
 
     def _solve_tt(self, b: Array) -> Array:
         return b if self._factor_tt is None else self._factor_tt.solve(b)
-
-
-class _Fista(_Gradients):
-    def _minimize(self, b: Array, start: Array) -> Array:
-        return minimize_with_fista(self._apply, b, start, self._lipschitz)
-
-
-class _Nesterov(_Gradients):
-    def _minimize(self, b: Array, start: Array) -> Array:
-        # H is half the identity and a positive semidefinite matrix.
-        return minimize_with_nesterov(self._apply, b, start, self._lipschitz, strong_convexity=0.5)
 
 
 @dataclass(frozen=True, eq=False)

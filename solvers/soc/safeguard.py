@@ -7,8 +7,9 @@ recursion diverges or cycles.
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -28,7 +29,7 @@ _DIVERGED = 10.0
 _PATIENCE = 20
 # The run has stalled when so many iterations have not brought the larger residual down to this
 # share of the smallest one before. Runs that converge on public graphs take 39 at most (M3500).
-_STALL_ITERATIONS = 100
+STALL_ITERATIONS = 100
 _STALL_RATIO = 0.9
 
 
@@ -69,11 +70,6 @@ class Steps(Summarised):
     # The smallest of the larger residuals, as of the last iterate that lowered it by enough.
     least_residual: float = np.inf
     last_progress: int = 0
-
-    @property
-    def makes_no_progress(self) -> bool:
-        """Whether the residuals have not fallen for long."""
-        return self.k - self.last_progress >= _STALL_ITERATIONS
 
     def is_best(self, merit: float) -> bool:
         """Whether no merit has been smaller since rho last changed."""
@@ -124,11 +120,35 @@ class SharedSteps(Steps):
         return replace(self, size=size, sums=AndersonSums(), merits=())
 
 
+T = TypeVar("T", bound=Steps)
+
+
+def with_due_penalty(
+    rule: PenaltyRule,
+    state: T,
+    rescaled: Callable[[T, float, bool], T],
+    refreshed: Callable[[T, Due], T],
+) -> T:
+    """State with the penalty that the rule or the safeguard asks for; usually unchanged.
+
+    RAISE, from the safeguard, multiplies rho from the best iterate on, RESCALE, from the rule, from
+    the current one: `rescaled` is given the state, the factor and which of the two it is. REFRESH
+    and RECHECK are left to `refreshed`. `refreshes` counts the changes that the rule has made.
+    """
+    due, factor = next_penalty(rule, state)
+    if due is Due.RAISE:
+        return replace(rescaled(state, factor, True), raises=state.raises + 1)
+    if due is Due.RESCALE:
+        return replace(rescaled(state, factor, False), refreshes=state.refreshes + 1)
+    return state if due is Due.NOTHING else refreshed(state, due)
+
+
 def next_penalty(rule: PenaltyRule, steps: Steps) -> tuple[Due, float]:
     """What is due before the next step, and the factor on rho."""
     merits = steps.merits
     can_raise = steps.raises < MAX_RAISES
-    if can_raise and (has_diverged(merits) or is_cycling(merits)):
+    has_diverged = len(merits) >= 2 and merits[-1] > _DIVERGED * min(merits)
+    if can_raise and (has_diverged or is_cycling(merits)):
         return Due.RAISE, 2.0
     if isinstance(rule, MultiplierPenalty):
         return _due_of_multipliers(rule, steps), 1.0
@@ -163,11 +183,6 @@ def has_stalled(rule: MultiplierPenalty, merits: tuple[float, ...]) -> bool:
     """Whether the last of `stall_window` merits is not below `stall_ratio` of the first of them."""
     window = rule.stall_window
     return len(merits) >= window and merits[-1] > rule.stall_ratio * merits[-window]
-
-
-def has_diverged(merits: tuple[float, ...]) -> bool:
-    """Whether the merit has grown far above the smallest."""
-    return len(merits) >= 2 and merits[-1] > _DIVERGED * min(merits)
 
 
 def is_cycling(merits: tuple[float, ...]) -> bool:

@@ -18,7 +18,7 @@ from solvers.soc.penalty import BoydPenalty, MultiplierPenalty, PenaltyOrder, Pe
 from solvers.soc.r_step import BackEnd, RStep
 from solvers.soc.recursion_block import StepSettings
 from solvers.soc.rounding import WHOLE
-from solvers.soc.safeguard import Steps
+from solvers.soc.safeguard import STALL_ITERATIONS, Steps
 
 # Under a MultiplierPenalty rho_i of a separator's rotation is at least m_i times this times the
 # square root of the translation penalty, or m_i times the maximum where that is less. On graphs
@@ -94,7 +94,8 @@ class SOCSettings:
         Another penalty may be far too small. The safeguard then doubles it many times, with
         iterations without progress between.
         """
-        has_stalled = isinstance(self.penalty, MultiplierPenalty) and steps.makes_no_progress
+        makes_no_progress = steps.k - steps.last_progress >= STALL_ITERATIONS
+        has_stalled = isinstance(self.penalty, MultiplierPenalty) and makes_no_progress
         return Status.NO_PROGRESS if has_stalled else None
 
     # What the recursions are given.

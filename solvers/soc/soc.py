@@ -77,11 +77,6 @@ class SOC(SOCSettings):
     max_iterations : int
         Maximal number of iterations.
 
-    Raises
-    ------
-    SettingError
-        If a setting is out of its range or does not go with the coupling.
-
     Notes
     -----
     CONVERGED means, for JOINT and SUBSTRUCTURED, that x agrees with omega and that omega has
@@ -140,20 +135,7 @@ class SOC(SOCSettings):
         return self._consensus.measure(problem, state)
 
     def poses(self, problem: PGOProblem, state: "SOCIterate") -> Poses:
-        """Return the poses that a state stands for.
-
-        Parameters
-        ----------
-        problem : PGOProblem
-            The problem that is solved.
-        state : SOCState or ConsensusState
-            A state of this solver.
-
-        Returns
-        -------
-        Poses
-            Omega with the best translations for it; in CONSENSUS with those that the robots hold.
-        """
+        """Omega with the best translations for it; in CONSENSUS with those that the robots hold."""
         if isinstance(state, SOCState):
             return Joint(self).poses(problem, state)
         return self._consensus.poses(problem, state)

@@ -29,8 +29,7 @@ from solvers import RayEngine
 from solvers.carry.ray_cluster import connect
 from solvers.cli import app as cli
 from solvers.robots import soc as substructured
-from solvers.robots.agent import Agent
-from solvers.robots.driver import order_interior
+from solvers.robots.agent import Agent, order_interior
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.soc import WARM_START
 from solvers.soc.subgraph import Subgraph, split_graph

@@ -17,8 +17,7 @@ from solvers import GNC, Checkpoint
 from solvers.carry.serialization import deserialize, serialize
 from solvers.result import Stage
 from solvers.robots import poses as pose_orders
-from solvers.robots.agent import Agent
-from solvers.robots.driver import order_interior
+from solvers.robots.agent import Agent, order_interior
 from solvers.robots.part import Reweigh
 from solvers.robots.reweigh import reweigh
 from solvers.robust.known import odometry
