@@ -60,13 +60,6 @@ def take_turns(
     return x, ledger
 
 
-def sweep_turns(
-    linear: LeastSquares, turns: Schedule, count: int, backend: CholeskyBackend | None
-) -> tuple[Turn, ...]:
-    """Prepare the turns of a sweep, in which `count` numbers are sent for every pose."""
-    return _prepare(linear.J, linear, turns, turns.group, count, backend)
-
-
 def flagged_turns(
     linear: LeastSquares,
     graph: PoseGraph,
@@ -87,10 +80,10 @@ def flagged_turns(
     is_later = turns.first[pose] > turns.first[other_end]
     data = entries.data * (is_inside | is_later)
     counted = coo_array((data, (entries.row, entries.col)), shape=entries.shape)
-    return _prepare(counted.tocsr(), linear, turns, turns.first, count, backend)
+    return prepare_turns(counted.tocsr(), linear, turns, turns.first, count, backend)
 
 
-def _prepare(
+def prepare_turns(
     left: csr_array,
     linear: LeastSquares,
     turns: Schedule,
@@ -98,7 +91,10 @@ def _prepare(
     count: int,
     backend: CholeskyBackend | None,
 ) -> tuple[Turn, ...]:
-    """Turns of left^T diag(w) (J x + r) = 0; `group`, (n,), is the turn of every pose."""
+    """Turns of a sweep of left^T diag(w) (J x + r) = 0, with `count` numbers sent for every pose.
+
+    `group`, (n,), is the turn of every pose.
+    """
     weighted = (left * linear.w[:, None]).T.tocsr()
     H = (weighted @ linear.J).tocsr()
     b = -(weighted @ linear.r)

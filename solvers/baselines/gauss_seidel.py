@@ -33,7 +33,7 @@ from solvers.baselines.block_relaxation import (
     LeastSquares,
     Turn,
     flagged_turns,
-    sweep_turns,
+    prepare_turns,
     take_turns,
 )
 from solvers.baselines.sweep_order import Schedule, schedule
@@ -265,7 +265,7 @@ def _prepared_sweeps(
     problem: PGOProblem, linear: LeastSquares, order: Schedule, count: int, is_flagged: bool
 ) -> tuple[tuple[Turn, ...], tuple[Turn, ...]]:
     """The turns of a sweep that sends `count` numbers a pose, and of a flagged first sweep."""
-    turns = sweep_turns(linear, order, count, problem.backend)
+    turns = prepare_turns(linear.J, linear, order, order.group, count, problem.backend)
     if not is_flagged:
         return turns, ()
     return turns, flagged_turns(linear, problem.graph, order, count, problem.backend)

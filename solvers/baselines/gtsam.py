@@ -15,18 +15,14 @@ minimum they end; of rotations alone GTSAM has a certificate, `RiemannianStairca
 it.
 """
 
-import enum
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from pgo_models.errors import NotPositiveDefiniteError, SettingError, check_settings, extra_module
+from pgo_models.errors import SettingError, extra_module
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, project_to_rotations
 from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
@@ -37,68 +33,40 @@ from pgo_models.problem.weighting import Weighting
 from solvers.result import History, Measurement, Record, Run, Status
 
 
-class GtsamMethod(enum.Enum):
-    """Which of GTSAM's optimisers is used."""
-
-    LEVENBERG_MARQUARDT = "Levenberg-Marquardt"
-    GAUSS_NEWTON = "Gauss-Newton"
-
-
-@dataclass(frozen=True)
-class Gtsam:
-    """Settings of a run of GTSAM.
-
-    Parameters
-    ----------
-    method : GtsamMethod
-        Which optimiser is used.
-    tolerance : float
-        On the relative change of its cost in one iteration; the default is GTSAM's.
-    max_iterations : int
-        Iterations at most.
-    """
-
-    method: GtsamMethod = GtsamMethod.LEVENBERG_MARQUARDT
-    tolerance: float = 1e-5
-    max_iterations: int = 100
-
-    def __post_init__(self) -> None:
-        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
-
-
 def run_gtsam(
-    problem: PGOProblem, settings: Gtsam | None = None, start: Poses | None = None
+    problem: PGOProblem,
+    start: Poses | None = None,
+    tolerance: float = 1e-5,
+    max_iterations: int = 100,
 ) -> Run[Poses]:
-    """Solve a pose graph by GTSAM; history and objective are our F at its iterates.
+    """Solve by GTSAM's Levenberg-Marquardt; history and objective are our F at its iterates.
+
+    It ends where the relative change of its cost in one iteration is within the tolerance, whose
+    default is GTSAM's.
 
     Without a start GTSAM has its own: chordal rotations and a Gauss-Newton step in space, LAGO in
     the plane. The seconds include making the factors and the start, and leave out importing GTSAM
     and measuring its poses.
 
-    A MissingExtraError without GTSAM, a GraphError when the start does not fit the graph, a
-    NotPositiveDefiniteError when GTSAM meets a singular linear system, as Gauss-Newton does far
-    from a solution.
+    A MissingExtraError without GTSAM, a GraphError when the start does not fit the graph.
     """
     gtsam = extra_module("gtsam", "peers")
-    settings = settings if settings is not None else Gtsam()
     if start is not None:
         problem.check_poses(start)
     began = time.perf_counter()
     graph = factor_graph(problem, start)
-    with _singular_named():
-        values = _own_start(gtsam, problem, graph) if start is None else _values(gtsam, start)
-        optimizer = _optimizer(gtsam, settings, graph, values)
+    values = _own_start(gtsam, problem, graph) if start is None else _values(gtsam, start)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
     seconds = time.perf_counter() - began
     poses = poses_of_values(gtsam, optimizer.values(), problem.d)
     objective = problem.objective(poses)
     best = (objective, poses)
     records = [Record(0, seconds, Measurement(objective, 0.0, math.inf))]
     status = Status.MAX_ITERATIONS
-    for k in range(1, settings.max_iterations + 1):
+    for k in range(1, max_iterations + 1):
         cost_before = optimizer.error()
         began = time.perf_counter()
-        with _singular_named():
-            optimizer.iterate()
+        optimizer.iterate()
         seconds += time.perf_counter() - began
         cost = optimizer.error()
         if not math.isfinite(cost):
@@ -110,12 +78,12 @@ def run_gtsam(
         objective = problem.objective(poses)
         records.append(Record(k, seconds, Measurement(objective, 0.0, change)))
         best = min(best, (objective, poses), key=lambda pair: pair[0])
-        if change <= settings.tolerance or cost <= np.finfo(float).tiny:
+        if change <= tolerance or cost <= np.finfo(float).tiny:
             status = Status.CONVERGED
             best = (objective, poses)
             break
     objective, poses = best
-    name = f"GTSAM {settings.method.value}"
+    name = "GTSAM Levenberg-Marquardt"
     iterations = records[-1].k
     return Run(name, objective, poses, status, iterations, History(tuple(records)), seconds, poses)
 
@@ -179,23 +147,6 @@ def _own_start(gtsam: ModuleType, problem: PGOProblem, graph: Any) -> Any:  # no
     if problem.d == 3:
         return gtsam.InitializePose3.initialize(graph)
     return gtsam.lago.initialize(graph, False)  # not every graph has an odometric path
-
-
-def _optimizer(gtsam: ModuleType, settings: Gtsam, graph: Any, values: Any) -> Any:  # noqa: ANN401
-    if settings.method is GtsamMethod.GAUSS_NEWTON:
-        return gtsam.GaussNewtonOptimizer(graph, values, gtsam.GaussNewtonParams())
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
-
-
-@contextmanager
-def _singular_named() -> Iterator[None]:
-    """Raise GTSAM's error of a singular linear system as ours."""
-    try:
-        yield
-    except RuntimeError as error:
-        first_paragraph = " ".join(str(error).strip().split("\n\n")[0].split())
-        message = f"GTSAM met a singular linear system: {first_paragraph}; try another start"
-        raise NotPositiveDefiniteError(message) from error
 
 
 def _values(gtsam: ModuleType, poses: Poses) -> Any:  # noqa: ANN401

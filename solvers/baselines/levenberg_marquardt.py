@@ -27,6 +27,7 @@ from solvers.riemannian.newton_step import scaled_decrement
 
 _SMALLEST_FACTOR = 1.0 / 3.0  # on the damping, after a step that the model predicted well
 _GROWTH = 2.0  # of the damping after a refused step; it doubles with each refusal in a row
+_FIRST_DAMPING = 1e-3  # relative to the diagonal of the Gauss-Newton matrix
 # Shares of the diagonal. Less damping changes no digit of the matrix; more leaves no step.
 _MIN_DAMPING = 1e-15
 _MAX_DAMPING = 1e15
@@ -65,8 +66,6 @@ class LevenbergMarquardt:
         On the decrement, once the damping is small.
     max_iterations : int
         Steps at most; refused steps count.
-    damping : float
-        First mu, relative to the diagonal of the Gauss-Newton matrix.
 
     References
     ----------
@@ -82,15 +81,14 @@ class LevenbergMarquardt:
 
     tolerance: float = STATIONARY_DECREMENT
     max_iterations: int = 200
-    damping: float = 1e-3
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=["tolerance", "damping"], not_negative=["max_iterations"])
+        check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
 
     def init(self, problem: PGOProblem, start: Poses | None) -> LevenbergMarquardtState:
         """State 0: `start`, or the chordal relaxation."""
         poses = start if start is not None else chordal_start(problem)
-        return _linearized(problem, 0, poses, problem.objective(poses), self.damping)
+        return _linearized(problem, 0, poses, problem.objective(poses), _FIRST_DAMPING)
 
     def step(self, problem: PGOProblem, state: LevenbergMarquardtState) -> LevenbergMarquardtState:
         """Take the step if F falls, and set the damping by how well the model predicted it."""

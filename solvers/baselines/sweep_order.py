@@ -69,7 +69,8 @@ def schedule(graph: PoseGraph, robots: Partition) -> Schedule:
     order = _most_anchored_first(between, int(piece[0]))
     owner = np.empty(num_pieces, dtype=np.int64)
     owner[piece] = robot
-    robot_order = _in_order_of_appearance(owner[order])
+    robots_found, first_positions = np.unique(owner[order], return_index=True)
+    robot_order = robots_found[np.argsort(first_positions)]
     group = _greedy_colors(edge_counts(robot[i], robot[j], num_robots), robot_order)
     num_steps = dijkstra(between, unweighted=True, indices=[int(piece[0])])
     first = num_steps[0].astype(np.int64)
@@ -79,12 +80,6 @@ def schedule(graph: PoseGraph, robots: Partition) -> Schedule:
     return Schedule(
         robot=robot, group=group[robot], first=first[piece], sent=sent, receiver=receiver
     )
-
-
-def _in_order_of_appearance(values: IntArray) -> IntArray:
-    """Each value once, in the order of its first appearance."""
-    distinct, first_positions = np.unique(values, return_index=True)
-    return distinct[np.argsort(first_positions)]
 
 
 def _most_anchored_first(adjacency: csr_array, root: int) -> IntArray:

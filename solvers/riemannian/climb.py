@@ -17,8 +17,6 @@ import enum
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
-
 from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, smallest_shift
 from pgo_models.geometry.rotations import Array
 from solvers.result import Status
@@ -150,11 +148,6 @@ def _escape(algebra: ClimbAlgebra[V, T], direction: V) -> T | None:
             return point
         length *= 0.5
     return None
-
-
-def turning_length(v: Array) -> float:
-    """Length s at which the largest block of s v, (n, d), turns by 45 degrees."""
-    return 1.0 / float(np.linalg.norm(v, axis=1).max())
 
 
 def staircase_status(is_solved: bool, stalled: bool) -> Status | None:

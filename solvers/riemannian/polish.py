@@ -238,12 +238,8 @@ def refine_translations(here: EvaluatedPoses) -> EvaluatedPoses:
 
 def start_polish(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishState:
     """Begin at poses; `share` is how many times looser than usual the tolerance is."""
-    return start_at(problem.at(poses), share)
-
-
-def start_at(here: EvaluatedPoses, share: float = 1.0) -> PolishState:
-    """Begin at poses that are evaluated, as `start_polish`."""
-    tolerance = stationary_tolerance(here.problem.is_quadratic, share)
+    here = problem.at(poses)
+    tolerance = stationary_tolerance(problem.is_quadratic, share)
     return PolishState(here=here, objective=here.value, tolerance=tolerance)
 
 
@@ -253,12 +249,11 @@ def start_run(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishSt
     The start of chi2 has the translations of another cost. With its own, the Hessian is the better
     model from the first step on, and one factorisation is saved.
     """
-    here = problem.at(poses)
-    if not problem.is_quadratic:
-        settled = problem.at(problem.at_best_translations(poses))
-        if settled.value < here.value:
-            here = settled
-    return start_at(here, share)
+    given = start_polish(problem, poses, share)
+    if problem.is_quadratic:
+        return given
+    settled = start_polish(problem, problem.at_best_translations(poses), share)
+    return settled if settled.objective < given.objective else given
 
 
 def polish_step(

@@ -32,7 +32,6 @@ from solvers.riemannian.climb import (
     DualBound as DualBound,
     climb,
     staircase_status,
-    turning_length,
 )
 from solvers.riemannian.newton_step import scaled_decrement
 from solvers.riemannian.trust_region import Precision, first_radius, trust_region_step
@@ -314,5 +313,5 @@ def escape_direction(
     """Direction of the smallest eigenvalue of Q - blockdiag(Lambda), which is below -`smallest`."""
     curvature = negative_curvature(problem, Lambda, smallest, rng)
     column = append_rank(np.zeros_like(Y), curvature.v)
-    length = turning_length(curvature.v)
+    length = 1.0 / float(np.linalg.norm(curvature.v, axis=1).max())  # that of 45 degrees
     return EscapeDirection(curvature.value, length, column, curvature.factor)

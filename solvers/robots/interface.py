@@ -250,13 +250,6 @@ class Interface:
         )
         return InterfaceFactor(self, unknowns.analysis.factorize(matrix))
 
-    def expected_error(self) -> Array:
-        """Return the share of the diagonal that factoring may take, 0 where it is not known before.
-
-        See `SymbolicCholesky.expected_error`.
-        """
-        return self.unknowns.analysis.expected_error()
-
     def rounding(
         self,
         sizes: Sequence[Array],
@@ -268,8 +261,8 @@ class Interface:
 
         `of_driver` are the blocks of `factorize`. `sizes`, (g,) each, are the `row_sums` of the
         contributions in the scale of `diagonal`, (side,), which is at least the diagonal of the
-        sum. `of_factor`, (side,), is the `expected_error` or the `backward_error` of the factor.
-        An entry of the sum has a term of every robot, and of the driver's own blocks.
+        sum. `of_factor`, (side,), is the `expected_error` of the analysis, or the `backward_error`
+        of the factor. An entry of the sum has a term of every robot, and of the driver's blocks.
         """
         of_sums = gamma(float(len(sizes) + len(of_driver)) + 8.0)
         sums = self.gather([size[:, None] for size in sizes])[:, 0]
@@ -298,10 +291,6 @@ class InterfaceFactor:
 
     interface: Interface
     factor: CholeskyFactor
-
-    def backward_error(self) -> Array:
-        """Share of the diagonal that factoring took at most (`CholeskyFactor.backward_error`)."""
-        return self.factor.backward_error()
 
     def solve(self, parts: Sequence[Array], of_driver: Array | None = None) -> Solved:
         """Solve for the sum of the robots' right-hand sides and that `of_driver`, (side, k).

@@ -161,12 +161,11 @@ class EliminatedAlgebra:
 
     def _straight_trial(self, model: Model, length: float) -> CoverTrial:
         """Return the trial whose translations move straight on."""
-        driver = self.driver
         if length == 1.0:
             moves = [Move(part, length) for part in model.parts]
-            answers = driver.ask_each(move_straight, moves)
+            answers = self.driver.ask_each(move_straight, moves)
         else:
-            answers = driver.ask(go_straight, length, Count.PIGGYBACKED)
+            answers = self.driver.ask(go_straight, length, Count.PIGGYBACKED)
         R, t = self._moved(model, length)
         return self._trial(R, t, answers)
 

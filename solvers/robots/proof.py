@@ -347,7 +347,7 @@ def _factored_S(
         rounding = space.rounding(sizes, blocks, diagonal, of_factor)
         return rounding + 8.0 * UNIT_ROUNDOFF * diagonal
 
-    of_factor = space.expected_error()
+    of_factor = space.unknowns.analysis.expected_error()
     for _ in range(ATTEMPTS):
         shift = np.maximum(share * diagonal, ROUNDING_MULTIPLE * lost(of_factor))
         shifted = np.where(is_fixed, diagonal, -shift)
@@ -356,7 +356,7 @@ def _factored_S(
             factor = space.factorize(contributions, [*blocks, on_diagonal])
         except NotPositiveDefiniteError:
             return None
-        of_factor = factor.backward_error()
+        of_factor = factor.factor.backward_error()
         taken = lost(of_factor)
         if (2.0 * taken <= shift).all():
             return factor, (shift - taken) / OUTWARD
@@ -470,7 +470,10 @@ def prove_interior(robot: Interior, order: ProofOrder) -> tuple[Interior, ProofA
     factored = robot.factored
     Lambda = robot.multipliers()
     Lambda[robot.part.boundary] = 0.0  # those are the driver's
-    trace = _trace(problem, Lambda, lost)
+    # The part of tr(Lambda), with the constant of the cost, less what rounding can make of them.
+    constant, constant_error = problem.weights.constant
+    diagonals = np.einsum("naa->na", Lambda).ravel()
+    trace = math.fsum([*diagonals, constant, -constant_error, -lost])
     cut = factored.cut(robot.widths)
     fixed = cut.boundary[order.fixed > 0]
     if not order.is_grounded and factored.grounds:
@@ -520,16 +523,6 @@ def move_proof(robot: Interior, x: Array) -> tuple[Interior, ProofStep]:
     assert session.proof is not None
     moved = session.proof.moved(robot.system.back_substitute(x))
     return _evaluated(robot.in_session(replace(session, proof=moved)))
-
-
-def _trace(problem: PGOProblem, Lambda: Array, lost: float) -> float:
-    """Compute the robot's part of tr(Lambda), with the constant of its cost, rounded down.
-
-    What rounding can make of handedness terms is subtracted.
-    """
-    constant, constant_error = problem.weights.constant
-    diagonals = np.einsum("naa->na", Lambda).ravel()
-    return math.fsum([*diagonals, constant, -constant_error, -lost])
 
 
 def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:
@@ -692,7 +685,9 @@ def verify_interior(
     # The entries of the separators are rounded, too.
     data[problem.diagonal_positions[cut.boundary]] -= OUTWARD * of_separators
     positions = problem.diagonal_positions[inside]
-    error = entries + _expected_error(cut)
+    error = entries.copy()
+    if cut.analysis is not None:  # what factoring may take is known before
+        error += cut.analysis.expected_error(len(cut.boundary))
     for _ in range(ATTEMPTS):
         shift = np.maximum(share, ROUNDING_MULTIPLE * error)
         data[positions] = S.data[positions] - shift * diagonal[inside]
@@ -719,10 +714,3 @@ def _entry_errors(problem: PGOProblem, diagonal: Array, cut: Cut) -> tuple[Array
     positive_size = np.where(size > 0.0, size, 1.0)
     errors = matrix_errors(problem, positive_size) * size
     return errors[cut.interior] / diagonal[cut.interior], errors[cut.boundary]
-
-
-def _expected_error(cut: Cut) -> Array:
-    """Return the share of the diagonal that factoring may take, 0 where it is not known before."""
-    if cut.analysis is None:
-        return np.zeros(len(cut.interior))
-    return cut.analysis.expected_error(len(cut.boundary))

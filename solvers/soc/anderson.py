@@ -171,32 +171,23 @@ class AndersonSums:
         return gamma, AndersonSums(gram, products, smallest)
 
 
-@dataclass(frozen=True, eq=False)
-class Extrapolation:
-    """The next s, the length of the residual, and what is remembered for the next step."""
-
-    image: Array
-    merit: float
-    share: AndersonShare
-    sums: AndersonSums
-
-
 def extrapolate(
     settings: Anderson | None,
     share: AndersonShare,
     sums: AndersonSums,
     residual: Array,
     image: Array,
-) -> Extrapolation:
+) -> tuple[Array, float, AndersonShare, AndersonSums]:
     """Accelerate one step s -> g(s) of a party that has all rows.
 
-    `residual` is g(s) - s, with weights; `image` is g(s). The result is the image itself without
-    settings, and nan where the residual is not finite.
+    `residual` is g(s) - s, with weights; `image` is g(s). The result is the next s, the length of
+    the residual, and what is remembered for the next step. Without settings the next s is the image
+    itself, and where the residual is not finite it is nan.
     """
     new_sums, share = share.observe(residual, image, 0 if settings is None else settings.memory)
     merit = math.sqrt(new_sums[0])
     if not math.isfinite(merit):
-        return Extrapolation(np.full_like(image, np.nan), merit, share, sums)
+        return np.full_like(image, np.nan), merit, share, sums
     gamma, sums = sums.coefficients(settings, new_sums)
     next_image, share = share.extrapolated(gamma)
-    return Extrapolation(next_image, merit, share, sums)
+    return next_image, merit, share, sums

@@ -242,7 +242,7 @@ class ConsensusRobot:
             ahead=None,
         )
         rotations = float(rotation_squares(layout.full_problem)[own_poses].sum())
-        stationarity = replace(following.stationarity(None)[1], rotations=rotations)
+        stationarity = replace(following.stationarity, rotations=rotations)
         size = d * float(rho[own_poses].sum())
         reply = copies.InitReply(size, stationarity)
         return following._prepared(), reply
@@ -299,8 +299,7 @@ class ConsensusRobot:
         block, squares = ahead.block.agreed(omega)  # (c) Bregman update, B = s - omega
         robot = ahead._with(block=block)
         following, reply_of_solve = robot.solve(None)  # (a) R-step
-        stationarity = robot.stationarity(None)[1]
-        return following, copies.StepReply(squares, stationarity, reply_of_solve)
+        return following, copies.StepReply(squares, robot.stationarity, reply_of_solve)
 
     def _accelerated(
         self, agreement: Agreement, messages: copies.RowMessages
@@ -358,9 +357,8 @@ class ConsensusRobot:
         block = replace(block, s=block.s + change)
         waiting = waiting.after(math.sqrt(sums[0]))
         robot, sent = self._with(X=X, waiting=waiting)._sending(block)
-        stationarity = robot.stationarity(None)[1]
         age = max(waiting.waited.values(), default=0)
-        return robot, copies.TurnAnswer(sent, sums, stationarity, age)
+        return robot, copies.TurnAnswer(sent, sums, robot.stationarity, age)
 
     @order("consensus.travel")
     def travel(self, _: None) -> tuple[ConsensusRobot, Array]:
@@ -442,9 +440,10 @@ class ConsensusRobot:
         n = self.layout.problem.num_poses
         return self, self._stationarity_at(Poses(unstack_transposes(X[n:]), X[:n]))
 
-    def stationarity(self, _: None) -> tuple[ConsensusRobot, copies.Stationarity]:
+    @property
+    def stationarity(self) -> copies.Stationarity:
         """The robot's part of F, and of the squared gradient on own poses beside its copies."""
-        return self, self._stationarity_at(self.poses)
+        return self._stationarity_at(self.poses)
 
     # What the orders share.
 

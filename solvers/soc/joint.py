@@ -128,17 +128,17 @@ class Joint:
         change = over_relax(x, state.omega, self.soc.alpha) - state.omega
         # With the factor sqrt(rho) plain inner products of residuals are those of the rho-norm.
         weighted_residual = np.sqrt(state.rho)[:, None, None] * change
-        accelerated = extrapolate(
+        next_s, merit, memory, sums = extrapolate(
             self.soc.acceleration, state.memory, state.sums, weighted_residual, s + change
         )
         updated = replace(
             state,
-            sums=accelerated.sums,
-            memory=accelerated.share,
-            best=s if state.is_best(accelerated.merit) else state.best,
-            merits=(*state.merits, accelerated.merit),
+            sums=sums,
+            memory=memory,
+            best=s if state.is_best(merit) else state.best,
+            merits=(*state.merits, merit),
         )
-        return accelerated.image - state.B, updated
+        return next_s - state.B, updated
 
     def _with_residuals(self, before: SOCState, state: SOCState) -> SOCState:
         """Count the step, and set its residuals, relative to ||omega||_rho = sqrt(d sum_i rho_i).

@@ -30,9 +30,9 @@ from pgo_models import (
     exp_map,
     write_g2o,
 )
-from pgo_models.errors import GraphError, MissingExtraError, NotPositiveDefiniteError, SettingError
+from pgo_models.errors import GraphError, MissingExtraError, SettingError
 from solvers import Status, certify, polish
-from solvers.baselines.gtsam import Gtsam, GtsamMethod, factor_graph, run_gtsam
+from solvers.baselines.gtsam import factor_graph, run_gtsam
 
 needs_gtsam = pytest.mark.skipif(
     importlib.util.find_spec("gtsam") is None, reason="GTSAM is an optional rival"
@@ -49,12 +49,6 @@ def test_without_gtsam_one_line_says_what_to_install(monkeypatch: pytest.MonkeyP
             match=r"gtsam is not installed; run: pip install 'pgo-splitting\[peers\]'",
         ):
             use(problem)
-
-
-def test_settings_out_of_range_are_refused() -> None:
-    for changes in ({"tolerance": 0.0}, {"tolerance": float("nan")}, {"max_iterations": -1}):
-        with pytest.raises(SettingError, match=next(iter(changes))):
-            Gtsam(**changes)
 
 
 @needs_gtsam
@@ -89,11 +83,10 @@ def test_its_cost_is_F_to_leading_order(seed: int, n: int, d: int) -> None:
 
 
 @needs_gtsam
-@pytest.mark.parametrize("method", GtsamMethod)
 @pytest.mark.parametrize("d", [2, 3])
-def test_with_little_noise_it_reaches_our_optimum(d: int, method: GtsamMethod) -> None:
+def test_with_little_noise_it_reaches_our_optimum(d: int) -> None:
     problem = PGOProblem(varied_graph(3, 40, d, QUIET_NOISE))
-    result = run_gtsam(problem, Gtsam(method=method, tolerance=1e-12))
+    result = run_gtsam(problem, tolerance=1e-12)
     assert result.status is Status.CONVERGED
     assert result.objective == problem.objective(result.poses) == result.history.objective[-1]
     optimum = problem.objective(polish(problem, result.poses))
@@ -114,7 +107,7 @@ def test_a_given_start_is_state_zero_and_is_left_alone() -> None:
         problem = varied_problem(4, 12, d)
         start = random_poses(12, d, 4)
         kept = start.R.copy(), start.t.copy()
-        result = run_gtsam(problem, Gtsam(max_iterations=3, tolerance=1e-12), start)
+        result = run_gtsam(problem, start, tolerance=1e-12, max_iterations=3)
         assert result.history.objective[0] == pytest.approx(problem.objective(start), rel=1e-12)
         assert (result.status, result.iterations, len(result.history)) == (
             Status.MAX_ITERATIONS,
@@ -136,17 +129,6 @@ def test_it_solves_public_graphs(name: str, benchmark_problem: Callable[[str], P
     assert result.status is Status.CONVERGED
     # Of fourth order in the residuals: 1e-4 on the noisiest of these.
     assert result.objective == pytest.approx(OPTIMUM[name], rel=2e-4)
-
-
-@needs_gtsam
-def test_a_singular_system_is_named() -> None:
-    problem = varied_problem(1, 30, 3)
-    start = random_poses(30, 3, 1, spread=1e5)
-    with pytest.raises(
-        NotPositiveDefiniteError,
-        match="GTSAM met a singular linear system: Indeterminate linear system",
-    ):
-        run_gtsam(problem, Gtsam(method=GtsamMethod.GAUSS_NEWTON, max_iterations=500), start)
 
 
 @needs_gtsam

@@ -50,5 +50,5 @@ def test_F_never_rises_from_hostile_starts(seed: int, n: int, d: int, spread: fl
 
 
 def test_settings_are_checked() -> None:
-    with pytest.raises(SettingError, match="damping must be positive, got 0"):
-        LevenbergMarquardt(damping=0.0)
+    with pytest.raises(SettingError, match="tolerance must be positive, got 0"):
+        LevenbergMarquardt(tolerance=0.0)

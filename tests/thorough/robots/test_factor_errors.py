@@ -313,8 +313,8 @@ def test_the_drivers_factor_is_within_its_rounding(
         sizes = [row_sums(C, diagonal[at]) for C, at in zip(parts, space.columns, strict=True)]
         own = [(columns, values)]
         factor = space.factorize(contributions, own)
-        assert (space.expected_error() <= factor.backward_error()).all()
-        lost = space.rounding(sizes, own, diagonal, factor.backward_error())
+        assert (space.unknowns.analysis.expected_error() <= factor.factor.backward_error()).all()
+        lost = space.rounding(sizes, own, diagonal, factor.factor.backward_error())
         difference = square_of(factor.factor, space.unknowns.analysis) - K
         assert max(largest_share(sign * difference, diagonal) for sign in (1, -1)) > 0.0
         assert largest_share(difference - np.diag(exact(lost)), diagonal) < 0.0
