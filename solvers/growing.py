@@ -119,7 +119,14 @@ def extend(
     ids = solution.problem.graph.pose_ids
     if robust is None:
         start = extended_poses(problem, ids, solution.poses)
-        grown = _solve_from(problem, pipeline, start, shared)
+        request = SolveRequest(problem, pipeline, start, robots=shared)
+        warn_of_landmarks_seen_once(graph)
+        # Newton alone would leave added terms out, and needs a driver.
+        has_driver = shared is None or shared.has_driver
+        if pipeline.has_added_terms or not has_driver:
+            grown = solution_for(request)
+        else:
+            grown = solution_by(update_at, request)
     else:
         kept, new = _decided_before(solution, graph)
         # Odometry that was rejected before is not taken for right again.
@@ -185,22 +192,6 @@ def _measure_alike(before: PoseGraph, graph: PoseGraph, shared: IntArray) -> Boo
     turn = np.linalg.norm(graph.R_ij[e] - before.R_ij[e_before], axis=(1, 2))
     size = 1.0 + np.linalg.norm(before.t_ij[e_before], axis=1)
     return np.asarray((shift <= _SAME * size) & (turn <= _SAME))
-
-
-def _solve_from(
-    problem: PGOProblem,
-    pipeline: Pipeline,
-    start: Poses,
-    robots: Robots | None = None,
-) -> Solution:
-    """Solution from the poses before, as `update_at` finds it."""
-    request = SolveRequest(problem, pipeline, start, robots=robots)
-    warn_of_landmarks_seen_once(problem.graph)
-    # Newton alone would leave added terms out, and needs a driver.
-    has_driver = robots is None or robots.has_driver
-    if pipeline.has_added_terms or not has_driver:
-        return solution_for(request)
-    return solution_by(update_at, request)
 
 
 def update_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:

@@ -214,10 +214,7 @@ class Place(ABC):
 
     @abstractmethod
     def salvage(self, reason: Status) -> Attempt:
-        """Return what there is when the first attempt is broken off, with no bound but F >= 0.
-
-        A line of the table says the reason.
-        """
+        """Return what there is when the first attempt is broken off, with no bound but F >= 0."""
 
     def finish(self, best: Attempt) -> None:
         """Put away what would only serve to go on with a solve that was broken off."""

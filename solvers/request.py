@@ -202,10 +202,7 @@ class SolveRequest:
 
     @contextmanager
     def with_checkpoint(self) -> Iterator[SolveRequest]:
-        """The request with a checkpoint in a temporary file, where robots can be lost.
-
-        One that was asked for serves as well.
-        """
+        """The request with a checkpoint in a temporary file, where robots can be lost."""
         robots = self.robots
         if robots is None or robots.checkpoint is not None or not most_restarts(robots.engine):
             yield self
@@ -239,19 +236,8 @@ class SolveRequest:
 
         problem = self.problem
         owners = robots.partition
-        mark = run_fingerprint(problem, owners, self._settings_of_run(robots), self.start)
-        journal = Journal(robots.checkpoint, mark, here.table)
-        engine = robots.engine if robots.engine is not None else InProcess()
-        thresholds = None if gnc is None else gnc.thresholds(problem)
-        driver = open_driver(problem, owners, engine, robots.driver_memory, thresholds)
-        kind = PlaceOfRobots if robots.has_driver else RobotsAlone
-        with closing(driver):
-            yield kind(self.monitor, here.table, driver, journal, here, owners, robots.faults)
-
-    def _settings_of_run(self, robots: Robots) -> tuple[object, ...]:
-        """Settings that a checkpoint must have in common with the run that goes on from it."""
         pipeline = self.pipeline
-        return (
+        settings = (  # which a checkpoint must have in common with the run that goes on from it
             pipeline.soc,
             pipeline.newton,
             pipeline.gap,
@@ -260,6 +246,14 @@ class SolveRequest:
             robots.faults,
             robots.has_driver,
         )
+        mark = run_fingerprint(problem, owners, settings, self.start)
+        journal = Journal(robots.checkpoint, mark, here.table)
+        engine = robots.engine if robots.engine is not None else InProcess()
+        thresholds = None if gnc is None else gnc.thresholds(problem)
+        driver = open_driver(problem, owners, engine, robots.driver_memory, thresholds)
+        kind = PlaceOfRobots if robots.has_driver else RobotsAlone
+        with closing(driver):
+            yield kind(self.monitor, here.table, driver, journal, here, owners, robots.faults)
 
     def _check_anchor(self, anchor: int) -> None:
         """Raise a SettingError unless the anchor is a pose with a rotation.

@@ -199,31 +199,9 @@ class Outcome(Summarised, Generic[S]):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run(Outcome[S]):
-    """A finished run of one solver on a pose graph.
+    """A finished run of one solver on a pose graph, whose objective is F of `poses`."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the solver.
-    objective : float
-        F of `poses`.
-    state : S
-        The last iterate, or the best one (lowest F) when the run did not succeed.
-    status : Status
-        Why the run ended.
-    iterations : int
-        Number of finished steps.
-    history : History
-        Figures of all iterates.
-    seconds : float
-        Wall time of the whole run.
-    poses : Poses
-        Poses of `state`.
-    method : object
-        The solver that ran, which is its settings.
-    """
-
-    poses: Poses
+    poses: Poses  # of `state`
 
 
 # What breaks a solve off, as tables name it.

@@ -163,11 +163,19 @@ class RobotsSolution(Summarised):
             f"{len(num_poses)}, {num_poses.min()} to {num_poses.max()} poses each, "
             "as their own files have them"
         )
+        of_certificate = dict(self.certificate.facts())
+        of_certificate["verdict"] += verdict_suffix(self.num_absent)
+        if self.num_rejected is not None:
+            of_certificate["verdict"] += ", for the edges that were kept"
+        other_cost = ""
+        if self.certificate.weighting is not Weighting.ISOTROPIC:
+            F = rounded_up(self.F)
+            other_cost = f"{F} with two precisions an edge; the bound is on chi2 alone"
         facts = [
             ("graph", graph),
             ("status", f"{self.status.name}: {self.status.value}"),
-            *self._facts_of_certificate(),
-            *self._other_cost(),
+            *of_certificate.items(),
+            ("F", other_cost),
             ("closures", self.robust),
             ("note", self.note),
             ("frame", self.frame),
@@ -176,18 +184,3 @@ class RobotsSolution(Summarised):
             *self.ledger.facts(),
         ]
         return "\n".join(f"{label:<12} {text}" for label, text in facts if text)
-
-    def _facts_of_certificate(self) -> list[tuple[str, str]]:
-        """Cost, bound, gap and verdict, which says for whom it holds."""
-        facts = dict(self.certificate.facts())
-        facts["verdict"] += verdict_suffix(self.num_absent)
-        if self.num_rejected is not None:
-            facts["verdict"] += ", for the edges that were kept"
-        return list(facts.items())
-
-    def _other_cost(self) -> list[tuple[str, str]]:
-        """F of the poses, where the cost is chi2."""
-        if self.certificate.weighting is Weighting.ISOTROPIC:
-            return []
-        F = rounded_up(self.F)
-        return [("F", f"{F} with two precisions an edge; the bound is on chi2 alone")]

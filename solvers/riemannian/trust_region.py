@@ -145,10 +145,7 @@ def first_radius(squared: float) -> float:
 
 
 def _next_radius(radius: float, ratio: float, trial: TruncatedStep, longest: float) -> float:
-    """Radius of the trust region after a step, from the ratio of actual to promised decrease.
-
-    `longest` is the norm of the step's longest block.
-    """
+    """Radius of the trust region after a step, from the ratio of actual to promised decrease."""
     if not ratio >= _POOR:
         return min(_SHRINK, 1.0 / max(1.0, longest)) * trial.length
     if ratio > _GOOD and trial.is_at_boundary:

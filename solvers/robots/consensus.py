@@ -57,10 +57,7 @@ class RobotsOfDriver:
         return self.driver.network.ledger.num_robots
 
     def begin(self, is_first: bool) -> list[Rows]:
-        """Set the poses of all robots, at the start of a run (`is_first`) or for new penalties.
-
-        The answers are the rows that the robots then send each other.
-        """
+        """Set the poses of all robots, at the start of a run (`is_first`) or for new penalties."""
         stays_at_own_poses = self.goes_on or not (is_first or self.has_driver)
         if stays_at_own_poses:
             return ask_all(self, ConsensusRobot.begin_here, None, Count.PIGGYBACKED)
@@ -95,10 +92,7 @@ class RobotsOfDriver:
 
 @dataclass(frozen=True)
 class ConsensusSOC:
-    """SOC by robots, from the poses that they and the driver hold.
-
-    The rows of an iterate are with the robots, which hold them at its moment.
-    """
+    """SOC by robots, from the poses that they and the driver hold."""
 
     soc: SOC = field(default_factory=SOC)  # settings; its coupling and robots are ignored
     has_driver: bool = True  # as in `RobotsOfDriver`
@@ -115,10 +109,7 @@ class ConsensusSOC:
         return Consensus(self.soc, self.rotations)
 
     def init(self, driver: Driver, start: ConsensusState | None) -> ConsensusState:
-        """State 0: omega = the current rotations, B in balance.
-
-        Poses, penalties and forces take two rounds.
-        """
+        """State 0: omega = the current rotations, B in balance."""
         state = start
         if state is None:
             state = self._method.init(RobotsOfDriver(driver, self.has_driver, self.goes_on))
@@ -142,10 +133,7 @@ class ConsensusSOC:
         return driver.measured(self._method.measure(state))
 
     def converged(self, state: ConsensusState, measurement: Measurement) -> Status | None:
-        """CONVERGED when primal residual and relative gradient of F are within tolerance.
-
-        The gradient is that at the poses which the robots hold.
-        """
+        """CONVERGED when primal residual and relative gradient of F are within tolerance."""
         return self._method.converged(state, measurement)
 
     def finish(self, driver: Driver, state: ConsensusState) -> None:
@@ -156,10 +144,7 @@ class ConsensusSOC:
 
 @dataclass(frozen=True, eq=False)
 class AsynchronousState:
-    """Round k: what the robots reported, and the messages under way.
-
-    The rows of the robots are with them, which hold them at a moment.
-    """
+    """Round k: what the robots reported, and the messages under way."""
 
     k: int
     moment: Moment
@@ -255,10 +240,7 @@ class AsynchronousSOC:
         return replace(following, moment=driver.moment())
 
     def _confirmed(self, robots: RobotsOfDriver, state: AsynchronousState) -> AsynchronousState:
-        """State with the gradient at the poses that the robots hold.
-
-        The robots send each other these poses until all have arrived.
-        """
+        """State with the gradient at the poses that the robots hold."""
         sent = ask_all(robots, ConsensusRobot.held_rows, None, Count.PIGGYBACKED)
         rows = robots.exchange(sent)
         parts = robots.ask(ConsensusRobot.stationarity_beside, rows, Count.ALL_REDUCE)
@@ -269,10 +251,7 @@ class AsynchronousSOC:
         return replace(state, quiet=0)
 
     def measure(self, driver: Driver, state: AsynchronousState) -> Measurement:
-        """F of the poses that the robots hold, and two residuals.
-
-        The primal residual is that of the recursion, the dual one the relative gradient of F.
-        """
+        """F of the poses that the robots hold, the residual of the recursion, and F's gradient."""
         if math.isnan(state.primal_residual):
             return driver.measured(Measurement(math.nan, math.nan, math.nan))
         return driver.measured(Measurement(state.objective, state.primal_residual, state.gradient))

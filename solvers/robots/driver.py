@@ -214,10 +214,7 @@ class Driver:
         self.has_whole = all(robot.part is not None for robot in summaries)
 
     def ask(self, order: InteriorOrder[Q, A], request: Q, count: Count = Count.ROUND) -> list[A]:
-        """Give all interiors an order with the same request; return their answers.
-
-        The module docstring says what `count` counts.
-        """
+        """Give all interiors an order with the same request; return their answers."""
         return self.ask_each(order, [request] * len(self.robots_with_edges), count)
 
     def ask_each(
@@ -276,10 +273,7 @@ class Driver:
         self.diagonal = self.gather_diagonal(self.ask(pose_orders.describe, None, count))
 
     def choose_cost(self, final: bool) -> None:
-        """Make one of two costs the current one, see `is_final`.
-
-        Where there is one cost nothing happens.
-        """
+        """Make one of two costs the current one, see `is_final`."""
         if self.has_two_costs and final != self.is_final:
             self.is_final = final
             answers = self.ask(pose_orders.choose_cost, final, Count.PIGGYBACKED)
@@ -401,10 +395,7 @@ class Driver:
         return self.network.ask(take_snapshot, [None] * self.network.ledger.num_robots, Count.OFF)
 
     def resume(self, state: DriverState, snapshots: Sequence[Snapshot]) -> None:
-        """Continue from a state, and robots from their snapshots.
-
-        The robots send again what they sent of the matrix of the translations.
-        """
+        """Continue from a state, and robots from their snapshots."""
         records = [deserialize(snapshot) for snapshot in snapshots]
         self.network.ask(restore, records, Count.OFF)
         self.current = state.current
@@ -443,10 +434,7 @@ class Driver:
         self.set_translations(self.ask(pose_orders.reduce_translations, None, Count.PIGGYBACKED))
 
     def set_poses(self, poses: Poses) -> None:
-        """Take all poses as they are, with F and M X on the cover, gathered with the next round.
-
-        Raises a GraphError if their number or dimension differs from the graph's.
-        """
+        """Take all poses as they are, with F and M X on the cover, gathered with the next round."""
         self.hand_out(poses)
         self.current = self.with_cost(
             self.current, self.ask(pose_orders.evaluate, None, Count.PIGGYBACKED)
@@ -493,10 +481,7 @@ class Driver:
         self.current = trial
 
     def adopt(self, R: Array) -> None:
-        """Take rotations of the cover, (g, d, d), and best translations for them: two rounds.
-
-        The first round scatters the rotations; `set_translations` is the second.
-        """
+        """Take rotations of the cover, (g, d, d), and best translations for them: two rounds."""
         self.current = replace(self.current, R=R)
         parts = self.scattered_rotations(stack_transposes(R))
         self.set_translations(self.ask_each(pose_orders.adopt, parts))

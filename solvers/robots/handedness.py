@@ -241,10 +241,7 @@ class VectorsOrder:
 @record("VectorsAnswer")
 @dataclass(frozen=True, eq=False)
 class VectorsAnswer:
-    """Vectors X of inverse iteration, of right-hand sides b.
-
-    Sums are over the rotations of the robot's interior.
-    """
+    """Vectors X of inverse iteration, of right-hand sides b."""
 
     b: Array  # ((d+1) g, q): the next right-hand side on the boundary, the interior eliminated
     energies: Array  # (q, q): X^T b

@@ -219,10 +219,7 @@ def read_file(agent: Agent, _: None) -> Claim:
 
 @order("files.number_poses")
 def number_poses(agent: Agent, runs: OwnedRuns) -> Messages[NumberedLines]:
-    """Take numbers and owners for the ids; return what others are to be told of their poses.
-
-    They are messages, by the number of the other robot.
-    """
+    """Take numbers and owners for the ids; return what others are to be told of their poses."""
     lines = agent.known(G2OLines)
     rows = measured_edges(lines)
     run = runs.of(rows.ids)

@@ -107,10 +107,7 @@ def _best_form(driver: Driver, gap: float, most_lost: float | None) -> LowerBoun
 
 
 def best_bound_with_terms(driver: Driver, gap: float, less_terms: Array) -> LowerBound:
-    """Return the best bound of the cost less the robots' handedness terms.
-
-    The diagonal of M `less_terms` is that on the cover, ((d+1) g,).
-    """
+    """Return the best bound of the cost less the robots' handedness terms."""
     grounded = _bound_with_terms(driver, less_terms)
     if grounded is not None:
         return grounded
@@ -184,10 +181,7 @@ def _collect_terms(driver: Driver) -> HandednessTerms | None:
 def prove_grounded(
     driver: Driver, eta: float, less_terms: Array | None = None
 ) -> LowerBound | None:
-    """Bound F grounded at the driver's pose; None unless S_r + eta blockdiag(0, I) is definite.
-
-    `less_terms` is as in `eliminate_S`.
-    """
+    """Bound F grounded at the driver's pose; None unless S_r + eta blockdiag(0, I) is definite."""
     g = len(driver.cover)
     position = driver.grounded_position
     X = _grounded_point(driver)

@@ -103,10 +103,7 @@ class OpenedFiles:
     threshold_scale: float = 1.0
 
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
-        """The same robots with other edges; `borders` are their borders with these.
-
-        A GraphError if these do not connect the poses.
-        """
+        """The same robots with other edges; `borders` are their borders with these."""
         old = self.driver
         driver, sizes = _placed(
             old.network, borders, old.num_poses, old.memory, self.weighting, self.folder

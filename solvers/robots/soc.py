@@ -97,10 +97,7 @@ class SubstructuredSOC:
         return self.soc.max_iterations
 
     def init(self, driver: Driver, start: SubstructuredState | None) -> SubstructuredState:
-        """State 0: omega = the rotations that driver and robots hold, B = 0.
-
-        With `start` the run continues from that state, to which driver and robots were resumed.
-        """
+        """State 0: omega = the rotations that driver and robots hold, B = 0."""
         if start is None:
             state = self._penalized(driver, is_stationary=False)
         else:
@@ -143,10 +140,7 @@ class SubstructuredSOC:
         return driver.measured(state.measurement(objective))
 
     def converged(self, state: SubstructuredState, measurement: Measurement) -> Status | None:
-        """CONVERGED when R agrees with omega and omega has stopped moving, or as `stall_of` says.
-
-        Both hold within the tolerance in the norm of rho.
-        """
+        """CONVERGED when x agrees with omega and omega has stopped moving, or as `stall_of`."""
         return self.soc.status_at(measurement) or self.soc.stall_of(state)
 
     def finish(self, driver: Driver, state: SubstructuredState) -> None:
@@ -326,10 +320,7 @@ def solve(robot: Interior, x: Array) -> tuple[Interior, Array]:
 
 @order("soc.agree")
 def agree(robot: Interior, order: Agree) -> tuple[Interior, Agreed]:
-    """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a).
-
-    With them goes the answer of `cost`.
-    """
+    """Steps (b) and (c): sums of the residuals, and the right-hand side of the next step (a)."""
     session = robot.session(RecursionSession)
     block = session.block.extrapolated(order.agreement)  # s = x_ahead + B
     block, sums = block.projected()  # (b) omega, (c) B = s - omega

@@ -234,10 +234,7 @@ class EdgesKept:
 
 
 def edges_kept(opened: OpenedFiles, cost: float) -> EdgesKept:
-    """What robots have kept, with the cost of the poses that they keep.
-
-    Its message is one from every robot, which has nothing of a single measurement.
-    """
+    """What robots have kept, with the cost of the poses that they keep."""
     driver = opened.driver
     request = (opened.weighting, opened.threshold_scale)
     requests = [request] * len(opened.borders)

@@ -131,10 +131,7 @@ class Consensus:
     rotations: Rotations = Rotations.PROJECTED
 
     def init(self, robots: AskedRobots, before: ConsensusState | None = None) -> ConsensusState:
-        """State 0: omega at the robots' poses, B in balance, separator penalties as in `before`.
-
-        It takes two rounds, for poses and for penalties and forces.
-        """
+        """State 0: omega at the robots' poses, B in balance, separator penalties as in `before`."""
         sent_poses = robots.begin(is_first=before is None)
         received_poses = robots.exchange(sent_poses)
         ratios = robots.ask(ConsensusRobot.multiplier_ratios, received_poses, Count.GATHER)
@@ -196,10 +193,7 @@ class Consensus:
         return self.soc.status_at(measurement)
 
     def _with_due_penalty(self, robots: AskedRobots, state: ConsensusState) -> ConsensusState:
-        """State with the penalty that the rule or the safeguard asks for; usually unchanged.
-
-        The relaxations of the start keep their penalties.
-        """
+        """State with the penalty that the rule or the safeguard asks for; usually unchanged."""
         if self.rotations is not Rotations.PROJECTED:
             return state
         rescaled = partial(self._rescaled, robots)
@@ -286,10 +280,7 @@ def _with_solution(
 
 @dataclass(eq=False)
 class LocalRobots:
-    """Robots in one process, for one step.
-
-    An order replaces them, and leaves the robots of the step before alone.
-    """
+    """Robots in one process, for one step."""
 
     problem: PGOProblem
     robots: tuple[ConsensusRobot, ...]

@@ -82,10 +82,7 @@ class Waiting:
 @record("ReceivedRows")
 @dataclass(frozen=True, eq=False)
 class ReceivedRows:
-    """Rows of a neighbour's s that the robot shares, and what the acceleration remembers of them.
-
-    The neighbour has the same numbers.
-    """
+    """Rows of a neighbour's s that the robot shares, and the memory of their acceleration."""
 
     s: Array
     share: AndersonShare = field(default_factory=AndersonShare)
@@ -362,10 +359,7 @@ class ConsensusRobot:
 
     @order("consensus.travel")
     def travel(self, _: None) -> tuple[ConsensusRobot, Array]:
-        """How far separator translations and their multipliers have gone.
-
-        `solvers.soc.separator_stiffness` has the sums.
-        """
+        """How far separator translations and their multipliers have gone."""
         assert self.state.origin is not None
         separators = self.layout.separators
         block = self.block

@@ -49,10 +49,7 @@ from solvers.soc.settings import SOCSettings
 
 @dataclass(frozen=True, eq=False)
 class SOCState(Steps):
-    """Iterate k of JOINT: x, omega, B and rho as above, acceleration and safeguard.
-
-    The fields of `Steps` (k, residuals, merits) come on top of these.
-    """
+    """Iterate k of JOINT: x, omega, B and rho as above, acceleration and safeguard."""
 
     # (n, d, d): solution of step (a): matrices that need not be orthogonal. At k = 0 the rotations
     # of the start.

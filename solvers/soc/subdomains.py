@@ -45,10 +45,7 @@ class Subdomains:
 
     @cached_property
     def coupled(self) -> csr_array:
-        """Entries where an edge or the elimination couples two poses of the boundary, (g, g).
-
-        They are those of the lower triangle with its diagonal.
-        """
+        """Entries where an edge or the elimination couples two poses of the boundary, (g, g)."""
         return lower_triangle(csr_array(self.reached.T @ self.reached + self.joined))
 
 

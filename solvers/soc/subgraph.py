@@ -192,10 +192,7 @@ class Placement:
         final: EdgeCost | None,
         thresholds: Array | None,
     ) -> Subgraph:
-        """The robot's subgraph, whether its edges are cut from a graph or its own lines.
-
-        What is given are fields of `Subgraph`.
-        """
+        """The robot's subgraph, whether its edges are cut from a graph or its own lines."""
         positions = np.searchsorted(poses, self.poses)
         is_separator = np.zeros(len(poses), dtype=bool)
         is_separator[positions] = self.is_separator
@@ -271,10 +268,7 @@ def _scaled(problem: PartProblem, weights: Array) -> PartProblem:
 def split_graph(
     given: PGOProblem | PoseGraph, parts: Partition, limits: Array | None = None
 ) -> tuple[Subgraph, ...]:
-    """Subgraphs of all robots; `limits`, (m,): thresholds of a robust solve.
-
-    A SettingError if `parts` does not fit.
-    """
+    """Subgraphs of all robots; `limits`, (m,): thresholds of a robust solve."""
     problem = as_problem(given)
     graph = problem.graph
     owner = parts.robot
@@ -369,10 +363,7 @@ def place_poses(pairs: IntArray, owners: IntArray, num_robots: int, middle: int)
 
 
 def _poses_in_common(holds: csc_array, robot: int) -> tuple[tuple[int, IntArray], ...]:
-    """Other robots that hold some of a robot's poses, and which of its poses these are.
-
-    Column b of `holds` has entries for those of the poses that robot b holds.
-    """
+    """Other robots that hold some of a robot's poses, and which of its poses these are."""
     others = np.flatnonzero(np.diff(holds.indptr))
     common = []
     for other in others[others != robot].tolist():

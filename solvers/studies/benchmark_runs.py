@@ -229,10 +229,7 @@ def _paper_soc(
 
 
 def _with_translations(stages: StageRecords) -> Array:
-    """Rounds of the first stage, and one more, in which robots with rotations get translations.
-
-    The bytes of that round are not counted.
-    """
+    """Rounds of the first stage, and one more (not in bytes) that gives the translations."""
     assert stages[0].rounds is not None
     return stages[0].rounds + 1.0
 

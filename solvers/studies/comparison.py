@@ -234,10 +234,7 @@ def compare_methods(
 
 
 def check_plot_format(path: Path) -> None:
-    """Raise the errors of `Comparison.save_plot` for the suffix of `path`.
-
-    They are a SettingError, and a MissingExtraError if its plotting library is missing.
-    """
+    """Raise the errors of `Comparison.save_plot` for the suffix of `path`."""
     if path.suffix.lower() != ".html" and not is_picture(path):
         problem = f"cannot write {path}: no plot has suffix {path.suffix!r}"
         raise SettingError(f"{problem}; use .html, .png, .svg or .pdf")
@@ -261,10 +258,7 @@ def _cells(figures: Mapping[str, Value]) -> list[str]:
 
 
 def _printed_costs(trial: BenchmarkRun, comparison: Comparison) -> dict[str, Value]:
-    """F and gap as they are printed: upper bounds for the exact cost of the poses.
-
-    The record has them as computed. A run without a result has none.
-    """
+    """F and gap as they are printed: upper bounds for the exact cost of the poses."""
     if not trial.is_answer:
         return {}
     cost = _cost_at_most(comparison.problem, trial.poses, trial.objective)

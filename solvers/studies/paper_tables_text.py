@@ -82,10 +82,7 @@ def findings(tables: Reproduction) -> tuple[Finding, ...]:
 
 
 def tables_as_text(tables: Reproduction) -> ResultTable:
-    """Return the reproduced tables, a line for each method on each graph, and the findings below.
-
-    The first part has the columns of the paper's tables 1 and 3, the second those of 2 and 4.
-    """
+    """Return the reproduced tables, a line for a method on a graph, and the findings below."""
     costs = []
     efforts = []
     name_before = ""
