@@ -103,7 +103,7 @@ def certify_command(
     to_digits = None
     if not certificate.is_certified:
         written = digits_of_estimate(graph, estimate)
-        to_digits = certify_to_digits(problem, poses, written, gap)
+        to_digits = certify_to_digits(problem, poses, certificate, written)
     record = _record(problem, poses, certificate)
     if to_digits is not None:
         record["note"] = joined_notes(_text_of_digits(to_digits), str(record["note"]))

@@ -129,7 +129,7 @@ def certify(
 
 
 def certify_to_digits(
-    problem: PGOProblem, poses: Poses, written: WrittenDigits, gap: float = DEFAULT_GAP
+    problem: PGOProblem, poses: Poses, certificate: Certificate, written: WrittenDigits
 ) -> Certificate | None:
     """Certificate of the optimum that poses of a file are, to the digits that they are written in.
 
@@ -141,25 +141,25 @@ def certify_to_digits(
         The problem.
     poses : Poses
         The poses of the file.
+    certificate : Certificate
+        Theirs, which has the poses that Newton leads to.
     written : WrittenDigits
-        Its digits.
-    gap : float
-        The relative gap to certify.
+        Digits of the file.
 
     Returns
     -------
     Certificate or None
-        That of the stationary poses that Newton leads to; None where they are not certified, or do
-        not round to the poses given.
+        That of the polished poses; None where they are not certified, or do not round to the poses
+        given.
     """
     if written == ALL_DIGITS:
         return None
     near = problem.graph.near_zero(problem.graph.completed(poses))
-    polished = polish(problem, near)
+    polished = certificate.poses
     if not _round_to(polished.aligned_to(near), near, written, problem.graph):
         return None
-    certificate = certify(problem, polished, gap)
-    return certificate if certificate.is_certified else None
+    of_polished = judge(problem.measured, polished, certificate)
+    return of_polished if of_polished.is_certified else None
 
 
 def _round_to(poses: Poses, given: Poses, written: WrittenDigits, graph: PoseGraph) -> bool:

@@ -318,3 +318,12 @@ def test_the_fit_is_that_of_the_cost_solved_as_it_is_printed() -> None:
     page = report_page(solution)
     assert f"Fit: {solution.fit_text}." in page
     assert ("of measurements that do not fit" in page) == solution.is_doubtful
+
+
+def test_the_word_above_a_robust_solve_says_of_which_edges_it_is() -> None:
+    graph = pgo.grid_world(1, 80, 2, d=2)
+    at_once = pgo.Poses(np.eye(2)[None], np.zeros((1, 2)))
+    wrong = graph.with_edges([5], [61], at_once, kappa=100.0, tau=100.0)
+    solution = solvers.solve(wrong, robust=solvers.GNC())
+    assert solution.is_certified
+    assert "CERTIFIED for the edges kept" in report_page(solution)
