@@ -18,8 +18,9 @@ import nbformat
 from nbclient import NotebookClient
 from PIL import Image
 
+from pgo_models.plots.pages import FILM
+
 FOLDER = Path(__file__).parent
-FILM = "application/vnd.plotly.v1+json"  # a figure of plotly, in the output of a cell
 COLOURS = 128  # of a picture; with fewer colours two robots look alike
 MOST_BYTES = 400_000
 

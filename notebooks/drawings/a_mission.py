@@ -11,6 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
 import pgo_models as pgo
+from drawings.traces import GRID
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
 if TYPE_CHECKING:
@@ -280,7 +281,6 @@ def _layout(t: NDArray[np.float64], seconds: int, largest: float) -> dict[str, o
     """Map above, with equal scales, and bounds below."""
     lower, upper = t.min(axis=0) - 0.3, t.max(axis=0) + 0.3
     hidden = {"visible": False}
-    grid = {"gridcolor": "#eeeeee", "zeroline": False}
     return {
         "height": 740,
         "xaxis": {**hidden, "range": [lower[0], upper[0]], "constrain": "domain"},
@@ -291,13 +291,13 @@ def _layout(t: NDArray[np.float64], seconds: int, largest: float) -> dict[str, o
             "domain": [0.44, 1.0],
         },
         "xaxis2": {
-            **grid,
+            **GRID,
             "range": [0, seconds + 4],
             "anchor": "y2",
             "title": {"text": "seconds"},
         },
         "yaxis2": {
-            **grid,
+            **GRID,
             "range": [-0.04 * largest, 1.08 * largest],
             "domain": [0.0, 0.25],
             "anchor": "x2",

@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import pgo_models as pgo
+from drawings.traces import GRID, line
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, METHOD_COLOURS
 
 if TYPE_CHECKING:
@@ -45,15 +46,14 @@ def film_of_plans(
                 }
         frames.append(layers)
     still = [
-        _line(hours, demand, "demand", "#000000", "dot"),
-        _line(hours, central.sum(axis=0), "central plan", ALARM_COLOUR, "solid"),
+        line(hours, demand.round(2), "#000000", "demand", dash="dot"),
+        line(hours, central.sum(axis=0).round(2), ALARM_COLOUR, "central plan"),
     ]
-    axis = {"gridcolor": "#eeeeee", "zeroline": False}
     highest = 1.1 * float(max(demand.max(), *(plan.sum(axis=0).max() for plan in plans)))
     layout = {
         "height": 460,
-        "xaxis": {**axis, "range": [0, num_hours - 1], "title": {"text": "hour"}, "dtick": 6},
-        "yaxis": {**axis, "range": [0, highest], "title": {"text": "power, all stations"}},
+        "xaxis": {**GRID, "range": [0, num_hours - 1], "title": {"text": "hour"}, "dtick": 6},
+        "yaxis": {**GRID, "range": [0, highest], "title": {"text": "power, all stations"}},
         "legend": {"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom"},
         "margin": {"l": 50, "r": 10, "t": 40, "b": 20},
     }
@@ -66,20 +66,6 @@ def film_of_plans(
     )
     labels = [f"round {k}" for k in range(len(plans))]
     return pgo.animate(frames, labels, still=still, layout=layout, description=description)
-
-
-def _line(
-    hours: list[int], values: NDArray[np.float64], name: str, colour: str, dash: str
-) -> dict[str, object]:
-    """A line over the hours."""
-    return {
-        "x": hours,
-        "y": values.round(2).tolist(),
-        "mode": "lines",
-        "name": name,
-        "line": {"color": colour, "width": 2, "dash": dash},
-        "hoverinfo": "skip",
-    }
 
 
 def draw_distances_and_prices(

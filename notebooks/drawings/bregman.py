@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import pgo_models as pgo
+from drawings.traces import line, numbers
 from pgo_models.geometry.rotations import Array
 from pgo_models.plots.style import COLOURS, QUIET_COLOUR
 
@@ -18,11 +19,6 @@ BLUE, ORANGE, GREEN, _, LIGHT_BLUE, BLACK = COLOURS
 LEGEND_BELOW = {"orientation": "h", "x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom"}
 LEVELS = (0.3, 0.6, 0.9, 1.2)
 FAR = 5000.0  # where a level line ends that has no end
-
-
-def _numbers(values: Array) -> list[float]:
-    """Values with few digits, so that a film stays small."""
-    return np.round(np.asarray(values, dtype=float), 3).tolist()
 
 
 def tangent_film(iterates: Array, slopes: Array, target: float, penalty: float) -> Figure:
@@ -38,15 +34,15 @@ def tangent_film(iterates: Array, slopes: Array, target: float, penalty: float) 
         next_cost = curve - tangent + 0.5 * penalty * (grid - target) ** 2
         frames.append(
             [
-                _line(grid, tangent, BLUE, "tangent"),
-                _line([target] * 2, [at_target - distance, at_target], ORANGE, "distance", 5),
-                _line(grid, next_cost, GREEN, "distance + penalty"),
+                line(grid, tangent, BLUE, "tangent"),
+                line([target] * 2, [at_target - distance, at_target], ORANGE, "distance", 5),
+                line(grid, next_cost, GREEN, "distance + penalty"),
                 _points([x], [height], BLUE, "iterate", 11),
             ]
         )
     still = [
-        _line([target] * 2, [-1.0, 8.0], QUIET_COLOUR, "x = f", 1),
-        _line(grid, curve, BLACK, "J"),
+        line([target] * 2, [-1.0, 8.0], QUIET_COLOUR, "x = f", 1),
+        line(grid, curve, BLACK, "J"),
     ]
     return pgo.animate(
         frames,
@@ -86,14 +82,14 @@ def tilting_film(
         path = iterates[: k + 1]
         frames.append(
             [
-                {**_line([], [], LIGHT_BLUE, "distance = const", 1.5), "x": x, "y": y},
+                {**line([], [], LIGHT_BLUE, "distance = const", 1.5), "x": x, "y": y},
                 {**_points(*path.T, BLUE, "iterates", 8), "mode": "lines+markers"},
                 {**_points(*iterates[k : k + 1].T, BLUE, "now", 14), "showlegend": False},
             ]
         )
     ends = np.array([-2.0, 3.0])
     still = [
-        _line(ends, (value - row[0] * ends) / row[1], BLACK, "K x = f"),
+        line(ends, (value - row[0] * ends) / row[1], BLACK, "K x = f"),
         _points(*penalty_alone.T, ORANGE, "penalty alone", 9, "diamond"),
     ]
     return pgo.animate(
@@ -129,27 +125,9 @@ def _level_lines(p: Array) -> tuple[list[float | None], list[float | None]]:
     for level in LEVELS:
         right, up = np.minimum(level / np.maximum(1.0 - p, 1e-6), FAR)
         left, down = -np.minimum(level / np.maximum(1.0 + p, 1e-6), FAR)
-        x += [*_numbers(np.array([right, 0.0, left, 0.0, right])), None]
-        y += [*_numbers(np.array([0.0, up, 0.0, down, 0.0])), None]
+        x += [*numbers(np.array([right, 0.0, left, 0.0, right])), None]
+        y += [*numbers(np.array([0.0, up, 0.0, down, 0.0])), None]
     return x, y
-
-
-def _line(
-    x: Sequence[float] | Array,
-    y: Sequence[float] | Array,
-    colour: str,
-    name: str,
-    width: float = 2.0,
-) -> dict[str, object]:
-    """Return a plotly trace that is a line."""
-    return {
-        "x": _numbers(np.asarray(x)),
-        "y": _numbers(np.asarray(y)),
-        "mode": "lines",
-        "line": {"color": colour, "width": width},
-        "name": name,
-        "hoverinfo": "skip",
-    }
 
 
 def _points(
@@ -162,8 +140,8 @@ def _points(
 ) -> dict[str, object]:
     """Return a plotly trace of markers."""
     return {
-        "x": _numbers(np.asarray(x)),
-        "y": _numbers(np.asarray(y)),
+        "x": numbers(x),
+        "y": numbers(y),
         "mode": "markers",
         "marker": {"color": colour, "size": size, "symbol": symbol},
         "line": {"color": colour, "width": 1.5},

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import pgo_models as pgo
+from drawings.traces import GRID, Trace, line
 from pgo_models.geometry.rotations import Array
 from pgo_models.plots.films import GraphFrames
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
-
-Trace = dict[str, object]
 
 _FIRST_ANGLE = -20.0  # degrees: what the curve shows
 _LAST_ANGLE = 180.0
@@ -38,19 +37,19 @@ def film_of_multipliers(
     ]
     frames: list[list[Trace]] = [
         [
-            _line([_FIRST_ANGLE, _LAST_ANGLE], [bound, bound], COLOURS[1], "lower bound", width=3),
+            line([_FIRST_ANGLE, _LAST_ANGLE], [bound, bound], COLOURS[1], "lower bound", width=3),
             _dot(point, COLOURS[1]),
         ]
         for point, bound in zip(cheapest_points.round(3), bounds.round(3), strict=True)
     ]
     arrows = [
-        _line([0, np.cos(a).round(3)], [0, np.sin(a).round(3)], QUIET_COLOUR, "", 1.5 * w, "x2")
+        line([0, np.cos(a).round(3)], [0, np.sin(a).round(3)], QUIET_COLOUR, "", 1.5 * w, "x2")
         for a, w in zip(angles, weights, strict=True)
     ]
     around = np.linspace(0.0, 2 * np.pi, 61)
     still = [
-        _line(theta, costs.round(3), COLOURS[0], "cost F of the answer"),
-        _line(np.cos(around).round(3), np.sin(around).round(3), COLOURS[0], "", 2, "x2"),
+        line(theta, costs.round(3), COLOURS[0], "cost F of the answer"),
+        line(np.cos(around).round(3), np.sin(around).round(3), COLOURS[0], "", 2, "x2"),
         *arrows,
     ]
     best = int(np.argmax(bounds))
@@ -99,15 +98,15 @@ def film_of_the_way(
     frames: list[list[Trace]] = [
         [
             *({**trace, "showlegend": False} for trace in drawn.traces(k)),
-            _line([share, share], [lower_bound, objective], ALARM_COLOUR, "", 3, "x2"),
+            line([share, share], [lower_bound, objective], ALARM_COLOUR, "", 3, "x2"),
             _dot((share, objective), COLOURS[0]),
         ]
         for k, (share, objective) in enumerate(zip(shares, costs.round(2), strict=True))
     ]
     bound = round(lower_bound, 2)
     still = [
-        _line(shares, costs.round(2), COLOURS[0], "cost F", 2, "x2", shown=True),
-        _line([0, 1], [bound, bound], COLOURS[1], "lower bound", 2, "x2", shown=True),
+        line(shares, costs.round(2), COLOURS[0], "cost F", 2, "x2"),
+        line([0, 1], [bound, bound], COLOURS[1], "lower bound", 2, "x2"),
     ]
     highest = float(costs.max())
     description = (
@@ -138,32 +137,7 @@ def film_of_the_way(
 
 def _axis(limits: Sequence[float], title: str, **properties: object) -> dict[str, object]:
     """Axis with a fixed range."""
-    axis: dict[str, object] = {"range": list(limits), "title": {"text": title}, "zeroline": False}
-    return {**axis, "gridcolor": "#eeeeee", **properties}
-
-
-def _line(
-    x: Sequence[float] | Array,
-    y: Sequence[float] | Array,
-    colour: str,
-    name: str,
-    width: float = 2.0,
-    axis: str = "x",
-    shown: bool | None = None,
-) -> Trace:
-    """A line, in the legend if it has a name."""
-    return {
-        "x": np.asarray(x, dtype=float).round(4).tolist(),
-        "y": np.asarray(y, dtype=float).round(4).tolist(),
-        "type": "scatter",
-        "mode": "lines",
-        "line": {"color": colour, "width": width},
-        "name": name,
-        "showlegend": bool(name) if shown is None else shown,
-        "xaxis": axis,
-        "yaxis": axis.replace("x", "y"),
-        "hoverinfo": "skip",
-    }
+    return {**GRID, "range": list(limits), "title": {"text": title}, **properties}
 
 
 def _dot(point: Sequence[float] | Array, colour: str) -> Trace:

@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import pgo_models as pgo
+from drawings.traces import GRID
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
 if TYPE_CHECKING:
@@ -264,12 +265,11 @@ def slider_of_losses(
     frames = [frames[0], *([{"y": trace["y"]} for trace in frame] for frame in frames[1:])]
     everything = np.maximum(np.concatenate([*newest, *only_what_arrived]), _SMALLEST_GAP)
     decades = [np.log10(everything.min()) - 0.3, np.log10(everything.max()) + 0.3]
-    axis = {"gridcolor": "#eeeeee", "zeroline": False}
     layout = {
         "height": 460,
-        "xaxis": {**axis, "range": [0, len(newest[0])], "title": {"text": "round"}},
+        "xaxis": {**GRID, "range": [0, len(newest[0])], "title": {"text": "round"}},
         "yaxis": {
-            **axis,
+            **GRID,
             "type": "log",
             "range": decades,
             "exponentformat": "power",

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import pgo_models as pgo
+from drawings.traces import GRID
 from pgo_models.geometry.rotations import Array
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
@@ -89,7 +90,6 @@ def _point(noise: float, gap: float) -> Trace:
 
 def _axes_of_noise(degrees: Sequence[float], largest: float) -> dict[str, object]:
     """Two panels, one above the other."""
-    grid = {"gridcolor": "#eeeeee", "zeroline": False}
     return {
         "height": 540,
         "showlegend": False,
@@ -100,7 +100,7 @@ def _axes_of_noise(degrees: Sequence[float], largest: float) -> dict[str, object
             "range": [0.4, NUM_EIGENVALUES + 0.6],
             "title": {"text": "k-th largest eigenvalue of Z", "standoff": 4},
         },
-        "yaxis": {**grid, "domain": [0.58, 1.0], "range": [0.0, 1.08 * largest]},
+        "yaxis": {**GRID, "domain": [0.58, 1.0], "range": [0.0, 1.08 * largest]},
         "xaxis2": {
             "anchor": "y2",
             "range": [min(degrees) - 3.0, max(degrees) + 3.0],
@@ -108,7 +108,7 @@ def _axes_of_noise(degrees: Sequence[float], largest: float) -> dict[str, object
             "zeroline": False,
         },
         "yaxis2": {
-            **grid,
+            **GRID,
             "domain": [0.0, 0.4],
             "type": "log",
             "range": [-15.5, 0.0],

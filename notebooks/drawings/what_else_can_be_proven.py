@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from plotly.graph_objects import Figure
 
 import pgo_models as pgo
+from drawings.traces import GRID, Trace
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR
 
 Array = NDArray[np.float64]
-Trace = dict[str, object]
 
-_GRID: dict[str, object] = {"gridcolor": "#eeeeee", "zeroline": False}
 _LEGEND = {"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom"}
 _MARGIN = {"l": 58, "r": 12, "t": 70, "b": 20}
 
@@ -107,12 +106,12 @@ def film_of_constraints(
             "margin": _MARGIN,
             "annotations": heads,
             "xaxis": {
-                **_GRID,
+                **GRID,
                 "range": [-0.5, last + 0.5],
                 "title": {"text": "number of equations", "standoff": 4},
             },
             "yaxis": {
-                **_GRID,
+                **GRID,
                 "range": [-0.02 * least, 1.22 * least],
                 "domain": [0.46, 1.0],
                 "title": {"text": "cost"},
@@ -123,7 +122,7 @@ def film_of_constraints(
                 "title": {"text": "k-th largest eigenvalue of Z", "standoff": 4},
             },
             "yaxis2": {
-                **_GRID,
+                **GRID,
                 "anchor": "x2",
                 "domain": [0.0, 0.3],
                 "range": [0.0, 1.05],
@@ -173,9 +172,9 @@ def slider_of_noise(gaps: Mapping[float, Mapping[str, Array]]) -> Figure:
             "height": 430,
             "legend": _LEGEND,
             "margin": _MARGIN,
-            "xaxis": {**_GRID, "title": {"text": "draw, from the smallest gap", "standoff": 4}},
+            "xaxis": {**GRID, "title": {"text": "draw, from the smallest gap", "standoff": 4}},
             "yaxis": {
-                **_GRID,
+                **GRID,
                 "range": [-0.03, 1.03],
                 "tickformat": ".0%",
                 "title": {"text": "gap"},

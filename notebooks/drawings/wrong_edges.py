@@ -10,6 +10,7 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
+from drawings.traces import GRID
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph
@@ -159,7 +160,7 @@ def _weight_points(ratio: Array, weights: Array, is_bad: BoolArray) -> list[Trac
 
 
 _BELOW = {"xaxis": "x2", "yaxis": "y2"}
-_AXIS = {"zeroline": False, "gridcolor": "#eeeeee", "title": {"standoff": 2}}
+_AXIS = {**GRID, "title": {"standoff": 2}}
 
 
 def _rounded(x: Array, y: Array) -> Trace:

@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 import pgo_models  # noqa: E402 - on the path that is set above
 import solvers  # noqa: E402
 from pgo_models.errors import MissingExtraError, extra_module  # noqa: E402
-from pgo_models.plots.pages import figure_html  # noqa: E402
+from pgo_models.plots.pages import FILM, figure_html  # noqa: E402
 
 PACKAGES = {"pgo_models": pgo_models, "solvers": solvers}
 # Pages of the repository, and their names on the site; links between them are adapted.
@@ -38,7 +38,6 @@ PAGES = {
     "CHANGELOG.md": "changelog.md",
     "data/README.md": "data.md",
 }
-FILM = "application/vnd.plotly.v1+json"  # a figure of plotly, in the output of a notebook's cell
 PLOTLY_SCRIPT = "../_static/plotly.min.js"  # of `conf.py`, seen from the pages of the notebooks
 FRONT_FILM = (
     ROOT / "notebooks" / "14_is_it_really_the_best.ipynb"

@@ -12,7 +12,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent.parent
 NOTEBOOKS = ROOT / "notebooks"
-FILM = "application/vnd.plotly.v1+json"  # a figure of plotly, in the output of a notebook's cell
 SHORTEST_NAME = 6  # of a function by which a notebook is found; `plot` is in every other one
 SECTION = re.compile(r"^### ([^\n]+)$|^!\[([^\]]*)\]\((\S+)\)$|^```python\n(.*?)^```$", re.M | re.S)
 

@@ -11,6 +11,7 @@ from pgo_models.files import replace_when_done
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
+FILM = "application/vnd.plotly.v1+json"  # a figure of plotly, in the output of a notebook's cell
 # A page sends nothing away: plotly's button to share a chart would upload it.
 PAGE_CONFIG: dict[str, object] = {
     "displaylogo": False,

@@ -20,6 +20,7 @@ import pytest
 
 import pgo_models
 import solvers
+from pgo_models.plots.pages import FILM
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 SOURCES = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
@@ -27,7 +28,6 @@ NAMES = [source.stem for source in SOURCES]
 LIBRARIES = {"cvxpy", "matplotlib", "numpy", "pandas", "scipy", "drawings"}
 ANSWER = re.compile(r"<details><summary>Answer</summary>\n\n(.*?)\n\n</details>", re.S)
 README = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
-FILM = "application/vnd.plotly.v1+json"
 MOST_BYTES = 400_000
 
 each_source = pytest.mark.parametrize("source", SOURCES, ids=NAMES)
