@@ -36,8 +36,9 @@ class News:
 
     `hears` are robots that it has heard of lately, which send it what they measure themselves.
     `takes_back` says that it comes from what was saved, and lacks what it has measured since;
-    `twins` are names that two robots have. `sent` is when pieces were sent, in milliseconds of the
-    sender's clock, and `answers` that number of those that have come last, or -1.
+    `twins` are names that two robots have. `sent` is when pieces were sent, by the clock of `Pace`,
+    and `answers` that number of those that have come last, or -1. `is_short` says that all it does
+    not tell is as it was told before; whom it hears and twins are not told.
     """
 
     has: Mapping[str, Revision]
@@ -47,6 +48,7 @@ class News:
     twins: tuple[str, ...] = ()
     sent: int = -1
     answers: int = -1
+    is_short: bool = False
 
     def as_bytes(self) -> bytes:
         """Bytes of which `from_bytes` makes the message: they are the most of what teams send."""
@@ -55,8 +57,10 @@ class News:
         parts = [_number(len(names))]
         for name in names:
             parts += [_text(name.encode("utf-8")), _revision(self.has.get(name, Revision()))]
-        parts += [_chosen(names, self.hears), _chosen(names, self.twins)]
-        parts += map(_number, (self.takes_back, self.sent + 1, self.answers + 1, len(owners)))
+        parts.append(_number(self.takes_back + 2 * self.is_short))
+        if not self.is_short:
+            parts += [_chosen(names, self.hears), _chosen(names, self.twins)]
+        parts += map(_number, (self.sent + 1, self.answers + 1, len(owners)))
         for piece in self.pieces:
             parts += [_number(names.index(piece.owner)), _revision(piece.before)]
             parts += [_number(piece.lines.num_lines), *map(_text, piece.lines[1:])]
@@ -70,8 +74,10 @@ class News:
         try:
             known = {reader.text().decode("utf-8"): reader.revision() for _ in reader.items()}
             names = list(known)
-            hears, twins = reader.chosen(names), reader.chosen(names)
-            takes_back, sent, answers = (reader.number() for _ in range(3))
+            flags = reader.number()
+            takes_back, is_short = bool(flags & 1), bool(flags & 2)
+            hears, twins = [() if is_short else reader.chosen(names) for _ in range(2)]
+            sent, answers = reader.number() - 1, reader.number() - 1
             pieces = []
             for _ in reader.items():
                 owner, before = names[reader.number()], reader.revision()
@@ -80,7 +86,7 @@ class News:
         except (IndexError, ValueError) as error:
             raise WireError(f"a message that cannot be read: {error}") from error
         has = {name: revision for name, revision in known.items() if revision.num_lines}
-        return cls(has, hears, tuple(pieces), bool(takes_back), twins, sent - 1, answers - 1)
+        return cls(has, hears, tuple(pieces), takes_back, twins, sent, answers, is_short)
 
 
 def _number(number: int) -> bytes:

@@ -21,21 +21,22 @@ from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, Priority, Term
 from solvers.team.news import News, Piece
-from solvers.team.pace import MOST_IN_A_PIECE, Pace
-from solvers.team.packed_lines import MOST_LINES, packed_lines, unpacked_lines
+from solvers.team.pace import MOST_IN_A_PIECE, Pace, clock
+from solvers.team.packed_lines import MOST_LINES, PackedLines, packed_lines, unpacked_lines
 from solvers.team.session import Session
 from solvers.team.shared_solve import SharedAnswer
 
+_MOST_FLIGHTS = 4  # pieces on their way to a robot that has not answered the first of them
 _FORGOTTEN = 10.0  # patiences without a sign, after which a robot is not waited for any more
 
 
 @dataclass(frozen=True)
 class _Flight:
-    """A piece that was sent: from which line on, when, how often, and whether it was the last."""
+    """A piece that was sent: its lines, when, and whether it was the last."""
 
     begins: int
+    ends: int
     when: float
-    num_sent: int
     is_last: bool
 
 
@@ -66,7 +67,14 @@ class SharedMap:
         # What the others have last said, also those that are out of reach, and who is within it.
         self._said: dict[str, _Said] = {}
         self._near: set[str] = set()
-        self._flights: dict[tuple[str, str], _Flight] = {}
+        # The lines that were packed last, and between which revisions: most are for all others.
+        self._packed_between: tuple[str, Revision, Revision] | None = None
+        self._packed: PackedLines
+        # What the others were told beside revisions, and when they are told again.
+        self._told: dict[str, tuple[bytes, tuple[str, ...], tuple[str, ...]]] = {}
+        self._tell_again: dict[str, float] = {}
+        # What is on its way, by receiver and owner, and the last piece of all.
+        self._flights: defaultdict[tuple[str, str], list[_Flight]] = defaultdict(list)
         self._paces: defaultdict[str, Pace] = defaultdict(Pace)
         self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
         # When an answer is owed to robots whose pieces have come: they are collected, too.
@@ -134,10 +142,21 @@ class SharedMap:
         return News(self.revisions, tuple(self._has), (), self._takes_back, self._session.twins)
 
     def _news(self, to: str, pieces: tuple[Piece, ...]) -> News:
-        """The greeting to a robot, with pieces, and as the answer to those that have come."""
-        sent = int(1000 * self._session.now)
+        """The greeting to a robot, with pieces, and as the answer to those that have come.
+
+        It is short where the robot was told the rest of late, and new lines of this one go along.
+        """
+        sent = clock(self._session.now)
         answers, self._paces[to].heard = self._paces[to].heard, -1
-        return replace(self.greeting(), pieces=pieces, sent=sent, answers=answers)
+        news = replace(self.greeting(), pieces=pieces, sent=sent, answers=answers)
+        told = (self._session.boot_of(to), news.hears, news.twins)
+        is_told = self._told.get(to) == told and self._session.now < self._tell_again[to]
+        if not is_told or [piece.is_last for piece in pieces if piece.owner == self.name] != [True]:
+            self._told[to] = told
+            self._tell_again[to] = self._session.now + self._session.patience
+            return news
+        has = {name: revision for name, revision in news.has.items() if name == to}
+        return replace(news, has=has, hears=(), twins=(), is_short=True)
 
     @property
     def _takes_back(self) -> bool:
@@ -160,10 +179,24 @@ class SharedMap:
                 pace.heard = message.sent
             if message.answers >= 0:
                 pace.note_answer(message.answers, self._session.now, self._session.pause(1))
-            self._said[sender] = _Said(message.has, message.hears, self._session.now)
+            self._said[sender] = self._said_in(sender, message)
             self._near.add(sender)
             if message.takes_back:
                 self._give_back(sender, message.has.get(sender, Revision()))
+
+    def _said_in(self, sender: str, news: News) -> _Said:
+        """What a robot has and hears; of its own it has all lines that a short message brings."""
+        now = self._session.now
+        before = self._said.get(sender)
+        if not news.is_short or before is None:
+            return _Said(news.has, news.hears, now)
+        own = {}
+        for piece in news.pieces:
+            if piece.owner == sender:
+                revision = self.logs[sender].revision
+                ends = piece.before.num_lines + piece.lines.num_lines
+                own[sender] = revision if revision.num_lines == ends else Revision(ends)
+        return _Said({**before.has, **news.has, **own}, before.hears, now)
 
     def _learn(self, sender: str, piece: Piece, is_latest: bool) -> None:
         """Add lines to those of a robot; of its own that robot alone decides which stand."""
@@ -204,7 +237,10 @@ class SharedMap:
         for name, has in self._has.items():
             pieces = self._pieces_for(name, has, awake)
             # Where lines for the robot are being collected, they take the answer along.
-            is_coming = has.get(self.name) != self._member.revision
+            sent = self._flights[name, self.name]
+            is_coming = (
+                bool(sent) and sent[-1].is_last and sent[-1].ends < len(self.logs[self.name].lines)
+            )
             delay = self._session.pause(1) / 2 if is_coming else 0.0
             if pieces or self._owed.get(name, np.inf) + delay <= self._session.now:
                 self._owed.pop(name, None)
@@ -247,32 +283,48 @@ class SharedMap:
         is_due = self._session.now - since >= rank * self._session.patience / 2
         return is_due and log.begins_with(known)
 
-    def _piece(self, to: str, log: Measurements, begins: int, owner: str) -> Piece | None:
-        """Lines from one on, cut to a length; None where a robot is to answer first."""
-        flight = self._flights.get((to, owner))
-        now = self._session.now
-        pace = self._paces[to]
-        num_sent = 0
-        if flight is not None:
-            # After the last piece, lines are collected for a while.
-            pause = self._session.pause(1) if flight.is_last else 0.0
-            if flight.begins == begins:
-                num_sent = flight.num_sent
-                pause = pace.pause(now - self._said[to].when, self._session.pause(1))
-            if now - flight.when < pause:
-                return None
-        if num_sent:
-            pace.shorten()
-        ends = begins
+    def _piece(self, to: str, log: Measurements, known: int, owner: str) -> Piece | None:
+        """Lines after those known, cut to a length; None where it is not yet time."""
+        flights = self._on_their_way(to, owner, known)
+        if flights is None:
+            return None
+        begins = ends = flights[-1].ends if flights else known
         num_bytes = 0
         most = min(len(log.lines), begins + MOST_LINES)
-        while ends < most and num_bytes < pace.num_bytes:
+        while ends < most and num_bytes < self._paces[to].num_bytes:
             num_bytes += len(log.lines[ends])
             ends += 1
+        if ends == begins:
+            return None
         is_last = ends == len(log.lines)
-        self._flights[to, owner] = _Flight(begins, now, num_sent + 1, is_last)
-        lines = packed_lines(log.lines[begins:ends], log.lines[:begins])
-        return Piece(owner, log.revision_at(begins), lines, is_last)
+        self._flights[to, owner] = [*flights, _Flight(begins, ends, self._session.now, is_last)]
+        before, after = log.revision_at(begins), log.revision_at(ends)
+        if (owner, before, after) != self._packed_between:
+            self._packed = packed_lines(log.lines[begins:ends], log.lines[:begins])
+            self._packed_between = (owner, before, after)
+        return Piece(owner, before, self._packed, is_last)
+
+    def _on_their_way(self, to: str, owner: str, known: int) -> list[_Flight] | None:
+        """Pieces that lines may follow now, after those known; None where they may not yet.
+
+        There are none where all have arrived, and where the first was not answered in time.
+        """
+        now = self._session.now
+        sent = self._flights[to, owner]
+        flights = [flight for flight in sent if known < flight.ends]
+        if flights and known < flights[0].begins:
+            flights = []
+        pace = self._paces[to]
+        pause = pace.pause(now - self._said[to].when, self._session.pause(1))
+        if flights and now - flights[0].when >= pause:
+            pace.shorten()
+            return []
+        if flights and (len(flights) == _MOST_FLIGHTS or not flights[-1].is_last):
+            return None
+        collected_until = (
+            sent[-1].when + self._session.pause(1) if sent and sent[-1].is_last else now
+        )
+        return flights if collected_until <= now else None
 
     # Solves
 

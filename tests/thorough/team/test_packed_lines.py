@@ -86,6 +86,8 @@ def test_messages_come_out_of_their_bytes_and_changed_bytes_are_messages_or_refu
     data = news.as_bytes()
     assert vars(News.from_bytes(data)) | {"pieces": ()} == vars(news) | {"pieces": ()}
     assert [vars(piece) for piece in News.from_bytes(data).pieces] == [*map(vars, pieces)]
+    short = News({"anna": before}, (), pieces, sent=3, is_short=True)
+    assert vars(News.from_bytes(short.as_bytes())) | {"pieces": pieces} == vars(short)
     for _ in range(100):
         changed = bytearray(data)
         changed[rng.integers(len(data))] = rng.integers(256)

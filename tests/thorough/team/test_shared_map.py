@@ -62,6 +62,33 @@ def test_each_line_goes_once_over_each_link() -> None:
     assert set(sent) == {(a, b, a) for a in robots for b in robots if a != b}
 
 
+def test_new_lines_do_not_wait_for_answers_to_those_before() -> None:
+    graph = world(n=200)
+    order = np.random.default_rng(1).permutation(np.arange(199, graph.num_edges))
+    robots = shared(graph.without_edges(np.arange(graph.num_edges) >= 199), 2)
+    network = Network(robots, np.random.default_rng(0), delay=0.2)
+    network.run(30.0)
+    begun: set[tuple[str, int]] = set()
+
+    def listen(sender: str, receiver: str, data: bytes) -> bool:
+        message = message_in(data)
+        assert isinstance(message, News)
+        begun.update((piece.owner, piece.before.num_lines) for piece in message.pieces)
+        return False
+
+    network.is_lost = listen
+    began = network.now
+    owners = pgo.partition(graph, 2).robot
+    for e in order:
+        give_edge(robots[f"r{owners[graph.i[e]]}"], graph, e)
+        network.wait(0.06)
+    num_pauses = (network.now - began) / robots["r0"].retry
+    assert len(begun) >= 0.7 * len(robots) * num_pauses
+    network.run(30.0)
+    assert network.is_settled
+    assert_is_the_optimum(robots, graph)
+
+
 def test_a_new_closure_reaches_all_in_a_short_message() -> None:
     graph = world(n=60)
     last = np.arange(graph.num_edges) >= graph.num_edges - 1
