@@ -322,11 +322,11 @@ class _Assembly:
         for tag, complete_tag in COMPLETE_TAGS.items():
             for part in parsed[complete_tag]:
                 numbers, is_symmetric = TAGS[complete_tag].triangles_of_complete(part.numbers)
-                with_triangles = ParsedLines(part.lines, part.ids, numbers)
                 problem = (
                     "the matrix is not symmetric; correct it, or give its upper triangle row by row"
                 )
-                parsed[tag].append(self._without(with_triangles, ~is_symmetric, problem))
+                self._note_problem(part.lines[~is_symmetric], problem)
+                parsed[tag].append(part._replace(numbers=numbers).some(is_symmetric))
             parsed[complete_tag] = []
 
     def _settle_edge2(self) -> None:
@@ -513,13 +513,10 @@ class _Assembly:
         if noise is not kind.noise:
             kind = replace(kind, noise=noise)
         part = part._replace(numbers=numbers_as(self._reading, kind, part.numbers))
-        part = self._without(part, *kind.problem(part.numbers))
-        part = self._with_known_weights(part, kind.weights_error(part.numbers))
-        numbers = kind.rows(part.numbers)
-        if kind.noise is not Noise.INFORMATION or kind.num_offsets:
-            part, numbers = self._without_wrong_rows(part, numbers)
+        part, numbers, weights_error = sound_rows(kind, part, self._source.problems)
+        self.weights_error = max(self.weights_error, weights_error)
         if kind.num_offsets:
-            numbers = self._in_frames_of_poses(kind, part, numbers)
+            part, numbers = self._in_frames_of_poses(kind, part, numbers)
         ids = part.ids[:, : kind.num_ids]
         ids_behind_world = np.insert(ids, 0, WORLD_ID, axis=1)
         last_two_ids = ids_behind_world[:, -2:]
@@ -539,42 +536,22 @@ class _Assembly:
                 "positions of these poses"
             )
 
-    def _with_known_weights(self, part: ParsedLines, errors: Array) -> ParsedLines:
-        """Lines with information that doubles can hold, by its errors, (n,), which are noted."""
-        is_hidden = errors > MOST
-        self._count_weights_error(errors[~is_hidden])
-        return self._without(part, is_hidden, HIDDEN_INFORMATION)
-
-    def _count_weights_error(self, errors: Array) -> None:
-        largest = float(errors.max(initial=0.0))
-        self.weights_error = max(self.weights_error, largest)
-
-    def _without(self, part: ParsedLines, is_wrong: BoolArray, problem: str) -> ParsedLines:
-        """Note the problem of wrong lines, (n,), and return the others."""
-        if not is_wrong.any():
-            return part
-        self._note_problem(part.lines[is_wrong], problem)
-        is_right = ~is_wrong
-        return ParsedLines(part.lines[is_right], part.ids[is_right], part.numbers[is_right])
-
-    def _without_wrong_rows(self, part: ParsedLines, numbers: Array) -> tuple[ParsedLines, Array]:
-        """Note the problems of rows that cannot be brought into other axes; return the others."""
-        is_beyond = (np.abs(numbers) > LARGEST).any(axis=1)
-        problems = far_information(np.flatnonzero(is_beyond))
-        if self._d == 3:
-            problems += zero_quaternion_lines(np.arange(len(numbers)), numbers[:, 3:7])
-        is_right = np.ones(len(numbers), dtype=bool)
-        for row, problem in problems:
-            is_right[row] = False
-            self._source.problems.append((int(part.lines[row]), problem))
-        rest = ParsedLines(part.lines[is_right], part.ids[is_right], part.numbers[is_right])
-        return rest, numbers[is_right]
-
     def _note_problem(self, lines: IntArray, problem: str) -> None:
         self._source.problems += [(line, problem) for line in lines.tolist()]
 
-    def _in_frames_of_poses(self, kind: Tag, part: ParsedLines, numbers: Array) -> Array:
-        """EDGE rows in the frames of the poses. Rows of sensors at their poses stay as they are."""
+    def _in_frames_of_poses(
+        self, kind: Tag, part: ParsedLines, numbers: Array
+    ) -> tuple[ParsedLines, Array]:
+        """EDGE rows in the frames of the poses. Rows of sensors at their poses stay as they are.
+
+        Rows with a zero quaternion, which have no frame, are left out.
+        """
+        if self._d == 3:
+            problems = zero_quaternion_lines(part.lines, numbers[:, 3:7])
+            self._source.problems += problems
+            is_right = ~np.isin(part.lines, [line for line, _ in problems])
+            part = part.some(is_right)
+            numbers = numbers[is_right]
         offset_ids = part.ids[:, kind.num_ids :]
         offset_of: dict[int, Array] = {}
         for offset_id in np.unique(offset_ids).tolist():
@@ -587,21 +564,21 @@ class _Assembly:
                 offset_of[offset_id] = offset
         is_moved = np.isin(offset_ids, list(offset_of)).any(axis=1)
         if not is_moved.any():
-            return numbers
+            return part, numbers
         if kind.is_position:
             problem = (
                 "the position of a sensor that is not at its pose; give the position of the pose, "
                 "without the offset"
             )
             self._note_problem(part.lines[is_moved], problem)
-            return numbers
+            return part, numbers
         offsets = [offsets_named(ids, self._d, offset_of) for ids in offset_ids[is_moved].T]
         numbers = numbers.copy()
         numbers[is_moved], errors = in_frames_of_poses(kind, numbers[is_moved], offsets)
-        is_hidden = errors > MOST
+        is_hidden = np.asarray(errors > MOST)
         self._note_problem(part.lines[is_moved][is_hidden], HIDDEN_INFORMATION)
-        self._count_weights_error(errors[~is_hidden])
-        return numbers
+        self.weights_error = max([self.weights_error, *errors[~is_hidden].tolist()])
+        return part, numbers
 
     def _check_unknown_offset(self, kind: Tag, offset_id: int, lines: IntArray) -> None:
         """Note a problem of lines that name an offset without a PARAMS_ line.
@@ -686,10 +663,27 @@ class _Assembly:
         )
 
 
-def far_information(lines: IntArray) -> list[Problem]:
-    """Problems of lines with information that is too large, because a covariance is too small."""
+def sound_rows(
+    kind: Tag, part: ParsedLines, problems: list[Problem]
+) -> tuple[ParsedLines, Array, float]:
+    """Lines of a tag that are sound, their rows, (n, width), and the error of their weights.
+
+    The others are left out, and their problems are added to those given: a noise that is none, and
+    information that doubles cannot hold.
+    """
+    is_wrong, problem = kind.problem(part.numbers)
+    problems += [(line, problem) for line in part.lines[is_wrong].tolist()]
+    part = part.some(~is_wrong)
+    errors = kind.weights_error(part.numbers)
+    is_hidden = np.asarray(errors > MOST)
+    problems += [(line, HIDDEN_INFORMATION) for line in part.lines[is_hidden].tolist()]
+    part = part.some(~is_hidden)
+    rows = kind.rows(part.numbers)
+    is_far = np.asarray((np.abs(rows) > LARGEST).any(axis=1))
     problem = f"information beyond {LARGEST:g}; correct the line"
-    return [(line, problem) for line in lines.tolist()]
+    problems += [(line, problem) for line in part.lines[is_far].tolist()]
+    weights_error = float(errors[~is_hidden].max(initial=0.0))
+    return part.some(~is_far), rows[~is_far], weights_error
 
 
 def problems_of(file: G2OLines) -> list[Problem]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pgo_models.errors import FileFormatError
 from pgo_models.files import LARGEST, LONGEST, Problem, check_length, finite_number
-from pgo_models.geometry.rotations import Array
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.g2o_dialects import NO_OFFSET
 from pgo_models.graphs.g2o_tags import (
     ALIASES,
@@ -50,6 +50,10 @@ class ParsedLines(NamedTuple):
     lines: IntArray  # (n,)
     ids: IntArray  # (n, num_ids + num_other_ids)
     numbers: Array  # (n, num_numbers)
+
+    def some(self, chosen: BoolArray) -> "ParsedLines":
+        """Lines that are chosen, (n,)."""
+        return ParsedLines(self.lines[chosen], self.ids[chosen], self.numbers[chosen])
 
 
 class Source:

@@ -23,17 +23,12 @@ from pgo_models.files import (
 )
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import edge_rows_to_keep, graph_of_files
-from pgo_models.graphs.g2o_parser import (
-    HIDDEN_INFORMATION,
-    G2OLines,
-    far_information,
-    problems_of,
-)
+from pgo_models.graphs.g2o_parser import G2OLines, problems_of, sound_rows
+from pgo_models.graphs.g2o_source import ParsedLines
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.origin import remainder_of
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
-from pgo_models.graphs.weight_errors import MOST
 from pgo_models.graphs.written_digits import digits_of
 
 SUFFIX = ".jrl"
@@ -256,39 +251,31 @@ def lines_of_measurements(
 ) -> G2OLines:
     """The measurements of a robot as edges, in the order of the file."""
     width = 9 if d == 2 else 28
-    ids = [np.zeros((0, 2), dtype=np.int64)]
+    ids: list[IntArray] = [np.zeros((0, 2), dtype=np.int64)]
     rows = [np.zeros((0, width))]
     remainders = [np.zeros((0, d))]
-    places = [np.zeros(0, dtype=np.int64)]
-    landmarks = [np.zeros(0, dtype=np.int64)]
+    places: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+    landmarks: list[IntArray] = [np.zeros(0, dtype=np.int64)]
     measured = [np.zeros(0)]
     weights_error = 0.0
     for of_type in by_type.values():
         kind = of_type.kind
         if kind.d != d:  # none of its measurements could be read
             continue
-        numbers = np.array(of_type.numbers).reshape(-1, kind.num_numbers)
-        is_wrong, problem = kind.problem(numbers)
-        of_kind = np.array(of_type.places, dtype=np.int64)
-        problems += [(place, problem) for place in of_kind[is_wrong].tolist()]
-        errors = np.zeros(len(numbers))
-        errors[~is_wrong] = kind.weights_error(numbers[~is_wrong])
-        is_hidden = errors > MOST
-        problems += [(place, HIDDEN_INFORMATION) for place in of_kind[is_hidden].tolist()]
-        is_wrong = is_wrong | is_hidden
-        weights_error = max(weights_error, float(errors[~is_wrong].max(initial=0.0)))
-        ids_of_kind = np.array(of_type.ids, dtype=np.int64).reshape(-1, 2)[~is_wrong]
-        rows_of_kind = kind.rows(numbers[~is_wrong])
-        is_right = (np.abs(rows_of_kind) <= LARGEST).all(axis=1)
-        places_of_kind = of_kind[~is_wrong]
-        problems += far_information(places_of_kind[~is_right])
-        rows.append(rows_of_kind[is_right])
-        remainders.append(_remainders(kind, rows[-1]))
-        measured.append(numbers[:, : kind.num_measured].ravel())
-        ids.append(ids_of_kind[is_right])
-        places.append(places_of_kind[is_right])
+        part = ParsedLines(
+            np.array(of_type.places, dtype=np.int64),
+            np.array(of_type.ids, dtype=np.int64).reshape(-1, 2),
+            np.array(of_type.numbers).reshape(-1, kind.num_numbers),
+        )
+        part, rows_of_kind, error = sound_rows(kind, part, problems)
+        weights_error = max(weights_error, error)
+        rows.append(rows_of_kind)
+        remainders.append(_remainders(kind, rows_of_kind))
+        measured.append(part.numbers[:, : kind.num_measured].ravel())
+        ids.append(part.ids)
+        places.append(part.lines)
         if kind.to_landmark:
-            landmarks.append(ids_of_kind[:, 1])
+            landmarks.append(part.ids[:, 1])
     edge_lines = np.concatenate(places)
     order = np.argsort(edge_lines)
     no_ids = np.zeros(0, dtype=np.int64)
