@@ -95,11 +95,14 @@ def test_a_callback_and_ctrl_c_end_a_run_with_its_best_poses(make):
 @EVERY
 def test_settings_are_frozen_and_checked(make):
     problem = pgo.PGOProblem(pgo.grid(1))
+    solver = make(problem)
     with pytest.raises(dataclasses.FrozenInstanceError):
-        make(problem).tolerance = 1.0
-    for changes in ({"max_iterations": -1}, {"tolerance": 0.0}, {"tolerance": float("nan")}):
+        solver.tolerance = 1.0
+    wrong = [{"max_iterations": -1}, *({"tolerance": value} for value in (0.0, -1.0, np.nan))]
+    for changes in wrong:
         with pytest.raises(pgo.PGOError):
             make(problem, **changes)
+    assert dataclasses.replace(solver, max_iterations=3).max_iterations == 3
 
 
 def test_a_method_of_ones_own_runs_in_the_same_loop():

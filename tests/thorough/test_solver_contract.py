@@ -184,22 +184,6 @@ def start(problem: PGOProblem) -> Poses:
 
 
 @EVERY
-def test_settings_are_frozen_and_checked(make: Make, problem: PGOProblem) -> None:
-    solver = make(problem)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        solver.tolerance = 1.0
-    for changes in (
-        {"max_iterations": -1},
-        {"tolerance": 0.0},
-        {"tolerance": -1.0},
-        {"tolerance": float("nan")},
-    ):
-        with pytest.raises(SettingError):
-            make(problem, **changes)
-    assert dataclasses.replace(solver, max_iterations=3).max_iterations == 3
-
-
-@EVERY
 @pytest.mark.parametrize("poses", [Poses.identity(26, 3), Poses.identity(27, 2)])
 def test_a_start_of_another_size_is_refused(make: Make, poses: Poses, problem: PGOProblem) -> None:
     with pytest.raises(GraphError, match="give one pose for every pose of the graph"):

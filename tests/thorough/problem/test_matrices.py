@@ -25,15 +25,6 @@ def rotation_cost(graph: PoseGraph, R: np.ndarray) -> float:
     )
 
 
-def translation_cost(graph: PoseGraph, R: np.ndarray, t: np.ndarray) -> float:
-    """Sum of tau ||t_j - t_i - R_i t_ij||^2, edge by edge."""
-    return sum(
-        graph.tau[e]
-        * np.linalg.norm(t[graph.j[e]] - t[graph.i[e]] - R[graph.i[e]] @ graph.t_ij[e]) ** 2
-        for e in range(graph.num_edges)
-    )
-
-
 @given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
 def test_M_is_A_transposed_w_A(seed: int, n: int, d: int) -> None:
     graph = varied_graph(seed, n, d)
@@ -74,26 +65,6 @@ def test_L_is_the_rotation_part(seed: int, n: int, d: int) -> None:
     # Measured translations only add tau t_ij t_ij^T to a diagonal block of M.
     turning = joint_matrix(replace(graph, t_ij=np.zeros_like(graph.t_ij)))[n:, n:].toarray()
     np.testing.assert_allclose(L.toarray(), turning, rtol=16 * EPS, atol=0)
-
-
-@given(seed=SEEDS, n=SIZES, d=DIMENSIONS)
-def test_Q_is_the_minimum_over_translations(seed: int, n: int, d: int) -> None:
-    graph = varied_graph(seed, n, d)
-    R = random_poses(n, d, seed).R
-    Y = stack_transposes(R)
-    Q = marginalized_matrix(graph)
-    # By least squares over the translation rows of A.
-    A = residual_matrix(graph)
-    w = isotropic_weights(graph).row_weights
-    root = np.sqrt(w[:, None])
-    t = np.linalg.lstsq(root * A[:, :n].toarray(), -root * (A[:, n:] @ Y), rcond=None)[0]
-    least = rotation_cost(graph, R) + translation_cost(graph, R, t)
-    assert np.trace(Y.T @ Q @ Y) == pytest.approx(least, rel=1e-9)
-    # By the pseudoinverse, as the formula has it.
-    M = joint_matrix(graph).toarray()
-    schur = M[n:, n:] - M[n:, :n] @ np.linalg.pinv(M[:n, :n], hermitian=True) @ M[:n, n:]
-    condition = np.linalg.cond(M[1:n, 1:n]) if n > 1 else 1.0
-    np.testing.assert_allclose(Q, schur, rtol=0, atol=64 * EPS * condition * np.abs(M).max())
 
 
 def test_a_dense_Q_has_a_largest_side() -> None:
