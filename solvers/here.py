@@ -30,15 +30,7 @@ from solvers.handedness.complex_relaxation import (
 )
 from solvers.handedness.hull_lagrangian import HullLagrangian, HullState
 from solvers.handedness.search import HandednessSearch, stage_of_search, terms_can_help
-from solvers.place import (
-    BROKEN_OFF,
-    Attempt,
-    OwnStart,
-    Place,
-    Step,
-    Traits,
-    after_search,
-)
+from solvers.place import BROKEN_OFF, Attempt, OwnStart, Place, Step, Traits, after_search
 from solvers.result import History, Outcome, Record, Run, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.other_starts import KINDS_OF_STARTS, best_of_starts

@@ -15,10 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, cast
 
-from pgo_models.certificates.certificate import (
-    DEFAULT_GAP,
-    judge,
-)
+from pgo_models.certificates.certificate import DEFAULT_GAP, judge
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.arrays import whole_number
 from pgo_models.geometry.poses import Poses

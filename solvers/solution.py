@@ -28,16 +28,8 @@ from solvers.carry.ledger import NOTHING_SENT, Ledger
 from solvers.reporting.edge_fit import fit_row
 from solvers.reporting.json_records import certificate_json, network_json, stage_json, write_json
 from solvers.reporting.notes import verdict_suffix
-from solvers.reporting.result_files import (
-    check_format,
-    write_poses,
-)
-from solvers.reporting.two_costs import (
-    Facts,
-    both_costs,
-    facts_of_unknowns,
-    other_cost,
-)
+from solvers.reporting.result_files import check_format, write_poses
+from solvers.reporting.two_costs import Facts, both_costs, facts_of_unknowns, other_cost
 from solvers.reporting.versions import installed_versions
 from solvers.result import Stage, Status
 from solvers.robust.rejection import Rejection, Support

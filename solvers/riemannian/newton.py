@@ -14,11 +14,7 @@ from pgo_models.summaries import Summarised
 from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.riemannian.newton_step import NewtonFigures
-from solvers.riemannian.polish import (
-    PolishState,
-    polish_step,
-    start_run,
-)
+from solvers.riemannian.polish import PolishState, polish_step, start_run
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,12 +18,7 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, vee
 from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
-from pgo_models.problem.hessian import (
-    TangentLayout,
-    ground_pose,
-    riemannian_hessian,
-    tangent_order,
-)
+from pgo_models.problem.hessian import TangentLayout, ground_pose, riemannian_hessian, tangent_order
 from pgo_models.problem.matrices import inner
 from pgo_models.problem.problem import LEAST_STIFFNESS, EvaluatedPoses, PGOProblem
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT

@@ -12,17 +12,9 @@ import numpy as np
 
 from pgo_models.certificates.certificate import BoundSource, Certificate, judge, judge_cost
 from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import (
-    NO_BOUND,
-    LowerBound,
-    has_complex_form,
-    prove_at,
-)
+from pgo_models.certificates.lower_bound import NO_BOUND, LowerBound, has_complex_form, prove_at
 from pgo_models.certificates.rounding_errors import ObjectiveRounding
-from pgo_models.certificates.shrunk_information import (
-    shrink_and_join,
-    without_singular_blocks,
-)
+from pgo_models.certificates.shrunk_information import shrink_and_join, without_singular_blocks
 from pgo_models.errors import GraphError, NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array

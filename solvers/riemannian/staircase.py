@@ -27,12 +27,7 @@ from pgo_models.relaxations.low_rank import LiftedPoint, hessian_product, lifted
 from pgo_models.relaxations.rounding import round_factor
 from pgo_models.summaries import Summarised
 from solvers.result import Measurement, Status
-from solvers.riemannian.climb import (
-    ClimbEnding,
-    DualBound as DualBound,
-    climb,
-    staircase_status,
-)
+from solvers.riemannian.climb import ClimbEnding, DualBound as DualBound, climb, staircase_status
 from solvers.riemannian.newton_step import scaled_decrement
 from solvers.riemannian.trust_region import Precision, first_radius, trust_region_step
 

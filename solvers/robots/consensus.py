@@ -24,12 +24,7 @@ from solvers.carry.registry import order
 from solvers.result import Measurement, Status
 from solvers.robots.agent import Agent, C, finish_copies, held_poses, order_copies
 from solvers.robots.driver import Driver
-from solvers.soc.consensus import (
-    Consensus,
-    ConsensusState,
-    ask_all,
-    objective_and_gradient,
-)
+from solvers.soc.consensus import Consensus, ConsensusState, ask_all, objective_and_gradient
 from solvers.soc.consensus_robot import ConsensusRobot, CopiesState
 from solvers.soc.copies import Rows
 from solvers.soc.recursion_block import Rotations

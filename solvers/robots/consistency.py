@@ -27,19 +27,8 @@ from solvers.carry.messages import Messages
 from solvers.carry.registry import order, record
 from solvers.riemannian.polish import polish
 from solvers.robots.agent import Agent
-from solvers.robots.own_file import (
-    Border,
-    OwnGraph,
-    border_of,
-)
-from solvers.robust.chains import (
-    Chains,
-    carried,
-    inverse,
-    is_whole,
-    measured_covariances,
-    product,
-)
+from solvers.robots.own_file import Border, OwnGraph, border_of
+from solvers.robust.chains import Chains, carried, inverse, is_whole, measured_covariances, product
 from solvers.robust.consistency import distances_from_odometry, largest_sets
 from solvers.robust.revision import error_scale
 

@@ -28,18 +28,8 @@ from pgo_models.problem.cholesky import (
 )
 from pgo_models.problem.floating_point import OUTWARD, gamma
 from pgo_models.problem.matrices import columns_of, inner
-from pgo_models.problem.ordering import (
-    most_counts,
-    order_of_pattern,
-    pattern_of_edges,
-    row_order,
-)
-from solvers.robots.subdomain_blocks import (
-    Widths,
-    coupled_unknowns,
-    entry_keys,
-    positions_of,
-)
+from pgo_models.problem.ordering import most_counts, order_of_pattern, pattern_of_edges, row_order
+from solvers.robots.subdomain_blocks import Widths, coupled_unknowns, entry_keys, positions_of
 from solvers.soc.subgraph import RobotSummary
 
 Int32Array = NDArray[np.int32]

@@ -34,20 +34,10 @@ from pgo_models.graphs.g2o_folder import (
 )
 from pgo_models.graphs.g2o_parser import G2OLines
 from pgo_models.graphs.g2o_rows import information_of, measurements_of, poses_of
-from pgo_models.graphs.pose_graph import (
-    WORLD_ID,
-    IntArray,
-    PoseGraph,
-    edge_counts,
-    middle_pose,
-)
+from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, edge_counts, middle_pose
 from pgo_models.graphs.precisions import edge_precisions, indefinite_edges
 from pgo_models.graphs.written_digits import WrittenDigits, written_errors
-from pgo_models.problem.weighting import (
-    Weighting,
-    convex_cost,
-    is_isotropic,
-)
+from pgo_models.problem.weighting import Weighting, convex_cost, is_isotropic
 from solvers.carry.messages import Messages
 from solvers.carry.registry import order, record
 from solvers.robots.agent import Agent, held_poses, order_interior

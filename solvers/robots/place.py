@@ -14,10 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from pgo_models.certificates.certificate import (
-    BoundSource,
-    certify_with,
-)
+from pgo_models.certificates.certificate import BoundSource, certify_with
 from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -31,15 +28,7 @@ from solvers.handedness.complex_relaxation import ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian
 from solvers.handedness.search import HandednessSearch, stage_of_search
 from solvers.here import Here
-from solvers.place import (
-    AnySOC,
-    Attempt,
-    OwnStart,
-    Place,
-    Step,
-    Traits,
-    after_search,
-)
+from solvers.place import AnySOC, Attempt, OwnStart, Place, Step, Traits, after_search
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
@@ -56,9 +45,7 @@ from solvers.robots.handedness import (
 )
 from solvers.robots.kept_answer import AnswerAtRobots
 from solvers.robots.newton import SubstructuredNewton
-from solvers.robots.own_file import (
-    READ_HERE,
-)
+from solvers.robots.own_file import READ_HERE
 from solvers.robots.paper import PaperByRobots
 from solvers.robots.poses import reduce_translations
 from solvers.robots.proof import best_bound_distributed, best_bound_with_terms

@@ -37,11 +37,7 @@ from solvers.robust.gnc import (
 )
 from solvers.robust.known import KnownEdges
 from solvers.robust.losses import RobustLoss
-from solvers.robust.weighted_edges import (
-    RatioSums,
-    held_together,
-    negligible_weight,
-)
+from solvers.robust.weighted_edges import RatioSums, held_together, negligible_weight
 
 # Share of the least weight that stays with an edge that a run in one place leaves out, where known
 # inliers alone may leave poses apart.

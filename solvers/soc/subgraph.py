@@ -11,12 +11,7 @@ from scipy.sparse import csc_array, csr_array
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.graphs.pose_graph import (
-    IntArray,
-    PoseGraph,
-    middle_pose,
-    written_error_of,
-)
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph, middle_pose, written_error_of
 from pgo_models.graphs.separators import cover_of_edges
 from pgo_models.problem.costs import EdgeCost
 from pgo_models.problem.initialization import largest_stiffness
