@@ -175,7 +175,6 @@ def run(
     problem: P,
     start: X | None = None,
     *,
-    earlier: Records = (),
     callback: Callable[[S, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
@@ -186,7 +185,6 @@ def run(
     problem: Any,
     start: Any = None,
     *,
-    earlier: Records = (),
     callback: Callable[[S, Record], bool | None] | None = None,
     time_limit: float = math.inf,
     verbose: bool = False,
@@ -206,9 +204,6 @@ def run(
         What to run it on; a PGOProblem or a PoseGraph for a Solver.
     start : Poses or X, optional
         Where it starts; at its own start unless given.
-    earlier : tuple of Record, optional
-        Records of a run that was broken off after them, and whose next iterate is `start`. The run
-        goes on counting from there.
     callback : callable, optional
         Called with every state and its Record. A true answer ends the run with `Status.STOPPED`.
     time_limit : float, optional
@@ -241,7 +236,7 @@ def run(
     'STOPPED'
     """
     problem, start = _fitted(method, problem, start)
-    return RunMonitor(time_limit, verbose, progress, callback).run(method, problem, start, earlier)
+    return RunMonitor(time_limit, verbose, progress, callback).run(method, problem, start)
 
 
 @dataclass(frozen=True)
@@ -306,7 +301,10 @@ class RunMonitor:
     def run(
         self, method: Method[Any, Any, S], problem: Any, start: Any = None, earlier: Records = ()
     ) -> Outcome[S]:
-        """Run a method on a problem of its kind: the loop."""
+        """Run a method on a problem of its kind: the loop.
+
+        It goes on counting from the records of an `earlier` run, whose next iterate is `start`.
+        """
         solver = cast(Solver[S], method) if hasattr(method, "poses") else None
         name = type(method).__name__
         line = None

@@ -55,7 +55,12 @@ def run_gtsam(
         problem.check_poses(start)
     began = time.perf_counter()
     graph = factor_graph(problem, start)
-    values = _own_start(gtsam, problem, graph) if start is None else _values(gtsam, start)
+    if start is not None:
+        values = _values(gtsam, start)
+    elif problem.d == 3:
+        values = gtsam.InitializePose3.initialize(graph)
+    else:
+        values = gtsam.lago.initialize(graph, False)  # not every graph has an odometric path
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
     seconds = time.perf_counter() - began
     poses = poses_of_values(gtsam, optimizer.values(), problem.d)
@@ -141,12 +146,6 @@ def _semidefinite_noise(gtsam: ModuleType, information: Array) -> Any:  # noqa: 
     eigenvalues, axes = np.linalg.eigh(information)
     root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * axes.T
     return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root)[1])
-
-
-def _own_start(gtsam: ModuleType, problem: PGOProblem, graph: Any) -> Any:  # noqa: ANN401
-    if problem.d == 3:
-        return gtsam.InitializePose3.initialize(graph)
-    return gtsam.lago.initialize(graph, False)  # not every graph has an odometric path
 
 
 def _values(gtsam: ModuleType, poses: Poses) -> Any:  # noqa: ANN401

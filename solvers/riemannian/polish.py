@@ -43,9 +43,7 @@ class PolishState(NewtonFigures):
     """Poses on the way to a stationary point, and `NewtonFigures` of them."""
 
     here: EvaluatedPoses  # of the poses
-    # whether the last factored matrix was the Hessian, not its damped Gauss-Newton part
-    is_newton: bool = False
-    # it and the last factor are for the next step to reuse
+    # the analysis and the factor of the last matrix are for the next step to reuse
     analysis: SymbolicCholesky | None = None
     factor: CholeskyFactor | None = None
 
@@ -265,7 +263,7 @@ def polish_step(
         result = newton_step(algebra, rules)
     except NotPositiveDefiniteError:
         # Its factor may have been overwritten.
-        return replace(state, is_newton=False, moved=False, factor=None)
+        return replace(state, moved=False, factor=None)
     model = result.model
     now = PolishState(
         here=model.here,
@@ -274,7 +272,6 @@ def polish_step(
         moved=result.moved,
         is_at_rounding=result.is_at_rounding,
         tolerance=state.tolerance,
-        is_newton=model.order.is_newton,
         analysis=algebra.analysis,
         factor=model.factor,
     )

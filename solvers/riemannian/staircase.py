@@ -50,7 +50,6 @@ class StaircaseState(Summarised):
     decrement: float
     radius: float  # of the trust region, in the preconditioner's norm
     rounding_level: float  # f below it cannot be told from zero; that of the start
-    inner_iterations: int = 0  # products with the Hessian so far
     bound: DualBound | None = None  # the best that was proven at a stationary point so far
     is_stationary: bool = False  # whether the next step proves a bound or climbs
     # whether the value is proven to be the relaxation's optimum, within the gap
@@ -141,15 +140,10 @@ class Staircase:
         precision = Precision.at(point.value, state.decrement, self.tolerance, state.rounding_level)
         function = _LiftedCost(problem, state.preconditioner)
         step = trust_region_step(function, point, state.radius, precision)
-        spent = state.inner_iterations + step.iterations
         if step.point is None:
             # Below rounding there is nothing to gain that double precision can see.
             return replace(
-                state,
-                k=state.k + 1,
-                radius=step.radius,
-                inner_iterations=spent,
-                is_stationary=step.is_below_rounding,
+                state, k=state.k + 1, radius=step.radius, is_stationary=step.is_below_rounding
             )
         arrived = self._arrive(
             problem, state.k + 1, step.point, state.preconditioner, state.rounding_level
@@ -158,7 +152,6 @@ class Staircase:
         return replace(
             arrived,
             radius=step.radius,
-            inner_iterations=spent,
             bound=state.bound,
             is_stationary=is_stuck or arrived.is_stationary,
         )
@@ -182,7 +175,7 @@ class Staircase:
         arrived = self._arrive(
             problem, state.k + 1, climbed.point, preconditioner, state.rounding_level
         )
-        return replace(arrived, inner_iterations=state.inner_iterations, bound=climbed.bound)
+        return replace(arrived, bound=climbed.bound)
 
     def _arrive(
         self,

@@ -62,7 +62,6 @@ class RobotsPoint:
     """
 
     driver: Driver
-    less_terms: Array  # ((d+1) g,): diagonal of M less the terms on the cover
     vectors: LowestVectors
     best: float  # largest of the smallest eigenvalues so far
     moment: Moment
@@ -80,7 +79,7 @@ class RobotsPoint:
         X[is_free] = np.random.default_rng(g).standard_normal((int(is_free.sum()), count))
         expected = -float(driver.scale.mean())
         vectors = lowest_vectors(driver, less_terms, X, expected)
-        return cls(driver, less_terms, vectors, float(vectors.values[0]), driver.moment())
+        return cls(driver, vectors, float(vectors.values[0]), driver.moment())
 
     @property
     def values(self) -> Array:
@@ -111,7 +110,7 @@ class RobotsPoint:
         if smallest > self.best:
             driver.ask(keep_best, None, Count.PIGGYBACKED)
         best = max(self.best, smallest)
-        return RobotsPoint(driver, less_terms, vectors, best, driver.moment())
+        return RobotsPoint(driver, vectors, best, driver.moment())
 
 
 def begin_without_terms(driver: Driver) -> None:
