@@ -105,21 +105,9 @@ def read_lines(
 ) -> G2OLines:
     """Read and check the lines of one g2o file, which may be compressed by gzip.
 
-    Blank lines, comments (#, // and %), data of sensors, switches, EQUIV lines and PARAMS_ lines
-    that nothing uses are skipped. With `skip_unknown`, so are lines with unknown tags. The
-    `reading` says what the lines mean. Unless `needs_matrices`, edges may have no matrix: theirs
-    are the identity. A `GraphWarning` gives the number of each unknown tag, and another one says
-    what was assumed where the tags leave a choice: see the page "My g2o file" of the guide.
-
-    A FileFormatError names the wrong lines, the first 20 as file:line, for: a file that is missing,
-    binary or without VERTEX and EDGE lines; an unknown tag; too few or too many numbers on a line,
-    or thousands of them; a word, nan or inf where a number belongs; an id that is no integer of 64
-    bits; an edge without a matrix, if it needs one, or with one that is not symmetric; a zero
-    quaternion; a length beyond `FARTHEST`; an information matrix whose translation or
-    rotation block has a negative eigenvalue, or both of whose blocks are zero; a covariance matrix
-    that is not positive definite; an edge to itself; a VERTEX line of an id that another one has
-    elsewhere; an offset without a PARAMS_ line, or of a position prior; lines in 2D
-    beside lines in 3D.
+    `skip_unknown` and `reading` are as for `read_g2o`, which lists what is assumed with a
+    `GraphWarning`. Unless `needs_matrices`, edges may have no matrix: theirs are the identity. A
+    FileFormatError names the wrong lines, as `check_lines` does.
     """
     path = Path(path)
     blocks = as_g2o(path, read_blocks(path))

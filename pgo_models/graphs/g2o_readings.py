@@ -58,19 +58,24 @@ class Reading(enum.Enum):
     @property
     def text(self) -> str:
         """The reading in words."""
-        return _TEXTS[self]
+        first, *others = (_TEXTS[part] for part in self.parts)
+        return " and ".join([first, *(text.removeprefix("with ") for text in others)])
 
     @property
     def dimension(self) -> int | None:
         """The dimension, 2 or 3, of the files that can be read like this; None for both."""
-        of_one_dimension = dict.fromkeys(_W_FIRST, 3)
-        of_one_dimension |= {Reading.DEGREES: 2, Reading.TORO_ORDER: 2}
-        return of_one_dimension.get(self)
+        dimensions = {Reading.W_FIRST: 3, Reading.DEGREES: 2, Reading.TORO_ORDER: 2}
+        return dimensions.get(self.parts[-1])
+
+    @property
+    def parts(self) -> "tuple[Reading, ...]":
+        """The readings that it consists of: the reading itself, or the two of a pair."""
+        return _PAIRS.get(self, (self,))
 
     @property
     def is_pair(self) -> bool:
         """Whether two things differ from what is written."""
-        return self in _REVERSED and self in _W_FIRST | ROTATION_FIRST
+        return self in _PAIRS
 
     @property
     def converts_units(self) -> bool:
@@ -91,32 +96,16 @@ _TEXTS = {
     Reading.SQUARE_ROOTS: "with square roots U of information matrices U^T U",
     Reading.CLOSURES_IN_MILLIMETRES: "with the closures in millimetres",
     Reading.ODOMETRY_IN_MILLIMETRES: "with the odometry in millimetres",
-    Reading.REVERSED_ROTATION_FIRST: ("with all edges reversed and the rotation first in matrices"),
-    Reading.CLOSURES_REVERSED_ROTATION_FIRST: (
-        "with the closures reversed and the rotation first in matrices"
-    ),
-    Reading.REVERSED_W_FIRST: "with all edges reversed and w first in quaternions",
-    Reading.CLOSURES_REVERSED_W_FIRST: ("with the closures reversed and w first in quaternions"),
 }
-ROTATION_FIRST = {
-    Reading.ROTATION_FIRST,
-    Reading.REVERSED_ROTATION_FIRST,
-    Reading.CLOSURES_REVERSED_ROTATION_FIRST,
+_PAIRS = {
+    Reading.REVERSED_ROTATION_FIRST: (Reading.REVERSED, Reading.ROTATION_FIRST),
+    Reading.CLOSURES_REVERSED_ROTATION_FIRST: (Reading.CLOSURES_REVERSED, Reading.ROTATION_FIRST),
+    Reading.REVERSED_W_FIRST: (Reading.REVERSED, Reading.W_FIRST),
+    Reading.CLOSURES_REVERSED_W_FIRST: (Reading.CLOSURES_REVERSED, Reading.W_FIRST),
 }
-_W_FIRST = {Reading.W_FIRST, Reading.REVERSED_W_FIRST, Reading.CLOSURES_REVERSED_W_FIRST}
-_ALL_REVERSED = {
-    Reading.REVERSED,
-    Reading.REVERSED_ROTATION_FIRST,
-    Reading.REVERSED_W_FIRST,
-}
-_CLOSURES_REVERSED = {
-    Reading.CLOSURES_REVERSED,
-    Reading.CLOSURES_REVERSED_ROTATION_FIRST,
-    Reading.CLOSURES_REVERSED_W_FIRST,
-}
-_REVERSED = {Reading.ODOMETRY_REVERSED, *_ALL_REVERSED, *_CLOSURES_REVERSED}
+ROTATION_FIRST = {reading for reading in Reading if Reading.ROTATION_FIRST in reading.parts}
+_REVERSED = {Reading.REVERSED, Reading.CLOSURES_REVERSED, Reading.ODOMETRY_REVERSED}
 _IN_MILLIMETRES = {Reading.CLOSURES_IN_MILLIMETRES, Reading.ODOMETRY_IN_MILLIMETRES}
-_OF_CLOSURES = {Reading.CLOSURES_IN_MILLIMETRES, *_CLOSURES_REVERSED}
 
 
 def noise_as(reading: Reading, tag: Tag) -> Noise:
@@ -132,7 +121,7 @@ def numbers_as(reading: Reading, tag: Tag, numbers: Array) -> Array:
     """Numbers on lines of a tag, (n, num_numbers), with quaternions and angles as g2o has them."""
     if reading in ROTATION_FIRST and tag.has_matrix and not tag.is_toro:
         numbers = tag.with_translation_first(numbers)
-    if reading in _W_FIRST and tag.has_quaternion:
+    if Reading.W_FIRST in reading.parts and tag.has_quaternion:
         w_last = [*range(3), 4, 5, 6, 3, *range(7, numbers.shape[1])]
         return np.asarray(numbers[:, w_last])
     has_heading = tag.d == 2 and not tag.is_point
@@ -149,14 +138,16 @@ def edges_as(
 
     `to_landmark`, (m,), says which edges end at a landmark.
     """
-    if reading not in _REVERSED | _IN_MILLIMETRES:
+    which = reading.parts[0]
+    if which not in _REVERSED | _IN_MILLIMETRES:
         return ids, rows
     between_poses = (ids[:, 0] != WORLD_ID) & ~to_landmark
     chosen = between_poses
-    if reading not in _ALL_REVERSED:
+    if which is not Reading.REVERSED:
         is_odometry = _joins_neighbours(ids, between_poses)
-        chosen = between_poses & (is_odometry != (reading in _OF_CLOSURES))
-    if reading in _REVERSED:
+        of_odometry = which in (Reading.ODOMETRY_REVERSED, Reading.ODOMETRY_IN_MILLIMETRES)
+        chosen = between_poses & (is_odometry == of_odometry)
+    if which in _REVERSED:
         return np.where(chosen[:, None], ids[:, ::-1], ids), rows
     rows = rows.copy()
     rows[chosen, :d] *= _MILLIMETRE

@@ -36,14 +36,13 @@ _SHRINKING = {
     Reading.ODOMETRY_IN_MILLIMETRES: 1e-3,
     Reading.DEGREES: math.pi / 180.0,
 }
-# Readings that are the same as another one, or change units alone, if they change all edges.
+# Parts of readings that are the same as another one, or change units alone, if they change all
+# edges.
 _OF_SOME_EDGES = (
     Reading.CLOSURES_REVERSED,
     Reading.ODOMETRY_REVERSED,
     Reading.CLOSURES_IN_MILLIMETRES,
     Reading.ODOMETRY_IN_MILLIMETRES,
-    Reading.CLOSURES_REVERSED_ROTATION_FIRST,
-    Reading.CLOSURES_REVERSED_W_FIRST,
 )
 # A reading is proposed from this evidence on, odds of 10,000 to one. It also has to be clearly
 # better: its cost is smaller by the next factor. Where the weights are others, so that the costs
@@ -81,10 +80,6 @@ _QUESTIONS = {
     Reading.DEGREES: "were they written in degrees?",
     Reading.TORO_ORDER: "were they written in this order?",
     Reading.ROTATION_FIRST: "were they written with the rotation first, as GTSAM has it?",
-    Reading.REVERSED_ROTATION_FIRST: "were they written so?",
-    Reading.CLOSURES_REVERSED_ROTATION_FIRST: "were they written so?",
-    Reading.REVERSED_W_FIRST: "were they written so?",
-    Reading.CLOSURES_REVERSED_W_FIRST: "were they written so?",
     Reading.COVARIANCES: "are they covariances?",
     Reading.SQUARE_ROOTS: "are they square roots?",
     Reading.CLOSURES_IN_MILLIMETRES: "were they written in millimetres?",
@@ -132,7 +127,7 @@ class ReadingFit(Summarised):
     @property
     def question(self) -> str:
         """What to ask whoever wrote the file."""
-        question = _QUESTIONS[self.reading]
+        question = _QUESTIONS.get(self.reading, "were they written so?")
         return question.replace("were they", "was it") if self.num_changed == 1 else question
 
 
@@ -374,7 +369,7 @@ class _Trial:
             return None
         changed = _changed_edges(graph, self.graph)
         num_changed = int(changed.sum())
-        if num_changed == 0 or (changed.all() and reading in _OF_SOME_EDGES):
+        if num_changed == 0 or (changed.all() and reading.parts[0] in _OF_SOME_EDGES):
             return None
         try:
             _, solution, residuals = _solved(graph)
