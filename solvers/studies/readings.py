@@ -187,9 +187,8 @@ class ReadingComparison(Summarised):
         width = max(26, *(len(fit.reading.value) for fit in fits))
         lines = [f"{'reading':<{width}}{self.cost_name:>12}{'times expected':>16}"]
         for fit in fits:
-            lines.append(
-                f"{fit.reading.value:<{width}}{fit.cost:>12.4g}{fit.times_expected:>16.3g}"
-            )
+            times = f"{fit.times_expected:.3g}" if fit.times_expected else "-"
+            lines.append(f"{fit.reading.value:<{width}}{fit.cost:>12.4g}{times:>16}")
         return "\n".join(lines)
 
 

@@ -204,3 +204,10 @@ def test_no_other_reading_is_proposed_of_any_public_graph(part: int, benchmark_d
     assert len(paths) >= 12
     named = {path.name: compare_readings(path).proposed for path in paths[part::6]}
     assert not {name: proposed for name, proposed in named.items() if proposed}
+
+
+def test_where_no_edge_checks_another_the_table_has_no_multiple(tmp_path):
+    chain = [f"EDGE_SE2 {i} {i + 1} 1 0 0.1 100 0 0 100 0 400\n" for i in range(3)]
+    (tmp_path / "chain.g2o").write_text("".join(chain))
+    table = str(compare_readings(tmp_path / "chain.g2o"))
+    assert {line.split()[-1] for line in table.splitlines()[1:]} == {"-"}
