@@ -86,7 +86,6 @@ class DrivenTeam:
         self._unheard: dict[str, Ended] = {}  # robots that have not confirmed the outcome
         self._said: Revision | None = None
         self._share_more: set[str] = set()
-        self._awake: tuple[str, ...] = ()
 
     @property
     def others(self) -> dict[str, Measurements]:
@@ -120,22 +119,12 @@ class DrivenTeam:
 
     @property
     def problems(self) -> list[str]:
-        """Robots that share more than this one, and a driver out of reach, a sentence each."""
-        sentences = [
+        """Robots that share more than this one, a sentence each."""
+        return [
             f"{name} shares its measurements, and {self.name} its interface alone; give all robots "
             "the same sharing"
             for name in sorted(self._share_more)
         ]
-        driver = self.term.driver
-        outcome = self._member.outcome
-        is_in_it = outcome is not None and outcome.term == self.term
-        is_far = len(self._awake) > 1 and driver not in (*self._awake, "")
-        if is_far and not is_in_it and self._session.is_complete(()):
-            sentences.append(
-                f"{driver} drives, and {self.name} hears of it through others alone; with "
-                "sharing=Sharing.MEASUREMENTS for all, these pass on what each has measured"
-            )
-        return sentences
 
     def greeting(self) -> Hello:
         """What tells others that this robot is there."""
@@ -144,7 +133,8 @@ class DrivenTeam:
         call = part.call + 1 if part is not None and is_computing else -1
         outcome = self._member.outcome
         known = Term(0, "") if outcome is None else outcome.term
-        return Hello(self._revision, self.term, known, call, self._session.twins)
+        session = self._session
+        return Hello(self._revision, self.term, known, call, session.twins, session.hears)
 
     def take(self, sender: str, message: object, is_latest: bool) -> None:
         """Update what is known of the team by a message, or obey the order in it."""
@@ -169,6 +159,7 @@ class DrivenTeam:
 
     def _take_hello(self, sender: str, hello: Hello, is_latest: bool) -> None:
         if is_latest:
+            self._session.reach[sender] = hello.hears
             self._revisions[sender] = hello.revision
             self._known[sender] = hello.known
         self._learn_term(hello.term)
@@ -178,7 +169,6 @@ class DrivenTeam:
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Begin a solve, repeat what was not answered, give up."""
-        self._awake = awake
         if self._said != self._revision:
             self._said = self._revision
             for name in awake:
@@ -297,8 +287,7 @@ class DrivenTeam:
         error = error_as_message(
             EngineError(
                 f"it is there, and has not answered for {seconds:.0f} seconds; "
-                "see whether it hears all its neighbours (with sharing=Sharing.MEASUREMENTS one is "
-                "enough), whether all have the same version, and what their ledgers have dropped"
+                "see whether all have the same version, and what their ledgers have dropped"
             )
         )
         for name, ask in list(self._drive.waiting.items()):

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
+
 from pgo_models import errors
 from pgo_models.errors import PGOError
 from solvers.carry.registry import record
@@ -45,7 +47,8 @@ class Hello:
     """A robot is there, with measurements of this revision; `term` is the latest that it knows.
 
     `known` is that of the outcome that it has, `computing` the order of the term that it computes
-    the answer to, or -1; `twins` are names that two robots have.
+    the answer to, or -1; `twins` are names that two robots have, and `hears` are robots that it has
+    heard of lately, not through others.
     """
 
     revision: Revision
@@ -53,6 +56,16 @@ class Hello:
     known: Term
     computing: int = -1
     twins: tuple[str, ...] = ()
+    hears: tuple[str, ...] = ()
+
+
+@record("Relayed")
+@dataclass(frozen=True, eq=False)
+class Relayed:
+    """A sealed message, (k,) bytes, for a robot that its sender does not hear, through a third."""
+
+    receiver: str
+    data: np.ndarray
 
 
 @record("Ask")
@@ -160,8 +173,14 @@ class Heard:
 
 def check_message(message: object, team: tuple[str, ...]) -> None:
     """Raise a WireError for names and numbers that no robot of the team sends."""
-    if not isinstance(message, Hello | News | Ask | Reply | Letter | LetterLost | Ended | Heard):
+    if not isinstance(
+        message, Hello | News | Relayed | Ask | Reply | Letter | LetterLost | Ended | Heard
+    ):
         raise WireError(f"a {type(message).__name__} is no message")
+    if isinstance(message, Relayed):
+        if message.receiver not in team:
+            raise WireError("a message to be passed on to nobody")
+        return
     names: list[str] = []
     for each in ("members", "revisions", "absent", "twins", "has", "hears"):
         names += getattr(message, each, ())

@@ -15,7 +15,7 @@ import numpy as np
 
 from solvers.carry.wire import MARK, WireError, opened, sealed
 from solvers.team.beside import OTHER_PROCESS, Beside
-from solvers.team.messages import Priority, check_message
+from solvers.team.messages import Priority, Relayed, check_message
 from solvers.team.speakers import Envelope, Speakers, Word
 
 PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
@@ -115,6 +115,8 @@ class Session:
         self._key = key
         self._began: float | None = None
         self._last_heard: dict[str, float] = {}
+        self._heard_directly: dict[str, float] = {}
+        self.reach: dict[str, tuple[str, ...]] = {}  # whom others hear, as they say
         self._greeted: dict[str, tuple[float, int]] = {}  # when, and how often without an answer
         self._out: list[Message] = []
         self._speakers = Speakers(name, patience)
@@ -125,6 +127,12 @@ class Session:
     def heard(self) -> tuple[str, ...]:
         """Robots of the team that have spoken to this one."""
         return tuple(self._last_heard)
+
+    @property
+    def hears(self) -> tuple[str, ...]:
+        """Robots of the team that were heard of lately, not through others."""
+        oldest = self.now - self.patience
+        return tuple(name for name, when in self._heard_directly.items() if when >= oldest)
 
     @property
     def is_settled(self) -> bool:
@@ -152,39 +160,65 @@ class Session:
         """Take what has arrived: in any order, and any number of times."""
         self.now = now
         self.beside.act()
+        self._take(data, is_direct=True)
+
+    def _envelope_in(self, data: bytes) -> Envelope | None:
+        """A message of another robot of the team to this one; None where it is dropped."""
         try:
             envelope = Envelope.from_bytes(opened(self._key, data))
         except WireError as error:
             self._drop("", "" if data[:3] != MARK else f"{error}; see whether all have the same")
-            return
+            return None
         sender = envelope.sender
         if envelope.receiver != self.name or sender == self.name:
             self._drop("", "")
-            return
+            return None
         if sender not in self.team:
             sentence = f"{sender!r:.80} has the key of the team, and is not in it; name it for all"
             self._drop("", sentence)
+            return None
+        return envelope
+
+    def _take(self, data: bytes, *, is_direct: bool) -> None:
+        """Take a message that has come from its sender, or through a third robot."""
+        envelope = self._envelope_in(data)
+        if envelope is None:
             return
+        sender = envelope.sender
         try:
             message = envelope.message
             check_message(message, self.team)
         except WireError:
             self._drop(sender, "")
             return
-        word = self._speakers.word_of(envelope, now)
-        if word is Word.REPEATED:
+        is_relayed_twice = isinstance(message, Relayed) and not is_direct
+        word = self._speakers.word_of(envelope, self.now)
+        if word is Word.REPEATED or is_relayed_twice:
             self._drop(sender, "")
             return
-        self.ledger = self.ledger.after_receiving(sender, data)
+        if is_direct:
+            self.ledger = self.ledger.after_receiving(sender, data)
         if word is Word.UNPROVEN:  # answered by a message that does name the boot of the other
             self._send(sender, self.way.greeting(), Priority.HELLO, envelope.boot)
             return
-        self._last_heard[sender] = now
+        self._last_heard[sender] = self.now
+        if is_direct:
+            self._heard_directly[sender] = self.now
+        if isinstance(message, Relayed):
+            self._relay(message)
+            return
         self._speakers.twins.update(getattr(message, "twins", ()))
         try:
             self.way.take(sender, message, word is Word.NEW)
         except WireError:
             self.ledger = self.ledger.after_dropping(sender)
+
+    def _relay(self, message: Relayed) -> None:
+        """Take what has come through a third robot, or pass it on."""
+        if message.receiver == self.name:
+            self._take(message.data.tobytes(), is_direct=False)
+        elif message.receiver in self.hears:
+            self.send(message.receiver, message, Priority.URGENT)
 
     def _drop(self, sender: str, sentence: str) -> None:
         """Count what is dropped, and remember a sentence on why."""
@@ -259,4 +293,15 @@ class Session:
         """Send a message to a robot, to its run `heard`."""
         envelope = self._speakers.addressed(to, message, heard)
         data = sealed(self._key, envelope.as_bytes())
-        self._out.append(Message(to, data, priority))
+        third = self._third_to(to)
+        if third is None:
+            self._out.append(Message(to, data, priority))
+        else:
+            self.send(third, Relayed(to, np.frombuffer(data, np.uint8)), priority)
+
+    def _third_to(self, to: str) -> str | None:
+        """A robot that hears one that this one has not heard for the patience; None if it has."""
+        hears = self.hears
+        if to in hears or self._began is None or self.now - self._began < self.patience:
+            return None
+        return next((name for name in hears if to in self.reach.get(name, ())), None)

@@ -17,7 +17,7 @@ import solvers
 from solvers.carry.serialization import serialize
 from solvers.carry.wire import deflated, opened, packed, sealed
 from solvers.team.measurements import Revision
-from solvers.team.messages import Hello, Term
+from solvers.team.messages import Hello, Relayed, Term
 from solvers.team.speakers import NO_BOOT, Envelope
 
 HELLO = Hello(Revision(1, "0"), Term(0, ""), Term(0, ""))
@@ -101,6 +101,25 @@ def test_a_seal_around_anything_else_is_dropped(body: bytes) -> None:
     robot = solvers.Robot("r0", ["r0", "r1"], KEY)
     robot.receive(sealed(KEY, body), 0.0)
     assert robot.ledger.dropped == 1
+
+
+def test_what_has_come_through_a_third_is_read_once_and_passed_on_to_nobody_else() -> None:
+    robot = solvers.Robot("r0", ["r0", "r1", "r2"], KEY)
+    robot.tick(0.0)
+    boot = Envelope.from_bytes(opened(KEY, robot.outbox()[0].data)).boot
+
+    def from_r1(number: int, message: object) -> bytes:
+        content = b"O" + deflated(packed(serialize(message)))
+        return sealed(KEY, Envelope("r1", "r0", b"8 bytes.", boot, number, content).as_bytes())
+
+    def within(receiver: str, data: bytes) -> Relayed:
+        return Relayed(receiver, np.frombuffer(data, np.uint8))
+
+    twice = within("r0", from_r1(1, within("r0", from_r1(2, HELLO))))
+    for message in (twice, within("r0", b"no message"), within("zed", b""), within("r2", b"")):
+        robot.receive(from_r1(int(3 + robot.ledger.dropped), message), 0.0)
+    assert robot.ledger.dropped_by == {"r1": 2, "": 1}
+    assert {message.to for message in robot.outbox()} <= {"r1"}
 
 
 ODD = ["text", None, -1, 1 << 70, 0.5, float("nan"), True, [], {}, {"items": []}, {"array": 0}]

@@ -656,40 +656,23 @@ def test_robots_without_a_common_edge_say_so() -> None:
         assert robot.covered == ()
 
 
+@pytest.mark.parametrize("far", [{"r0", "r2"}, {"r1", "r2"}], ids=["the driver", "others"])
 @pytest.mark.parametrize("pipeline", [None, PEERS], ids=["SUBSTRUCTURED", "CONSENSUS"])
-def test_neighbours_that_do_not_hear_each_other_end_with_a_way_out(
-    pipeline: solvers.Pipeline | None,
+@pytest.mark.parametrize("lost", [0.0, 0.05])
+def test_robots_that_hear_each_other_only_through_a_third_solve_together(
+    pipeline: solvers.Pipeline | None, far: set[str], lost: float
 ) -> None:
-    robots = robots_of(world(), 3, pipeline=pipeline)
-
-    def is_far(sender: str, receiver: str, data: bytes) -> bool:
-        return {sender, receiver} == {"r1", "r2"}
-
-    network = Network(robots, np.random.default_rng(0), is_lost=is_far)
-    network.wait(70.0)
-    for robot in robots.values():
-        assert "it hears all its neighbours (with sharing=Sharing.MEASUREMENTS" in robot.failure
-
-
-def test_a_robot_that_does_not_hear_the_driver_proposes_to_share_measurements() -> None:
     graph = world()
-    robots = robots_of(graph, 3)
+    robots = robots_of(graph, 3, pipeline=pipeline)
 
     def is_far(sender: str, receiver: str, data: bytes) -> bool:
-        return {sender, receiver} == {"r0", "r2"}
+        return {sender, receiver} == far
 
-    network = Network(robots, np.random.default_rng(0), is_lost=is_far)
-    network.wait(12.0)
-    assert robots["r0"].covered == robots["r1"].covered == ("r0", "r1")
-    assert robots["r0"].problems == robots["r1"].problems == []
-    assert robots["r2"].problems == [
-        "r0 drives, and r2 hears of it through others alone; with sharing=Sharing.MEASUREMENTS for "
-        "all, these pass on what each has measured"
-    ]
-    network.is_lost = lambda sender, receiver, data: False
-    network.run(60.0)
+    network = Network(robots, np.random.default_rng(0), lost, is_lost=is_far)
+    network.run(200.0)
+    assert network.is_settled
     assert_is_the_optimum(robots, graph)
-    assert robots["r2"].problems == []
+    assert all(robot.problems == [] for robot in robots.values())
 
 
 @pytest.mark.parametrize(
