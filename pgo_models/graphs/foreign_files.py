@@ -209,7 +209,8 @@ def _view(line: str) -> Array | None:
 
 
 def _words_of(line: str) -> list[str]:
-    return line.replace(",", " ").split()
+    """Words of a line, which commas may separate, without a comment behind them."""
+    return line.partition("#")[0].replace(",", " ").split()
 
 
 def _of_views(path: Path, text: str) -> str:

@@ -184,7 +184,8 @@ def lines_of_table(path: Path, table: Table, text: str) -> str:
     for place, line in enumerate(lines[table.header :], table.header):
         if not line.strip() or line.lstrip().startswith(COMMENT_SIGNS):
             continue
-        words = [word.strip().strip("\"'") for word in line.split(table.separator)]
+        words = line.partition("#")[0].split(table.separator)
+        words = [word.strip().strip("\"'") for word in words]
         if len(words) <= max(used):
             problem = f"{len(words)} columns, and column {max(used) + 1} of the header is used"
             problems.append((place + 1, f"{problem}; complete the line"))

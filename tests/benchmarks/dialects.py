@@ -174,6 +174,8 @@ def exported_forms(plane: list[str], space: list[str]) -> Iterator[tuple[str, li
     """Files as other programs export them."""
     fixes = [f"EDGE_POINTXYZ_PRIOR {k} {k % 7} {k % 5} 0 1 0 0 1 0 1" for k in range(0, 60, 9)]
     yield "rtabmap_fixes", [*space, *fixes]
+    edges = [line for line in space if line.startswith("EDGE")]
+    yield "rtabmap_fixes_of_edges_alone", [*edges, *fixes]
     key = 103 << 56
     robots = changed(space, lambda words: named_by_labels(words, key), "")
     yield "labeled_symbols", robots

@@ -583,6 +583,8 @@ def test_the_rotations_of_view_graphs_are_read(
         R = np.array(words[2:11]).reshape(3, 3)
         R = R.T if is_of_cameras else R
         lines.append(" ".join([*words[:2], *R.ravel(), *words[11:]]))
+    if is_of_cameras:  # a line with two counts, commas, and comments behind the numbers
+        lines = [f"99 {len(lines)}", *(line.replace(" ", ",") + " # 120" for line in lines)]
     (tmp_path / "EGs.txt").write_text("\n".join(lines))
     code, out, err = said(pgo_command, "solve", tmp_path / "EGs.txt", "--rotations", "--json")
     assert code == 0
@@ -653,7 +655,7 @@ def test_views_may_have_names_and_quaternions(
 )
 def test_tables_with_a_header_are_read(header: str, line: str, tmp_path: Path) -> None:
     ends = [(0, 1), (1, 2), (2, 0)]
-    rows = [line.format(*pair, 0.5, "100;0;0;100;0;400") for pair in ends]
+    rows = [line.format(*pair, 0.5, "100;0;0;100;0;400") + " # row" for pair in ends]
     (tmp_path / "table.csv").write_text("\n".join([header, *rows]))
     with pytest.warns(GraphWarning, match="a table of EDGE_SE2 measurements, with "):
         graph = read_g2o(tmp_path / "table.csv")
