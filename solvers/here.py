@@ -146,7 +146,8 @@ class Here(Place):
 
     def better(self, best: Attempt, other: Attempt) -> Attempt:
         """Return the cheaper poses with the best bound: of either, or of the relaxation."""
-        is_cheaper = other.proof.poses_objective < best.proof.objective
+        # A cost below zero is zero but for rounding.
+        is_cheaper = max(other.proof.poses_objective, 0.0) < best.proof.objective
         cheaper = other if is_cheaper else best
         poses = other.proof.poses if is_cheaper else best.known_poses
         highest = max(best.proof, other.proof, key=lambda known: known.lower_bound)

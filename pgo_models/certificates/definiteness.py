@@ -112,6 +112,8 @@ def prove_definite(
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = np.repeat(etas_of_rotations(problem, eta), problem.d)
     stored, diagonal = shifted_certificate(problem, Lambda, shifts)
+    # A row that is left out may be empty, as that of a height which no prior measures.
+    diagonal[fixed] = np.maximum(diagonal[fixed], 1.0)
     if not is_in_range(stored.data, diagonal):
         return None
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
@@ -204,7 +206,7 @@ def is_definite_in_doubles(problem: PGOProblem, Lambda: Array, fixed: IntArray) 
     That proves nothing.
     """
     stored, diagonal = shifted_certificate(problem, Lambda, np.zeros(problem.side))
-    problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
+    problem.leave_out(stored.data, fixed, np.maximum(2.0 * diagonal[fixed], 1.0))
     return _factor(problem.analysis, stored) is not None
 
 

@@ -242,14 +242,21 @@ class Tangent(EdgeArrays):
 
     @cached_property
     def C_error(self) -> Array:
-        """Bound on what the entries of C are off by, (m, d + 1, 1), beyond what `loss` makes up.
+        """Bound on what the entries of C are off by, (m, d + 1, d), beyond what `loss` makes up.
 
-        It is zero but where J is semidefinite alone.
+        It is zero but where J is semidefinite alone. Even there C_t has no error along an axis of
+        which J has no entry, where the frames of both poses are the same, as of priors of
+        positions: J is then what is given.
         """
+        d = self.Z.shape[2]
         share, length = self._rounding
-        rows = np.repeat(self.excess.size, [1, self.Z.shape[2]], axis=1)
+        rows = np.repeat(self.excess.size, [1, d], axis=1)
         errors = 4.0 * OUTWARD * share * length[:, None] * rows
-        return np.asarray(np.where(self.is_semidefinite[:, None], errors, 0.0))[:, :, None]
+        of_entries = np.repeat(errors[:, :, None], d, axis=2)
+        is_given = (self.excess.R_ij == np.eye(d)).all(axis=(1, 2))
+        is_empty = (self.excess.J[:, :d] == 0.0).all(axis=2)
+        of_entries[:, 0][is_given[:, None] & is_empty] = 0.0
+        return np.where(self.is_semidefinite[:, None, None], of_entries, 0.0)
 
     @cached_property
     def _rounding(self) -> tuple[float, Array]:

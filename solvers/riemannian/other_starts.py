@@ -67,7 +67,7 @@ def best_of_starts(
 ) -> FoundStart:
     """The cheapest poses that the starts lead to, or the best ones where none are cheaper.
 
-    No start begins when the time is up.
+    A cost below zero is zero but for rounding. No start begins when the time is up.
     """
     began = time.perf_counter()
     cheapest = FoundStart("none is better", best, objective, 0)
@@ -77,7 +77,7 @@ def best_of_starts(
         poses = polish(problem, start, TRIAL_STEPS)
         cost = problem.objective(poses)
         num_tried = cheapest.num_tried + 1
-        if cost < cheapest.objective * (1.0 - BETTER):
+        if max(cost, 0.0) < cheapest.objective * (1.0 - BETTER):
             cheapest = FoundStart(name, poses, cost, num_tried)
         else:
             cheapest = replace(cheapest, num_tried=num_tried)

@@ -248,6 +248,39 @@ def test_directions_that_nothing_measures_are_named_and_held(
     assert free in record["note"]
 
 
+def test_positions_without_height_are_certified_in_either_form(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    lines = []
+    for line in (CASES / "a1_gps_xy_only.g2o").read_text().splitlines():
+        if line.startswith("EDGE_SE3_XYZ_PRIOR"):
+            _, pose, _, x, y, _, *information = line.split()
+            line = " ".join(["EDGE_SE3_PRIORXY", pose, x, y, *np.array(information)[[0, 1, 3]]])
+        lines.append(line)
+    (tmp_path / "xy.g2o").write_text("\n".join(lines))
+    code, out, _ = pgo_command("solve", tmp_path / "xy.g2o", "--json")
+    record = json.loads(out)
+    assert code == 0
+    assert record["objective"] == pytest.approx(13.14183858, rel=1e-8)
+    assert record["proven_gap"] <= 1e-6
+
+
+def test_no_start_is_better_than_one_that_fits_to_rounding(tmp_path: Path) -> None:
+    """Planar scans measure half of every pose in space: all of them fit."""
+    rng = np.random.default_rng(0)
+    matrix = "100 0 0 0 0 0 100 0 0 0 0 0 0 0 0 0 0 0 0 0 1000"
+    lines = []
+    for i in range(12):
+        x, y, yaw = np.array([1.0, 0.0, np.pi / 12]) + rng.normal(0.0, 0.1, 3)
+        rest = f"{x} {y} {rng.normal()} 0 0 {np.sin(yaw)} {np.cos(yaw)} {matrix}"
+        lines += [f"EDGE_SE3:QUAT {i} {(i + step) % 12} {rest}" for step in (1, 5)[: 2 - i % 2]]
+    (tmp_path / "planar.g2o").write_text("\n".join(lines))
+    solution = solvers.solve(read_g2o(tmp_path / "planar.g2o"), progress=False)
+    assert solution.objective <= 1e-8
+    started = [stage.name for stage in solution.stages if "starts" in stage.name]
+    assert started[-1] == "random starts: none is better"
+
+
 @pytest.mark.parametrize("name", ["a3_gravity_only", "a6_compass_2d", "i3_gauge_prior_1e12"])
 def test_a_bound_with_free_directions_is_proven_of_the_file(
     name: str, pgo_command: Call, tmp_path: Path
