@@ -146,6 +146,11 @@ def _entries_of_some_proofs(
     terms = _terms_of_poses(of_file, bound.terms)
     if terms is not None:
         entries["handedness"] = _rows_of_terms(of_file, terms)
+    held = _held_shift(problem.graph)
+    if held is not None:
+        edge, weights = held
+        pose = _name(problem.graph, int(problem.graph.j[edge]))
+        entries["held"] = {"id": pose, "weights": weights.tolist()}
     if isinstance(problem.weights, ExcessCost):
         entries["splits"] = _rows_of_splits(problem.graph, problem.weights)
     return entries
@@ -326,11 +331,29 @@ def _name(graph: PoseGraph, pose: int) -> int | str:
     return "world" if pose == graph.world else int(graph.pose_ids[pose])
 
 
+def _held_shift(graph: PoseGraph) -> tuple[int, Array] | None:
+    """The prior that holds shifts along axes of the world, and the weights that do so, (d,).
+
+    None where nothing is held, or something else, and where no prior has a position: a proof needs
+    no convention there.
+    """
+    if graph.unheld is None or not graph.unheld[graph.is_prior, : graph.d].any():
+        return None
+    added = matrices_of_edges(graph) - graph.unheld
+    changed = np.flatnonzero(added.any(axis=(1, 2)))
+    prior = int(changed[0])
+    weights = np.diag(added[prior])[: graph.d]
+    of_shifts = np.zeros_like(added[prior])
+    np.fill_diagonal(of_shifts[: graph.d, : graph.d], weights)
+    is_shift = len(changed) == 1 and bool(graph.is_prior[prior] & (added[prior] == of_shifts).all())
+    return (prior, weights) if is_shift else None
+
+
 def _check_conventions(graph: PoseGraph) -> None:
     """Raise a SettingError where a free direction is held in a way that `pgo verify` does not know.
 
-    It knows what places the map as a whole: positions of poses where priors measure none, and a
-    single prior.
+    It knows what places the map as a whole: positions of poses where priors measure none, a single
+    prior, and shifts along axes that priors of positions leave out.
     """
     if graph.unheld is None:
         return
@@ -342,7 +365,8 @@ def _check_conventions(graph: PoseGraph) -> None:
     is_complete = not are_singular(graph.unheld[changed]).any()
     of_rotations = (information - graph.unheld)[:, d:].any()
     places_map = not graph.unheld[is_prior, :d].any() and not of_rotations
-    if not (is_single and is_complete) and not (places_map and is_prior[changed].all()):
+    is_known = (is_single and is_complete) or (places_map and is_prior[changed].all())
+    if not is_known and _held_shift(graph) is None:
         raise SettingError(
             f"no proof to write: {graph.free}, by a convention that pgo verify does not have; "
             "leave out --proof"

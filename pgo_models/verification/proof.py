@@ -64,6 +64,9 @@ class Proof:
     # Of the edges from a pose to another, in the order of the file of the graph. The verifier
     # chooses tau and J_ss itself where they are missing or do not fit.
     splits: dict[tuple[int, int], list[Split]] = field(default_factory=dict)
+    # The pose whose prior holds shifts of the map that no prior measures, and the information, (d),
+    # along the axes of the world that holds them.
+    held: tuple[int, list[float]] | None = None
 
 
 def read_proof(path: Path, d: int) -> Proof:
@@ -101,6 +104,7 @@ def read_proof(path: Path, d: int) -> Proof:
         terms=read_terms(path, record, d),
         is_complex=read_is_complex(path, record, d),
         splits=read_splits(path, record, d),
+        held=read_held(path, record, d),
     )
 
 
@@ -131,6 +135,15 @@ def read_terms(path: Path, record: dict[str, Any], d: int) -> list[HandednessTer
         )
         for row in rows
     ]
+
+
+def read_held(path: Path, record: dict[str, Any], d: int) -> tuple[int, list[float]] | None:
+    """The pose that shifts of the map are held at, and by what; None where none are."""
+    if "held" not in record:
+        return None
+    row = record["held"]
+    weights = numbers(path, entry(path, row, "weights"), "weights of the pose held", d)
+    return name_of(path, entry(path, row, "id")), weights
 
 
 def read_is_complex(path: Path, record: dict[str, Any], d: int) -> bool:

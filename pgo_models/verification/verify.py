@@ -60,6 +60,11 @@ with a compass and no position, a common shift of one part does not change the r
 one pose of it may be shifted to where X' V has it, and the row of Z of its translation is zero: it
 is left out, too.
 
+**Shifts that are held.** Where the priors leave an axis of the world out, as positions without
+height do, all poses but the world may be shifted along it, and the cost stays. So a prior may be
+given information along this axis: of all the shifts there is one at which the added term is zero,
+so that a bound on the sum is one on the cost (`with_shift_held`).
+
 **The world pose.** Priors measure from it, and where it stands is a matter of names: with another
 point o of its frame in its place, t_w + R_w o is the unknown, and positions p in its frame become
 p - o, which leaves every residual t_j - t_w - R_w p as it is. Where a proof has the world pose
@@ -131,7 +136,7 @@ from pgo_models.verification.costs import (
     proper_edge,
 )
 from pgo_models.verification.doubles import Resolution
-from pgo_models.verification.measurements import WORLD, Graph, read_graph
+from pgo_models.verification.measurements import WORLD, Edge, Graph, read_graph
 from pgo_models.verification.proof import (
     ROTATION_COSTS,
     HandednessTerm,
@@ -214,6 +219,11 @@ def verify_proof(
     measured = read(path, skip_unknown)
     given = read_proof(Path(proof), measured.d)
     measured, given = with_world_at_zero(measured, given)
+    if given.held is not None:
+        try:
+            measured = with_shift_held(measured, *given.held)
+        except StepFailedError as failed:
+            return Verification(str(graph), given.cost, failure=str(failed))
     name = f"{graph}: {len(measured.nodes)} nodes, {len(measured.edges)} edges, {measured.d}D"
     failure = ""
     before = ctx.prec
@@ -520,6 +530,58 @@ def held_poses(graph: Graph, ground: int) -> list[int]:
             seen.append(part_of[node])
             held.append(node)
     return held
+
+
+def with_shift_held(graph: Graph, pose: int, weights: list[float]) -> Graph:
+    """The graph with information along axes of the world that its priors leave out.
+
+    It is added to a prior of a pose. A StepFailedError where some prior measures a shift along one
+    of these axes, or may do so because it is turned.
+    """
+    axes = [axis for axis, weight in enumerate(weights) if weight != 0.0]
+    priors = [edge for edge in graph.edges if WORLD in (edge.i, edge.j)]
+    for edge in priors:
+        for axis in axes:
+            if edge.i != WORLD or not leaves_out(edge, axis):
+                raise StepFailedError(
+                    f"the shift that is held: the prior of {pose_name(edge.j)} may measure it "
+                    f"(line {edge.line})"
+                )
+    of_pose = [edge for edge in priors if edge.j == pose and keeps_axes(edge, axes)]
+    if not of_pose or not all(weight >= 0.0 for weight in weights):
+        raise StepFailedError(f"the shift that is held: no prior of {pose_name(pose)} can hold it")
+    first = of_pose[0]
+    rows = symmetric(first.triangle, first.tag.side)
+    for axis in axes:
+        rows[axis][axis] += exact(weights[axis])
+    triangle = tuple(rows[a][b] for a in range(len(rows)) for b in range(a, len(rows)))
+    completed = replace(first, triangle=triangle)
+    return replace(graph, edges=[completed if edge is first else edge for edge in graph.edges])
+
+
+def leaves_out(edge: Edge, axis: int) -> bool:
+    """Whether a prior says nothing of a shift of the map along an axis of the world."""
+    d = edge.tag.d
+    rows = symmetric(edge.triangle, edge.tag.side)[:d]
+    has_position = any(number != 0 for row in rows for number in row)
+    leaves_axis = not any(number != 0 for number in rows[axis])
+    return not has_position or (leaves_axis and keeps_axes(edge, [axis]))
+
+
+def keeps_axes(edge: Edge, axes: list[int]) -> bool:
+    """Whether axes of the world are those of the measured pose, which is turned about them alone.
+
+    In the plane and with the angles of TORO the pose must not be turned at all.
+    """
+    d = edge.tag.d
+    if edge.tag.is_point:
+        return True
+    turn = edge.measured[d:]
+    is_quaternion = d == 3 and not edge.tag.is_toro
+    others = [
+        number for k, number in enumerate(turn[: 2 * d - 3]) if not (is_quaternion and axes == [k])
+    ]
+    return not any(number != 0 for number in others)
 
 
 def without_translation_of(

@@ -281,7 +281,9 @@ def test_no_start_is_better_than_one_that_fits_to_rounding(tmp_path: Path) -> No
     assert started[-1] == "random starts: none is better"
 
 
-@pytest.mark.parametrize("name", ["a3_gravity_only", "a6_compass_2d", "i3_gauge_prior_1e12"])
+@pytest.mark.parametrize(
+    "name", ["a1_gps_xy_only", "a3_gravity_only", "a6_compass_2d", "i3_gauge_prior_1e12"]
+)
 def test_a_bound_with_free_directions_is_proven_of_the_file(
     name: str, pgo_command: Call, tmp_path: Path
 ) -> None:
@@ -290,6 +292,36 @@ def test_a_bound_with_free_directions_is_proven_of_the_file(
     code, out, _ = pgo_command("verify", CASES / f"{name}.g2o", proof)
     assert code == 0, out
     assert "VERIFIED: no poses" in out
+
+
+@pytest.mark.parametrize(
+    ("held", "reason"),
+    [
+        ({"id": 0, "weights": [1.0, 0.0, 1.0]}, "the prior of pose 0 may measure it"),
+        ({"id": 1, "weights": [0.0, 0.0, 1.0]}, "no prior of pose 1 can hold it"),
+        ({"id": 0, "weights": [0.0, 0.0, -1.0]}, "no prior of pose 0 can hold it"),
+    ],
+)
+def test_a_proof_holds_no_shift_that_may_be_measured(
+    held: dict[str, object], reason: str, pgo_command: Call, tmp_path: Path
+) -> None:
+    proof = tmp_path / "proof.json"
+    solved(pgo_command, "a1_gps_xy_only", "--proof", proof)
+    record = json.loads(proof.read_text())
+    proof.write_text(json.dumps(record | {"held": held}))
+    case = CASES / "a1_gps_xy_only.g2o"
+    code, out, _ = pgo_command("verify", case, proof)
+    assert code == 3
+    assert reason in " ".join(out.split())
+    proof.write_text(json.dumps(record))
+    # A prior that is turned, or has a height, may measure the shift.
+    for turn, diagonal in (("0.6 0 0 0.8", [4, 4, 0, 0, 0, 0]), ("0 0 0 1", [0, 0, 1, 0, 0, 0])):
+        triangle = " ".join(map(str, np.diag(diagonal)[np.triu_indices(6)]))
+        prior = f"EDGE_SE3_PRIOR 3 0 0 0 0 {turn} {triangle}"
+        (tmp_path / "other.g2o").write_text(f"{case.read_text()}\n{prior}\n")
+        code, out, _ = pgo_command("verify", tmp_path / "other.g2o", proof)
+        assert code == 3
+        assert "the prior of pose 3 may measure it" in " ".join(out.split())
 
 
 @pytest.mark.parametrize("name", ["a3_gravity_only", "a6_compass_2d", "a1_gps_xy_only"])
