@@ -34,74 +34,23 @@ class Method(Protocol[P, X, S]):
         """Most steps of a run."""
 
     def init(self, problem: P, start: X | None) -> S:
-        """Return state 0.
-
-        Parameters
-        ----------
-        problem : P
-            What is to be solved.
-        start : X or None
-            Where to start; None stands for the start of the method.
-
-        Returns
-        -------
-        S
-            The state at the start, factorisations included.
-        """
+        """Return state 0, factorisations included; None stands for the start of the method."""
 
     def step(self, problem: P, state: S) -> S:
-        """Return the next state; the given one stays as it is.
-
-        Parameters
-        ----------
-        problem : P
-            What is to be solved.
-        state : S
-            State k.
-
-        Returns
-        -------
-        S
-            State k + 1.
-        """
+        """Return state k + 1; the given state k stays as it is."""
 
     def measure(self, problem: P, state: S) -> Measurement:
-        """Return figures of a state.
-
-        Returns
-        -------
-        Measurement
-            Objective and residuals, all of one iterate.
-        """
+        """Return objective and residuals of a state, all of one iterate."""
 
     def converged(self, state: S, measurement: Measurement) -> Status | None:
-        """Return how the run ended, if the method is done.
-
-        Parameters
-        ----------
-        state : S
-            The current state.
-        measurement : Measurement
-            Its figures.
-
-        Returns
-        -------
-        Status or None
-            CONVERGED or STALLED when the run is done, else None.
-        """
+        """Return how the run ended, if a state and its figures say that it is done, else None."""
 
 
 class Solver(Method[PGOProblem, Poses, S], Protocol[S]):
     """A method for pose graphs: every state stands for feasible poses."""
 
     def poses(self, problem: PGOProblem, state: S) -> Poses:
-        """Return the feasible poses of a state.
-
-        Returns
-        -------
-        Poses
-            Those whose F `measure` reports.
-        """
+        """Return the feasible poses of a state, whose F `measure` reports."""
 
 
 @overload

@@ -100,18 +100,7 @@ class Pipeline:
         return isinstance(soc, SOC) and soc.effective_coupling is Coupling.CONSENSUS
 
     def with_newton_alone(self, newton: Newton) -> Pipeline:
-        """The pipeline without all stages but a start, Newton and its certificate.
-
-        Parameters
-        ----------
-        newton : Newton
-            Settings of Newton.
-
-        Returns
-        -------
-        Pipeline
-            The gap is that of this one.
-        """
+        """The pipeline of a start, Newton and its certificate alone, to the same gap."""
         return replace(
             self,
             soc=None,
@@ -125,16 +114,8 @@ class Pipeline:
     def asks_for(self, step: Step) -> bool:
         """Whether there are settings for a step that may improve the answer.
 
-        Parameters
-        ----------
-        step : Step
-            A step of `solvers.plan` that is taken where the settings ask for it (`improved`).
-
-        Returns
-        -------
-        bool
-            False for what `solve` is to leave out. A staircase of None also leaves out what takes
-            its place: complex numbers, and smaller matrices.
+        A staircase of None also leaves out what takes its place: complex numbers, and smaller
+        matrices.
         """
         search = self.handedness
         has_relaxation = self.staircase is not None

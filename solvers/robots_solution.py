@@ -86,15 +86,7 @@ class RobotsSolution(Summarised):
 
     @classmethod
     def of(cls, solution: Solution, ledger: Ledger) -> RobotsSolution:
-        """Return what robots are told of a solution of the graph of all, beside their own poses.
-
-        Parameters
-        ----------
-        solution : Solution
-            The solution.
-        ledger : Ledger
-            What crossed the network for it.
-        """
+        """What robots are told of a solution of the graph of all, beside their own poses."""
         problem = solution.problem
         graph = problem.graph
         d = graph.d

@@ -165,15 +165,7 @@ class Solution:
         return self.edge_residuals.is_doubtful
 
     def before(self) -> tuple[Poses, str]:
-        """Return the poses before the solve, to compare with.
-
-        Returns
-        -------
-        poses : Poses
-            Those that the graph came with, else those along a spanning tree.
-        name : str
-            What these poses are.
-        """
+        """Return poses before the solve and their name: the graph's own, or a spanning tree's."""
         graph = self.problem.graph
         if graph.initial is not None:
             return graph.initial, "estimate that came with the graph"
@@ -297,14 +289,9 @@ class Solution:
         write_report(self, path)
 
     def plot(self) -> "Figure":
-        """Draw the graph as it came and as it was solved; this needs matplotlib.
+        """Draw the graph as it came and as it was solved, side by side; this needs matplotlib.
 
         As it came is its own estimate, or a spanning tree where it has none.
-
-        Returns
-        -------
-        Figure
-            Two pictures side by side.
 
         Raises
         ------
@@ -331,11 +318,8 @@ class Solution:
     def as_json(self) -> dict[str, object]:
         """Return what `.json` files hold: figures, stages, versions, and the poses by id.
 
-        Returns
-        -------
-        dict
-            Numbers, texts and lists alone, as `json.dumps` takes them. Of rotations alone there are
-            no translations.
+        It has numbers, texts and lists alone, as `json.dumps` takes them; of rotations alone no
+        translations.
         """
         graph = self.problem.graph
         named = graph.in_files

@@ -108,17 +108,7 @@ def newton_status(figures: NewtonFigures) -> Status | None:
 
 
 def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
-    """Return Newton with the Gauss-Newton matrix instead of the Hessian.
-
-    Parameters
-    ----------
-    max_iterations : int, optional
-        Most factorisations.
-
-    Returns
-    -------
-    Newton
-        The method, without secants.
+    """Return Newton with the Gauss-Newton matrix instead of the Hessian, and without secants.
 
     Examples
     --------

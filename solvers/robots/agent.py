@@ -108,31 +108,15 @@ class Agent:
 
     It is given its part of a graph, or lines of its own, of which the orders of the set-up make its
     part (`solvers.robots.own_file`). After that nothing differs.
-
-    Parameters
-    ----------
-    source : Subgraph or OwnLines
-        What it is given.
-    backend : CholeskyBackend, optional
-        What factors its matrices.
-
-    Attributes
-    ----------
-    robot : int
-        Number of the robot.
-    interior, copies
-        As in `Held`.
-    record
-        What the last order has left that is about its own lines.
     """
 
     def __init__(self, source: Subgraph | OwnLines, backend: CholeskyBackend | None = None) -> None:
         self.robot = source.robot
         self.backend = backend
-        self.interior: Interior | None = None
+        self.interior: Interior | None = None  # as in `Held`
         self.copies: Copies | None = None
         self.moments: dict[int, Held] = {}
-        self.record: object = None
+        self.record: object = None  # what the last order has left that is about its own lines
         self._own_lines: OwnLines | None = None
         self._subgraph: Subgraph | None = None
         if isinstance(source, Subgraph):

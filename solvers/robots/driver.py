@@ -129,28 +129,7 @@ class DriverState:
 
 
 class Driver:
-    """The driver: the network of its robots, the current poses of the cover, and saved ones.
-
-    Attributes
-    ----------
-    current, saved : CoverPoses
-        Current poses of the cover, and those of `save_poses`.
-    cover : ndarray of int, (g,)
-        Numbers of the poses of the cover in the whole graph; the first is pose 0 if it is in the
-        cover.
-    diagonal : ndarray, ((d + 1) g,)
-        Diagonal of M on the cover.
-    is_final : bool
-        Which of two costs is the current one, where a graph has two: the cost that is asked for
-        (`Part.final`; chi2, or one that is not convex), or the convex quadratic cost near it that
-        SOC minimizes instead (`PGOProblem.convex_part`). False where there is one cost.
-    has_translations : bool
-        Whether translations are among the unknowns (`PGOProblem.has_translations`).
-    robots_with_edges : ndarray of int
-        Numbers of the robots to which at least one edge belongs. Only they have an interior.
-    network : CountedPool
-        All robots, and the ledger.
-    """
+    """The driver: the network of its robots, the current poses of the cover, and saved ones."""
 
     def __init__(
         self,
@@ -175,7 +154,10 @@ class Driver:
         g = len(self.cover)
         R = np.broadcast_to(np.eye(self.d), (g, self.d, self.d)).copy()
         self.current = CoverPoses(R, np.zeros((g, self.d)), np.zeros(((self.d + 1) * g, self.d)))
-        self.saved = self.current
+        self.saved = self.current  # the poses of `save_poses`
+        # Which of two costs is the current one, where a graph has two: the cost that is asked for
+        # (`Part.final`; chi2, or one that is not convex), or the convex quadratic cost near it that
+        # SOC minimizes instead (`PGOProblem.convex_part`). False where there is one cost.
         self.is_final = False
         # Factor of the matrix of the translations on the cover, once it is needed.
         self._laplacian: InterfaceFactor | None = None
@@ -199,9 +181,10 @@ class Driver:
 
     def _read_cover(self, summaries: Sequence[RobotSummary]) -> None:
         """Take the cover, and what every robot holds of it, from the robots' summaries."""
+        # (g,): numbers of the poses of the cover in the whole graph, of which pose 0 is the first
         self.cover = self._separators.cover
         self._held_cover = [self.positions(robot.cover) for robot in summaries]
-        # Robots with edges, and the poses that these edges join.
+        # Robots with edges, which alone have an interior, and the poses that these edges join.
         with_edges = [robot for robot in summaries if robot.touched is not None]
         self.robots_with_edges = np.array([robot.robot for robot in with_edges])
         self._parts = [robot.part for robot in with_edges]
@@ -270,6 +253,7 @@ class Driver:
 
     def describe(self, count: Count) -> None:
         """Ask for the diagonal of M at the current poses."""
+        # ((d + 1) g,)
         self.diagonal = self.gather_diagonal(self.ask(pose_orders.describe, None, count))
 
     def choose_cost(self, final: bool) -> None:

@@ -66,13 +66,7 @@ class BenchmarkSettings:
             )
 
     def robots(self, graph: PoseGraph) -> Partition:
-        """Share a graph among the robots, by `suited_partition`.
-
-        Returns
-        -------
-        Partition
-            Owner of every pose.
-        """
+        """Share a graph among the robots, by `suited_partition`."""
         return suited_partition(graph, min(self.num_robots, graph.num_poses))
 
 

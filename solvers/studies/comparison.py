@@ -102,13 +102,7 @@ class Comparison(Summarised):
         return [trial.curve(self.lower_bound) for trial in self.trials if trial.is_answer]
 
     def table(self) -> ResultTable:
-        """Return a row for every method, with those without figures last.
-
-        Returns
-        -------
-        ResultTable
-            The table, which prints itself.
-        """
+        """Return a row for every method, with those without figures last."""
         rows = []
         records = []
         for trial in self.trials:
@@ -183,11 +177,6 @@ def compare_methods(
         Which methods, and their common settings.
     progress : bool, optional
         Whether to show a bar on stderr; if not given, it is shown on a terminal.
-
-    Returns
-    -------
-    Comparison
-        The runs, and the bound.
 
     Raises
     ------

@@ -106,11 +106,6 @@ def estimate_noise(graph: PoseGraph | PGOProblem) -> NoiseEstimate:
     graph : PoseGraph or PGOProblem
         A connected graph, or the problem of one; its kappa and tau are where the iteration begins.
 
-    Returns
-    -------
-    NoiseEstimate
-        Standard deviations, and the graph with the weights that belong to them.
-
     Raises
     ------
     GraphError

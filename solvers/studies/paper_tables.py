@@ -74,18 +74,7 @@ class ReproductionSettings:
         return tuple(row for row in published_rows() if not self.only or row.name in self.only)
 
     def seeds(self, name: str) -> range:
-        """Return the seeds of the draws of a row.
-
-        Parameters
-        ----------
-        name : str
-            Name of the graph.
-
-        Returns
-        -------
-        range
-            Seeds; one if the graph is a file.
-        """
+        """Return the seeds of the draws of a row; one if the graph is a file."""
         return range(self.num_seeds if name in SCENES else 1)
 
 

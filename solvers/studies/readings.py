@@ -162,22 +162,14 @@ class ReadingComparison(Summarised):
     def sentence(self) -> str:
         """Return the costs as written and as proposed, and the question that they raise."""
         written = _with_share(self.written)
-        if self.invalid:
-            return self._sentence_on_invalid()
+        invalid = f"As written the file is invalid: {self.invalid}." if self.invalid else ""
+        if not self.proposed and invalid:
+            return f"{invalid} No other reading fits."
         if not self.proposed:
             return f"{self.cost_name} {written}: no other reading fits better beyond chance."
         best, *others = self.proposed
-        text = f"{self.cost_name} {written}, {_with_share(best)}: {best.question}"
-        if others:
-            text += f" Nearly as likely: {' or '.join(fit.text for fit in others)}."
-        return text
-
-    def _sentence_on_invalid(self) -> str:
-        text = f"As written the file is invalid: {self.invalid}."
-        if not self.proposed:
-            return f"{text} No other reading fits."
-        best, *others = self.proposed
-        text += f" {self.cost_name} {_with_share(best)}: {best.question}"
+        begin = f"{invalid} {self.cost_name} " if invalid else f"{self.cost_name} {written}, "
+        text = f"{begin}{_with_share(best)}: {best.question}"
         if others:
             text += f" Nearly as likely: {' or '.join(fit.text for fit in others)}."
         return text
@@ -212,11 +204,6 @@ def compare_readings(
         As for `load`; a JSON robot log leaves no choice.
     unit_weights, skip_unknown, trust_folder : bool
         As for `read_g2o`.
-
-    Returns
-    -------
-    ReadingComparison
-        Costs under all readings, and those that are proposed.
 
     Raises
     ------

@@ -131,11 +131,6 @@ def noise_sweep(
     rng : numpy.random.Generator or int
         Source of the noise.
 
-    Returns
-    -------
-    NoiseSweep
-        Which graphs were certified, and their gaps.
-
     Raises
     ------
     SettingError
