@@ -348,7 +348,7 @@ def estimated_poses(graph: PoseGraph, path: Path | None) -> Poses:
             )
         return graph.initial
     suffix = path.suffix.lower()
-    if suffix == ".g2o":
+    if suffix in (".g2o", ".gz", ".json"):  # of Open3D, which has the poses of its nodes
         return read_g2o_poses(path, graph)
     poses = _read_trajectory(path, graph.d)
     if poses.num_poses != len(graph.in_files):
@@ -384,5 +384,6 @@ def _read_trajectory(path: Path, d: int) -> Poses:
     if suffix == ".kitti":
         return read_kitti(path, d)
     raise SettingError(
-        f"cannot read {path}: no format has suffix {suffix!r}; use .g2o, .tum or .kitti"
+        f"cannot read {path}: no format has suffix {suffix!r}; "
+        "use .g2o, .json of Open3D, .tum or .kitti"
     )

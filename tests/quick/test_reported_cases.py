@@ -583,6 +583,14 @@ def test_pose_graphs_of_open3d_are_read() -> None:
     np.testing.assert_array_equal(diagonal, [5000.0] * 3 + [200000.0] * 3)
 
 
+def test_the_nodes_of_open3d_are_an_estimate(pgo_command: Call, tmp_path: Path) -> None:
+    path = CASES / "b1_open3d_posegraph.json"
+    (tmp_path / "optimised.json").write_text(path.read_text())
+    own = said(pgo_command, "certify", path, "--json")
+    given = said(pgo_command, "certify", path, "--estimate", tmp_path / "optimised.json", "--json")
+    assert json.loads(own[1])["objective"] == json.loads(given[1])["objective"]
+
+
 @pytest.mark.filterwarnings("ignore:.*edges are uncertain")
 @pytest.mark.parametrize("indent", [None, 1])
 def test_what_is_wrong_in_a_graph_of_open3d_is_named(indent: int | None, tmp_path: Path) -> None:
