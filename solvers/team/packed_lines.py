@@ -2,7 +2,7 @@
 
 A line is its form, in which marks stand for ids and for numbers of many digits, and these. Forms
 that have come before, changes of ids, and sign and exponent of a number are symbols. They are as
-probable as they were so far, and one integer has them all (asymmetric numeral systems, Duda 2013).
+probable as they were so far, and one integer has many (asymmetric numeral systems, Duda 2013).
 The mantissa of a number follows as it is. The last number of a unit quaternion is the root that the
 other three leave, up to a few units in its last place. Other forms are compressed (RFC 1951) with
 those before as a dictionary.
@@ -20,7 +20,9 @@ from typing import Any, NamedTuple
 
 from solvers.carry.wire import WireError
 
-MOST_LINES = 1024  # that are packed at once: the integer is divided for every symbol
+MOST_LINES = 1024  # that are packed at once
+_IN_AN_INTEGER = 512  # symbols, as each takes a division of the integer
+_LENGTH_BYTES = 2  # of the length of an integer
 _BEFORE = 64  # how many lines before tell what is probable
 _FEWEST_LETTERS = 12  # of a number that is taken out: text has about half a byte a digit
 _NUMBER, _ID, _TEXT = "\0", "\1", "\2"  # begin words in place of numbers and ids, and any like them
@@ -67,7 +69,7 @@ def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) 
     digits = packed.mantissas.hex()
     ends = range(_MANTISSA_DIGITS, len(digits) + 1, _MANTISSA_DIGITS)
     coder.mantissas = [digits[end - _MANTISSA_DIGITS : end] for end in reversed(ends)]
-    coder.symbols.state = int.from_bytes(packed.symbols, "little")
+    coder.symbols.unread = packed.symbols
     lines: list[str] = []
     try:
         new_forms = _forms(packed.forms, coder.text_of_forms(0), most_bytes)
@@ -78,7 +80,7 @@ def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) 
                 raise WireError("lines of too many bytes")
     except (zlib.error, struct.error, ValueError, LookupError, StopIteration) as error:
         raise WireError(f"lines that cannot be read: {error}") from error
-    if coder.symbols.state != 1:
+    if coder.symbols.state != 1 or coder.symbols.unread:
         raise WireError("lines that go on after their end")
     return lines
 
@@ -95,26 +97,53 @@ def _forms(data: bytes, dictionary: bytes, most_bytes: int) -> Iterator[str]:
 
 
 class _Symbols:
-    """Natural numbers in an integer, each with its probability among those before in a context.
+    """Natural numbers in integers, each with its probability among those before in a context.
 
     One that is new in its context has the probability of an escape, which grows with the number of
-    different ones, and its bits follow. What is read leaves the integer `state`.
+    different ones, and its bits follow. What is read leaves the integer `state`; others follow in
+    `unread`.
     """
 
     def __init__(self) -> None:
-        self.state = 1
-        self.steps: list[tuple[int, int, int]] = []  # intervals: begin, width, and width of all
         self._counts: defaultdict[Hashable, dict[int, int]] = defaultdict(dict)
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin to write or to read, with the probabilities so far."""
+        self.state = 1
+        self.unread = b""
+        self._num_symbols = 0
+        # For each integer, intervals: begin, width, and width of all.
+        self._steps: list[list[tuple[int, int, int]]] = []
 
     def as_bytes(self) -> bytes:
-        """The integer of what was written."""
-        state = 1
-        for begins, width, total in reversed(self.steps):
-            state = state // width * total + begins + state % width
-        return state.to_bytes((state.bit_length() + 7) // 8, "little")
+        """The integers of what was written, each with its length before it."""
+        parts = []
+        for steps in self._steps:
+            state = 1
+            for begins, width, total in reversed(steps):
+                state = state // width * total + begins + state % width
+            num_bytes = (state.bit_length() + 7) // 8
+            parts.append(num_bytes.to_bytes(_LENGTH_BYTES, "little"))
+            parts.append(state.to_bytes(num_bytes, "little"))
+        return b"".join(parts)
+
+    def _next_integer(self, is_read: bool) -> None:
+        """Begin an integer, where one is full or none is begun."""
+        if not is_read:
+            self._steps.append([])
+            return
+        if self.state != 1:
+            raise WireError("symbols that go on after their end")
+        ends = _LENGTH_BYTES + int.from_bytes(self.unread[:_LENGTH_BYTES], "little")
+        self.state = int.from_bytes(self.unread[_LENGTH_BYTES:ends], "little")
+        self.unread = self.unread[ends:]
 
     def code(self, context: Hashable, symbol: int | None) -> int:
         """Write a symbol, or read it where there is None."""
+        if self._num_symbols % _IN_AN_INTEGER == 0:
+            self._next_integer(symbol is None)
+        self._num_symbols += 1
         counts = self._counts[context]
         coded = self._among(counts, symbol)
         if coded is None:
@@ -132,16 +161,19 @@ class _Symbols:
 
     def _among(self, counts: Mapping[int, int], symbol: int | None) -> int | None:
         """Code a symbol that has come before; else an escape, which is None."""
-        total = sum(counts.values()) + max(1, len(counts))
+        num_known = sum(counts.values())
+        total = num_known + max(1, len(counts))
         place = total if symbol is not None else self.state % total
+        if place >= num_known and symbol not in counts:
+            self._pass(num_known, total - num_known, total, symbol is None)
+            return None
         begins = 0
         for known, count in counts.items():
             if known == symbol or place < begins + count:
-                self._pass(begins, count, total, symbol is None)
-                return known
+                break
             begins += count
-        self._pass(begins, total - begins, total, symbol is None)
-        return None
+        self._pass(begins, count, total, symbol is None)
+        return known
 
     def _plain(self, number: int | None, total: int) -> int:
         """Code a number below `total`, all of which are as probable."""
@@ -154,7 +186,7 @@ class _Symbols:
         if is_read:
             self.state = self.state // total * width + self.state % total - begins
         else:
-            self.steps.append((begins, width, total))
+            self._steps[-1].append((begins, width, total))
 
 
 class _Coder:
@@ -170,7 +202,7 @@ class _Coder:
         self._seen: set[str] = set()
         for line in before[-_BEFORE:]:
             self.write(line)
-        self.symbols.steps.clear()
+        self.symbols.begin()
         self.mantissas.clear()
 
     def text_of_forms(self, first: int) -> bytes:

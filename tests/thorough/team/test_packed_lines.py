@@ -47,6 +47,7 @@ def test_an_edge_takes_the_mantissas_of_six_numbers_and_little_else(tmp_path: ob
     assert len(packed.mantissas) <= 50 * 6 * 52 / 8 + 1
     assert len(packed.symbols) <= 50 * 6
     assert packed.forms == b""
+    assert unpacked_lines(packed, odometry[:100], MOST) == odometry[100:]
 
 
 @pytest.mark.parametrize("seed", range(examples(20)))
