@@ -4,7 +4,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import sqrtm
 
-from pgo_models import OrthogonalProblem, PoseGraph
+from pgo_models import OrthogonalProblem
 from pgo_models.geometry.rotations import Array
 
 
@@ -42,21 +42,3 @@ def one_norm_components(A: Array, count: int) -> OrthogonalProblem:
     """
     X = cp.Variable((A.shape[1], count), name="X")
     return OrthogonalProblem(cp.Problem(cp.Minimize(cp.sum(cp.abs(A @ X)))), orthogonal=[X])
-
-
-def rotation_averaging(graph: PoseGraph) -> OrthogonalProblem:
-    """Minimise sum_e kappa ||R_j - R_i R_ij||_F^2 over rotations R_0 ..
-
-    R_{n-1} (paper: `rotation`).
-
-    The rotation part of F, one (d, d) variable a pose. A common rotation of all is free.
-    """
-    R = [cp.Variable((graph.d, graph.d), name=f"R_{pose}") for pose in range(graph.num_poses)]
-    root = np.sqrt(graph.kappa)
-    residuals = [
-        root[edge] * (R[j] - R[i] @ graph.R_ij[edge])
-        for edge, (i, j) in enumerate(zip(graph.i.tolist(), graph.j.tolist(), strict=True))
-    ]
-    return OrthogonalProblem(
-        cp.Problem(cp.Minimize(cp.sum_squares(cp.vstack(residuals)))), rotations=R
-    )

@@ -216,7 +216,6 @@ def graph_qp(
     rho: Array | float,
     unknowns: Unknowns = Unknowns.POSES,
     changer: Changer | None = None,
-    rho_t: Array | float | None = None,
     solver: ConvexSolver | str = "CLARABEL",
 ) -> GraphQP:
     """Pose the R-subproblem of a whole graph.
@@ -231,8 +230,6 @@ def graph_qp(
         Whether translations are unknown too.
     changer : callable or None
         Given the `PoseVariables`, it returns the `ModelChange`.
-    rho_t : (n,) array, a number for all poses, or None
-        Penalties of the translations; none unless given.
     solver : ConvexSolver or str
         What solves the program.
 
@@ -264,10 +261,14 @@ def graph_qp(
     n = graph.num_poses
     d = graph.d
     has_translations = unknowns is Unknowns.POSES
-    penalty = np.repeat(_penalties(rho, "rho", graph), d)
+    penalties = np.asarray(rho, dtype=float)
+    if penalties.shape not in ((), (n,)):
+        raise SettingError(
+            f"rho has shape {penalties.shape}; give one number, or one for each of {n} poses"
+        )
+    penalty = np.repeat(np.broadcast_to(penalties, n), d)
     if has_translations:
-        penalty_t = np.zeros(n) if rho_t is None else _penalties(rho_t, "rho_t", graph)
-        penalty = np.concatenate([penalty_t, penalty])
+        penalty = np.concatenate([np.zeros(n), penalty])
     A = residual_matrix(graph)
     X = cp.Variable((len(penalty), d), name="X")
     variables = pose_variables(graph, unknowns, A, X)
@@ -288,17 +289,6 @@ def check_terms_are_added_to_F(problem: PGOProblem) -> None:
         raise SettingError(
             "terms are added to F, with two precisions an edge; use Weighting.ISOTROPIC"
         )
-
-
-def _penalties(rho: Array | float, name: str, graph: PoseGraph) -> Array:
-    """One penalty for every pose, (n,)."""
-    penalties = np.asarray(rho, dtype=float)
-    if penalties.shape not in ((), (graph.num_poses,)):
-        raise SettingError(
-            f"{name} has shape {penalties.shape}; give one number, or one for each of "
-            f"{graph.num_poses} poses"
-        )
-    return np.broadcast_to(penalties, graph.num_poses)
 
 
 def pose_variables(

@@ -11,17 +11,14 @@ ones with S u* = 0 in all coordinates that are not fixed, so that the bound is J
 definite. P stays positive semidefinite if P W(u*) = 0, as at the optimum.
 """
 
-from dataclasses import dataclass
-
 import cvxpy as cp
 import numpy as np
 from scipy.sparse import block_diag, coo_array, csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
-from pgo_models.convex.convex_solver import COLD, ConvexSolver, solve_compiled
+from pgo_models.convex.convex_solver import solve_compiled
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.convex.set_equations import SetEquations
-from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 
@@ -111,48 +108,11 @@ def _congruence(N: Array) -> Array:
     return np.asarray(np.where(rows == columns, products, products + mirrored))
 
 
-@dataclass(frozen=True, eq=False)
-class RelaxedModel(ReadOnly):
-    """The relaxation, solved.
+def solve_model_relaxation(form: QuadraticForm, equations: SetEquations) -> tuple[Array, Array]:
+    """Multipliers l and u, the last column of Z, of a model with few coordinates.
 
-    Parameters
-    ----------
-    value : float
-        g, which is no bound.
-    multipliers : array
-        l.
-    u : (N,) array
-        The last column of Z, whose x is in no set unless the relaxation is tight.
-    """
-
-    value: float
-    multipliers: Array
-    u: Array
-
-
-def solve_model_relaxation(
-    form: QuadraticForm, equations: SetEquations, solver: ConvexSolver | str = COLD
-) -> RelaxedModel:
-    """Solve the relaxation of a model with few coordinates.
-
-    Parameters
-    ----------
-    form : QuadraticForm
-        The model.
-    equations : SetEquations
-        Its equations.
-    solver : ConvexSolver or str
-        A solver of semidefinite programs.
-
-    Returns
-    -------
-    RelaxedModel
-        Its multipliers and its point.
-
-    Raises
-    ------
-    PGOError
-        If the solver ends without a solution.
+    The x of u is in no set unless the relaxation is tight. A PGOError if the solver ends without a
+    solution.
     """
     D = _reduction(form)
     side = D.shape[1]
@@ -175,12 +135,10 @@ def solve_model_relaxation(
         P = _from_triangle(product.side) @ multipliers[product.entries]
         constraints.append(cp.reshape(P, (product.side, product.side), order="F") >> 0)
     model = cp.Problem(cp.Maximize(g), constraints)
-    solve_compiled(
-        model, "relaxation", tolerance=1e-10, solver=solver, accepted=cp.OPTIMAL_INACCURATE
-    )
+    solve_compiled(model, "relaxation", tolerance=1e-10, accepted=cp.OPTIMAL_INACCURATE)
     Z = np.asarray(is_semidefinite.dual_value)
     u = D @ (Z[:, -1] / Z[-1, -1])
-    return RelaxedModel(scale * float(g.value), scale * np.asarray(multipliers.value), u)
+    return scale * np.asarray(multipliers.value), u
 
 
 def _reduction(form: QuadraticForm) -> Array:

@@ -409,12 +409,11 @@ def kkt_residuals(
     problem: OrthogonalProblem,
     point: OrthogonalPoint,
     rho: float,
-    solver: ConvexSolver | str = COLD,
     split: Split | None = None,
 ) -> KKTResiduals:
     """Check the KKT conditions of a point by one step (a), with any solver's point.
 
-    It is compiled for the solver unless it is given.
+    It is compiled unless it is given.
 
     rho should be of the order of the curvature of J. The normals N of the point, projected once
     more onto the normal spaces, are its multipliers: for X^T X = I they are -X Lambda. X is
@@ -433,7 +432,7 @@ def kkt_residuals(
         V.append(copy - normal / rho)
         is_orthonormal = isinstance(term.constraint, Orthonormal)
         multipliers.append(-copy.T @ normal if is_orthonormal else -normal)
-    Z, others = (split or problem.split(solver)).solve(V, rho)
+    Z, others = (split or problem.split()).solve(V, rho)
     pairs = zip(problem.terms, point.copies, strict=True)
     gaps = problem.sums([rho * (copy - Z[term.variable]) for term, copy in pairs])
     gradients = problem.sums(normals)

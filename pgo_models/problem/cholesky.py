@@ -204,11 +204,9 @@ def analyze(
     return _SuperLU(pattern, order)
 
 
-def factorize(
-    A: csc_array, backend: CholeskyBackend | None = None, order: IntArray | None = None
-) -> CholeskyFactor:
+def factorize(A: csc_array, backend: CholeskyBackend | None = None) -> CholeskyFactor:
     """Factor one symmetric positive definite matrix, as `analyze` and `factorize` do."""
-    return analyze(A, backend, order).factorize(A)
+    return analyze(A, backend).factorize(A)
 
 
 def factorize_damped(analysis: SymbolicCholesky, matrix: csc_array) -> CholeskyFactor:

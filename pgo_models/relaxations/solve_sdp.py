@@ -48,11 +48,6 @@ class RelaxationForm(enum.Enum):
     HULL = "PRIMAL, and Z_ij in the convex hull of SO(3) at every edge"
     HULL_DUAL = "DUAL, with a multiplier of the convex hull of SO(3) at every edge"
 
-    @property
-    def has_hull(self) -> bool:
-        """Whether blocks are mixtures of rotations: a tighter relaxation, in space."""
-        return self in (RelaxationForm.HULL, RelaxationForm.HULL_DUAL)
-
 
 class RelaxationStatus(enum.Enum):
     """How the solver ended."""
@@ -74,8 +69,6 @@ class RelaxationSolution(Summarised):
 
     Parameters
     ----------
-    relaxation : PrimalRelaxation or DualRelaxation
-        The model with its variables and duals as solved.
     form : RelaxationForm
         How the relaxation was posed.
     solver : ConvexSolver
@@ -95,7 +88,6 @@ class RelaxationSolution(Summarised):
         From posing to proof.
     """
 
-    relaxation: Relaxation
     form: RelaxationForm
     solver: ConvexSolver
     status: RelaxationStatus
@@ -227,7 +219,7 @@ def solve_relaxation(
     iterations = int(relaxation.model.solver_stats.num_iters or 0)
     seconds = time.perf_counter() - began
     solution = RelaxationSolution(
-        relaxation, form, solver, status, value, certificate, rank, iterations, seconds
+        form, solver, status, value, certificate, rank, iterations, seconds
     )
     if verbose:
         print(solution)

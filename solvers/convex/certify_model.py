@@ -171,13 +171,13 @@ class _Search:
         """Solve a relaxation, whose point is one more candidate, and take its multipliers."""
         form = self.newton.form
         try:
-            relaxed = solve_model_relaxation(form, equations)
+            multipliers, u = solve_model_relaxation(form, equations)
         except PGOError:  # of the solver; the bounds that are known are what is left
             return
-        other = self.stationary(self.newton.on_sets(relaxed.u))
+        other = self.stationary(self.newton.on_sets(u))
         if self.newton.is_possible or is_feasible(self.newton.equations, other):
             self.best = min(self.best, other, key=form.objective)
-        moved = moved_multipliers(form, equations, relaxed.multipliers, self.best)
+        moved = moved_multipliers(form, equations, multipliers, self.best)
         self.add(prove_model_bound(form, equations, moved, self.best))
-        given = definite_multipliers(equations, relaxed.multipliers)
-        self.last_multipliers = [(equations, given, relaxed.u), (equations, moved, self.best)]
+        given = definite_multipliers(equations, multipliers)
+        self.last_multipliers = [(equations, given, u), (equations, moved, self.best)]

@@ -229,7 +229,7 @@ class OrthogonalSOC:
         """
         if not isinstance(self.x_step, XStep):
             return self.x_step
-        is_solver_named = self.x_step is XStep.AUTOMATIC and self.solver is not COLD
+        is_solver_named = self.x_step is XStep.AUTOMATIC and self.solver != COLD
         if not is_solver_named and self.x_step is not XStep.CONVEX_SOLVER:
             try:
                 return QuadraticSplit(problem, _form_of_step(problem))

@@ -107,7 +107,7 @@ def newton_status(figures: NewtonFigures) -> Status | None:
     return None if figures.moved else Status.STALLED
 
 
-def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
+def gauss_newton() -> Newton:
     """Return Newton with the Gauss-Newton matrix instead of the Hessian, and without secants.
 
     Examples
@@ -115,4 +115,4 @@ def gauss_newton(max_iterations: int = Newton.max_iterations) -> Newton:
     >>> gauss_newton().second_order
     False
     """
-    return Newton(max_iterations=max_iterations, second_order=False, secants=False)
+    return Newton(second_order=False, secants=False)

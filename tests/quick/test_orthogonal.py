@@ -1,5 +1,7 @@
 """Orthogonality constraints on the variables of any convex cvxpy objective."""
 
+import pickle
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -126,6 +128,12 @@ def test_a_rule_of_ones_own_sets_the_penalty(x_step):
     gradient = 2.0 * np.linalg.norm(turned - np.diag([3.0, 2.0]), 2)
     assert outcome.state.rho == pytest.approx(1.5 * 2.0 * gradient, rel=0.2)
     assert outcome.objective == pytest.approx(5.0, rel=ACCURACY)
+
+
+def test_settings_that_come_out_of_a_pickle_make_the_same_step():
+    model, settings = nearest(np.eye(2), orthogonal=True), solvers.OrthogonalSOC()
+    copied = pickle.loads(pickle.dumps(settings))
+    assert type(copied.split(model)) is type(settings.split(model))
 
 
 @pytest.mark.parametrize("x_step", ["automatic", "convex_solver"])

@@ -120,6 +120,15 @@ def test_what_is_not_there_is_named() -> None:
         graph_qp(problem.graph, rho, changer=concave)
 
 
+@pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
+def test_penalties_must_not_be_negative_nor_all_zero(value: float) -> None:
+    problem, rho, _ = drawn(3, 6, 2)
+    with pytest.raises(SettingError, match="must not be negative, and one must be positive"):
+        graph_qp(problem.graph, value)
+    with pytest.raises(SettingError, match="one for each of 6 poses"):
+        graph_qp(problem.graph, rho[1:])
+
+
 def test_edges_are_replaced_by_number_by_array_or_by_mask() -> None:
     mask = np.array([False, True, False, True])
     for edges in ([1, 3], range(1, 4, 2), np.array([1, 3]), mask):
