@@ -67,7 +67,7 @@ class DrivenTeam:
     """
 
     def __init__(self, member: Member, session: Session) -> None:
-        self.name = member.name
+        self.name = session.name
         self.term = Term(0, "")
         self.last: Ended | None = None
         self._member = member
@@ -256,7 +256,7 @@ class DrivenTeam:
             self.term,
             members,
             member.measurements,
-            member.driven_solve,
+            member.settings,
             self._beside,
             self._after_step,
         )

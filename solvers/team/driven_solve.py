@@ -13,23 +13,20 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pgo_models.errors import PGOError
-from pgo_models.problem.weighting import Weighting
 from solvers.carry.messages import Idle, Worker, obey, raise_first_error
 from solvers.carry.process import DEFAULT_MEMORY
 from solvers.carry.wire import Order
 from solvers.loop import RunMonitor
-from solvers.request import Pipeline
 from solvers.robots.agent import Agent, OwnLines
 from solvers.robots.own_file import READ_HERE
 from solvers.robots.setup import SOLVE_PARTS
 from solvers.robots_solution import RobotsSolution
-from solvers.robust.consistency import PCM
-from solvers.robust.gnc import GNC
 from solvers.solves.folder_solve import FilesOfRobots
 from solvers.team.beside import Line, result_or_error
 from solvers.team.measurements import Measurements
 from solvers.team.messages import Ask, Term
 from solvers.team.refusals import function_for_teams
+from solvers.team.shared_solve import TeamSettings
 from solvers.team.sharing import OwnAnswer, answer_of
 
 T = TypeVar("T")
@@ -38,35 +35,30 @@ A = TypeVar("A")
 UNKNOWN = "it cannot compute what it was asked"
 
 
-@dataclass(frozen=True, eq=False)
-class DrivenSolve:
-    """Settings of the solves that a robot drives."""
-
-    pipeline: Pipeline
-    weighting: Weighting
-    robust: GNC | PCM | None
-    trust_folder: bool
-
-    def solved(
-        self, term: Term, members: tuple[str, ...], own: Measurements, line: Line
-    ) -> tuple[RobotsSolution, OwnAnswer | None]:
-        """The solution of the term by these robots, the first of which has the measurements."""
-        engine = _Team(term, members, _agent(0, members[0], own), line)
-        files = [OwnLines(place, _path_of(name)) for place, name in enumerate(members)]
-        job = FilesOfRobots(
-            "team",
-            files,
-            engine,
-            DEFAULT_MEMORY,
-            self.weighting,
-            trust_folder=self.trust_folder,
-            robust=self.robust,
-        )
-        try:
-            solution = job.solved(self.pipeline, RunMonitor(progress=False))
-        except PGOError as error:
-            raise PGOError(_with_ways_out_of_teams(str(error))) from error
-        return solution.without_histories, answer_of(engine.agent)
+def solve_with_team(
+    settings: TeamSettings,
+    term: Term,
+    members: tuple[str, ...],
+    own: Measurements,
+    line: Line,
+) -> tuple[RobotsSolution, OwnAnswer | None]:
+    """The solution of the term by these robots, the first of which has the measurements."""
+    engine = _Team(term, members, _agent(0, settings.name, own), line)
+    files = [OwnLines(place, _path_of(name)) for place, name in enumerate(members)]
+    job = FilesOfRobots(
+        "team",
+        files,
+        engine,
+        DEFAULT_MEMORY,
+        settings.weighting,
+        trust_folder=settings.trust_folder,
+        robust=settings.robust,
+    )
+    try:
+        solution = job.solved(settings.pipeline, RunMonitor(progress=False))
+    except PGOError as error:
+        raise PGOError(_with_ways_out_of_teams(str(error))) from error
+    return solution.without_histories, answer_of(engine.agent)
 
 
 def obey_orders(place: int, name: str, own: Measurements, line: Line) -> None:

@@ -9,9 +9,10 @@ from typing import Any
 from pgo_models.errors import PGOError
 from solvers.robots_solution import RobotsSolution
 from solvers.team.beside import Beside
-from solvers.team.driven_solve import DrivenSolve
+from solvers.team.driven_solve import solve_with_team
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.messages import Ask, Ended, Hello, Reply, Term, error_of_message
+from solvers.team.shared_solve import TeamSettings
 from solvers.team.sharing import OwnAnswer
 
 
@@ -28,7 +29,7 @@ class Drive:
         term: Term,
         members: tuple[str, ...],
         measurements: Measurements,
-        solve: DrivenSolve,
+        settings: TeamSettings,
         beside: Beside,
         tell: Callable[[Drive], None],
     ) -> None:
@@ -40,7 +41,7 @@ class Drive:
         self._answers: dict[str, Any] = {}
         self._tell = tell
         self._talk = beside.begin(
-            partial(solve.solved, term, members, measurements),
+            partial(solve_with_team, settings, term, members, measurements),
             self._end,
             "an answer of another robot cannot be computed with",
             self._ask,

@@ -33,6 +33,7 @@ from solvers.team.member import Member
 from solvers.team.messages import Ended, Term
 from solvers.team.session import PATIENCE, RETRY, Message, Session, TeamLedger
 from solvers.team.shared_map import SharedMap
+from solvers.team.shared_solve import TeamSettings
 from solvers.team.sharing import OwnAnswer, Sharing
 
 _FEWEST_KEY_BYTES = 16  # 128 bits, which nobody can guess
@@ -150,7 +151,7 @@ class Robot:
                 f"{error}; a robot computes in another process, which has copies of its settings"
             ) from error
         self._sharing = sharing
-        self._member = Member(name, pipeline, weighting, robust, trust_folder)
+        self._member = Member(TeamSettings(name, pipeline, weighting, robust, trust_folder))
         self._session = Session(name, self.team, key, patience, retry)
         self._way: SharedMap | DrivenTeam
         if sharing is Sharing.MEASUREMENTS:
@@ -333,7 +334,8 @@ class Robot:
     def is_settled(self) -> bool:
         """Whether a solve was of the whole team, and nobody waits for this robot.
 
-        It was of all measurements that this robot has.
+        It was of all measurements that this robot has. In teams that keep theirs it may have failed
+        (`failure`): nothing is solved again before something is new.
         """
         return self._session.is_settled
 
@@ -529,7 +531,7 @@ class Robot:
         saved = Saved(
             self.name,
             self.team,
-            self._member.weighting,
+            self._member.settings.weighting,
             self._sharing,
             self._member.measurements,
             self._way.term,

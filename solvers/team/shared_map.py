@@ -55,10 +55,10 @@ class SharedMap:
     """
 
     def __init__(self, member: Member, session: Session) -> None:
-        self.name = member.name
+        self.name = session.name
         self.term = Term(0, "")
         self.last: Ended | None = None
-        self.logs: dict[str, Measurements] = {member.name: member.measurements}
+        self.logs: dict[str, Measurements] = {session.name: member.measurements}
         # Whether the robot comes from what was saved and has measured nothing since: then it takes
         # back what others still have of it.
         self.saved: Revision | None = None
@@ -355,7 +355,7 @@ class SharedMap:
         self._changed_at = None
         self._is_solving = True
         lines = {name: "".join(self.logs[name].lines) for name in revisions}
-        solve = partial(self._member.shared_solve.solved, lines, self._member.solution)
+        solve = partial(self._member.settings.solved, lines, self._member.solution)
         self._session.beside.begin(
             solve,
             lambda answer: self._end(revisions, answer),

@@ -51,7 +51,7 @@ class SharedAnswer:
 
 
 @dataclass(frozen=True, eq=False)
-class SharedSolve:
+class TeamSettings:
     """Settings of the solves of the robot `name`."""
 
     name: str
