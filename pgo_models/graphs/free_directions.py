@@ -27,6 +27,7 @@ from pgo_models.graphs.pose_graph import (
 from pgo_models.graphs.precisions import edge_precisions, partial_edges
 
 _AXES = "xyz"
+_ROUNDING = 2.0**-44  # share of a matrix that turning it can leave where it has zeros
 _MOST_NAMED = 3  # edges that are named one by one
 
 
@@ -40,6 +41,8 @@ class _Frame:
     I_rr: Array  # (k, p, p)
     # (k, d): whether an axis of the world is the same axis of the measured pose, exactly.
     keeps_axis: BoolArray
+    # (k,): what counts as zero in I_rr, which is in the axes of the world where this is not zero.
+    slack: Array
 
     @property
     def sees_shift(self) -> BoolArray:
@@ -67,16 +70,16 @@ class _Frame:
         """Whether a prior measures, or may measure, a turn about an axis of the world in space."""
         first, second = (other for other in range(3) if other != axis)
         I_rr = self.I_rr
+        slack = self.slack
         measures: BoolArray = np.any(self.I_tt, axis=(1, 2)) | np.any(I_rr, axis=(1, 2))
-        is_uneven = (I_rr[:, first, first] != I_rr[:, second, second]) | (
-            I_rr[:, first, second] != 0.0
-        )
+        is_uneven = np.abs(I_rr[:, first, first] - I_rr[:, second, second]) > slack
+        is_uneven |= np.abs(I_rr[:, first, second]) > slack
         reasons = (
             self.I_tt[:, [first, second]],  # a position beside the axis
             self.I_tr,
-            I_rr[:, axis],
+            np.abs(I_rr[:, axis]) > slack[:, None],
             is_uneven,
-            measures & ~self.keeps_axis[:, axis],
+            measures & ~self.keeps_axis[:, axis] & (slack == 0.0),
         )
         return any(bool(np.any(reason)) for reason in reasons)
 
@@ -231,7 +234,10 @@ def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:
     if d == 3:
         axes = np.union1d(free_shifts, free_turns)
     is_of_pose = ~np.isin(graph.j[priors], graph.landmarks)
-    keeps_all = is_of_pose & frame.keeps_axis[:, axes].all(axis=1)
+    keeps_all = frame.keeps_axis[:, axes].all(axis=1)
+    if len(free_shifts) in (0, d):
+        keeps_all |= frame.slack > 0.0
+    keeps_all &= is_of_pose
     shifts_alone = len(free_shifts) == d and not len(free_turns)
     candidates = is_of_pose if shifts_alone else keeps_all
     if not candidates.any():
@@ -242,8 +248,10 @@ def _with_frame_held(graph: PoseGraph, priors: IntArray) -> PoseGraph:
     usual = isotropic_information(np.array([kappa]), np.array([tau]), d)
     added = np.zeros_like(usual)
     added[0, free_shifts, free_shifts] = usual[0, free_shifts, free_shifts]
-    added[0, d + free_turns, d + free_turns] = usual[0, d + free_turns, d + free_turns]
     edge = priors[[place]]
+    # The axes of turns, in the frame of the measured pose.
+    turned = graph.R_ij[edge[0]][free_turns] if d == 3 else np.ones((len(free_turns), 1))
+    added[0, d:, d:] = usual[0, d, d] * turned.T @ turned
     before = matrices_of_edges(graph)[edge]
     pose = graph.pose_name(int(graph.j[edge[0]]))
     text = _text_of_frame(d, free_shifts, free_turns, pose)
@@ -263,7 +271,15 @@ def _frame_of(graph: PoseGraph, priors: IntArray) -> _Frame:
     R = graph.R_ij[priors]
     identity = np.eye(d)
     keeps_axis = (identity == R).all(axis=2) & (identity == R).all(axis=1)
-    return _Frame(priors, matrices[:, :d, :d], matrices[:, :d, d:], matrices[:, d:, d:], keeps_axis)
+    I_rr = matrices[:, d:, d:]
+    slack = np.zeros(len(priors))
+    if d == 3 and graph.weights_error > 0.0:
+        # Directions such as gravity have been turned to the axes of the poses, with rounding.
+        is_turned = ~keeps_axis.all(axis=1) & ~matrices[:, :d].any(axis=(1, 2))
+        of_world = R @ I_rr @ np.swapaxes(R, 1, 2)
+        I_rr = np.where(is_turned[:, None, None], of_world, I_rr)
+        slack = np.where(is_turned, _ROUNDING * np.einsum("kaa->k", I_rr), 0.0)
+    return _Frame(priors, matrices[:, :d, :d], matrices[:, :d, d:], I_rr, keeps_axis, slack)
 
 
 def _text_of_frame(d: int, shifts: IntArray, turns: IntArray, pose: str) -> str:

@@ -265,6 +265,27 @@ def test_positions_without_height_are_certified_in_either_form(
     assert record["proven_gap"] <= 1e-6
 
 
+def test_gravity_as_directions_leaves_the_turn_about_it_free(
+    pgo_command: Call, tmp_path: Path
+) -> None:
+    lines = []
+    for line in (CASES / "a3_gravity_only.g2o").read_text().splitlines():
+        if line.startswith("EDGE_SE3_PRIOR"):
+            pose, _, *numbers = line.split()[1:]
+            x, y, z, w = map(float, numbers[3:7])
+            up = [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]
+            measured = " ".join(map(str, up))
+            line = f"EDGE_SE3_PRIORVEC {pose} 0 0 1 {measured} 1e4 0 0 1e4 0 1e4"
+        lines.append(line)
+    (tmp_path / "gravity.g2o").write_text("\n".join(lines))
+    for robots in ([], ["--robots", "3"]):
+        code, out, _ = pgo_command("solve", tmp_path / "gravity.g2o", "--json", *robots)
+        record = json.loads(out)
+        assert code == 0
+        assert record["proven_gap"] <= 1e-9
+        assert "the turn of the map about z are free" in record["note"]
+
+
 def test_no_start_is_better_than_one_that_fits_to_rounding(tmp_path: Path) -> None:
     """Planar scans measure half of every pose in space: all of them fit."""
     rng = np.random.default_rng(0)
