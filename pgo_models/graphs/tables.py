@@ -147,7 +147,7 @@ def _noise(
         kind = _KINDS[kind_of_name]
         is_deviation = kind is Noise.DEVIATIONS
         a, b = sorted((axes.get(row, -1), axes.get(column or row, -1)))
-        if a < 0 or (not kind_of_name and not column) or (is_deviation and column):
+        if a < 0 or (len(kind_of_name) < 2 and not column) or (is_deviation and column):
             continue
         entries.setdefault(kind, {})[a, b] = place
     if not entries:

@@ -745,6 +745,7 @@ def test_views_may_have_names_and_quaternions(
             '"{}","{}",1,0,2,.01,.01,.0025',
         ),
         ("type,id_a,id_b,rel_x,rel_y,rel_yaw,std_x,std_y,std_yaw", "odom,{},{},1,0,2,0.1,0.1,0.05"),
+        ("i,j,x,y,theta,px,py,var_x,var_y,var_theta", "{},{},1,0,2,7,8,0.01,0.01,0.0025"),
     ],
 )
 def test_tables_with_a_header_are_read(header: str, line: str, tmp_path: Path) -> None:
