@@ -79,7 +79,7 @@ def _chi2_weights(graph: PoseGraph, cost: EdgeCost, is_chi2: bool) -> Array:
     Those of chi2 are ones, as many as the rank.
     """
     d = graph.d
-    scaled, scale = scaled_blocks(_measured_information(graph))
+    scaled, scale = scaled_blocks(measured_information(graph))
     eigenvalues, eigenvectors = np.linalg.eigh(scaled)
     is_known = eigenvalues > LEAST_SCALED
     if is_chi2:
@@ -102,7 +102,7 @@ def _chi2_weights(graph: PoseGraph, cost: EdgeCost, is_chi2: bool) -> Array:
     return np.where(w > least, w, 0.0)
 
 
-def _measured_information(graph: PoseGraph) -> Array:
+def measured_information(graph: PoseGraph) -> Array:
     """Information matrices, (m, d + p, d + p), without those that fix rotations of landmarks.
 
     A landmark has no rotation; its first edge holds the rotation of its pose, which is no

@@ -137,9 +137,13 @@ def squared_distances(motions: Motions, covariances: Array) -> Array:
     """Squared Mahalanobis distances, (m,), of the logarithms of motions to zero."""
     R, t = motions
     w = log_map(R)
-    e = np.concatenate([logarithm_translation(w, t), w], axis=1)
-    weighted = np.linalg.solve(covariances, e[:, :, None])[:, :, 0]
-    return np.asarray(np.sum(e * weighted, axis=1))
+    return squared_lengths(np.concatenate([logarithm_translation(w, t), w], axis=1), covariances)
+
+
+def squared_lengths(errors: Array, covariances: Array) -> Array:
+    """Squared Mahalanobis lengths e^T C^-1 e of errors, (k,)."""
+    weighted = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(errors * weighted, axis=1))
 
 
 def carried(motions: Motions, C: Array) -> Array:

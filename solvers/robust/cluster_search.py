@@ -130,6 +130,7 @@ class ClusterSearch:
         """The fit that no addition, removal or exchange of a cluster improves."""
         best: Fit | None = None
         while True:
+            fit = self._with_landmarks_elsewhere(fit)
             fit = self._without_misfits(self._with_clusters(fit))
             exchanged = self._exchanged(fit)
             if exchanged is None:
@@ -407,6 +408,38 @@ class ClusterSearch:
             if self.sets.is_better(other, fit):
                 return other
         return None
+
+    def _with_landmarks_elsewhere(self, fit: Fit) -> Fit:
+        """The fit with each landmark at the best place where one of its poses sees it.
+
+        A wrong sighting that is kept holds its landmark away from where right ones agree that it
+        is, and these are far from the map one by one. Truncated costs are compared with the poses
+        as they are, so that all landmarks are moved at once.
+        """
+        problem = self.sets.problem
+        graph = problem.graph
+        sights = np.flatnonzero(np.isin(graph.j, graph.landmarks))
+        if fit.kept[sights].all():
+            return fit
+        allowed = np.where(self.sets.known, np.inf, self.sets.allowed)
+        sights = sights[np.argsort(graph.j[sights], kind="stable")]
+        seen = graph.j[sights]
+        number = np.arange(len(seen)) - np.searchsorted(seen, seen)
+        best = fit.poses
+        least = np.full(graph.num_poses, np.inf)
+        for k in range(-1, min(_MOST_SAMPLED, int(number.max()) + 1)):  # first where they are
+            chosen = sights[number == k]
+            i = graph.i[chosen]
+            t = fit.poses.t.copy()
+            t[graph.j[chosen]] = t[i] + np.einsum("kab,kb->ka", fit.poses.R[i], graph.t_ij[chosen])
+            costs = np.minimum(problem.edge_costs(Poses(best.R, t)), allowed)
+            of_landmarks = np.bincount(graph.j[sights], costs[sights], graph.num_poses)
+            is_best = of_landmarks < (1.0 - 1e-9) * least
+            least = np.where(is_best, of_landmarks, least)
+            best = Poses(best.R, np.where(is_best[:, None], t, best.t))
+        if np.array_equal(best.t, fit.poses.t):
+            return fit
+        return self._within_thresholds(Fit.of(problem, fit.kept, best))
 
     def _without_bridges(self, fit: Fit) -> Iterator[Fit]:
         """Fits with the largest rejected cluster between two parts in place of their only edge.

@@ -17,40 +17,42 @@ from solvers.robust.revision import Fit, inlier_problem, truncated_cost
 
 # Newton steps in which poses follow a change of the edges kept, at most.
 _MOST_STEPS = 20
-# Poses of all maps that the searches of a solve make, at most; half of them for the first search,
-# which is 100 maps of a graph of 10,000 poses. On public graphs of 2500 poses and more a search
-# made 7 to 111 maps. From a map far from the right one it finds thousands of clusters near it, one
-# after the other.
-MOST_POSES = 2_000_000
+# Work of all maps that the searches of a solve make, at most; half of it is for the first search. A
+# map is as much work as it has poses, and some more: 1000 maps of a small graph are allowed, and
+# 170 of one of 10,000 poses. On public graphs of 2500 poses and more a search made 7 to 111 maps,
+# and all searches on one of 45 worlds of 40 to 150 poses at most 210. From a map far from the right
+# one a search finds thousands of clusters near it, one after the other.
+_MOST_WORK = 2_000_000
+_WORK_OF_MAP = 2000
 # Relative decrease of a cost that is more than rounding.
 _LEAST_DECREASE = 1e-9
 
 
 @dataclass(eq=False)
 class Effort:
-    """Maps that searches have made, and the poses of them all; of `total` half is for the next one.
+    """Maps that searches have made, and the work of them all; of `total` half is for the next one.
 
     So every search has a part, and all together are bounded.
     """
 
-    total: int = MOST_POSES
+    total: int = _MOST_WORK
     num_maps: int = 0
-    num_poses: int = 0
-    limit: int = MOST_POSES // 2
+    work: int = 0
+    limit: int = _MOST_WORK // 2
     has_run_out: bool = False
 
     def begin_search(self) -> None:
         """Give the next search half of what is left."""
-        self.limit = (self.num_poses + self.total) // 2
+        self.limit = (self.work + self.total) // 2
 
     def add(self, num_poses: int) -> None:
         """Count a map."""
         self.num_maps += 1
-        self.num_poses += num_poses
+        self.work += _WORK_OF_MAP + num_poses
 
     def is_left(self) -> bool:
         """Whether the search may make another map; that it may not is remembered."""
-        is_left = self.num_poses < self.limit
+        is_left = self.work < self.limit
         self.has_run_out |= not is_left
         return is_left
 

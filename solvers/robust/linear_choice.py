@@ -23,12 +23,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, BoolArray, hat, log_map, tangent_dimension
+from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.marginals import Marginals
 from pgo_models.problem.problem import PGOProblem
-from solvers.robust.chains import Motions, inverse, product
+from solvers.robust.chains import squared_lengths
+from solvers.robust.distances import linearised_errors
 
 # Steps of the search, those in a row without a better set, and those for which a closure stays as
 # it is at most.
@@ -66,7 +67,12 @@ class LinearChoice:
         """
         edges, measured = closures
         k, p, _ = measured.shape
-        errors, derivative, ends = _linearised(graph, edges, poses)
+        errors, of_ends = linearised_errors(graph, edges, poses)
+        ends, place = np.unique([graph.i[edges], graph.j[edges]], return_inverse=True)
+        blocks = np.zeros((k, p, len(ends), p))
+        for of_end, places in zip(of_ends, place.reshape(2, k), strict=True):
+            blocks[np.arange(k), :, places] += of_end
+        derivative = blocks.reshape(k * p, len(ends) * p)
         hessian = riemannian_hessian(staying.at(poses), None)
         layout = TangentLayout(staying.num_poses, staying.d)
         joint = Marginals(hessian, layout, backend=staying.backend).joint(*ends.tolist())
@@ -135,9 +141,12 @@ class SweptChoice:
 
     def changes(self) -> Array:
         """How the cost changes when each closure, (k,), comes or goes."""
+        # The blocks of chosen closures are negative definite.
         k, p = self.errors.shape
         blocks = self.matrix.reshape(k, p, k, p)[np.arange(k), :, np.arange(k)]
-        return _squared(self.errors, blocks) + np.where(self.chosen, self.allowed, -self.allowed)
+        return squared_lengths(self.errors, blocks) + np.where(
+            self.chosen, self.allowed, -self.allowed
+        )
 
     def change(self, e: int) -> None:
         """Take closure e in, or out if it is chosen."""
@@ -156,45 +165,3 @@ class SweptChoice:
         self.matrix[block, block] = -inverse_block
         self.errors[e] = sign * error
         self.chosen[e] = not self.chosen[e]
-
-
-def _squared(errors: Array, variance: Array) -> Array:
-    """e^T V^-1 e of every error, (k,), which is negative where V is negative definite."""
-    weighted = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
-    return np.asarray(np.einsum("ka,ka->k", errors, weighted))
-
-
-def _linearised(graph: PoseGraph, edges: IntArray, poses: Poses) -> tuple[Array, Array, IntArray]:
-    """Errors r (k, p) of edges, their derivative (k p, q p), and the q poses that they join.
-
-    r is (R_ij^T (R_i^T (t_j - t_i) - t_ij), log(R_ij^T R_i^T R_j)), in the frame of the measured
-    end, which is that of information matrices. Moves of a pose are (v, w) as in `Marginals`. The
-    derivative of the logarithm is taken to be the identity, as it is where the error is zero.
-    """
-    d = graph.d
-    p = d + tangent_dimension(d)
-    k = len(edges)
-    i, j = graph.i[edges], graph.j[edges]
-    measured: Motions = graph.R_ij[edges], graph.t_ij[edges]
-    step = product(inverse((poses.R[i], poses.t[i])), (poses.R[j], poses.t[j]))
-    error_R, error_t = product(inverse(measured), step)
-    errors = np.concatenate([error_t, log_map(error_R)], axis=1)
-    to_end = np.swapaxes(poses.R[i] @ measured[0], 1, 2)
-    of_first = np.zeros((k, p, p))
-    of_second = np.zeros((k, p, p))
-    of_first[:, :d, :d] = -to_end
-    of_second[:, :d, :d] = to_end
-    if d == 3:
-        of_first[:, :d, d:] = np.swapaxes(measured[0], 1, 2) @ hat(step[1])
-        of_first[:, d:, d:] = -np.swapaxes(step[0], 1, 2)
-        of_second[:, d:, d:] = np.eye(d)
-    else:
-        turned = np.column_stack([step[1][:, 1], -step[1][:, 0]])
-        of_first[:, :d, d] = np.einsum("kba,kb->ka", measured[0], turned)
-        of_first[:, d, d] = -1.0
-        of_second[:, d, d] = 1.0
-    ends, place = np.unique(np.concatenate([i, j]), return_inverse=True)
-    derivative = np.zeros((k, p, len(ends), p))
-    derivative[np.arange(k), :, place[:k]] += of_first
-    derivative[np.arange(k), :, place[k:]] += of_second
-    return errors, derivative.reshape(k * p, len(ends) * p), ends

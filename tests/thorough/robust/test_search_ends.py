@@ -87,7 +87,7 @@ def test_every_search_ends_in_small_worlds_with_slips(first: int, keeps_all: boo
         assert num_questions(slipped_world(seed), pgo.Weighting.OWN, keeps_all) < MOST, seed
 
 
-@pytest.mark.parametrize("total", [1000, 100_000])
+@pytest.mark.parametrize("total", [10_000, 2_000_000])
 def test_all_searches_of_a_solve_together_end_at_their_limit(total: int) -> None:
     graph = slipped_world(3)
     problem = pgo.PGOProblem(graph)
@@ -100,5 +100,5 @@ def test_all_searches_of_a_solve_together_end_at_their_limit(total: int) -> None
         sets = EdgeSets(problem, pairs, allowed, 1.0, lambda: True, effort)
         ClusterSearch(sets).improved(known, pgo.odometry_start(graph))
     # A trial that has begun is finished: by a few maps more.
-    assert effort.num_poses <= total + 10 * graph.num_poses
-    assert effort.has_run_out == (total == 1000)
+    assert effort.num_maps <= total / 2000 + 10
+    assert effort.has_run_out == (total == 10_000)

@@ -249,6 +249,35 @@ def test_a_landmark_keeps_its_best_sighting():
     assert solution.problem.num_poses == graph.num_poses
 
 
+def park_with_mistaken_landmarks(d: int, share: float) -> tuple[pgo.PoseGraph, np.ndarray]:
+    """Poses without closures that see landmarks nearby, some of which they take for others."""
+    rng = np.random.default_rng(d)
+    graph = pgo.grid_world(1, 60, rng, d=d, loop_closure_probability=0.0)
+    truth = graph.truth
+    points = truth.t[::4] + rng.standard_normal((15, d))
+    seen = [np.argsort(np.linalg.norm(truth.t - point, axis=1))[:8] for point in points]
+    owner = np.repeat(np.arange(15), 8)
+    filed = np.where(rng.random(len(owner)) < share, rng.integers(0, 15, len(owner)), owner)
+    is_wrong = [np.zeros(graph.num_edges, dtype=bool)]
+    for landmark in range(15):
+        sights = np.flatnonzero(filed == landmark)
+        poses, first = np.unique(np.concatenate(seen)[sights], return_index=True)
+        offsets = points[owner[sights[first]]] - truth.t[poses]
+        positions = np.einsum("kba,kb->ka", truth.R[poses], offsets)
+        positions += 0.05 * rng.standard_normal(positions.shape)
+        graph = graph.with_landmark(poses, positions, 400.0)
+        is_wrong.append(owner[sights[first]] != landmark)
+    return graph, np.concatenate(is_wrong)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_landmark_is_where_right_sightings_agree_that_it_is(d):
+    graph, is_wrong = park_with_mistaken_landmarks(d, 0.3)
+    robust = solvers.solve(graph, robust=solvers.GNC()).robust
+    assert not (robust.kept & is_wrong).any()
+    assert (robust.rejected & ~is_wrong).sum() <= 0.02 * graph.num_edges
+
+
 def test_edges_that_leave_poses_apart_are_one_clear_error(clean):
     known = np.zeros(clean.num_edges, dtype=bool)
     kept = known.copy()
