@@ -210,8 +210,10 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     It is exact where the w are equal. Otherwise the probability of exceeding it differs from 1 -
     quantile by at most 7 % at the quantile 0.99, and by at most a factor of 2.5 at 1 - 2e-6. For F
     with the kappa of SE-Sync in the plane, the w of the angle is 2. Least squares fits the poses to
-    the errors, so that the costs at an optimum are smaller than these where there is little
-    redundancy.
+    the errors, so that the costs at an optimum of chi2 are smaller than these where there is little
+    redundancy. An optimum of F may put the error of a loosely measured edge on a precise one: of
+    right maps with coupled matrices of condition 1e4, 29 % in the plane and 5 % in space have an
+    edge beyond its threshold at 1 - 0.01 / m, and 0 % at condition 100. In chi2 1 % are doubted.
 
     Parameters
     ----------
