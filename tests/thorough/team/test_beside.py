@@ -32,6 +32,21 @@ while not robot.is_settled:
 print(robot.solution.verdict.name, sorted(robot.covariances), flush=True)
 time.sleep(float(sys.argv[1]))
 """
+# Settings of a class that no module has.
+OWN_SETTINGS = """
+import sys, time, numpy as np, solvers
+class OwnRStep:
+    def prepare(self, subproblem):
+        raise AssertionError
+pipeline = solvers.Pipeline(soc=solvers.SOC(r_step=OwnRStep()))
+sharing = solvers.Sharing[sys.argv[1]]
+robot = solvers.Robot("a", ["a"], b"sixteen or more bytes", pipeline=pipeline, sharing=sharing)
+robot.add_pose(0)
+robot.add_edge(0, 1, np.eye(2), np.array([1.0, 0.0]), kappa=100.0, tau=100.0)
+while not robot.failure:
+    robot.tick(time.monotonic())
+print(robot.failure)
+"""
 
 
 @pytest.mark.parametrize("ends_by", [None, signal.SIGINT, signal.SIGKILL])
@@ -123,6 +138,17 @@ def test_settings_that_cannot_be_given_to_another_process_are_refused() -> None:
     pipeline = solvers.Pipeline(soc=solvers.SOC(r_step=OwnRStep()))
     with pytest.raises(SettingError, match="a robot computes in another process"):
         solvers.Robot("a", ["a"], KEY, pipeline=pipeline)
+
+
+@pytest.mark.parametrize("sharing", solvers.Sharing)
+def test_settings_that_the_main_script_defines_end_a_solve_with_a_sentence(
+    sharing: solvers.Sharing, tmp_path: Path
+) -> None:
+    path = tmp_path / "script.py"
+    path.write_text(OWN_SETTINGS)
+    command = [sys.executable, str(path), sharing.name]
+    output = subprocess.check_output(command, text=True, timeout=SECONDS)
+    assert "the process that computes does not run the main script: " in output
 
 
 def test_a_driver_may_take_longer_for_its_part_than_all_others() -> None:
