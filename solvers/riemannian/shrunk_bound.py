@@ -53,6 +53,9 @@ def bound_by_shrinking(problem: PGOProblem, poses: Poses) -> ShrunkBound:
         has_bound, best = _try_cap(problem, whole, math.exp(low), best, by_positions)
     if not has_bound:
         return best
+    has_all, best = _try_cap(problem, whole, math.exp(high), best, by_positions)
+    if has_all:
+        return best
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         has_bound, best = _try_cap(problem, whole, math.exp(middle), best, by_positions)
