@@ -233,11 +233,6 @@ def graph_qp(
     solver : ConvexSolver or str
         What solves the program.
 
-    Returns
-    -------
-    GraphQP
-        The compiled program, which is solved for every shift.
-
     Raises
     ------
     SettingError

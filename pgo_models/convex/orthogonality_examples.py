@@ -30,11 +30,6 @@ def procrustes(A: Array, B: Array, *, rotation: bool = False) -> OrthogonalProbl
     rotation : bool
         Whether X must be a rotation.
 
-    Returns
-    -------
-    OrthogonalProblem
-        The model, with the (n, p) variable X.
-
     Raises
     ------
     SettingError

@@ -482,16 +482,6 @@ def _is_zero(rows: csr_array, shift: Array) -> bool:
 def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     """The quadratic form of a convex quadratic model with linear constraints.
 
-    Parameters
-    ----------
-    problem : OrthogonalProblem
-        The model.
-
-    Returns
-    -------
-    QuadraticForm
-        J = u^T Q u.
-
     Raises
     ------
     NotQuadraticError

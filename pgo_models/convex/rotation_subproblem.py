@@ -103,11 +103,6 @@ def rotation_qp(
     solver : ConvexSolver or str
         What solves it.
 
-    Returns
-    -------
-    RotationQP
-        The compiled program, which is solved for every shift V.
-
     Raises
     ------
     SettingError

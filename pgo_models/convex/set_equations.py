@@ -169,11 +169,6 @@ class SetEquations(ReadOnly):
 def set_equations(form: QuadraticForm) -> SetEquations:
     """The equations of all sets and equalities of a form.
 
-    Parameters
-    ----------
-    form : QuadraticForm
-        The form.
-
     Returns
     -------
     SetEquations

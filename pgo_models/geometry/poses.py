@@ -86,20 +86,7 @@ class Poses(ReadOnly):
 
     @classmethod
     def identity(cls, n: int, d: int) -> Poses:
-        """Return poses at the origin, unrotated.
-
-        Parameters
-        ----------
-        n : int
-            Number of poses.
-        d : int
-            Dimension of space: 2 or 3.
-
-        Returns
-        -------
-        Poses
-            The identity of SE(d), n times.
-        """
+        """Return n poses at the origin, unrotated, in d = 2 or 3 dimensions."""
         return cls(np.broadcast_to(np.eye(d), (n, d, d)).copy(), np.zeros((n, d)))
 
     @classmethod
@@ -161,11 +148,6 @@ class Poses(ReadOnly):
         ----------
         t : Array, (n, d)
             Positions, metres. Their shape is not checked, nor are the rotations again.
-
-        Returns
-        -------
-        Poses
-            The poses (R_i, t_i).
         """
         poses = copy(self)
         object.__setattr__(poses, "t", real_array(t, "t"))
@@ -199,22 +181,12 @@ class Poses(ReadOnly):
             Rotation vectors in the frames of the poses, radians.
         v : Array, (n, d)
             Moves of the positions in the world, metres.
-
-        Returns
-        -------
-        Poses
-            The poses after the move.
         """
         R = project_to_rotations(self.R @ exp_map(w))
         return Poses(R, self.t + v)
 
     def with_gauge_at(self, index: int = 0) -> Poses:
         """Move the world so that one pose is the identity.
-
-        Parameters
-        ----------
-        index : int
-            Number of the pose.
 
         Returns
         -------
@@ -264,11 +236,6 @@ class Poses(ReadOnly):
         ----------
         other : Poses
             Poses (R_i', t_i') of the same number and dimension.
-
-        Returns
-        -------
-        Poses
-            The moved poses.
 
         Raises
         ------

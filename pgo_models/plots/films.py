@@ -62,11 +62,6 @@ def animate(
     description : str
         What is to be seen, in words, for those who cannot see it.
 
-    Returns
-    -------
-    plotly.graph_objects.Figure
-        Figure, which a notebook shows by itself.
-
     Raises
     ------
     SettingError
@@ -144,11 +139,6 @@ def animate_poses(
         For example `[soc.poses(problem, state) for state in islice(iterate(soc, problem), 30)]`.
     labels : sequence of str, optional
         What the slider says of each; `k = 0`, `k = 1`, .. unless given.
-
-    Returns
-    -------
-    plotly.graph_objects.Figure
-        Figure, which a notebook shows by itself.
 
     Raises
     ------

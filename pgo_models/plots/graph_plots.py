@@ -220,11 +220,6 @@ def plot_graph(
     residuals : EdgeResiduals, optional
         Residuals that decide which edges are misfits; those of F unless given.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Figure, which a notebook shows by itself.
-
     Raises
     ------
     GraphError
@@ -281,11 +276,6 @@ def compare_poses(
         Title and poses of every panel; poses alone are one panel without a title.
     residuals : EdgeResiduals, optional
         Residuals at the poses of the last panel, in which edges are marked by them.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Figure, which a notebook shows by itself.
 
     Raises
     ------

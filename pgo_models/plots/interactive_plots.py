@@ -73,11 +73,6 @@ def explore_graph(
     before : Poses, optional
         Other poses, such as the start of a solve, drawn in grey and aligned to `poses`.
 
-    Returns
-    -------
-    plotly.graph_objects.Figure
-        Figure, which a notebook shows by itself.
-
     Raises
     ------
     GraphError

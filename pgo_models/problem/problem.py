@@ -233,11 +233,6 @@ class PGOProblem(ReadOnly):
     def check_positions(self, purpose: str) -> None:
         """Raise an error where something needs positions, and rotations alone are the unknowns.
 
-        Parameters
-        ----------
-        purpose : str
-            What needs them, for the message.
-
         Raises
         ------
         SettingError
@@ -254,11 +249,6 @@ class PGOProblem(ReadOnly):
 
         Its cost F(X) is at most chi2(X) for all poses, and has the value and the gradient of chi2
         at the given ones. A quadratic problem is its own tangent.
-
-        Parameters
-        ----------
-        poses : Poses
-            Where they touch.
 
         Returns
         -------
@@ -418,16 +408,6 @@ class PGOProblem(ReadOnly):
     def objective(self, poses: Poses) -> float:
         """Return the cost of poses: F (equation (16) of the paper, weighted), or chi2.
 
-        Parameters
-        ----------
-        poses : Poses
-            One pose for every pose of the graph.
-
-        Returns
-        -------
-        float
-            It has no unit.
-
         Raises
         ------
         GraphError
@@ -446,11 +426,6 @@ class PGOProblem(ReadOnly):
     def edge_costs(self, poses: Poses) -> Array:
         """Return the share of every edge in the cost.
 
-        Parameters
-        ----------
-        poses : Poses
-            One pose for every pose of the graph.
-
         Returns
         -------
         (m,) array
@@ -462,11 +437,6 @@ class PGOProblem(ReadOnly):
         """Return the gradient of F(R_i Exp(hat(w_i)), t_i + v_i) in (w, v) at zero.
 
         With G = 2 M X it is (-2 vee(G_i R_i), G_{t_i}).
-
-        Parameters
-        ----------
-        poses : Poses
-            One pose for every pose of the graph.
 
         Returns
         -------
@@ -491,21 +461,11 @@ class PGOProblem(ReadOnly):
         ----------
         R : (n, d, d) array
             Rotations.
-
-        Returns
-        -------
-        Poses
-            (R, t).
         """
         return Poses(R, self.translations.best_for(stack_transposes(R)))
 
     def translation_factor(self, poses: Poses) -> CholeskyFactor | None:
         """Factor the matrix of the translations where it depends on the rotations.
-
-        Parameters
-        ----------
-        poses : Poses
-            Their rotations count.
 
         Returns
         -------
@@ -539,11 +499,6 @@ class PGOProblem(ReadOnly):
         factor : CholeskyFactor, optional
             The `translation_factor` of these poses. That of poses with nearly the same rotations
             gives nearly the best translations.
-
-        Returns
-        -------
-        Poses
-            With the same rotations.
         """
         if not self.has_translations:
             return self.seen_poses(poses)
@@ -560,11 +515,6 @@ class PGOProblem(ReadOnly):
     def seen_poses(self, poses: Poses) -> Poses:
         """Return the poses that the cost is evaluated at.
 
-        Parameters
-        ----------
-        poses : Poses
-            One pose for every pose of the graph.
-
         Returns
         -------
         Poses
@@ -576,11 +526,6 @@ class PGOProblem(ReadOnly):
 
     def check_poses(self, poses: Poses) -> None:
         """Raise an error unless there is one pose for every pose of the graph.
-
-        Parameters
-        ----------
-        poses : Poses
-            Poses, or what somebody gave for them.
 
         Raises
         ------
@@ -599,11 +544,6 @@ class PGOProblem(ReadOnly):
 
     def at(self, poses: Poses) -> "EvaluatedPoses":
         """Return the cost at poses with what belongs to it: residuals, gradient, minorant.
-
-        Parameters
-        ----------
-        poses : Poses
-            One pose for every pose of the graph.
 
         Returns
         -------

@@ -102,11 +102,6 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     poses : Poses
         One pose for every pose of the graph.
 
-    Returns
-    -------
-    EdgeResiduals
-        Residuals, costs and thresholds.
-
     Raises
     ------
     GraphError

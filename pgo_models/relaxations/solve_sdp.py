@@ -167,11 +167,6 @@ def solve_relaxation(
     verbose : bool
         Whether the solver's table and the result are printed.
 
-    Returns
-    -------
-    RelaxationSolution
-        The rounded poses with their certificate.
-
     Raises
     ------
     SettingError

@@ -163,11 +163,6 @@ def solve_orthogonal(
     verbose : bool
         Whether the table of every run is printed.
 
-    Returns
-    -------
-    OrthogonalSolution
-        The best run.
-
     Raises
     ------
     SettingError

@@ -102,11 +102,6 @@ def solve_folder(
     trust_folder : bool
         As of `read_g2o`.
 
-    Returns
-    -------
-    RobotsSolution
-        Cost, certificate and stages.
-
     Raises
     ------
     SettingError
