@@ -104,9 +104,9 @@ class _LoadedClasses(Mapping[str, object]):
 
 @functools.cache
 def _options(hint: object) -> tuple[object, ...]:
-    """The types of a union; a type alone is its only option."""
+    """The types of a union, in which Any is `MaybeNone`; a type alone is its only option."""
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        return typing.get_args(hint)
+        return tuple(type(None) if option is Any else option for option in typing.get_args(hint))
     return (hint,)
 
 
