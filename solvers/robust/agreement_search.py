@@ -13,7 +13,6 @@ import numpy as np
 
 from pgo_models.errors import FAILURES, GraphError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import BoolArray
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from solvers.robust.agreement import Agreement
 from solvers.robust.edge_sets import EdgeSets
@@ -84,9 +83,9 @@ def _shrunk(sets: EdgeSets, poses: Poses, seen: set[bytes]) -> Fit:
 
     `seen` has the edges that starts so far have kept at the last threshold.
     """
-    fit = sets.settled(_within(sets, _SHRINKING[0], poses), poses)
+    fit = sets.settled(sets.within(poses, _SHRINKING[0]), poses)
     for factor in _SHRINKING[1:]:
-        kept = _within(sets, factor, fit.poses)
+        kept = sets.within(fit.poses, factor)
         is_last = factor == _SHRINKING[-1]
         if is_last and kept.tobytes() in seen:
             break
@@ -95,9 +94,3 @@ def _shrunk(sets: EdgeSets, poses: Poses, seen: set[bytes]) -> Fit:
         if not np.array_equal(kept, fit.kept):
             fit = sets.settled(kept, fit.poses)
     return fit
-
-
-def _within(sets: EdgeSets, factor: float, poses: Poses) -> BoolArray:
-    """Edges within so many thresholds, (m,), known ones, and those that hold the graph together."""
-    ratio = sets.problem.edge_costs(poses) / sets.allowed
-    return held_together(sets.problem.graph, sets.known | (ratio <= factor), ratio)

@@ -35,7 +35,7 @@ from solvers.robust.edge_sets import EdgeSets, with_edges
 from solvers.robust.fixes import agreeing_fixes, is_fix
 from solvers.robust.linear_search import LinearSearch
 from solvers.robust.revision import Fit, inlier_problem, is_held
-from solvers.robust.weighted_edges import first_poses, held_together
+from solvers.robust.weighted_edges import first_poses
 
 # Probability with which a right edge comes back in the end, where few wrong ones lie between this
 # and `QUANTILE`.
@@ -434,7 +434,7 @@ class ClusterSearch:
             t[graph.j[chosen]] = t[i] + np.einsum("kab,kb->ka", fit.poses.R[i], graph.t_ij[chosen])
             costs = np.minimum(problem.edge_costs(Poses(best.R, t)), allowed)
             of_landmarks = np.bincount(graph.j[sights], costs[sights], graph.num_poses)
-            is_best = of_landmarks < (1.0 - 1e-9) * least
+            is_best = of_landmarks < least
             least = np.where(is_best, of_landmarks, least)
             best = Poses(best.R, np.where(is_best[:, None], t, best.t))
         if np.array_equal(best.t, fit.poses.t):
@@ -514,8 +514,7 @@ class ClusterSearch:
     def _within_thresholds(self, fit: Fit) -> Fit:
         """The fit with the edges within their thresholds alone, as the map follows them."""
         for _ in range(_MOST_ROUNDS):
-            ratio = self.sets.problem.edge_costs(fit.poses) / self.sets.allowed
-            kept = held_together(self.sets.problem.graph, self.sets.known | (ratio <= 1.0), ratio)
+            kept = self.sets.within(fit.poses)
             if np.array_equal(kept, fit.kept):
                 return fit
             fit = self.sets.settled(kept, fit.poses)

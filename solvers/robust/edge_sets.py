@@ -14,6 +14,7 @@ from solvers.riemannian.polish import polished
 from solvers.robust.chains import Chains
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.revision import Fit, inlier_problem, truncated_cost
+from solvers.robust.weighted_edges import held_together
 
 # Newton steps in which poses follow a change of the edges kept, at most.
 _MOST_STEPS = 20
@@ -102,6 +103,11 @@ class EdgeSets:
         self.effort.add(self.problem.num_poses)
         inliers = inlier_problem(self.problem, kept)
         return Fit.of_state(kept, polished(inliers, poses, _MOST_STEPS))
+
+    def within(self, poses: Poses, factor: float = 1.0) -> BoolArray:
+        """Edges within so many thresholds, (m,), known ones, and those that the poses need."""
+        ratio = self.problem.edge_costs(poses) / self.allowed
+        return held_together(self.problem.graph, self.known | (ratio <= factor), ratio)
 
     def cost(self, fit: Fit) -> float:
         """Truncated cost of the poses of a fit."""
