@@ -5,6 +5,7 @@ import json
 import cvxpy as cp
 import numpy as np
 import pytest
+from orthogonal_models import random_squares
 from scipy.sparse import block_diag, csr_array, diags_array, kron
 
 import pgo_models as pgo
@@ -33,16 +34,6 @@ def random_model(seed: int, kind: str, shape: tuple[int, int], count: int):
     squares = cp.sum_squares(A @ entries + C @ y - rng.standard_normal(entries.size + 3))
     problem = cp.Problem(cp.Minimize(squares + y[0]))
     return pgo.OrthogonalProblem(problem, **{kind: variables})
-
-
-def square_model(seed: int, kind: str, shape: tuple[int, int], count: int):
-    """A sum of as many squares as there are entries, far from any noise model."""
-    rng = np.random.default_rng(seed)
-    variables = [cp.Variable(shape) for _ in range(count)]
-    entries = cp.hstack([cp.vec(X, order="F") for X in variables])
-    A = rng.standard_normal((entries.size, entries.size))
-    squares = cp.sum_squares(A @ entries - rng.standard_normal(entries.size))
-    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(squares)), **{kind: variables})
 
 
 @pytest.mark.parametrize(("kind", "shape", "count"), SETS)
@@ -79,7 +70,7 @@ def test_products_of_hulls_certify_what_equations_do_not(
     kind, shape, count, seed, tmp_path
 ) -> None:
     pytest.importorskip("flint")
-    solution = solvers.solve_orthogonal(square_model(seed, kind, shape, count), 0)
+    solution = solvers.solve_orthogonal(random_squares(seed, kind, shape, count), 0)
     assert solution.verdict is Verdict.CERTIFIED
     assert solution.gap <= 1e-9
     path = tmp_path / "proof.json"

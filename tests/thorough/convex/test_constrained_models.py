@@ -6,43 +6,29 @@ from pathlib import Path
 import cvxpy as cp
 import numpy as np
 import pytest
+from orthogonal_models import CONSTRAINTS, constrained
 
 import pgo_models as pgo
 import solvers
 
-KINDS = {
-    "a column is given": lambda R, t, S: [R[0][:, 2] == S[:, 2]],
-    "an equality of entries": lambda R, t, S: [cp.sum(R[0][0]) == np.sum(S[0])],
-    "a shared column": lambda R, t, S: [R[0][:, 0] == R[-1][:, 0]],
-    "a largest angle": lambda R, t, S: [cp.trace(R[0]) >= np.trace(S)],
-    "an entry is large": lambda R, t, S: [R[0][0, 0] >= 0.9],
-    "of a translation, too": lambda R, t, S: [R[0] @ S[0] + t >= 0.0, t <= 1.0],
-    "nowhere active": lambda R, t, S: [t <= 1e3, cp.trace(R[0]) >= -1.5],
-}
-OF_THE_PLANE = list(KINDS)[3:]
-
-
-def model(kind: str, seed: int = 0, d: int = 3) -> pgo.OrthogonalProblem:
-    """Squares of affine functions of one or two rotations and a translation."""
-    rng = np.random.default_rng(seed)
-    R = [cp.Variable((d, d)) for _ in range(2 if kind == "a shared column" else 1)]
-    t = cp.Variable(d)
-    entries = cp.hstack([*(cp.vec(X, order="F") for X in R), t])
-    misfits = rng.standard_normal((7, entries.size)) @ entries - rng.standard_normal(7)
-    J = cp.sum_squares(misfits) + 0.1 * cp.sum_squares(t)
-    constraints = KINDS[kind](R, t, pgo.random_rotations(1, d, rng)[0])
-    return pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), constraints), rotations=R)
+OF_THE_PLANE = [
+    "a largest angle",
+    "a large entry",
+    "a half space, and a box of t",
+    "nowhere active",
+]
+OF_SPACE = [kind for kind in CONSTRAINTS if kind != "one angle below the other"]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
-    ("kind", "d"), [*((kind, 3) for kind in KINDS), *((kind, 2) for kind in OF_THE_PLANE)]
+    ("kind", "d"), [*((kind, 3) for kind in OF_SPACE), *((kind, 2) for kind in OF_THE_PLANE)]
 )
 def test_what_is_certified_is_feasible_proven_and_no_start_ends_lower(
     kind: str, d: int, seed: int, tmp_path: Path
 ) -> None:
     pytest.importorskip("flint")
-    problem = model(kind, seed, d)
+    problem = constrained(kind, seed, d)
     solution = solvers.solve_orthogonal(problem, seed, starts=3)
     assert solution.is_certified
     assert problem.problem.value == pytest.approx(solution.objective, rel=1e-9)
@@ -74,7 +60,7 @@ def test_factors_of_equal_entries_are_added_where_the_sum_is_exact() -> None:
 
 
 def test_values_that_are_feasible_and_not_the_best_are_not_certified() -> None:
-    problem = model("a largest angle")
+    problem = constrained("a largest angle", 0)
     least = solvers.solve_orthogonal(problem, 0, starts=2)
     certificate = solvers.certify(problem, [np.eye(3)])
     held = cp.Problem(problem.problem.objective, [problem.variables[0] == np.eye(3)])
@@ -86,7 +72,7 @@ def test_values_that_are_feasible_and_not_the_best_are_not_certified() -> None:
 
 def proof_of(kind: str, tmp_path: Path) -> dict:
     path = tmp_path / "proof.json"
-    solvers.solve_orthogonal(model(kind), 0, starts=2).save_proof(path)
+    solvers.solve_orthogonal(constrained(kind, 0), 0, starts=2).save_proof(path)
     return json.loads(path.read_text())
 
 
@@ -130,6 +116,6 @@ def test_no_variable_is_held_where_inequalities_tell_directions_apart(tmp_path: 
 
 
 def test_values_that_no_other_variable_makes_feasible_are_said_to_be_so() -> None:
-    problem = model("an entry is large")
+    problem = constrained("a large entry", 0)
     with pytest.raises(pgo.PGOError, match="infeasible"):
         solvers.certify(problem, [np.diag([-1.0, -1.0, 1.0])])
