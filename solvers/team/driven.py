@@ -15,7 +15,7 @@ import numpy as np
 
 from pgo_models.errors import EngineError, PGOError
 from solvers.carry.letters import LetterName, Letters
-from solvers.team.beside import Talk
+from solvers.team.beside import Talk, result_or_error
 from solvers.team.driven_solve import UNKNOWN, obey_orders
 from solvers.team.driving import Drive
 from solvers.team.measurements import Measurements, Revision
@@ -297,9 +297,10 @@ class DrivenTeam:
             )
 
     def _take_reply(self, sender: str, reply: Reply) -> None:
-        if self._drive is not None and reply.term == self._drive.term:
+        drive = self._drive
+        if drive is not None and reply.term == drive.term and sender in drive.members:
             self._tried[sender] = (reply.revision, self._session.boot_of(sender))
-            self._drive.take(sender, reply)
+            drive.take(sender, reply)
 
     def _after_step(self, drive: Drive) -> None:
         """Send what the solve asks for, or its outcome if it has ended."""
@@ -375,16 +376,14 @@ class DrivenTeam:
 
     def _begin_answer(self, part: Following, ask: Ask) -> set[LetterName]:
         """Begin to obey an order, unless letters are missing."""
-        try:
-            request, missing = part.letters.put_in(ask.request)
-        except (LookupError, TypeError, PGOError) as error:
-            if not isinstance(error, PGOError):
-                error = PGOError(f"{UNKNOWN}: {error!r:.200}")
-            failure = error_as_message(error)
+        completed = result_or_error(partial(part.letters.put_in, ask.request), UNKNOWN)
+        if isinstance(completed, PGOError):
+            failure = error_as_message(completed)
             part.reply = Reply(ask.term, ask.call, part.revision, None, failure)
             part.call = ask.call
             self._session.send(ask.term.driver, part.reply, Priority.URGENT)
             return set()
+        request, missing = completed
         if missing:
             return {name for name in missing if 0 <= name.other < len(part.members)}
         part.obeyed = ask
@@ -403,9 +402,13 @@ class DrivenTeam:
         part.own = own
         part.obeyed = None
         part.call = ask.call
-        is_error = isinstance(found, PGOError)
-        error = error_as_message(found) if is_error else None
-        answer, letters = part.letters.take_out(ask.call, None if is_error else found)
+        answer, letters = part.letters.take_out(ask.call, found)
+        if not {name.other for name in letters} <= set(range(len(part.members))):
+            found = PGOError(f"{UNKNOWN}: it has no names of the robots that its answer is for")
+        error = None
+        if isinstance(found, PGOError):
+            error = error_as_message(found)
+            answer, letters = None, []
         part.reply = Reply(ask.term, ask.call, part.revision, answer, error)
         if part is not self._following:
             return

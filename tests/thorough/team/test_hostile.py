@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
 from budget import examples
-from networks import KEY, Network, robots_of
+from networks import KEY, Network, message_in, robots_of
 
 import pgo_models as pgo
 import solvers
 from solvers.carry.serialization import serialize
-from solvers.carry.wire import deflated, opened, packed, sealed
+from solvers.carry.wire import Order, deflated, opened, packed, sealed
+from solvers.robots.own_file import OwnedRuns, number_poses, read_file
 from solvers.team.measurements import Revision
-from solvers.team.messages import Hello, Relayed, Term
+from solvers.team.messages import Ask, Hello, Relayed, Reply, Term
 from solvers.team.speakers import NO_BOOT, Envelope
 
 HELLO = Hello(Revision(1, "0"), Term(0, ""), Term(0, ""))
@@ -120,6 +123,63 @@ def test_what_has_come_through_a_third_is_read_once_and_passed_on_to_nobody_else
         robot.receive(from_r1(int(3 + robot.ledger.dropped), message), 0.0)
     assert robot.ledger.dropped_by == {"r1": 2, "": 1}
     assert {message.to for message in robot.outbox()} <= {"r1"}
+
+
+def as_r0(robot: solvers.Robot) -> Callable[[object], None]:
+    """A function that has r0 send a message to r1, this robot, at time 0."""
+    robot.tick(0.0)
+    boot = Envelope.from_bytes(opened(KEY, robot.outbox()[0].data)).boot
+    numbers = count(1)
+
+    def send(message: object) -> None:
+        content = b"O" + deflated(packed(serialize(message)))
+        envelope = Envelope("r0", "r1", b"8 bytes.", boot, next(numbers), content)
+        robot.receive(sealed(KEY, envelope.as_bytes()), 0.0)
+
+    return send
+
+
+@pytest.mark.parametrize("owner", [-1, 2, 7])
+def test_an_order_to_tell_robots_that_are_not_there_is_answered_with_an_error(owner: int) -> None:
+    robot = solvers.Robot("r1", ["r0", "r1"], KEY, sharing=solvers.Sharing.INTERFACE)
+    robot.add_pose(1)
+    robot.add_edge(1, 0, np.eye(2), np.zeros(2), kappa=1.0, tau=1.0)
+    send = as_r0(robot)
+
+    def answer(call: int, order: Callable[..., Any], request: object) -> Reply:
+        members = ("r0", "r1") if call == 0 else ()
+        send(Ask(Term(1, "r0"), call, 1, Order.of(order), request, members))
+        while robot.is_computing:
+            time.sleep(1e-3)
+        (reply,) = [
+            reply
+            for message in robot.outbox()
+            if isinstance(reply := message_in(message.data), Reply)
+        ]
+        assert reply.call == call
+        return reply
+
+    digits = answer(0, read_file, None).answer[-1]
+    runs = OwnedRuns(np.array([0, 1]), np.array([0, 1]), np.array([owner, 1]), digits)
+    error = answer(1, number_poses, runs).error
+    assert error is not None
+    assert "names of the robots" in error[1]
+    assert answer(2, read_file, None).error is None
+
+
+def test_a_solve_covers_no_robot_that_answers_and_was_not_asked() -> None:
+    sharing = solvers.Sharing.INTERFACE
+    robot = solvers.Robot("r1", ["r0", "r1"], KEY, sharing=sharing, patience=1.0)
+    robot.add_pose(1)
+    robot.add_edge(1, 2, np.eye(2), np.zeros(2), kappa=1.0, tau=1.0)
+    send = as_r0(robot)
+    robot.tick(2.0)
+    send(Reply(Term(1, "r1"), 0, Revision(1, "0"), None))
+    while robot.last is None:
+        robot.tick(2.0)
+        time.sleep(1e-3)
+    assert robot.last.term == Term(1, "r1")
+    assert robot.covered == ("r1",)
 
 
 ODD = ["text", None, -1, 1 << 70, 0.5, float("nan"), True, [], {}, {"items": []}, {"array": 0}]
