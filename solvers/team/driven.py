@@ -349,16 +349,16 @@ class DrivenTeam:
         self._following = part
 
     def _lose_part(self, part: Following, error: PGOError) -> None:
-        """Answer that the process has died that computes, or begin anew with the next order."""
+        """Answer the order under way with the error that has ended the computation of the part."""
         if part.obeyed is not None:
             self._end_answer(part, error, None)
-        elif part is self._following:
-            self._following = None
 
     def _answer(self, part: Following, ask: Ask) -> None:
         """Begin to obey the next order, or send the last answer again."""
         if part.obeyed is not None:
             self._session.say_hello(ask.term.driver)
+        elif ask.call == part.call + 1 and part.talk.is_over:
+            self._have_all_begin_again(ask.term)
         elif ask.call == part.call + 1:
             lost = self._begin_answer(part, ask)
             if part.waiting is not None:  # asked again: the letters should be here by now

@@ -19,6 +19,7 @@ import solvers
 from solvers.carry.serialization import serialize
 from solvers.carry.wire import Order, deflated, opened, packed, sealed
 from solvers.robots.own_file import OwnedRuns, number_poses, read_file
+from solvers.team.beside import OTHER_PROCESS
 from solvers.team.measurements import Revision
 from solvers.team.messages import Ask, Hello, Relayed, Reply, Term
 from solvers.team.speakers import NO_BOOT, Envelope
@@ -165,6 +166,24 @@ def test_an_order_to_tell_robots_that_are_not_there_is_answered_with_an_error(ow
     assert error is not None
     assert "names of the robots" in error[1]
     assert answer(2, read_file, None).error is None
+
+
+def test_a_robot_whose_computation_has_ended_begins_anew_with_the_next_order() -> None:
+    sharing = solvers.Sharing.INTERFACE
+    robot = solvers.Robot("r1", ["r0", "r1"], KEY, sharing=sharing)
+    robot.add_pose(1)
+    robot.add_edge(1, 2, np.eye(2), np.zeros(2), kappa=1.0, tau=1.0)
+    send = as_r0(robot)
+    term, order = Term(1, "r0"), Order.of(read_file)
+    send(Ask(term, 0, 1, order, None, ("r0", "r1")))
+    OTHER_PROCESS.close()
+    (reply,) = (message_in(message.data) for message in robot.outbox())
+    assert isinstance(reply, Reply)
+    send(Ask(term, 1, 1, order, None))
+    (hello,) = (message_in(message.data) for message in robot.outbox())
+    assert isinstance(hello, Hello)
+    assert hello.term > term
+    assert not robot.is_computing
 
 
 def test_a_solve_covers_no_robot_that_answers_and_was_not_asked() -> None:
