@@ -181,7 +181,7 @@ class Driver:
 
     def _read_cover(self, summaries: Sequence[RobotSummary]) -> None:
         """Take the cover, and what every robot holds of it, from the robots' summaries."""
-        # (g,): numbers of the poses of the cover in the whole graph, of which pose 0 is the first
+        # (g,): numbers of the poses of the cover in the whole graph, ascending
         self.cover = self._separators.cover
         self._held_cover = [self.positions(robot.cover) for robot in summaries]
         # Robots with edges, which alone have an interior, and the poses that these edges join.

@@ -161,8 +161,7 @@ class OwnGraph:
     """
 
     graph: PoseGraph  # its n_a poses and m_a edges
-    # (n_a,): numbers of the poses in the whole graph, which ascend, and which
-    # robot owns each
+    # (n_a,): numbers of the poses in the whole graph, which ascend, and which robot owns each
     numbers: IntArray
     owners: IntArray
     given: Array  # as in `Answer`

@@ -61,8 +61,7 @@ class OwnSupport:
     # (l, 2): own pieces of odometry that edges kept join; without odometry every pose is a piece
     links: IntArray
     num_pieces: int  # how many pieces there are
-    # (h,): numbers of own poses with edges to other robots, ascending, and their
-    # pieces
+    # (h,): numbers of own poses with edges to other robots, ascending, and their pieces
     poses: IntArray
     pieces: IntArray
 

@@ -123,7 +123,7 @@ def test_a_team_whose_computations_die_solves_anew_or_says_so_until_something_is
     robots["r1"].add_edge(i, j, np.eye(2), np.zeros(2), kappa=1e-3, tau=1e-3)
     revision = robots["r1"].revision
     while not all(
-        robot.outcome is not None and robot.outcome.revisions["r1"] == revision
+        robot.outcome is not None and robot.outcome.revisions.get("r1") == revision
         for robot in robots.values()
     ):
         step(robots)
