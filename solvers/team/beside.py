@@ -208,7 +208,8 @@ class OtherProcess:
         process.kill()
         to_write.put(None)
         code = process.wait()
-        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        names = {-each.value: each.name for each in signal.Signals}  # not all signals have one
+        how = names.get(code, f"exit code {code}")
         error = EngineError(
             f"the process that computes has ended ({how}); the next solve starts another"
         )
@@ -222,9 +223,10 @@ class OtherProcess:
 
     def close(self) -> None:
         """End it, also while it computes."""
-        if self._process is not None and self._reader is not None:
-            self._process.kill()
-            self._reader.join(_SECONDS_TO_END)
+        process, reader = self._process, self._reader
+        if process is not None and reader is not None:
+            process.kill()
+            reader.join(_SECONDS_TO_END)
 
 
 def _write(
