@@ -6,7 +6,7 @@ the terms of solves only grow. What a robot brings into a solve is its `Member`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -402,19 +402,27 @@ class DrivenTeam:
         part.own = own
         part.obeyed = None
         part.call = ask.call
-        answer, letters = part.letters.take_out(ask.call, found)
-        if not {name.other for name in letters} <= set(range(len(part.members))):
-            found = PGOError(f"{UNKNOWN}: it has no names of the robots that its answer is for")
-        error = None
-        if isinstance(found, PGOError):
-            error = error_as_message(found)
-            answer, letters = None, []
+        is_error = isinstance(found, PGOError)
+        error = error_as_message(found) if is_error else None
+        answer, letters = part.letters.take_out(ask.call, None if is_error else found)
         part.reply = Reply(ask.term, ask.call, part.revision, answer, error)
         if part is not self._following:
             return
+        send = partial(self._send_answer, part, ask.term, part.reply, letters)
+        unsent = result_or_error(send, UNKNOWN)
+        if isinstance(unsent, PGOError):  # an odd order: messages for nobody, or no numbers
+            for name in letters:
+                del part.letters.sent[name]
+            error = error_as_message(unsent)
+            part.reply = Reply(ask.term, ask.call, part.revision, None, error)
+            self._session.send(ask.term.driver, part.reply, Priority.URGENT)
+
+    def _send_answer(
+        self, part: Following, term: Term, reply: Reply, letters: Iterable[LetterName]
+    ) -> None:
         for name in letters:
-            self._send_letter(part, ask.term, name)
-        self._session.send(ask.term.driver, part.reply, Priority.URGENT)
+            self._send_letter(part, term, name)
+        self._session.send(term.driver, reply, Priority.URGENT)
 
     def _send_letter(self, part: Following, term: Term, name: LetterName) -> None:
         letter = Letter(term, name.call, part.letters.place, part.letters.sent[name])
