@@ -118,7 +118,7 @@ def extend(
     problem = PGOProblem(graph, solution.problem.backend, weighting)
     ids = solution.problem.graph.pose_ids
     if robust is None:
-        start = extended_poses(problem, ids, solution.poses)
+        start = extended_poses(problem, ids, solution.all_poses)
         request = SolveRequest(problem, pipeline, start, robots=shared)
         warn_of_landmarks_seen_once(graph)
         # Newton alone would leave added terms out, and needs a driver.
@@ -133,7 +133,7 @@ def extend(
         known = KnownEdges.of(graph, robust.known).edges & (kept | new)
         robust = replace(robust, known=known)
         kept = held_together(graph, kept | known, np.zeros(graph.num_edges))
-        start = extended_poses(inlier_problem(problem, kept), ids, solution.poses)
+        start = extended_poses(inlier_problem(problem, kept), ids, solution.all_poses)
         request = SolveRequest(problem, pipeline, start, robots=shared)
         grown = go_on_robustly(robust, kept, new, request)
     return replace(grown, ledger=solution.ledger.joined(grown.ledger))

@@ -104,6 +104,8 @@ def _fitted(method: Method[Any, Any, Any], problem: object, start: object) -> tu
     _, problem, start = fitted_arguments(
         init, (method, problem, start), f"{type(method).__name__}: "
     )
+    if isinstance(problem, PGOProblem) and isinstance(start, Poses):
+        start = problem.check_poses(start)
     return problem, start
 
 

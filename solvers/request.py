@@ -165,9 +165,9 @@ class SolveRequest:
             )
         if self.robots is not None:
             self._check_robots(self.robots)
-        if self.start is not None and self.problem.graph.has_far_priors:
-            self.problem.check_poses(self.start)
-            object.__setattr__(self, "start", self.problem.graph.near_zero(self.start))
+        if self.start is not None:
+            start = self.problem.check_poses(self.start)
+            object.__setattr__(self, "start", self.problem.graph.near_zero(start))
 
     def with_partition(self) -> SolveRequest:
         """The request with the robots that a number of them stands for."""
@@ -317,7 +317,7 @@ def solution_of(request: SolveRequest, place: Place, best: Attempt) -> Solution:
     certificate = judge(problem, poses, best.proof)
     return Solution(
         problem=problem,
-        poses=poses,
+        all_poses=poses,
         objective=certificate.objective,
         certificate=certificate,
         status=best.status,

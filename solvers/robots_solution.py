@@ -94,7 +94,7 @@ class RobotsSolution(Summarised):
         owned = (owners[graph.in_files], np.minimum(owners[graph.i], owners[graph.j]))
         sizes = [np.bincount(of, minlength=ledger.num_robots) for of in owned]
         no_poses = Poses.identity(0, d)
-        F = both_costs(problem, solution.poses)["F"]
+        F = both_costs(problem, solution.all_poses)["F"]
         robust = solution.robust
         return cls(
             name=graph.name,

@@ -51,8 +51,9 @@ class Solution:
     ----------
     problem : PGOProblem
         What was solved; of a robust solve, the edges that were kept.
-    poses : Poses
-        The answer, in the frame that `frame` says: F leaves it open.
+    all_poses : Poses
+        The answer, in the frame that `frame` says: F leaves it open. Where the graph has priors,
+        the world pose is among them; `poses` are those of the file.
     objective : float
         Cost of the poses: F, chi2 with `Weighting.INFORMATION`, or the rotation part of F with
         `Weighting.ROTATIONS`. In a problem of rotations alone the poses have zero translations.
@@ -92,7 +93,7 @@ class Solution:
     """
 
     problem: PGOProblem
-    poses: Poses
+    all_poses: Poses
     objective: float
     certificate: Certificate
     status: Status
@@ -105,6 +106,12 @@ class Solution:
     anchor: int = 0
     covariances: Array | MaybeNone = None
     robust: Rejection | MaybeNone = None
+
+    @cached_property
+    def poses(self) -> Poses:
+        """The answer: a pose for every pose of the file, and every landmark, in their order."""
+        graph = self.problem.graph
+        return self.all_poses if graph.world is None else self.all_poses[graph.in_files]
 
     @property
     def lower_bound(self) -> float:
@@ -136,7 +143,7 @@ class Solution:
     @cached_property
     def edge_residuals(self) -> EdgeResiduals:
         """How well every edge fits the poses, in the cost that was solved, and whether it may."""
-        return edge_residuals(self.problem, self.poses)
+        return edge_residuals(self.problem, self.all_poses)
 
     @property
     def fit_ratio(self) -> float:
@@ -188,18 +195,18 @@ class Solution:
         Returns
         -------
         Array
-            Shape (k p, k p) for k poses, or (n, p, p) for every pose, with p = d(d+1)/2, and
-            p = d(d-1)/2 for rotations.
+            Shape (k p, k p) for k poses, or (n, p, p) for every pose of `poses`, with
+            p = d(d+1)/2, and p = d(d-1)/2 for rotations.
         """
         problem = self.problem.measured
-        at = problem.graph.near_zero(self.poses)
+        at = problem.graph.near_zero(self.all_poses)
         hessian = riemannian_hessian(problem.at(at), multipliers(problem, at))
         hessian, layout = unknowns_of(problem, hessian)
         anchor = self.anchor if anchor is None else anchor
 
         def covariances(hessian: csc_array) -> Array:
             marginals = Marginals(hessian, layout, anchor, problem.backend)
-            return marginals.joint(*poses) if poses else marginals.diagonal
+            return marginals.joint(*poses) if poses else marginals.diagonal[problem.graph.in_files]
 
         if problem.has_free_directions:
             return with_infinite_variances(hessian, covariances)
@@ -328,7 +335,7 @@ class Solution:
             network = network_json(self.ledger, self.robots)
         translations = {}
         if self.problem.has_translations:
-            translations["t"] = self.poses.t[named].tolist()
+            translations["t"] = self.poses.t.tolist()
         return {
             "graph": {
                 "name": graph.name,
@@ -338,7 +345,7 @@ class Solution:
                 "absent": graph.pose_ids[graph.absent].tolist(),
             },
             "objective": self.objective,
-            **both_costs(self.problem, self.poses),
+            **both_costs(self.problem, self.all_poses),
             **certificate_json(self.certificate),
             "verdict": self.verdict.name,
             "fit_ratio": self.fit_ratio or None,
@@ -352,7 +359,7 @@ class Solution:
             **network,
             "versions": installed_versions(self.problem.backend),
             "ids": graph.pose_ids[named].tolist(),
-            "R": self.poses.R[named].tolist(),
+            "R": self.poses.R.tolist(),
             **translations,
         }
 
@@ -421,7 +428,7 @@ class Solution:
             facts += self.robust.facts()
         if self.note:
             facts.append(("note", self.note))
-        facts += other_cost(self.problem, self.poses)
+        facts += other_cost(self.problem, self.all_poses)
         if self.frame:
             facts.append(("frame", self.frame))
         facts.append(("seconds", f"{self.seconds:.3g}"))

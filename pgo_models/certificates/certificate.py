@@ -392,7 +392,7 @@ def certify_at(
     True
     """
     problem = as_problem(problem)
-    check_poses(problem.graph, poses)
+    poses = check_poses(problem.graph, poses)
     poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
     if problem.graph.has_far_priors:
         near = problem.graph.near_zero(poses)

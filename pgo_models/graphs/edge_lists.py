@@ -291,8 +291,7 @@ def _poses_to_give(graph: PoseGraph, poses: Poses | None) -> Poses | None:
         )
     if poses is None:
         return graph.initial
-    check_poses(graph, poses)
-    return poses
+    return check_poses(graph, poses)
 
 
 def _matrices(R: Array, t: Array) -> Array:

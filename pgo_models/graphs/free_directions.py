@@ -187,7 +187,7 @@ def _with_rest_of_estimate(held: PoseGraph, graph: PoseGraph, prior: int) -> Pos
     """The graph with the estimate of what its only prior does not measure, if it has one."""
     if graph.initial is None or graph.world is None:
         return held
-    seen = graph.initial.with_gauge_at(graph.world)
+    seen = graph.with_world_of(graph.initial).with_gauge_at(graph.world)
     pose = int(graph.j[prior])
     R_ij = graph.R_ij.copy()
     t_ij = graph.t_ij.copy()

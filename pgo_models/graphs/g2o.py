@@ -357,7 +357,7 @@ def read_g2o_poses(path: Path | str, graph: PoseGraph) -> Poses:
     ascending_ids = file.vertex_ids[order]
     row = order[np.searchsorted(ascending_ids, ids)]
     R, t = poses_of(file.d, file.vertices[row])
-    return graph.completed(Poses(R, t))
+    return graph.completed(Poses(R, t))[graph.in_files]
 
 
 def digits_of_vertices(path: Path) -> WrittenDigits:
@@ -848,6 +848,8 @@ def _fixed(ids: IntArray, files: list[G2OLines]) -> IntArray:
 def _poses_to_write(graph: PoseGraph, poses: Poses | None) -> Poses | None:
     """Given poses, else the estimate; a GraphError when they do not have the size of the graph."""
     written = graph.initial if poses is None else poses
+    if written is not None:
+        written = graph.with_world_of(written)
     expected_shape = (graph.num_poses, graph.d)
     if written is not None and written.t.shape != expected_shape:
         raise GraphError(

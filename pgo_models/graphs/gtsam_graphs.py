@@ -222,8 +222,8 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
         raise GraphError(f"{graph.name} has landmarks, which are not written for GTSAM; leave out")
     if poses is None:
         poses = graph.initial
-    else:
-        check_poses(graph, poses)
+    if poses is not None:
+        poses = check_poses(graph, poses)
     information = proper_information(graph)
     is_position = graph.is_prior & ~(graph.kappa > 0.0)
     d = graph.d

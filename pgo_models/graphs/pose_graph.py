@@ -110,9 +110,9 @@ class PoseGraph(ReadOnly):
     robot : IntArray, (n,), optional
         Robot 0 .. num_robots - 1 that owns every pose; all 0 unless given.
     initial : Poses, optional
-        Estimate of the file. It may leave out the world pose.
+        Estimate of the file, of all poses but the world pose, which may be given, too.
     truth : Poses, optional
-        Ground truth, for example of a generated scene. It may leave out the world pose.
+        Ground truth, for example of a generated scene; of the same poses as the estimate.
     fixed : IntArray, (f,)
         Poses that the file calls fixed. F does not depend on the gauge: the solution is moved so
         that the first of them is where the file has it. All of them are kept for writing.
@@ -220,7 +220,7 @@ class PoseGraph(ReadOnly):
         for name in ("initial", "truth"):
             poses = getattr(self, name)
             if poses is not None:
-                self._set(name, self.completed(poses))
+                self._set(name, self._as_in_files(poses))
 
     def _set(self, name: str, value: object) -> None:
         """Set a field while the frozen object is being made."""
@@ -380,22 +380,28 @@ class PoseGraph(ReadOnly):
             All n poses. The world pose is at the `origin` where it was left out. A landmark has the
             rotation of the pose that saw it first.
         """
+        poses = self.with_world_of(poses)
         first = self.first_sights
-        if self.world is None and not len(first):
+        if not len(first) or poses.num_poses != self.num_poses:
             return poses
-        R = poses.R
-        t = poses.t
-        num_given = poses.num_poses
-        if self.world is not None and num_given == self.num_poses - 1:
-            identity = np.eye(poses.d)
-            R = np.insert(R, self.world, identity, axis=0)
-            t = np.insert(t, self.world, self.world_point, axis=0)
-        if len(first) and len(t) == self.num_poses:
-            landmarks = self.j[first]
-            seen_from = self.i[first]
-            R = R.copy()
-            R[landmarks] = R[seen_from]
-        return Poses(R, t)
+        R = poses.R.copy()
+        R[self.j[first]] = R[self.i[first]]
+        return Poses(R, poses.t)
+
+    def with_world_of(self, poses: Poses) -> Poses:
+        """Return poses with the world pose, which stands at the `origin` where it was left out."""
+        if self.world is None or poses.num_poses != self.num_poses - 1:
+            return poses
+        R = np.insert(poses.R, self.world, np.eye(poses.d), axis=0)
+        return Poses(R, np.insert(poses.t, self.world, self.world_point, axis=0))
+
+    def _as_in_files(self, poses: Poses) -> Poses:
+        """Estimate or truth, without the world pose, in whose frame they are."""
+        if self.world is None:
+            return self.completed(poses)
+        if poses.num_poses == self.num_poses:
+            poses = self.in_frame_of_priors(poses)
+        return self.completed(poses)[self.in_files]
 
     @property
     def world_point(self) -> Array:
@@ -409,13 +415,14 @@ class PoseGraph(ReadOnly):
         return self.world is not None and bool(self.world_point.any())
 
     def near_zero(self, poses: Poses) -> Poses:
-        """Return poses of a graph with far priors in the frame of the world pose; others as given.
+        """Return poses, with the world pose, in the frame of that if priors are far away.
 
         Returns
         -------
         Poses
             With the world pose at the identity. Poses in the frame of the file lose nothing.
         """
+        poses = self.with_world_of(poses)
         if not self.has_far_priors:
             return poses
         world = self.world
@@ -434,6 +441,7 @@ class PoseGraph(ReadOnly):
             With the world pose unturned at the `origin`. Far from zero each coordinate is rounded.
         """
         assert self.world is not None
+        poses = self.with_world_of(poses)
         if not self.has_far_priors:
             return poses.with_gauge_at(self.world)
         near = self.near_zero(poses)
@@ -846,8 +854,8 @@ class PoseGraph(ReadOnly):
             **rows,
             ids=self.pose_ids[chosen],
             robot=robot,
-            initial=None if self.initial is None else self.initial[chosen],
-            truth=None if self.truth is None else self.truth[chosen],
+            initial=None if self.initial is None else self.with_world_of(self.initial)[chosen],
+            truth=None if self.truth is None else self.with_world_of(self.truth)[chosen],
             fixed=fixed[fixed >= 0],
             times=times,
             world=world,
@@ -1086,6 +1094,7 @@ class PoseGraph(ReadOnly):
             name = int(ids.max()) + 1
         initial = self.initial
         if initial is not None:
+            initial = self.with_world_of(initial)
             R_first = initial.R[first]
             position = initial.t[first] + R_first @ points.t[0]
             R = np.append(initial.R, R_first[None], axis=0)

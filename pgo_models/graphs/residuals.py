@@ -24,7 +24,7 @@ def edge_errors(graph: PoseGraph, poses: Poses) -> tuple[Array, Array, Array]:
     They are ||t_j - t_i - R_i t_ij|| in metres, the angle of R_ij^T R_i^T R_j in radians, and the
     summand of F. A GraphError when the poses are not those of the graph.
     """
-    check_poses(graph, poses)
+    poses = check_poses(graph, poses)
     R_i = poses.R[graph.i]
     R_j = poses.R[graph.j]
     predicted = R_i @ graph.R_ij
@@ -117,7 +117,7 @@ def chi2(
     >>> 0 < chordal < geodesic
     True
     """
-    check_poses(graph, poses)
+    poses = check_poses(graph, poses)
     d = graph.d
     shift = poses.t[graph.j] - poses.t[graph.i]
     E, r_t = _motions(graph, poses.R[graph.i], poses.R[graph.j], shift)
@@ -177,10 +177,12 @@ def _sum_of_forms(left: Array, blocks: Array, right: Array) -> float:
     return float(total)
 
 
-def check_poses(graph: PoseGraph, poses: Poses) -> None:
-    """Raise a GraphError unless there is one pose for every pose of the graph."""
+def check_poses(graph: PoseGraph, poses: Poses) -> Poses:
+    """The poses, with the world pose; a GraphError unless there is one for every other pose."""
+    poses = graph.with_world_of(poses)
     if poses.t.shape != (graph.num_poses, graph.d):
         raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
+    return poses
 
 
 def logarithm_translation(w: Array, t: Array) -> Array:

@@ -163,8 +163,7 @@ def animate_poses(
         labels = [f"k = {k}" for k in range(len(iterates))]
     if len(labels) != len(iterates):
         raise GraphError(f"{len(labels)} labels for {len(iterates)} iterates; give one each")
-    for poses in iterates:
-        check_poses(graph, poses)
+    iterates = [check_poses(graph, poses) for poses in iterates]
     shown = frames_to_show(len(iterates))
     drawn = GraphFrames.of(graph, [iterates[k] for k in shown])
     frames = [drawn.traces(k) for k in range(len(shown))]

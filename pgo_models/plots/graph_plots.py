@@ -52,7 +52,7 @@ def edge_kinds(
     With `mark`, UNCERTAIN and MISFIT take precedence over the others. Misfits are of F unless
     `residuals` are given. Priors, which are not drawn, are -1. A GraphError if sizes differ.
     """
-    check_poses(graph, poses)
+    poses = check_poses(graph, poses)
     robot_i = graph.robots[graph.i]
     robot_j = graph.robots[graph.j]
     kind = np.where(robot_i == robot_j, OWN, BETWEEN)
@@ -123,11 +123,15 @@ def thinning_step(count: int, most: int) -> int:
     return max(1, -(-count // most))
 
 
-def check_covariances(covariances: Array | None, graph: PoseGraph) -> None:
-    """Raise a SettingError unless covariances are one matrix for every pose, (n, p, p)."""
-    if covariances is not None:
-        p = graph.d * (graph.d + 1) // 2
-        check_shape(covariances, (graph.num_poses, p, p), "covariances")
+def covariances_to_draw(covariances: Array | None, graph: PoseGraph) -> Array | None:
+    """Covariances, (n, p, p), without that of the world pose; a SettingError for other shapes."""
+    if covariances is None:
+        return None
+    shown = graph.in_files
+    p = graph.d * (graph.d + 1) // 2
+    drawn = covariances[shown] if len(covariances) == graph.num_poses else covariances
+    check_shape(drawn, (len(shown), p, p), "covariances")
+    return drawn
 
 
 def confidence_ellipses(poses: Poses, covariances: Array) -> Array:
@@ -170,6 +174,7 @@ def draw_graph(
     """
     from matplotlib.colors import to_rgb
 
+    poses = check_poses(graph, poses)
     kind_of_edge = edge_kinds(graph, poses, mark_edges, residuals)
     ends, kind = lines_to_draw(graph, kind_of_edge)
     names = (*COLOURS, QUIET_COLOUR, ALARM_COLOUR)
@@ -216,7 +221,7 @@ def plot_graph(
     title : str
         Title of the figure; the name of the graph unless given.
     covariances : Array, (n, p, p), optional
-        Covariances of the poses (`Marginals`), drawn as ellipses that hold x and y with 95 %.
+        Covariances of the poses (`marginals`), drawn as ellipses that hold x and y with 95 %.
     residuals : EdgeResiduals, optional
         Residuals that decide which edges are misfits; those of F unless given.
 
@@ -234,16 +239,17 @@ def plot_graph(
     >>> plot_graph(graph, graph.truth, "27 poses").axes[0].get_title()
     '27 poses'
     """
-    check_covariances(covariances, graph)
+    poses = check_poses(graph, poses)
+    drawn = covariances_to_draw(covariances, graph)
     with column_figure(height=1.15) as figure:
         axes = _add_axes(figure, graph)
         draw_graph(graph, poses, axes, residuals=residuals)
         axes.set_title(title or graph.name)
         kind = edge_kinds(graph, poses, residuals=residuals)
         handles: list[Artist] = list(_legend(graph, kind))
-        if covariances is not None:
+        if drawn is not None:
             shown = graph.in_files
-            outlines = confidence_ellipses(poses[shown], covariances[shown])
+            outlines = confidence_ellipses(poses[shown], drawn)
             collection = _line_collection(graph.d)
             ellipses = collection(
                 list(outlines),
@@ -316,8 +322,8 @@ def plot_against_truth(graph: PoseGraph, poses: Poses, truth: Poses | None = Non
         truth = graph.truth
     if truth is None:
         raise GraphError(f"{graph!r} came without a ground truth; give one as truth=")
-    check_poses(graph, poses)
-    check_poses(graph, truth)
+    poses = check_poses(graph, poses)
+    truth = check_poses(graph, truth)
     poses = poses[graph.bodies]
     truth = truth[graph.bodies]
     aligned = poses.aligned_to(truth)

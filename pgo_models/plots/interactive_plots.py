@@ -12,6 +12,7 @@ from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import pose_names
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
+from pgo_models.graphs.residuals import check_poses
 from pgo_models.plots import graph_plots
 from pgo_models.plots.style import ALARM_COLOUR, COLOURS, QUIET_COLOUR, plotly
 from pgo_models.problem.thresholds import EdgeResiduals, edge_residuals
@@ -66,7 +67,7 @@ def explore_graph(
     title : str
         Title of the figure.
     covariances : Array, (n, p, p), optional
-        Covariances of the poses (`Marginals`), drawn as ellipses that hold x and y with 95 %.
+        Covariances of the poses (`marginals`), drawn as ellipses that hold x and y with 95 %.
     residuals : EdgeResiduals, optional
         Residuals that decide which edges are misfits; those of F unless given. Give those of the
         problem that was solved.
@@ -87,14 +88,15 @@ def explore_graph(
     >>> [trace.name for trace in explore_graph(graph, graph.truth).data]
     ['edges and poses', 'edges and poses', 'misfit']
     """
-    graph_plots.check_covariances(covariances, graph)
+    drawn = graph_plots.covariances_to_draw(covariances, graph)
+    poses = check_poses(graph, poses)
     go = plotly("graph_objects")
     if residuals is None:
         residuals = edge_residuals(graph, poses)
     kind = graph_plots.edge_kinds(graph, poses, residuals=residuals)
     traces: list[Trace] = []
     if before is not None:
-        aligned = before.aligned_to(poses)
+        aligned = check_poses(graph, before).aligned_to(poses)
         traces.append(_lines_before(graph, aligned, kind))
     ends, line_kind = graph_plots.lines_to_draw(graph, kind)
     own_ends = ends[line_kind == graph_plots.OWN]
@@ -106,8 +108,8 @@ def explore_graph(
             traces.append(_lines(poses.t, ends_of_kind, label, line))
     traces.append(_misfit_dots(graph, poses, kind, residuals))
     shown = graph.in_files
-    if covariances is not None:
-        traces.append(_ellipses(poses[shown], covariances[shown]))
+    if drawn is not None:
+        traces.append(_ellipses(poses[shown], drawn))
     figure = go.Figure(traces)
     lay_out(figure, title, legend_y=-0.12 if graph.d == 2 else 0.0)
     figure.update_layout(**layout_around(poses.t[shown].min(axis=0), poses.t[shown].max(axis=0)))

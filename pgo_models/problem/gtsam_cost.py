@@ -26,7 +26,7 @@ def gtsam_cost(graph: PoseGraph, poses: Poses) -> tuple[float, float]:
     and H = J^T I J. The share is zero at the minimum of C. A GraphError when the poses do not fit
     the graph or a matrix is indefinite.
     """
-    check_poses(graph, poses)
+    poses = check_poses(graph, poses)
     information = proper_information(graph)
     is_turned = measures_rotation(graph, information)
     shift = poses.t[graph.j] - poses.t[graph.i]

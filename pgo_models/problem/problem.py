@@ -500,6 +500,7 @@ class PGOProblem(ReadOnly):
             The `translation_factor` of these poses. That of poses with nearly the same rotations
             gives nearly the best translations.
         """
+        poses = self.check_poses(poses)
         if not self.has_translations:
             return self.seen_poses(poses)
         if self.is_quadratic:
@@ -524,8 +525,8 @@ class PGOProblem(ReadOnly):
             return poses
         return poses.with_translations(np.zeros_like(poses.t))
 
-    def check_poses(self, poses: Poses) -> None:
-        """Raise an error unless there is one pose for every pose of the graph.
+    def check_poses(self, poses: Poses) -> Poses:
+        """Return poses with the world pose, where the graph has one.
 
         Raises
         ------
@@ -537,10 +538,12 @@ class PGOProblem(ReadOnly):
                 f"poses are a {type(poses).__name__}; "
                 "give Poses(R, t), or use with_best_translations(R)"
             )
+        poses = self.graph.with_world_of(poses)
         if (poses.num_poses, poses.d) != (self.num_poses, self.d):
             raise GraphError(
                 f"{poses} beside {self}; give one pose for every pose of the graph, in its order"
             )
+        return poses
 
     def at(self, poses: Poses) -> "EvaluatedPoses":
         """Return the cost at poses with what belongs to it: residuals, gradient, minorant.
@@ -563,7 +566,7 @@ class PGOProblem(ReadOnly):
         >>> bool(np.isclose(here.value, np.sum(here.X * here.half_gradient)))
         True
         """
-        self.check_poses(poses)
+        poses = self.check_poses(poses)
         return EvaluatedPoses(self, read_only(self.seen_poses(poses).stacked()), poses)
 
     def at_point(self, X: Array) -> "EvaluatedPoint":

@@ -52,7 +52,7 @@ def run_gtsam(
     """
     gtsam = extra_module("gtsam", "peers")
     if start is not None:
-        problem.check_poses(start)
+        start = problem.check_poses(start)
     began = time.perf_counter()
     graph = factor_graph(problem, start)
     if start is not None:

@@ -109,7 +109,7 @@ def edge_fit(
 def edge_fit_of_solution(solution: Solution, graph: str, dropped: Dropped) -> EdgeFit:
     """How well the edges fit, with `file:line` of every edge if the advice is to leave one out."""
     residuals = solution.edge_residuals  # which the printed row of the fit has, too
-    fit = edge_fit(solution.problem, solution.poses, graph, dropped, residuals)
+    fit = edge_fit(solution.problem, solution.all_poses, graph, dropped, residuals)
     if solution.robust is not None or not fit.suspected.is_misfit.any():
         return fit
     num_edges = len(fit.residuals.cost)

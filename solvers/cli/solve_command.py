@@ -732,14 +732,13 @@ def _files_of_solution(
         targets.append((outputs.film, save_film))
     if outputs.covariances is not None:
         graph = solution.problem.graph
-        named = graph.in_files
-        ids = graph.pose_ids[named]
+        ids = graph.pose_ids[graph.in_files]
 
         def save_covariances(path: Path) -> None:
             from pgo_models.problem.marginals import write_covariances
 
             has_translations = solution.problem.has_translations
-            write_covariances(solution.marginals()[named], ids, path, has_translations)
+            write_covariances(solution.marginals(), ids, path, has_translations)
 
         targets.append((outputs.covariances, save_covariances))
     return targets
@@ -755,8 +754,8 @@ def _text_with_error(solution: Solution) -> str:
     if graph.truth is None:
         return str(solution)
     bodies = graph.bodies
-    estimate = solution.poses[bodies]
-    truth = graph.truth[bodies]
+    estimate = solution.all_poses[bodies]
+    truth = graph.with_world_of(graph.truth)[bodies]
     if not solution.problem.has_translations:
         error = np.rad2deg(absolute_rotation_error(estimate, truth))
         return f"{solution}\n\nerror to the truth, of rotations: {error:.4g} degrees"

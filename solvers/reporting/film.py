@@ -107,7 +107,7 @@ def filmed_iterates(
     problem: PGOProblem, methods: Sequence[Solver[Any]], start: Poses | None
 ) -> list[FilmedIterate]:
     """The iterates that a film shows, with their costs and bounds."""
-    poses = start if start is not None else spanning_tree_start(problem.graph)
+    poses = problem.check_poses(start if start is not None else spanning_tree_start(problem.graph))
     named = [("start", poses)]
     for method in methods:
         reached = _poses_on_the_way(problem, method, named[-1][1])

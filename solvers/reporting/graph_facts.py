@@ -44,8 +44,8 @@ def _cost_facts(graph: PoseGraph, has_chi2: bool) -> list[tuple[str, str]]:
     problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
     name = problem.cost_name
     rows = []
-    estimate = graph.initial
-    if estimate is not None:
+    if graph.initial is not None:
+        estimate = graph.with_world_of(graph.initial)
         rows.append((f"{name}, estimate", rounded_up(problem.objective(estimate), 8)))
         if has_chi2:
             for convention in Chi2Convention:

@@ -116,7 +116,7 @@ def report_page(solution: Solved, *, source: str | None = None, fit: EdgeFit | N
     robots = _partition(solution)
     certificate = solution.certificate
     graph = solution.problem.graph.with_robots(robots.robot)
-    fit = fit or judge_edges(solution.problem, solution.poses, solution.edge_residuals)
+    fit = fit or judge_edges(solution.problem, solution.all_poses, solution.edge_residuals)
     stage_names = _stage_names(solution)
     plots = _plots(solution, graph, fit, stage_names)
     figures = ",".join(f'"{name}":{figure.to_json()}' for name, figure in plots.items())
@@ -169,7 +169,7 @@ def _plots(
     before, _ = solution.before()
     picture = explore_graph(
         graph,
-        solution.poses,
+        solution.all_poses,
         covariances=solution.covariances,
         residuals=fit.residuals,
         before=before,
@@ -188,7 +188,8 @@ def _trajectory_error(solution: Solved, graph: PoseGraph) -> float | None:
     """Absolute trajectory error; None if the truth is not known."""
     if graph.truth is None:
         return None
-    return absolute_trajectory_error(solution.poses[graph.bodies], graph.truth[graph.bodies])
+    truth = graph.with_world_of(graph.truth)
+    return absolute_trajectory_error(solution.all_poses[graph.bodies], truth[graph.bodies])
 
 
 def _advice(solution: Solved, graph: PoseGraph, fit: EdgeFit, source: str | None) -> list[Advice]:

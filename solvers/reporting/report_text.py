@@ -54,7 +54,7 @@ class Solved(Protocol):
         """What was solved."""
 
     @property
-    def poses(self) -> Poses:
+    def all_poses(self) -> Poses:
         """Poses of the solution, (n)."""
 
     @property

@@ -338,7 +338,7 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
     >>> bool(problem.objective(polish(problem, start)) < problem.objective(start))
     True
     """
-    return polished(problem, poses, max_steps).poses
+    return polished(problem, problem.check_poses(poses), max_steps).poses
 
 
 def polished(problem: PGOProblem, poses: Poses, max_steps: int) -> PolishState:

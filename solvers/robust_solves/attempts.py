@@ -218,7 +218,7 @@ class Estimate:
     @property
     def poses(self) -> Poses:
         """Poses of the solution."""
-        return self.solution.poses
+        return self.solution.all_poses
 
     @property
     def certificate(self) -> Certificate:
@@ -242,7 +242,7 @@ class Estimate:
         began: float,
     ) -> Estimate:
         """Estimate of an attempt that began at the time `began`, and whose stage bears its name."""
-        poses = solution.poses
+        poses = solution.all_poses
         num_cycles = int(kept.sum()) - (doubted.problem.num_poses - 1)
         errors = 1.0
         if num_cycles >= _MIN_CYCLES:

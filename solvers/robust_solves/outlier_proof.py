@@ -108,11 +108,11 @@ def prove_outliers(solution: Solution, time_limit: float = math.inf) -> Solution
     if rejection is None:
         raise SettingError("outliers are proven of a robust solve; give solve(.., robust=GNC())")
     problem = rejection.problem
-    if (problem.edge_costs(solution.poses) < 0.0).any():
+    if (problem.edge_costs(solution.all_poses) < 0.0).any():
         raise SettingError("an edge has a negative cost, so that nothing can be proven; use F")
     thresholds = rejection.threshold_scale * chi2_thresholds(problem, rejection.quantile)
     deadline = time.perf_counter() + time_limit
-    search = _Search.of(problem, rejection.known, thresholds, solution.poses, deadline)
+    search = _Search.of(problem, rejection.known, thresholds, solution.all_poses, deadline)
     search.run()
     return replace(
         solution, robust=replace(rejection, proof=search.proven.proof(search.is_complete))

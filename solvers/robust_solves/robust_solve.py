@@ -206,7 +206,7 @@ class _RobustSolve:
         if noise is not None:
             name = "the plain solution: errors are larger than claimed, on all edges alike"
             return self._result(solution, every_edge, noise, name, noise)
-        self.least_squares = solution.poses
+        self.least_squares = solution.all_poses
         return None
 
     def _fits_every_edge(self, solution: Solution) -> bool:
@@ -227,7 +227,7 @@ class _RobustSolve:
         if not (given | (residuals.cost <= scale * chi2_thresholds(problem, quantile))).all():
             return False
         every_edge = self.doubted.every_edge
-        remaining = drop_contradicted(problem, known, every_edge, solution.poses)
+        remaining = drop_contradicted(problem, known, every_edge, solution.all_poses)
         return bool(remaining.all())
 
     def _noise_of_every_edge(self, solution: Solution) -> float | None:
@@ -450,7 +450,7 @@ class _RobustSolve:
         """
         if kept.all() or solution.status in OUT_OF_TIME:
             return 0.0
-        fit = Fit.of(self.doubted.problem, kept, solution.poses)
+        fit = Fit.of(self.doubted.problem, kept, solution.all_poses)
         return self._search(self.choice).expected_by_chance(fit)
 
     def _rival(self, solution: Solution, kept: BoolArray) -> Rival | None:
@@ -461,7 +461,7 @@ class _RobustSolve:
         fits = kept.all() and not solution.edge_residuals.is_doubtful
         if fits or self.doubted.is_large or solution.status in OUT_OF_TIME:
             return None
-        fit = Fit.of(self.doubted.problem, kept, solution.poses)
+        fit = Fit.of(self.doubted.problem, kept, solution.all_poses)
         search = self._search(self.choice)
         others = [(estimate.kept, estimate.poses) for estimate in self.estimates]
         others += [(other.kept, other.poses) for other in search.aligned_anew(fit)]
@@ -595,11 +595,11 @@ class _RobustSolve:
             problem=self.doubted.problem,
             known=self.doubted.known,
             kept=kept,
-            ratio=self.doubted.problem.edge_costs(solution.poses) / allowed,
+            ratio=self.doubted.problem.edge_costs(solution.all_poses) / allowed,
             quantile=self.doubted.quantile,
             start=name,
             attempts=choice.attempts_beside(kept),
-            cost=choice.cost(solution.poses),
+            cost=choice.cost(solution.all_poses),
             threshold_scale=choice.threshold_scale,
             verdict=solution.certificate.verdict,
             is_misfit=noise == 1.0 and solution.edge_residuals.is_overall_misfit,

@@ -82,7 +82,7 @@ def solve_extended(
     if not left_out:
         return solution
     stages = list(solution.stages)
-    poses = solution.poses
+    poses = solution.all_poses
     status = solution.status
     if status not in OUT_OF_TIME:
         with_terms = monitor.run(soc, problem, start)
@@ -109,7 +109,7 @@ def solve_extended(
     return replace(
         solution,
         problem=problem,
-        poses=poses if of_model is None else of_model.poses,
+        all_poses=poses if of_model is None else of_model.poses,
         objective=certificate.objective,
         certificate=certificate,
         status=status,

@@ -117,8 +117,8 @@ def certify(
         why = "the graph came without these" if given is None else f"poses is {given!r:.60}"
         raise SettingError(f"{why}; give Poses, as solve returns them")
     problem = as_problem(problem)
-    check_poses(problem.graph, given)
-    poses = problem.graph.completed(given)  # a landmark has no rotation of its own
+    poses = check_poses(problem.graph, given)
+    poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
     near = problem.graph.near_zero(poses)
     certificate = _certificate_near(problem, near, gap)
     # What nothing measures costs nothing, wherever the poses given are.

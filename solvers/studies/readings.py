@@ -316,7 +316,7 @@ def _solved(graph: PoseGraph) -> tuple[PGOProblem, Solution, EdgeResiduals]:
     """A graph solved for its own cost by Newton's method alone, and how well its edges fit."""
     problem = PGOProblem(graph)
     solution = solve(problem, _PLAIN)
-    return problem, solution, edge_residuals(problem, solution.poses)
+    return problem, solution, edge_residuals(problem, solution.all_poses)
 
 
 def _as_expected(fits: list[ReadingFit]) -> tuple[ReadingFit, ...]:

@@ -293,9 +293,9 @@ class Robot:
         if solution is None:
             return {}
         try:
-            covariances = dict(
-                zip(solution.problem.graph.pose_ids.tolist(), solution.marginals(), strict=True)
-            )
+            graph = solution.problem.graph
+            ids = graph.pose_ids[graph.in_files].tolist()
+            covariances = dict(zip(ids, solution.marginals(), strict=True))
         except PGOError:
             return {}
         return {pose: covariances[pose] for pose in self.poses}

@@ -54,7 +54,7 @@ class OwnAnswer:
             touches = np.isin(all_edges.pose_ids[ends], graph.pose_ids[is_own]).any(axis=1)
             chosen = solution.robust.rejected & touches
             rejected = all_edges.pose_ids[ends[chosen]]
-        return cls(graph.pose_ids[is_own], solution.poses[is_own], rejected)
+        return cls(graph.pose_ids[is_own], solution.all_poses[is_own], rejected)
 
 
 def answer_of(agent: Agent) -> OwnAnswer | None:

@@ -130,8 +130,8 @@ def test_a_solve_has_the_gap_and_the_poses_of_the_graph_less_a_constant(d, offse
     assert near.is_certified
     assert_gap_is_that_of_near(far.certificate, near.certificate)
     assert_poses_differ_by(offset, graphs[1], far.poses, near.poses)
-    np.testing.assert_array_equal(far.poses.R[graphs[1].world], np.eye(d))
-    np.testing.assert_array_equal(far.poses.t[graphs[1].world], graphs[1].origin)
+    np.testing.assert_array_equal(far.all_poses.R[graphs[1].world], np.eye(d))
+    np.testing.assert_array_equal(far.all_poses.t[graphs[1].world], graphs[1].origin)
     # It is of the problem that was given, and certifies again in every way.
     assert far.problem.graph is graphs[1]
     for judge in (certify, certify_at):
@@ -169,7 +169,7 @@ def test_robots_starts_and_robust_solves_do_as_they_do_near_zero(d, make):
 def test_the_cost_of_a_solution_is_that_of_its_poses_as_they_are_printed(d):
     graph = with_gps(varied_graph(1, 12, d), UTM)
     solution = solve(PGOProblem(graph, weighting=Weighting.ISOTROPIC))
-    cost = ExactGraph.of_doubles(graph).objective_of(solution.poses)
+    cost = ExactGraph.of_doubles(graph).objective_of(solution.all_poses)
     certificate = solution.certificate
     assert abs(cost - MP.mpf(certificate.objective)) <= certificate.objective_error
     assert certificate.objective_error < ROUNDING * certificate.objective
@@ -187,11 +187,11 @@ def test_poses_in_another_frame_are_judged_with_the_rounding_of_their_coordinate
     solution = solve(PGOProblem(graph, weighting=Weighting.ISOTROPIC))
     w = np.full((1, tangent_dimension(d)), 0.7)
     exactly = ExactGraph.of_doubles(graph)
-    away = 0.1 * np.random.default_rng(0).standard_normal(solution.poses.t.shape)
+    away = 0.1 * np.random.default_rng(0).standard_normal(solution.all_poses.t.shape)
     for poses in (
-        solution.poses.moved(exp_map(w)[0], np.arange(d) + 0.3),
-        solution.poses.with_gauge_at(0),
-        solution.poses.with_translations(solution.poses.t + 1.0 / 3.0),
+        solution.all_poses.moved(exp_map(w)[0], np.arange(d) + 0.3),
+        solution.all_poses.with_gauge_at(0),
+        solution.all_poses.with_translations(solution.all_poses.t + 1.0 / 3.0),
     ):
         for judge in (certify, certify_at):
             certificate = judge(solution.problem, poses)

@@ -70,7 +70,7 @@ def test_where_newton_ends_elsewhere_the_whole_pipeline_follows_and_its_stages_s
     before = solvers.solve(ring.without_edges(np.arange(n) == n - 1))
     # a local minimum of the ring
     wound = before.poses.R @ exp_map(2.0 * np.pi * np.arange(n)[:, None] / n)
-    grown = extend(replace(before, poses=Poses(wound, before.poses.t)), ring)
+    grown = extend(replace(before, all_poses=Poses(wound, before.poses.t)), ring)
     assert [stage.name for stage in grown.stages][:4] == [
         "given start",
         "Newton",

@@ -51,7 +51,7 @@ def test_gps_on_ten_poses_of_sphere_is_certified_from_the_default_start(robots):
     best = solvers.solve(graph, start=graph.truth)
     np.testing.assert_allclose(solution.objective, best.objective, rtol=1e-10, atol=0)
     np.testing.assert_allclose(solution.poses.t, best.poses.t, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(solution.poses.R[graph.world], np.eye(3), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(solution.all_poses.R[graph.world], np.eye(3), rtol=0, atol=1e-15)
     assert solution.frame == "that of the priors"
     assert pgo.absolute_trajectory_error(solution.poses, graph.truth) < 0.5
     # In that frame without an alignment, which GPS without noise leaves but a little to do.
@@ -142,7 +142,7 @@ def test_the_optimum_with_landmarks_is_that_of_least_squares_without_their_rotat
         graph = graph.with_landmark(seen_from, sights + 0.1 * rng.standard_normal((3, d)), 20.0)
     solution = solvers.solve(graph)
     assert solution.is_certified
-    start = solution.poses if has_world else solution.poses.with_gauge_at(0)
+    start = solution.all_poses if has_world else solution.poses.with_gauge_at(0)
     rough = start.t + 0.05 * rng.standard_normal(start.t.shape)
     rough[0 if graph.world is None else graph.world] = 0.0
     cost, poses = brute_force(graph, Poses(start.R, rough))
@@ -180,6 +180,36 @@ def test_robots_share_landmarks_and_gps(d, coupling):
     assert solution.is_certified
     assert solution.frame == "that of the priors"
     np.testing.assert_allclose(solution.objective, best.objective, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("robots", [None, 2])
+def test_priors_add_no_row_to_poses_covariances_and_estimates(robots):
+    graph = with_gps(varied_graph(3, 8, 3), 4)
+    # The world pose is among the others.
+    graph = graph.with_landmark(np.array([0, 1]), np.array([[1.0, 2.0, 3.0], [0.5, 2.0, 3.0]]), 9.0)
+    solution = solvers.solve(graph, robots=robots)
+    assert solution.poses.num_poses == len(graph.in_files) == 9
+    assert solution.all_poses.num_poses == graph.num_poses == 10
+    np.testing.assert_array_equal(
+        solution.poses.t, np.delete(solution.all_poses.t, graph.world, axis=0)
+    )
+    assert solution.marginals().shape == (9, 6, 6)
+    again = replace(
+        graph, initial=solution.all_poses.moved(exp_map(np.ones((1, 3)))[0], np.ones(3))
+    )
+    np.testing.assert_allclose(again.initial.stacked(), solution.poses.stacked(), atol=1e-12)
+    problem = solution.problem
+    for poses in (solution.poses, solution.all_poses):
+        assert problem.objective(poses) == pytest.approx(solution.objective, rel=1e-12)
+        assert pgo.certify_at(problem, poses).is_certified
+        assert solvers.certify(graph, poses).is_certified
+        assert solvers.solve(graph, start=poses).objective == pytest.approx(solution.objective)
+        assert solvers.run(solvers.Newton(), problem, poses).objective == pytest.approx(
+            solution.objective
+        )
+        assert pgo.chi2(graph, poses) == pytest.approx(pgo.chi2(graph, again.initial), rel=1e-9)
+    with pytest.raises(pgo.PGOError, match="one pose for every pose"):
+        problem.objective(solution.poses[np.arange(7)])
 
 
 def test_a_landmark_seen_once_moves_nothing_and_is_named():

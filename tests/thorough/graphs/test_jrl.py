@@ -99,9 +99,7 @@ def test_a_log_of_two_robots_written_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(graph.kappa, 3 / (2 * 0.03), rtol=1e-14, atol=0)
     assert graph.initial is None  # one pose of four has a value
     assert graph.truth is not None
-    np.testing.assert_array_equal(
-        graph.truth.t, [[1, 2, 3], [1, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, 0]]
-    )
+    np.testing.assert_array_equal(graph.truth.t, [[1, 2, 3], [1, 0, 0], [0, 0, 0], [0, 0, 1]])
     assert repr(pgo.load(path)) == repr(graph)
     # Measurements count from 1, robot by robot; the one in both logs is that of a.
     assert places_of_edges(path) == [f"{path}:{number}" for number in (1, 2, 3, 4)]

@@ -85,10 +85,12 @@ def test_poses_without_the_world_pose_are_in_the_frame_of_the_file():
     bodies = graph.bodies
     far = pgo.Poses(graph.truth.R[bodies], graph.truth.t[bodies] + UTM)
     graph = replace(graph, initial=far, truth=None)
-    np.testing.assert_array_equal(graph.initial.t[graph.world], graph.origin)
+    np.testing.assert_array_equal(graph.initial.t, far.t)
+    completed = graph.completed(graph.initial)
+    np.testing.assert_array_equal(completed.t[graph.world], graph.origin)
     near = graph.near_zero(graph.initial)
-    np.testing.assert_array_equal(near.t + graph.origin, graph.initial.t)
-    np.testing.assert_array_equal(graph.in_frame_of_priors(near).t, graph.initial.t)
+    np.testing.assert_array_equal(near.t + graph.origin, completed.t)
+    np.testing.assert_array_equal(graph.in_frame_of_priors(near).t, completed.t)
     problem = pgo.PGOProblem(graph)
     assert problem.objective(near) == pytest.approx(problem.objective(graph.initial), rel=1e-9)
 

@@ -93,7 +93,7 @@ def test_edits_keep_what_they_do_not_touch():
     seen = more.with_landmark(np.array([0, 1]), np.ones((2, 3)), 1.0)
     assert (seen.landmarks.tolist(), seen.pose_ids[-1]) == ([28], 127)
     np.testing.assert_allclose(
-        seen.initial.t[28], graph.initial.t[0] + graph.initial.R[0] @ np.ones(3), rtol=0, atol=1e-14
+        seen.initial.t[-1], graph.initial.t[0] + graph.initial.R[0] @ np.ones(3), rtol=0, atol=1e-14
     )
     named = seen.with_landmark(np.array([0]), np.ones((1, 3)), 1.0, name=5)
     assert named.pose_ids[-1] == 5

@@ -137,7 +137,7 @@ def test_the_page_asks_for_nothing_online(solution):
 
 def test_ten_thousand_poses_take_less_than_five_megabytes_beside_the_library(solution):
     graph = pgo.random_geometric(10_000, np.random.default_rng(0), d=3, mean_degree=6.0)
-    large = replace(solution, problem=pgo.PGOProblem(graph), poses=graph.truth)
+    large = replace(solution, problem=pgo.PGOProblem(graph), all_poses=graph.truth)
     assert graph.num_edges > 20_000
     assert len(own_part(report_page(large)).encode()) < 5e6
 

@@ -114,7 +114,7 @@ def test_the_page_is_painted_before_the_library_is_parsed(browser, solution, tmp
 
 def test_a_large_graph_is_thinned_and_its_page_can_be_opened(browser, solution, tmp_path):
     graph = pgo.grid_world(1, 44_521, np.random.default_rng(0), d=2)
-    bounded = replace(solution, problem=pgo.PGOProblem(graph), poses=graph.truth)
+    bounded = replace(solution, problem=pgo.PGOProblem(graph), all_poses=graph.truth)
     bounded.report(tmp_path / "out.html")
     assert (tmp_path / "out.html").stat().st_size < 15e6
     text = Page(own_part((tmp_path / "out.html").read_text(encoding="utf-8"))).text
