@@ -101,9 +101,8 @@ class OrthogonalSolution(Summarised):
         return self.outcome.status
 
     def __repr__(self) -> str:
-        best = f"J = {self.objective:.10g}, stationarity {self.kkt.stationarity:.1e}"
-        kkt = f"{best}, feasibility {self.kkt.feasibility:.1e}"
-        return f"OrthogonalSolution({self.status.name}, {kkt}, {len(self.objectives)} starts)"
+        bound = f"gap={self.gap:.3g}, {self.verdict.name}"
+        return f"OrthogonalSolution({self.status.name}, J={self.objective:.10g}, {bound})"
 
     def __str__(self) -> str:
         finite_objectives = [J for J in self.objectives if not math.isnan(J)]
