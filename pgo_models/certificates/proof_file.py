@@ -341,11 +341,13 @@ def _held_shift(graph: PoseGraph) -> tuple[int, Array] | None:
         return None
     added = matrices_of_edges(graph) - graph.unheld
     changed = np.flatnonzero(added.any(axis=(1, 2)))
+    if len(changed) != 1:
+        return None
     prior = int(changed[0])
     weights = np.diag(added[prior])[: graph.d]
     of_shifts = np.zeros_like(added[prior])
     np.fill_diagonal(of_shifts[: graph.d, : graph.d], weights)
-    is_shift = len(changed) == 1 and bool(graph.is_prior[prior] & (added[prior] == of_shifts).all())
+    is_shift = bool(graph.is_prior[prior]) and np.array_equal(added[prior], of_shifts)
     return (prior, weights) if is_shift else None
 
 

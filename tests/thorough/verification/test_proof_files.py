@@ -17,7 +17,7 @@ from graphs import COSTS, varied_graph
 from proofs import PLANE, SPACE, edited, proof_of, written
 
 import solvers
-from pgo_models import PGOProblem, RotationWeight, Weighting
+from pgo_models import PGOProblem, Poses, RotationWeight, Weighting, chordal_start
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.proof_file import proof_json, save_proof
 from pgo_models.errors import FileFormatError, SettingError
@@ -52,6 +52,8 @@ CASES = Path(__file__).parent / "cases"
         ("ground", True, "id of a pose"),
         ("handedness", {"i": 0}, "no list of terms"),
         ("handedness", [{"i": 0, "j": 1, "T": [1, 0], "P": 6 * [0.0]}], "T of a handedness term"),
+        ("held", 5, "no entry 'weights'"),
+        ("held", {"id": 0, "weights": [0, 0, float("inf")]}, "weights of the pose held"),
         ("poses", 5, "no entry 'id'"),
         ("poses", [5], "no entry 'id'"),
         ("poses", [{"id": 0}], "no entry 't'"),
@@ -232,6 +234,16 @@ def test_proofs_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
     certificate = certify(of_file, solvers.solve(of_file).poses)
     with pytest.raises(SettingError, match="smaller information matrices"):
         proof_json(of_file, replace(certificate, source=BoundSource.SOFTENED))
+
+
+def test_a_turn_that_fixes_on_a_line_leave_free_has_no_proof() -> None:
+    graph = varied_graph(0, 6, 3)
+    line = Poses(np.tile(np.eye(3), (6, 1, 1)), np.outer(np.arange(6), [1.0, 2.0, 3.0]))
+    graph = graph.with_prior(np.arange(6), line, 0.0, 1.0)
+    problem = PGOProblem(graph, weighting=Weighting.ISOTROPIC)
+    certificate = certify(problem, chordal_start(problem))
+    with pytest.raises(SettingError, match="the line through its fixes is free"):
+        proof_json(problem, certificate)
 
 
 def test_numbers_come_back_with_all_their_digits(tmp_path: Path) -> None:
