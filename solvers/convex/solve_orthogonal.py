@@ -260,7 +260,10 @@ def _lowered_by_reflections(
     while is_lower:
         is_lower = False
         for start in reflections(problem, problem.values(best.state.copies)):
-            outcome = run(method, problem, start, verbose=verbose)
+            try:
+                outcome = run(method, problem, start, verbose=verbose)
+            except PGOError:  # the solver could not make a step (a)
+                continue
             if outcome.status is Status.INTERRUPTED:
                 return best
             least = best.objective - _LOWER * abs(best.objective)

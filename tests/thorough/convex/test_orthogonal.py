@@ -1,5 +1,7 @@
 import itertools
 import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from graphs import polar_factor
 from orthogonal_models import one_norm_components, smallest_eigenvectors, sparse_low_rank
 
-from pgo_models import OrthogonalProblem
+from pgo_models import OrthogonalProblem, PGOError
 from pgo_models.convex.orthogonality import OrthogonalPoint
 from pgo_models.convex.orthogonality_examples import procrustes
 from pgo_models.errors import SettingError
@@ -239,3 +241,28 @@ def test_ctrl_c_ends_all_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     solution = solve_orthogonal(problem, np.random.default_rng(0), starts=5)
     assert len(solution.objectives) == 1
     assert solution.outcome.status is Status.INTERRUPTED
+
+
+@dataclass(frozen=True)
+class StepBesideRotations:
+    """Step (a) of matrices whose determinant is not negative; of others it fails."""
+
+    step: Any
+
+    def solve(self, V: list[np.ndarray], rho: float) -> Any:
+        if np.linalg.det(V[0]) < 0.0:
+            raise PGOError("the solver ended without a solution")
+        return self.step.solve(V, rho)
+
+
+@pytest.mark.parametrize("starts", [1, 4])  # one start leads on to a reflected one
+def test_runs_whose_step_fails_leave_the_others(starts: int) -> None:
+    X = cp.Variable((2, 2))
+    nearest = cp.Problem(cp.Minimize(cp.sum_squares(X - np.eye(2))))
+    problem = OrthogonalProblem(nearest, orthogonal=[X])
+    split = problem.split()
+    soc = OrthogonalSOC(x_step=replace(split, step=StepBesideRotations(split.step)))
+    solution = solve_orthogonal(problem, rng_of(0), soc, starts=starts)
+    assert solution.is_certified
+    assert len(solution.objectives) == starts
+    assert np.isnan(solution.objectives).any() == (starts > 1)
