@@ -194,7 +194,7 @@ def test_a_robust_solve_of_victoria_park_ends_near_the_plain_one(benchmark_data:
     solution = solvers.solve(graph, robust=solvers.GNC(), progress=False)
     assert solution.certificate.verdict is Verdict.CERTIFIED
     assert solution.robust is not None
-    assert solution.robust.rejected.sum() == 13
+    assert solution.robust.cost < 89.0  # truncated; 91.9 with 13 edges rejected, 88.7 with 15
     assert solution.robust.start.startswith("from least squares with every edge")
     assert "limit" not in solution.note
 
