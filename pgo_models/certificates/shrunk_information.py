@@ -60,9 +60,10 @@ def shrink_and_join(
 
     Parts that no edge joins can be moved, each as a whole, and those that no translation joins can
     be shifted. So edges that join them, without a cycle, fit at the least cost, which they leave as
-    it is, whatever they measure and weigh. They make the minimum a single one. What all but leaves
-    directions out joins nothing, and is dropped between parts. So are positions that alone join
-    parts, unless `by_positions`: too few of them leave the turn of a part free.
+    it is, whatever they measure and weigh. They make the minimum a single one. An edge that all but
+    leaves a direction out joins no parts, and is dropped between them. So is an edge between poses
+    that measures positions alone, unless `by_positions`: too few of them leave the turn of a part
+    free.
     """
     d = graph.d
     smaller = _smaller_information(whole, d, cap)

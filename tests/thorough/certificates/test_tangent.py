@@ -515,6 +515,13 @@ def test_no_bound_of_half_known_edges_is_above_chi2(seed: int, d: int, share: fl
         assert shrunk.bound.value <= most
 
 
+@pytest.mark.parametrize(("seed", "d"), [(5002, 2), (5001, 3)])
+def test_parts_that_positions_alone_join_have_a_bound(seed: int, d: int) -> None:
+    """Too few positions leave the turn of a part free: a bound is found without them."""
+    graph, truth = half_known(seed, d, 1.0)
+    assert bound_by_shrinking(of_file(graph), truth).bound.value > 0.0
+
+
 def test_what_half_known_edges_say_of_rotations_is_proven() -> None:
     """Planar scans leave the cycle of rotations, and each of them is half known."""
     graph = informed(3, 12, 3, coupled=False)
