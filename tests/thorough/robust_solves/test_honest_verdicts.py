@@ -103,7 +103,7 @@ def test_the_certificate_does_not_choose(monkeypatch: pytest.MonkeyPatch) -> Non
         if estimates:
             worse[np.flatnonzero(worse & ~self.doubted.known)[: 5 * len(estimates)]] = False
             solution = replace(
-                solution, poses=polish(self.doubted.with_edges(worse), solution.poses)
+                solution, all_poses=polish(self.doubted.with_edges(worse), solution.poses)
             )
         solution = replace(solution, certificate=certificate)
         estimates.append(replace(estimate, kept=worse, solution=solution))
