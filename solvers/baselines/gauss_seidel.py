@@ -133,7 +133,6 @@ class GaussSeidel:
         problem.check_quadratic("Gauss-Seidel", convex=True)
         robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
         poses = start if start is not None else Poses.identity(problem.num_poses, problem.d)
-        poses = problem.check_poses(poses)
         if problem.graph.is_world_loose:
             raise SettingError(
                 "rotations alone do not tell that of the world of position priors; "

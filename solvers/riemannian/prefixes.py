@@ -214,7 +214,7 @@ class GrowingStart:
             )
         poses = tree.poses
         if start is not None:
-            poses = problem.check_poses(start)
+            poses = start
         size = min(self.first_size, tree.num_ranks)
         return PrefixState(0, tree, poses, size, self.growth)
 

@@ -100,7 +100,7 @@ class Staircase:
     def init(self, problem: PGOProblem, start: Poses | None) -> StaircaseState:
         """State 0: rank d, at the rotations of `start`, or of the chordal relaxation."""
         problem.check_quadratic("the staircase")
-        poses = problem.check_poses(start if start is not None else chordal_start(problem))
+        poses = start if start is not None else chordal_start(problem)
         rotation_diagonal = problem.M.data[problem.diagonal_positions[problem.num_poses :]]
         shift = _SHIFT * float(rotation_diagonal.mean())
         no_multipliers = np.zeros((problem.num_poses, problem.d, problem.d))

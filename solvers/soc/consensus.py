@@ -325,7 +325,6 @@ class LocalConsensus:
     def init(self, problem: PGOProblem, start: Poses) -> ConsensusState:
         """State 0: omega = the rotations of `start`."""
         assert self.soc.robots is not None
-        start = problem.check_poses(start)
         robots = []
         for subgraph in split_graph(problem, self.soc.robots):
             layout = CopyLayout(subgraph, problem.backend, self.soc.r_step)

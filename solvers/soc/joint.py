@@ -76,7 +76,6 @@ class Joint:
 
     def init(self, problem: PGOProblem, start: Poses) -> SOCState:
         """State 0: omega = the rotations of `start`, B = 0."""
-        start = problem.check_poses(start)
         return self._state_at(problem, start, treat_as_stationary=False)
 
     def step(self, problem: PGOProblem, state: SOCState) -> SOCState:

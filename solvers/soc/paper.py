@@ -358,7 +358,6 @@ class PaperSOC:
         """State 0: R = omega = start, a spanning tree unless given; B = 0."""
         problem.check_quadratic("SOC", convex=True)
         start = start if start is not None else spanning_tree_start(problem.graph)
-        start = problem.check_poses(start)
         robots = self.robots or partition(problem.graph, method=PartitionMethod.SINGLETONS)
         all_poses = np.arange(problem.num_poses)
         blocks = Blocks.of(problem, robots.cut_edges(problem.graph), all_poses)
