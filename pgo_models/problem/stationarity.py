@@ -35,8 +35,8 @@ def gradient_squares(problem: PGOProblem, poses: Poses) -> Array:
     M_tt = problem.M.data[problem.diagonal_positions[:n]]
     # A landmark has no rotation, and a pose of rotation averaging no translation: gradient and
     # diagonal are zero there, and so is the quotient.
-    of_rotations = _quotient(squares_w, 4.0 * rotation_scale(problem))
-    of_translations = _quotient(squares_t, 2.0 * M_tt)
+    of_rotations = quotient(squares_w, 4.0 * rotation_scale(problem))
+    of_translations = quotient(squares_t, 2.0 * M_tt)
     return of_rotations + of_translations
 
 
@@ -78,7 +78,7 @@ def relative_gradient(problem: PGOProblem, poses: Poses) -> float:
     return relative_length(gradient_square, objective, rotation_square)
 
 
-def _quotient(numerator: Array, denominator: Array) -> Array:
+def quotient(numerator: Array, denominator: Array) -> Array:
     """Quotients, entry by entry; zero where the denominator is zero."""
     quotient = np.zeros_like(numerator)
     is_positive = denominator > 0

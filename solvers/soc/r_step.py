@@ -17,6 +17,7 @@ from pgo_models.geometry.rotations import Array, stack_transposes, unstack_trans
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, factorize
 from pgo_models.problem.matrices import entry_positions
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.stationarity import quotient
 from pgo_models.summaries import Summarised
 from solvers.carry.registry import record
 from solvers.soc.accelerated_gradients import minimize_with_fista, minimize_with_nesterov
@@ -149,7 +150,8 @@ def prepare_joint(problem: PGOProblem, rho: Array, back_end: BackEnd) -> JointSt
     of_rows = np.concatenate([np.zeros(n), of_rotations])
     subproblem = RSubproblem(A, w, problem.M, d, n, of_rows, problem.analysis, problem.backend)
     diagonal = problem.M.data[problem.diagonal_positions[n:]]
-    stiffness = np.maximum(1.0, of_rotations / diagonal)
+    # Where the cost does not depend on a row, as with positions on an axis, the diagonal is zero.
+    stiffness = np.maximum(1.0, quotient(of_rotations, diagonal))
     return JointStep(prepare(subproblem, back_end), n, stiffness.reshape(n, 1, d))
 
 

@@ -22,6 +22,7 @@ from pgo_models.geometry.rotations import (
     unstack_transposes,
 )
 from pgo_models.problem.matrices import inner
+from pgo_models.problem.stationarity import quotient
 from solvers.carry.registry import record
 from solvers.soc.anderson import AndersonShare, over_relax
 from solvers.soc.rounding import WHOLE, ShortNumbers
@@ -147,7 +148,7 @@ class RecursionBlock:
 
         The sums, (2,), are this party's part of the squared residuals (`squared_residuals`).
         """
-        stiffness = np.maximum(1.0, self.rho / self.diagonal)[:, None]
+        stiffness = np.maximum(1.0, quotient(self.rho, self.diagonal))[:, None]
         squares = squared_residuals(self.x, omega, self.omega, self.rho[:, None], stiffness)
         return replace(self, omega=omega), squares
 

@@ -210,6 +210,15 @@ def test_graphs_without_noise_end_at_zero(
             assert result.objective <= 1e-12
 
 
+def test_positions_on_an_axis_leave_turns_that_cost_nothing() -> None:
+    """M has zeros on its diagonal then, by which the stiffness of step (a) was a penalty over."""
+    graph = exact_graph(0, 8, 3)
+    on_an_axis = np.arange(8.0)[:, None] * np.eye(3)[0]
+    problem = PGOProblem(graph.with_position_prior(np.arange(8), on_an_axis, tau=1.0))
+    for robots in (None, partition(problem.graph, 2)):
+        assert np.isfinite(run(SOC(robots=robots, max_iterations=3), problem).objective)
+
+
 # Endings and settings.
 
 
