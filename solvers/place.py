@@ -170,13 +170,15 @@ class Place(ABC):
         return ""
 
     def note(self, best: Attempt) -> str:
-        """Say which steps failed and, where the gap is too wide, which were skipped and why."""
+        """Say, where the gap is too wide, which steps failed, and which were skipped and why."""
+        if best.proof.is_certified:
+            return ""
         sentences = list(best.failures)
         skipped: dict[str, list[str]] = {}
         for stage in self.table.stages:
             if not stage.was_taken:
                 skipped.setdefault(stage.reason, []).append(stage.name)
-        if skipped and not best.proof.is_certified:
+        if skipped:
             parts = [f"{', '.join(names)} ({reason})" for reason, names in skipped.items()]
             sentences.append(f"not tried: {', '.join(parts)}")
             sentences += [self.way_out] if self.way_out else []

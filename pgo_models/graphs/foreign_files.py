@@ -25,6 +25,7 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.tables import COMMENT_SIGNS, UNIT_ROTATION, lines_of_table, table_of
 
 # Words on a line of a view graph: i j, a quaternion or a rotation by rows, perhaps a translation.
+# One more is a weight, such as the number of matches.
 _QUATERNION_WORDS = (6, 9)
 _VIEW_WORDS = (*_QUATERNION_WORDS, 11, 14)
 _CLEARLY = 0.7  # share of a misfit that is better not only by chance
@@ -189,9 +190,11 @@ def _view(line: str) -> Array | None:
     """Rotation, (3, 3), between two views with ids or names; None if a line has no such thing.
 
     It is given by rows, as in EGs.txt, or as a quaternion, its w first, as GLOMAP reads it. A
-    translation may follow.
+    translation may follow, and a weight.
     """
     words = _words_of(line)
+    if _has_weight(words):
+        words.pop()
     are_numbers = [word.isdigit() for word in words[:2]]
     if len(words) not in _VIEW_WORDS or are_numbers[0] is not are_numbers[1]:
         return None
@@ -206,6 +209,11 @@ def _view(line: str) -> Array | None:
     R = numbers[:9].reshape(3, 3)
     is_rotation = np.abs(R @ R.T - np.eye(3)).max() < _NOT_UNIT and np.linalg.det(R) > 0.0
     return R if is_rotation else None
+
+
+def _has_weight(words: list[str]) -> bool:
+    """Whether there is one word more than a view takes."""
+    return len(words) not in _VIEW_WORDS and len(words) - 1 in _VIEW_WORDS
 
 
 def _words_of(line: str) -> list[str]:
@@ -246,6 +254,8 @@ def _of_views(path: Path, text: str) -> str:
         pose = _words_of_pose(R.T if are_transposed else R, np.zeros(3))
         written[place] = f"EDGE_SE3:QUAT {i} {j} {pose} {UNIT_ROTATION}"
     note = "R_j R_i^T of R_i, from the world to camera i" if are_transposed else "R_i^T R_j"
+    if any(_has_weight(_words_of(lines[place])) for place in rotations):
+        note += "; the last column, taken for a weight, is not used"
     if are_named:
         note += f"; views have the numbers 0 ({names[0]}) to {len(names) - 1} ({names[-1]}), sorted"
     warnings.warn(

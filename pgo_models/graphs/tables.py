@@ -124,44 +124,52 @@ def _measurement(places: dict[str, int]) -> tuple[str, int, list[int]]:
     return "", 0, []
 
 
-def _noise(
-    path: Path, line: int, others: dict[int, str], side: int
-) -> tuple[Noise, dict[tuple[int, int], int]]:
-    """What the other columns say of the noise, and their places by row and column of the matrix."""
+Places = dict[tuple[int, int], int]  # columns by row and column of the matrix
+
+
+def _noise(path: Path, line: int, others: dict[int, str], side: int) -> tuple[Noise, Places]:
+    """What the other columns say of the noise, and their places.
+
+    Columns with numbers come before named ones. Columns of other names are a triangle where they
+    are as many as its entries.
+    """
     triangle = [(a, b) for a in range(side) for b in range(a, side)]
-    if side == 0:
-        return Noise.MISSING, {}
     numbered = _numbered(others)
-    if len(numbered) == len(triangle):
+    if triangle and len(numbered) == len(triangle):
         kind = next(iter(numbered.values()))
         return kind, dict(zip(triangle, numbered, strict=True))
-    axes = _PLANAR_AXES if side == 3 else _AXES
+    named = _named(others, side) if triangle else {}
+    if len(named) > 1:
+        kinds = " and ".join(_TEXTS[kind] for kind in named)
+        raise FileFormatError(path, line, f"a table with {kinds}; leave one of them out")
+    for kind, places in named.items():
+        if not all((axis, axis) in places for axis in range(side)):
+            problem = f"the columns of {_TEXTS[kind]} lack an entry on the diagonal; add it"
+            raise FileFormatError(path, line, problem)
+        return kind, places
+    if triangle and len(others) == len(triangle):
+        return Noise.INFORMATION, dict(zip(triangle, others, strict=True))
+    return Noise.MISSING, {}
+
+
+def _named(others: dict[int, str], side: int) -> dict[Noise, Places]:
+    """Columns whose names have a kind of noise and one or two axes, as `cov_xx` and `std_x` do."""
     first_number = 0 if any("0" in name for name in others.values()) else 1
+    axes = _PLANAR_AXES if side == 3 else _AXES
     axes = axes | {str(first_number + axis): axis for axis in range(side)}
-    entries: dict[Noise, dict[tuple[int, int], int]] = {}
+    named: dict[Noise, Places] = {}
     for place, name in others.items():
         match = _ENTRY.fullmatch(name)
         if match is None:
             continue
         kind_of_name, row, column = match.groups()
         kind = _KINDS[kind_of_name]
-        is_deviation = kind is Noise.DEVIATIONS
+        needs_two_axes = len(kind_of_name) < 2  # "x" alone, or "ix", is no entry of a matrix
+        has_one_too_many = kind is Noise.DEVIATIONS and column
         a, b = sorted((axes.get(row, -1), axes.get(column or row, -1)))
-        if a < 0 or (len(kind_of_name) < 2 and not column) or (is_deviation and column):
-            continue
-        entries.setdefault(kind, {})[a, b] = place
-    if not entries:
-        is_triangle = len(others) == len(triangle)
-        given = dict(zip(triangle, others, strict=True)) if is_triangle else {}
-        return (Noise.INFORMATION if is_triangle else Noise.MISSING), given
-    kinds = " and ".join(_TEXTS[kind] for kind in entries)
-    if len(entries) > 1:
-        raise FileFormatError(path, line, f"a table with {kinds}; leave one of them out")
-    ((kind, of_kind),) = entries.items()
-    if not all((axis, axis) in of_kind for axis in range(side)):
-        problem = f"the columns of {kinds} lack an entry on the diagonal; add it"
-        raise FileFormatError(path, line, problem)
-    return kind, of_kind
+        if a >= 0 and not has_one_too_many and (column or not needs_two_axes):
+            named.setdefault(kind, {})[a, b] = place
+    return named
 
 
 def _numbered(others: dict[int, str]) -> dict[int, Noise]:

@@ -3,8 +3,10 @@
 import math
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -594,19 +596,21 @@ def _solve_components(
 ) -> int:
     """Solve every component of a graph as `_solve_graph` does; the largest exit code.
 
-    JSON is a list of their records.
+    JSON is a list of their records, printed when all are solved.
     """
     if anchor is not None:
         pose_named(loaded, anchor)
     codes = []
+    records = []
     for number, component in enumerate(components_of(loaded), 1):
         named = outputs if number == 1 else outputs.numbered(number)
         held = anchor if anchor in component.pose_ids else None
-        if display.as_json:
-            typer.echo("[" if number == 1 else ",")
-        codes.append(_solve_graph(component, source, stages, network, named, display, held))
+        with redirect_stdout(StringIO()) if display.as_json else nullcontext() as printed:
+            codes.append(_solve_graph(component, source, stages, network, named, display, held))
+        if printed is not None:
+            records.append(printed.getvalue())
     if display.as_json:
-        typer.echo("]")
+        typer.echo(f"[\n{','.join(records)}]")
     return max(codes)
 
 

@@ -514,6 +514,11 @@ def test_edges_that_fit_exactly_are_not_said_to_be_reversed(pgo_command: Call) -
         assert json.loads(out)["proposed"] == []
 
 
+def test_a_step_that_fails_is_not_noted_beside_a_certificate(pgo_command: Call) -> None:
+    code, out, _ = pgo_command("solve", CASES / "a5_corridor_2d.g2o", "--json")
+    assert (code, "failed" in json.loads(out)["note"]) == (0, False)
+
+
 def test_wrong_edges_are_looked_for_among_edges_that_measure_a_part(pgo_command: Call) -> None:
     case = CASES / "a5_corridor_2d.g2o"
     _, out, _ = pgo_command("solve", case, "--robust", "gnc", "--json")
@@ -539,6 +544,10 @@ def test_every_component_is_solved_when_asked(pgo_command: Call, tmp_path: Path)
     code, _, err = pgo_command("solve", tmp_path / "parts.g2o", "--all-components", "--anchor", 5)
     assert code == 1
     assert "no pose 5 to anchor" in err
+    nowhere = tmp_path / "nowhere" / "map.g2o"
+    options = ("--all-components", "--json", "--out", nowhere)
+    code, out, _ = pgo_command("solve", tmp_path / "parts.g2o", *options)
+    assert (code, out) == (1, "")
     code, out, err = said(pgo_command, "doctor", tmp_path / "parts.g2o")
     assert code == 0
     assert err.count("2 components, of which the largest is compared") == 1
@@ -676,13 +685,14 @@ def test_the_rotations_of_view_graphs_are_read(
         words = line.split()
         R = np.array(words[2:11]).reshape(3, 3)
         R = R.T if is_of_cameras else R
-        lines.append(" ".join([*words[:2], *R.ravel(), *words[11:]]))
+        lines.append(" ".join([*words[:2], *R.ravel(), *words[11:], "57"]))
     if is_of_cameras:  # a line with two counts, commas, and comments behind the numbers
         lines = [f"99 {len(lines)}", *(line.replace(" ", ",") + " # 120" for line in lines)]
     (tmp_path / "EGs.txt").write_text("\n".join(lines))
     code, out, err = said(pgo_command, "solve", tmp_path / "EGs.txt", "--rotations", "--json")
     assert code == 0
     assert "a view graph, of which the rotations are read" in err
+    assert "the last column, taken for a weight, is not used" in err
     assert json.loads(out)["objective"] == pytest.approx(13.86581241, rel=1e-6)
 
 
