@@ -117,9 +117,9 @@ def note_of_tangent(problem: PGOProblem, certificate: Certificate) -> str:
     if num_beyond == 0:
         return ""
     return (
-        f"chi2 is open because of its translations: the information of {num_beyond} edges has a "
-        f"condition of up to {condition.max():.2g}, and the bound could keep "
-        f"{certificate.bound.cap:.2g}; F has no such loss"
+        f"chi2 is open because of its translations: {num_beyond} edges are up to "
+        f"{condition.max():.2g} times as precise in one direction as in another, and this bound is "
+        f"for ratios of up to {certificate.bound.cap:.2g}; F has no such loss"
     )
 
 

@@ -61,6 +61,7 @@ _LEAST_MISFIT = {
 _ORDERS = {Reading.TORO_ORDER, *ROTATION_FIRST}
 _LEAST_EXCESS = 1000.0
 _MOST_MISFIT = 10.0
+_FAR_TOO_SMALL = 1.0 / 30.0  # times what is expected: then square roots are at least mentioned
 _MOST_MISFIT_OF_BLOCKS = 2.0  # where blocks are exchanged, which changes the cost either way
 _CLOSE = math.log(1e3)  # difference of evidence up to which a reading is named beside the best
 _TURN = 2.0 * math.pi  # no program writes larger angles in radians
@@ -166,13 +167,21 @@ class ReadingComparison(Summarised):
         if not self.proposed and invalid:
             return f"{invalid} No other reading fits."
         if not self.proposed:
-            return f"{self.cost_name} {written}: no other reading fits better beyond chance."
+            return f"{self.cost_name} {written}: {self._no_other_reading()}"
         best, *others = self.proposed
         begin = f"{invalid} {self.cost_name} " if invalid else f"{self.cost_name} {written}, "
         text = f"{begin}{_with_share(best)}: {best.question}"
         if others:
             text += f" Nearly as likely: {' or '.join(fit.text for fit in others)}."
         return text
+
+    def _no_other_reading(self) -> str:
+        """What is said where no reading is proposed, though square roots may explain the cost."""
+        for fit in self.others:
+            is_likely = fit.reading is Reading.SQUARE_ROOTS and fit.evidence >= _LEAST_EVIDENCE
+            if is_likely and self.written.times_expected <= _FAR_TOO_SMALL <= fit.times_expected:
+                return f"the matrices claim too little, or are square roots: {_with_share(fit)}."
+        return "no other reading fits better beyond chance."
 
     def __str__(self) -> str:
         fits = (self.written, *self.others)

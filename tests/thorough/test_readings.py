@@ -96,6 +96,14 @@ def test_a_planted_reading_is_named_and_the_corrected_file_is_right(
     assert not compare_readings(corrected).proposed
 
 
+def test_square_roots_of_matrices_that_are_not_large_are_mentioned(tmp_path: Path) -> None:
+    """A file may as well claim a fiftieth of the information that it has: nothing is proposed."""
+    written(walk(2, std=0.02), tmp_path / "walk.g2o", "all", with_diagonal(0.5))
+    comparison = compare_readings(tmp_path / "walk.g2o")
+    assert not comparison.proposed
+    assert "or are square roots" in comparison.sentence()
+
+
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("std", [1e-4, 0.01, 0.2])
 def test_no_other_reading_is_proposed_of_a_file_that_means_what_it_says(
