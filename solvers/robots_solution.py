@@ -39,7 +39,7 @@ class RobotsSolution(Summarised):
     certificate : Certificate
         Cost, lower bound, gap and verdict, without poses and multipliers.
     sizes : IntArray, shape (2, num_robots)
-        How many poses, and edges, every robot has.
+        How many poses with an edge, and edges, the file of every robot has.
     status : Status
         How the run ended that found the poses, or what broke the solve off.
     stages : tuple of Stage
@@ -85,21 +85,17 @@ class RobotsSolution(Summarised):
     num_bridges: int = 0
 
     @classmethod
-    def of(cls, solution: Solution, ledger: Ledger) -> RobotsSolution:
+    def of(cls, solution: Solution, ledger: Ledger, sizes: IntArray) -> RobotsSolution:
         """What robots are told of a solution of the graph of all, beside their own poses."""
         problem = solution.problem
         graph = problem.graph
-        d = graph.d
-        owners = graph.robots
-        owned = (owners[graph.in_files], np.minimum(owners[graph.i], owners[graph.j]))
-        sizes = [np.bincount(of, minlength=ledger.num_robots) for of in owned]
-        no_poses = Poses.identity(0, d)
+        no_poses = Poses.identity(0, graph.d)
         F = both_costs(problem, solution.all_poses)["F"]
         robust = solution.robust
         return cls(
             name=graph.name,
             certificate=replace(solution.certificate, poses=no_poses, Lambda=no_poses.R),
-            sizes=np.stack(sizes),
+            sizes=sizes,
             status=solution.status,
             stages=solution.stages,
             ledger=ledger,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ import numpy as np
 from pgo_models.errors import GraphError, GraphWarning, PGOError
 from pgo_models.graphs.g2o import graph_of_robots
 from pgo_models.graphs.g2o_parser import G2OLines, parse_lines
-from pgo_models.graphs.pose_graph import PoseGraph
+from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
@@ -83,7 +83,9 @@ class TeamSettings:
         if num_apart:
             problems.append(f"no edge joins {num_apart} poses of {self.name} with its others")
         own = OwnAnswer.of(solution, is_own)
-        found = RobotsSolution.of(solution, Ledger(len(lines))).without_histories
+        sizes = _sizes_in(part, [files[name] for name in covered])
+        found = RobotsSolution.of(solution, Ledger(len(covered)), sizes)
+        found = found.without_histories
         return SharedAnswer(found, pickle.dumps(solution), own, tuple(covered), tuple(problems))
 
     def _graph(self, files: Mapping[str, G2OLines]) -> tuple[PoseGraph, dict[str, PGOError]]:
@@ -155,3 +157,13 @@ def _has_poses_of(graph: PoseGraph, file: G2OLines) -> bool:
     """Whether a pose of a robot is in a graph, or one that it has measured."""
     named = np.concatenate([file.vertex_ids, file.edge_ids.ravel()])
     return bool(np.isin(graph.pose_ids, named).any())
+
+
+def _sizes_in(graph: PoseGraph, files: Sequence[G2OLines]) -> IntArray:
+    """Number of poses, and of edges, that each file brings into a connected part, (2, files)."""
+    sizes = []
+    for file in files:
+        poses = np.union1d(file.vertex_ids, file.edge_ids)
+        num_poses = np.isin(poses, graph.pose_ids[graph.in_files]).sum()
+        sizes.append([num_poses, np.isin(file.edge_ids[:, 1], graph.pose_ids).sum()])
+    return np.array(sizes).T

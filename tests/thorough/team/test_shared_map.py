@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from networks import (
     give_edge,
     message_in,
     robots_of,
+    robots_with_files,
     world,
 )
 from wrong_edges import spoiled
@@ -25,6 +28,7 @@ from pgo_models.errors import GraphError
 from solvers.team.news import News
 
 SHARED = solvers.Sharing.MEASUREMENTS
+ROBOTS = Path(__file__).parents[3] / "data" / "robots"
 
 
 def shared(graph: PoseGraph, num_robots: int, **settings: object) -> dict[str, solvers.Robot]:
@@ -154,6 +158,24 @@ def test_what_an_absent_robot_has_contributed_stays_and_reaches_those_that_come_
     network.run(30.0)
     assert network.is_settled
     assert_is_the_optimum(network.robots, graph)
+
+
+def test_robots_have_a_map_without_the_one_that_the_ids_of_poses_name_last(tmp_path: Path) -> None:
+    team = robots_with_files(ROBOTS, 4, patience=5.0, retry=0.3)
+    network = Network(team, np.random.default_rng(0), asleep={"d"})
+    network.wait(8.0)
+    for k in range(3):
+        shutil.copy(ROBOTS / f"{k}.g2o", tmp_path)
+    best = solvers.solve_folder(tmp_path)
+    for name in "abc":
+        robot = team[name]
+        assert robot.failure == ""
+        assert robot.covered == ("a", "b", "c")
+        assert robot.absent == ("d",)
+        assert robot.is_certified
+        assert robot.solution is not None
+        assert robot.solution.objective == pytest.approx(best.objective, rel=1e-6)
+        assert robot.solution.sizes.sum(axis=1).tolist() == [178, 189]
 
 
 def test_two_robots_that_hear_each_other_only_through_a_third_have_the_map_of_all() -> None:
