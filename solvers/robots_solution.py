@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
