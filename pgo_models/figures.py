@@ -20,18 +20,8 @@ _EXACT = Context(prec=2 * _DIGITS_OF_A_DOUBLE, Emin=MIN_EMIN, Emax=MAX_EMAX)
 def rounded_down(value: float | Decimal, digits: int = 10) -> str:
     """Text of a lower bound: the largest decimal of so many digits that is not above the value.
 
-    Parameters
-    ----------
-    value : float or Decimal
-        Number to be written; nan and inf are written as such.
-    digits : int
-        Significant digits, at least one.
-
-    Returns
-    -------
-    str
-        As the format `g` writes it: without trailing zeros, with an exponent for large and small
-        numbers.
+    It is written as the format `g` writes it: without trailing zeros, with an exponent for large
+    and small numbers. Nan and inf are written as such.
 
     Examples
     --------
@@ -44,18 +34,7 @@ def rounded_down(value: float | Decimal, digits: int = 10) -> str:
 def rounded_up(value: float | Decimal, digits: int = 10) -> str:
     """Text of a cost or a gap: the smallest decimal of so many digits that is not below the value.
 
-    Parameters
-    ----------
-    value : float or Decimal
-        Number to be written; nan and inf are written as such.
-    digits : int
-        Significant digits, at least one.
-
-    Returns
-    -------
-    str
-        As the format `g` writes it: without trailing zeros, with an exponent for large and small
-        numbers.
+    Otherwise as `rounded_down`.
 
     Examples
     --------

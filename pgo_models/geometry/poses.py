@@ -91,23 +91,7 @@ class Poses(ReadOnly):
 
     @classmethod
     def of_points(cls, t: Array) -> Poses:
-        """Return unrotated poses at points.
-
-        Parameters
-        ----------
-        t : Array, (n, d)
-            Points, metres.
-
-        Returns
-        -------
-        Poses
-            A pose with R_i = I at every point.
-
-        Raises
-        ------
-        GraphError
-            When the points are no (n, d) array of real numbers.
-        """
+        """Return poses with R_i = I at points, (n, d), metres."""
         points = real_array(t, "points")
         if points.ndim != 2:
             raise GraphError(f"points have shape {points.shape}; give (n, d), a row for each point")
@@ -132,22 +116,13 @@ class Poses(ReadOnly):
         return type(self)(self.R[index], self.t[index])
 
     def stacked(self) -> Array:
-        """Return translations and rotations as one matrix X.
-
-        Returns
-        -------
-        Array, ((d+1) n, d)
-            First the n rows t_i, then the d rows of every R_i^T.
-        """
+        """Return X, ((d+1) n, d): first the n rows t_i, then the d rows of every R_i^T."""
         return np.concatenate([self.t, stack_transposes(self.R)])
 
     def with_translations(self, t: Array) -> Poses:
-        """Return poses with the same rotations at other positions.
+        """Return poses with the same rotations at other positions, (n, d), metres.
 
-        Parameters
-        ----------
-        t : Array, (n, d)
-            Positions, metres. Their shape is not checked, nor are the rotations again.
+        Their shape is not checked, nor are the rotations again.
         """
         poses = copy(self)
         object.__setattr__(poses, "t", real_array(t, "t"))
@@ -156,65 +131,31 @@ class Poses(ReadOnly):
         return poses
 
     def moved(self, R: Array, t: Array) -> Poses:
-        """Return the same poses seen from another world: (R R_i, R t_i + t).
+        """Return the same poses seen from another world: (R R_i, R t_i + t). F stays the same.
 
-        Parameters
-        ----------
-        R : Array, (d, d)
-            Rotation, new world from old world.
-        t : Array, (d,)
-            Origin of the old world in the new one, metres.
-
-        Returns
-        -------
-        Poses
-            The moved poses. F of them is the same.
+        R, (d, d), is the rotation from the old world to the new one, and t, (d,), the origin of the
+        old world in the new one, metres.
         """
         return Poses(R @ self.R, self.t @ R.T + t)
 
     def moved_along(self, w: Array, v: Array) -> Poses:
         """Return the poses (R_i Exp(hat(w_i)), t_i + v_i), the rotations cleaned of rounding.
 
-        Parameters
-        ----------
-        w : Array, (n, 1) or (n, 3)
-            Rotation vectors in the frames of the poses, radians.
-        v : Array, (n, d)
-            Moves of the positions in the world, metres.
+        w, (n, 1) or (n, 3), is in radians and in the frames of the poses, v, (n, d), in metres and
+        in the frame of the world.
         """
         R = project_to_rotations(self.R @ exp_map(w))
         return Poses(R, self.t + v)
 
     def with_gauge_at(self, index: int = 0) -> Poses:
-        """Move the world so that one pose is the identity.
-
-        Returns
-        -------
-        Poses
-            The moved poses. F of them is the same.
-        """
+        """Move the world so that one pose is the identity. F stays the same."""
         R = self.R[index].T
         return self.moved(R, -R @ self.t[index])
 
     def anchored_to(self, other: Poses, index: int) -> Poses:
-        """Move the world so that one pose is exactly where others have it.
+        """Move the world so that pose `index` is exactly where others of the same size have it.
 
-        Parameters
-        ----------
-        other : Poses
-            Poses of the same number and dimension.
-        index : int
-            Number of the pose that is the same in both afterwards.
-
-        Returns
-        -------
-        Poses
-            The moved poses. F of them is the same up to rounding.
-
-        Raises
-        ------
-        GraphError
-            When the number of poses or the dimension differs.
+        F stays the same up to rounding.
         """
         _check_same_size(self, other)
         turn = other.R[index] @ self.R[index].T
@@ -230,17 +171,7 @@ class Poses(ReadOnly):
 
         The rigid motion (R, t) minimises sum_i ||R t_i + t - t_i'||^2. When the positions do not
         fix the rotation (all in one point or, in space, on a line), R minimises sum_i ||R R_i -
-        R_i'||^2 instead.
-
-        Parameters
-        ----------
-        other : Poses
-            Poses (R_i', t_i') of the same number and dimension.
-
-        Raises
-        ------
-        GraphError
-            When the number of poses or the dimension differs.
+        R_i'||^2 instead. A GraphError when the number of poses or the dimension differs.
 
         References
         ----------
@@ -292,22 +223,8 @@ def rotations_to_rounding(R: Array, name: Callable[[int], str]) -> tuple[Array, 
 def absolute_trajectory_error(estimate: Poses, truth: Poses) -> float:
     """Compute the ATE: the root mean square of ||t_i - t_i'||, after the estimate is aligned.
 
-    Parameters
-    ----------
-    estimate : Poses
-        Poses to judge.
-    truth : Poses
-        True poses, with the positions t_i'.
-
-    Returns
-    -------
-    float
-        Error, metres.
-
-    Raises
-    ------
-    GraphError
-        When the number of poses or the dimension differs.
+    It is in metres, and t_i' are the positions of the truth. A GraphError when the number of poses
+    or the dimension differs.
 
     References
     ----------
@@ -329,30 +246,7 @@ def absolute_rotation_error(estimate: Poses, truth: Poses) -> float:
     """Compute the root mean square of the angles between R_i and R_i', after alignment.
 
     The estimate is turned by the R that minimises sum_i ||R R_i - R_i'||^2; positions do not count.
-
-    Parameters
-    ----------
-    estimate : Poses
-        Poses to judge.
-    truth : Poses
-        True poses, with the rotations R_i'.
-
-    Returns
-    -------
-    float
-        Error, radians.
-
-    Raises
-    ------
-    GraphError
-        When the number of poses or the dimension differs.
-
-    Examples
-    --------
-    >>> truth = Poses.identity(3, 2)
-    >>> turned = truth.moved(np.array([[0.0, -1.0], [1.0, 0.0]]), np.zeros(2))
-    >>> absolute_rotation_error(turned, truth)
-    0.0
+    The error is in radians. A GraphError when the number of poses or the dimension differs.
     """
     _check_same_size(estimate, truth)
     correlation = np.einsum("nab,ncb->ac", truth.R, estimate.R)
@@ -366,27 +260,8 @@ def relative_pose_error(estimate: Poses, truth: Poses, step: int = 1) -> tuple[f
     """Compute the RPE over all pairs (i, i + step), without alignment.
 
     The error of a pair is (x_i'^-1 x_{i+step}')^-1 (x_i^-1 x_{i+step}), with ' for the truth.
-
-    Parameters
-    ----------
-    estimate : Poses
-        Poses to judge.
-    truth : Poses
-        True poses.
-    step : int
-        Distance of the two poses of a pair.
-
-    Returns
-    -------
-    translation : float
-        Root mean square of the translation error, metres.
-    rotation : float
-        Root mean square of the rotation error, radians.
-
-    Raises
-    ------
-    GraphError
-        When the number of poses or the dimension differs, or there is no such pair.
+    Returned are the root mean squares of its translation, metres, and of its rotation, radians. A
+    GraphError when the number of poses or the dimension differs, or there is no such pair.
 
     References
     ----------

@@ -51,20 +51,7 @@ def project_to_rotations(A: Array) -> Array:
     <- (X + cof(X) / det X) / 2, which has the same limit. Where several rotations are nearest, the
     result is one of them.
 
-    Parameters
-    ----------
-    A : Array, (n, d, d)
-        Matrices, d = 2 or 3.
-
-    Returns
-    -------
-    Array, (n, d, d)
-        Rotations.
-
-    Raises
-    ------
-    SettingError
-        When A is no array of this shape.
+    A has shape (n, d, d) with d = 2 or 3, as the result has; else a SettingError is raised.
 
     References
     ----------
@@ -216,22 +203,10 @@ def vee(W: Array) -> Array:
 
 
 def exp_map(w: Array) -> Array:
-    """Compute the rotations Exp(hat(w)) of tangent vectors.
+    """Compute the rotations Exp(hat(w)), (n, d, d), of tangent vectors.
 
-    Parameters
-    ----------
-    w : Array, (n, 1) or (n, 3)
-        Angles in the plane, or rotation vectors in space, radians.
-
-    Returns
-    -------
-    Array, (n, d, d)
-        Rotations.
-
-    Raises
-    ------
-    SettingError
-        When w is no array of this shape.
+    They are angles in the plane, (n, 1), or rotation vectors in space, (n, 3), in radians; for
+    another shape a SettingError is raised.
 
     Examples
     --------
@@ -253,20 +228,8 @@ def exp_map(w: Array) -> Array:
 def log_map(R: Array) -> Array:
     """Compute the tangent vectors w of rotations, with Exp(hat(w)) = R and ||w|| <= pi.
 
-    Parameters
-    ----------
-    R : Array, (n, d, d)
-        Rotations, d = 2 or 3.
-
-    Returns
-    -------
-    Array, (n, 1) or (n, 3)
-        Angles in the plane, or rotation vectors in space, radians.
-
-    Raises
-    ------
-    SettingError
-        When R is no array of this shape.
+    Of rotations (n, 2, 2) they are angles, (n, 1), and of (n, 3, 3) rotation vectors, (n, 3), in
+    radians; for another shape a SettingError is raised.
 
     Examples
     --------
@@ -307,21 +270,7 @@ def as_generator(rng: np.random.Generator | int) -> np.random.Generator:
 
 
 def random_rotations(count: int, d: int, rng: np.random.Generator | int) -> Array:
-    """Draw rotations uniformly (by the Haar measure) from SO(d).
-
-    Parameters
-    ----------
-    count : int
-        Number of rotations.
-    d : int
-        Dimension of space: 2 or 3.
-    rng : numpy.random.Generator or int
-        Source of the draws.
-
-    Returns
-    -------
-    Array, (count, d, d)
-        Rotations.
+    """Draw rotations, (count, d, d), uniformly (by the Haar measure) from SO(d), d = 2 or 3.
 
     Examples
     --------

@@ -26,22 +26,13 @@ _TIMEOUT = 30.0  # seconds without an answer
 
 @dataclass(frozen=True)
 class Registry:
-    """A public folder of g2o files with their checksums.
+    """A public folder of g2o files with their checksums."""
 
-    Parameters
-    ----------
-    base_url : str
-        Address of the folder: the file of a name is at `base_url/name.g2o`.
-    checksums : mapping of str to str
-        Name of a data set to `sha256:` and the digest of its file, or to `blob:` and its git blob
-        id, which is the SHA-1 of "blob <size>", a zero byte, and the file.
-    cache : Path, optional
-        Folder for downloads; the cache folder of the user unless given.
-    """
-
-    base_url: str
+    base_url: str  # address of the folder: the file of a name is at `base_url/name.g2o`
+    # Name of a data set to `sha256:` and the digest of its file, or to `blob:` and its git blob id,
+    # which is the SHA-1 of "blob <size>", a zero byte, and the file.
     checksums: Mapping[str, str]
-    cache: Path | None = None
+    cache: Path | None = None  # folder for downloads; the cache folder of the user unless given
 
 
 _SE_SYNC_CHECKSUMS: Mapping[str, str] = {
@@ -96,17 +87,8 @@ def load(
         As for `read_g2o`.
     reading : Reading
         As for `read_g2o`; a JSON robot log leaves no choice.
-    unit_weights : bool
+    unit_weights, skip_unknown, trust_folder : bool
         As for `read_g2o`.
-    skip_unknown : bool
-        As for `read_g2o`.
-    trust_folder : bool
-        As for `read_g2o`.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with estimate and truth, where there are files of them.
 
     Raises
     ------
@@ -216,11 +198,6 @@ def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
     """Return the names that `load` takes, in alphabetical order.
 
     They are those of the files in the data folders, and of those that can be downloaded.
-
-    Examples
-    --------
-    >>> "sphere" in known_datasets()
-    True
     """
     names = set(registry.checksums)
     for folder in _folders():

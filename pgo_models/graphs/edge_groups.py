@@ -14,21 +14,11 @@ from pgo_models.graphs.pose_graph import IntArray
 
 @dataclass(frozen=True, eq=False)
 class EdgeGroups:
-    """Groups of edges, none of which is empty.
+    """Groups of edges, none of which is empty."""
 
-    Parameters
-    ----------
-    edges : (k,) array
-        The edges, group by group.
-    sizes : (g,) array
-        How many edges each group has.
-    names : (g,) array
-        A number for every group, which it keeps when edges are taken out.
-    """
-
-    edges: IntArray
-    sizes: IntArray
-    names: IntArray
+    edges: IntArray  # (k,): group by group
+    sizes: IntArray  # (g,): how many edges each group has
+    names: IntArray  # (g,): a number for every group, which it keeps when edges are taken out
 
     @classmethod
     def of(cls, groups: Sequence[IntArray]) -> EdgeGroups:

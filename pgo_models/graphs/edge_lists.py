@@ -28,27 +28,8 @@ def from_networkx(network: Any) -> PoseGraph:  # noqa: ANN401 - networkx has no 
     edges or of none; else `kappa` and `tau`, which are 1 unless given. Where every node has a
     `pose`, these are the initial estimate. Nodes that are whole numbers keep them as `pose_ids`.
 
-    Parameters
-    ----------
-    network : networkx.DiGraph or networkx.MultiDiGraph
-        Graph whose edges are measurements.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with the poses in the order of the nodes.
-
-    Raises
-    ------
-    GraphError
-        For a graph that is not directed, an edge without a pose, or as for `PoseGraph`.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> network = to_networkx(grid(0))  # doctest: +SKIP
-    >>> from_networkx(network)  # doctest: +SKIP
-    PoseGraph('networkx', d=3, poses=25, edges=55, robots=1)
+    The poses are in the order of the nodes. A GraphError for a graph that is not directed, an edge
+    without a pose, or as for `PoseGraph`.
     """
     if not (hasattr(network, "is_directed") and hasattr(network, "edges")):
         raise SettingError(f"network is a {type(network).__name__}; give a graph of networkx")
@@ -87,33 +68,12 @@ def from_networkx(network: Any) -> PoseGraph:  # noqa: ANN401 - networkx has no 
 
 
 def to_networkx(graph: PoseGraph, poses: Poses | None = None) -> Any:  # noqa: ANN401
-    """Make a networkx graph of a PoseGraph, with the measured poses on its edges.
+    """Make a networkx.MultiDiGraph of a PoseGraph, with the measured poses on its edges.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        Graph without priors and landmarks.
-    poses : Poses, optional
-        Poses of the nodes; `graph.initial` unless given.
-
-    Returns
-    -------
-    networkx.MultiDiGraph
-        Nodes are the `pose_ids`. Edges have the attributes `pose`, (d + 1, d + 1), `kappa`, `tau`
-        and, where the graph has them, `information`.
-
-    Raises
-    ------
-    GraphError
-        When the graph has priors or landmarks, or the poses do not fit it.
-    MissingExtraError
-        Without networkx, which the extra `notebooks` brings.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> to_networkx(grid(0)).number_of_edges()  # doctest: +SKIP
-    55
+    Nodes are the `pose_ids`, with the given poses or `graph.initial`. Edges have the attributes
+    `pose`, (d + 1, d + 1), `kappa`, `tau` and, where the graph has them, `information`. A
+    GraphError when the graph has priors or landmarks, or the poses do not fit it. The extra
+    `notebooks` brings networkx.
     """
     networkx = extra_module("networkx", "notebooks")
     poses = _poses_to_give(graph, poses)
@@ -145,16 +105,6 @@ def from_pandas(edges: Any, poses: Any = None) -> PoseGraph:  # noqa: ANN401 - m
         Frame of the edges, in metres and radians.
     poses : pandas.DataFrame, optional
         Initial estimate: the same columns of a pose, with the ids of the poses as index.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with the poses in the order of their ids.
-
-    Raises
-    ------
-    GraphError
-        For a column that is missing, poses without an estimate, or as for `PoseGraph`.
 
     Examples
     --------
@@ -193,27 +143,11 @@ def from_pandas(edges: Any, poses: Any = None) -> PoseGraph:  # noqa: ANN401 - m
 
 
 def to_pandas(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
-    """Make frames of pandas of a PoseGraph: its edges, and poses.
+    """Make frames of pandas of a PoseGraph: its edges, and the given poses or `graph.initial`.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        Graph without priors and landmarks.
-    poses : Poses, optional
-        Poses to write; `graph.initial` unless given.
-
-    Returns
-    -------
-    edges, poses : pandas.DataFrame
-        Frames with the columns of `from_pandas`; the poses are None where there are none.
-        Information matrices are not written.
-
-    Raises
-    ------
-    GraphError
-        When the graph has priors or landmarks, or the poses do not fit it.
-    MissingExtraError
-        Without pandas, which the extra `notebooks` brings.
+    They have the columns of `from_pandas`; the poses are None where there are none. Information
+    matrices are not written. A GraphError when the graph has priors or landmarks, or the poses do
+    not fit it. The extra `notebooks` brings pandas.
 
     Examples
     --------

@@ -89,13 +89,6 @@ def with_free_directions_held(graph: PoseGraph) -> PoseGraph:
 
     Its `free` names the directions and says how they are held. A graph without such directions is
     returned as it is.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> graph = grid(np.random.default_rng(0))
-    >>> with_free_directions_held(graph) is graph
-    True
     """
     partial = partial_edges(graph)
     if graph.world is None and not partial.any():

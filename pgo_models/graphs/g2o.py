@@ -150,11 +150,6 @@ def read_g2o(
         Whether the files of a folder are of one graph whatever speaks against it: the same id is
         the same pose, and edges count unless all their numbers are the same.
 
-    Returns
-    -------
-    PoseGraph
-        Graph with kappa and tau, and `information` as in the file.
-
     Raises
     ------
     FileFormatError
@@ -422,13 +417,6 @@ def write_g2o(
     mine : BoolArray, (n,), optional
         Poses that have VERTEX and FIX lines; all unless given.
 
-    Raises
-    ------
-    GraphError
-        When there is not one pose for every pose of the graph.
-    PGOError
-        When the file cannot be written.
-
     Examples
     --------
     >>> import tempfile
@@ -588,13 +576,11 @@ def g2o_files(path: Path) -> list[Path]:
         raise FileFormatError(
             path, None, "a folder without g2o files; give a file, or a folder with a file a robot"
         )
-    return sorted(files, key=_natural_order)
 
+    def natural_order(file: Path) -> list[tuple[int, str]]:  # 9 before 10
+        return [(len(part), part) for part in re.findall(r"\d+|\D+", file.name)]
 
-def _natural_order(file: Path) -> list[tuple[int, str]]:
-    """Key by which 9 comes before 10: shorter runs of digits first."""
-    parts = re.findall(r"\d+|\D+", file.name)
-    return [(len(part), part) for part in parts]
+    return sorted(files, key=natural_order)
 
 
 def _files_of_robots(files: list[G2OLines]) -> list[G2OLines]:

@@ -67,11 +67,6 @@ def grid_world(
     loop_closure_probability : float
         Probability that two poses which see each other are measured.
 
-    Raises
-    ------
-    SettingError
-        For fewer than 1 robot or 2 poses a robot, d other than 2 and 3, or no probability.
-
     Examples
     --------
     >>> grid_world(2, 10, np.random.default_rng(0), d=2).is_connected

@@ -148,8 +148,6 @@ def from_gtsam(
         that lack a key.
     FileFormatError
         For factors that measure nothing, with their numbers in the graph, from 1.
-    MissingExtraError
-        Without the extra `peers`.
 
     Examples
     --------
@@ -192,30 +190,10 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
     information matrices has those of its kappa and tau, as `write_g2o` writes them. Without priors
     GTSAM leaves the frame open: add a prior on one pose.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        Graph without landmarks, all of whose edges between poses have definite matrices.
-    poses : Poses, optional
-        Values of the poses; `graph.initial` unless given.
-
-    Returns
-    -------
-    gtsam.NonlinearFactorGraph, gtsam.Values
-        Factors, and the values, which are empty if there are none. Keys are the ids of the poses.
-
-    Raises
-    ------
-    GraphError
-        When the graph has landmarks or an edge that GTSAM's noise models cannot have, or the poses
-        do not fit it.
-    MissingExtraError
-        Without the extra `peers`.
-
-    Examples
-    --------
-    >>> import pgo_models as pgo
-    >>> factors, values = pgo.to_gtsam(pgo.load("sphere"))  # doctest: +SKIP
+    Returned are the gtsam.NonlinearFactorGraph, and gtsam.Values of the given poses or
+    `graph.initial`, empty if there are none. Keys are the ids of the poses. A GraphError when the
+    graph has landmarks or an edge between poses whose matrix is singular, or the poses do not fit
+    it.
     """
     gtsam = extra_module("gtsam", "peers")
     if len(graph.landmarks):

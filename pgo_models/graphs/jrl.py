@@ -82,44 +82,15 @@ def read_jrl(
 
     Measurements have no lines: messages count them from 1, robot by robot in alphabetical order.
 
-    Parameters
-    ----------
-    path : Path or str
-        JSON file; a CBOR file is refused.
-    weights : RotationWeight
-        As for `read_g2o`.
-    skip_unknown : bool
-        Whether measurements of other types are skipped with a warning.
-
-    Returns
-    -------
-    PoseGraph
-        Graph with kappa and tau, and `information` that is inverse to the covariances.
-
-    Raises
-    ------
-    FileFormatError
-        For a file that is no JSON or no JRL, and with the numbers of the first 20 measurements that
-        cannot be read or measure nothing.
+    `information` is inverse to the covariances. `weights` are as for `read_g2o`; with
+    `skip_unknown` measurements of other types are skipped with a warning. A FileFormatError for a
+    file that is no JSON, as CBOR, or no JRL, and with the numbers of the first 20 measurements that
+    cannot be read or measure nothing.
 
     References
     ----------
     McGann, Lassak & Kaess, *Asynchronous distributed smoothing and mapping via on-manifold
     consensus ADMM*, ICRA 2024.
-
-    Examples
-    --------
-    >>> import json, tempfile
-    >>> pose = {"type": "Pose2", "x": 1.0, "y": 0.0, "theta": 0.5}
-    >>> covariance = [0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.01]
-    >>> a0 = ord("a") << 56
-    >>> between = {"type": "BetweenFactorPose2", "key1": a0, "key2": a0 + 1}
-    >>> between |= {"measurement": pose, "covariance": covariance}
-    >>> log = {"name": "two", "robots": ["a"], "measurements": {"a": [{"measurements": [between]}]}}
-    >>> path = Path(tempfile.mkdtemp()) / "two.jrl"
-    >>> _ = path.write_text(json.dumps(log))
-    >>> read_jrl(path)
-    PoseGraph('two', d=2, poses=2, edges=1, robots=1)
     """
     path = Path(path)
     log = _read_json(path)

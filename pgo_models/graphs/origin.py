@@ -32,16 +32,10 @@ _EXACT = Context(prec=700)
 def far_middle(positions: Array, offsets: Array) -> Array:
     """Return the middle of positions, (d,), along axes on which it is far from zero; else zero.
 
-    That is their median, so that a few wrong ones do not matter, rounded to a power of two of about
-    their spread: with so few digits the difference of most numbers to it is exact.
-
-    Parameters
-    ----------
-    positions : Array, (k, d)
-        Measured positions of poses, metres.
-    offsets : Array, (l, d)
-        Measured translations between poses. Far is what is many times the spread of the positions
-        and the usual length of these.
+    That is the median of the measured positions, (k, d), so that a few wrong ones do not matter,
+    rounded to a power of two of about their spread: with so few digits the difference of most
+    numbers to it is exact. Far is what is many times this spread and the usual length of offsets,
+    (l, d), the measured translations between poses.
     """
     if not len(positions):
         return np.zeros(positions.shape[1])
@@ -65,19 +59,8 @@ def is_exact_difference(a: Array, b: Array) -> BoolArray:
 def shifted_exactly(positions: Array, remainders: Array, origin: Array) -> Array:
     """Return positions + remainders - origin, (k, d), as if it were rounded once.
 
-    Parameters
-    ----------
-    positions : Array, (k, d)
-        Decimals of a file, rounded to doubles.
-    remainders : Array, (k, d)
-        What the decimals have beyond these (`remainder_of`).
-    origin : Array, (d,)
-        The point.
-
-    Returns
-    -------
-    Array, (k, d)
-        The remainder itself is known to 2^-53 of it, which is far below the last bit.
+    Positions are decimals of a file, rounded to doubles, and remainders what the decimals have
+    beyond these (`remainder_of`), known to 2^-53 of it, which is far below the last bit.
     """
     return (positions - origin) + (_error_of_difference(positions, origin) + remainders)
 

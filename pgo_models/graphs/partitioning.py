@@ -66,10 +66,7 @@ class Partition(ReadOnly):
     def cut_edges(self, graph: PoseGraph) -> BoolArray:
         """Return which edges of a graph, (m,), join two robots.
 
-        Raises
-        ------
-        SettingError
-            When the partition is one of another number of poses.
+        A SettingError when the partition is one of another number of poses.
         """
         if len(self.robot) != graph.num_poses:
             raise SettingError(
@@ -106,10 +103,7 @@ def partition(
     Raises
     ------
     SettingError
-        When the number is no whole number of 1 to n, or the method is none, or GIVEN for a graph
-        that does not name as many robots.
-    MissingExtraError
-        For METIS without the extra `fast`.
+        For a number beyond 1 to n, or GIVEN for a graph that does not name as many robots.
 
     Examples
     --------

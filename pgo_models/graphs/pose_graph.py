@@ -211,7 +211,7 @@ class PoseGraph(ReadOnly):
         self._check_landmark_edges()
         self._check_precisions()
         self._check_names()
-        R_ij, _ = rotations_to_rounding(self.R_ij, self._rotation_label)
+        R_ij, _ = rotations_to_rounding(self.R_ij, lambda e: f"R_ij of {self.edge_label(e)}")
         self._set("R_ij", R_ij)
         self._check_not_empty()
         self._settle_landmarks()
@@ -232,9 +232,6 @@ class PoseGraph(ReadOnly):
             value = getattr(self, name)
             if value is not None or name not in _OPTIONAL:
                 self._set(name, checked(value, name))
-
-    def _rotation_label(self, e: int) -> str:
-        return f"R_ij of {self.edge_label(e)}"
 
     # Sizes and names
 
@@ -367,18 +364,10 @@ class PoseGraph(ReadOnly):
         return read_only(candidates[first])
 
     def completed(self, poses: Poses) -> Poses:
-        """Return poses of this graph with the world pose, and with the rotations of landmarks set.
+        """Return all n poses: those given, the world pose, and landmarks with rotations.
 
-        Parameters
-        ----------
-        poses : Poses
-            Poses of the graph, n of them or, without the world pose, n - 1.
-
-        Returns
-        -------
-        Poses
-            All n poses. The world pose is at the `origin` where it was left out. A landmark has the
-            rotation of the pose that saw it first.
+        The world pose is at the `origin` where it was left out. A landmark has the rotation of the
+        pose that saw it first.
         """
         poses = self.with_world_of(poses)
         first = self.first_sights
@@ -415,12 +404,9 @@ class PoseGraph(ReadOnly):
         return self.world is not None and bool(self.world_point.any())
 
     def near_zero(self, poses: Poses) -> Poses:
-        """Return poses, with the world pose, in the frame of that if priors are far away.
+        """Return poses with the world pose, which is at the identity if priors are far away.
 
-        Returns
-        -------
-        Poses
-            With the world pose at the identity. Poses in the frame of the file lose nothing.
+        Poses in the frame of the file lose nothing.
         """
         poses = self.with_world_of(poses)
         if not self.has_far_priors:
@@ -435,10 +421,7 @@ class PoseGraph(ReadOnly):
     def in_frame_of_priors(self, poses: Poses) -> Poses:
         """Return poses of a graph with priors in the frame of its file.
 
-        Returns
-        -------
-        Poses
-            With the world pose unturned at the `origin`. Far from zero each coordinate is rounded.
+        The world pose is unturned at the `origin`. Far from zero each coordinate is rounded.
         """
         assert self.world is not None
         poses = self.with_world_of(poses)
@@ -528,7 +511,6 @@ class PoseGraph(ReadOnly):
         return bool(is_pose.all())
 
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of every array."""
         n = self.num_poses
         m = self.num_edges
         d = self.d
@@ -640,16 +622,7 @@ class PoseGraph(ReadOnly):
     def components(self, edges: BoolArray | None = None) -> list[IntArray]:
         """Return the poses of every connected component, the largest component first.
 
-        Parameters
-        ----------
-        edges : BoolArray, (m,), optional
-            Edges that connect poses; all edges unless given.
-
-        Examples
-        --------
-        >>> from pgo_models.graphs.datasets import load
-        >>> [len(part) for part in load("grid").components()]
-        [27]
+        All edges connect poses unless a mask, (m,), says which.
         """
         if edges is None:
             adjacency = self.adjacency
@@ -798,7 +771,9 @@ class PoseGraph(ReadOnly):
 
         In a point or, in space, on a line they do not.
         """
-        measured = self._first_positions(self.is_prior & kept)
+        priors = self.is_prior & kept
+        _, first = np.unique(self.j[priors], return_index=True)
+        measured = self.t_ij[priors][first]  # one position of every pose
         if len(measured) < self.d:
             return False
         centred = measured - measured.mean(axis=0)
@@ -806,11 +781,6 @@ class PoseGraph(ReadOnly):
         rounding = _ROUNDING * np.abs(measured).max(initial=0.0)
         threshold = max(_COLLINEAR * spread[0], rounding, 1e-300)
         return bool(spread[self.d - 2] > threshold)
-
-    def _first_positions(self, priors: BoolArray) -> Array:
-        """One measured position of every pose that has priors among those chosen, (m,)."""
-        _, first = np.unique(self.j[priors], return_index=True)
-        return self.t_ij[priors][first]
 
     # Other graphs made of this one
 
@@ -902,16 +872,9 @@ class PoseGraph(ReadOnly):
         return self.with_weights(kappa, tau)
 
     def with_weights(self, kappa: Array, tau: Array) -> PoseGraph:
-        """Return the graph with other precisions.
+        """Return the graph with other precisions, (m,), per radian^2 and per metre^2.
 
         Information matrices as read are left out.
-
-        Parameters
-        ----------
-        kappa : Array, (m,)
-            Precisions of the rotations, per radian^2.
-        tau : Array, (m,)
-            Precisions of the translations, per metre^2.
         """
         return replace(self, kappa=kappa, tau=tau, information=None, unheld=None, weights_error=0.0)
 
@@ -921,14 +884,9 @@ class PoseGraph(ReadOnly):
 
     @door
     def without_edges(self, mask: BoolArray) -> PoseGraph:
-        """Return the graph without the edges that a mask, (m,), names.
+        """Return the graph without the edges that a mask, (m,), names; some have to be left.
 
         It has no world pose if no prior is left.
-
-        Raises
-        ------
-        GraphError
-            When the mask has another shape, or no edge is left.
         """
         if mask.shape != (self.num_edges,):
             raise GraphError(
@@ -958,10 +916,8 @@ class PoseGraph(ReadOnly):
             First and second pose of every new edge.
         measured : Poses
             Measured x_i^-1 x_j of the k edges.
-        kappa : Array, (k,), or float
-            Precisions of the rotations, per radian^2, or one for all new edges.
-        tau : Array, (k,), or float
-            Precisions of the translations, per metre^2, or one for all new edges.
+        kappa, tau : Array, (k,), or float
+            Precisions, per radian^2 and per metre^2, each or one for all new edges.
 
         Raises
         ------
@@ -1004,21 +960,7 @@ class PoseGraph(ReadOnly):
     ) -> PoseGraph:
         """Return the graph with priors, after which the solution is in the frame of the world.
 
-        Parameters
-        ----------
-        poses : IntArray, (k,)
-            Poses that are measured.
-        measured : Poses
-            Measured poses in the frame of the world, k of them.
-        kappa : Array, (k,), or float
-            Precisions of the rotations, per radian^2.
-        tau : Array, (k,), or float
-            Precisions of the positions, per metre^2.
-
-        Raises
-        ------
-        GraphError
-            When there is no such pose, or as for `with_edges`.
+        The k `poses` are measured in this frame. Precisions and errors are those of `with_edges`.
         """
         poses = self._checked_poses(poses)
         graph = self
@@ -1030,19 +972,8 @@ class PoseGraph(ReadOnly):
     def with_position_prior(self, poses: IntArray, positions: Array, tau: Weights) -> PoseGraph:
         """Return the graph with priors of positions, as measured by GPS.
 
-        Parameters
-        ----------
-        poses : IntArray, (k,)
-            Poses that are measured.
-        positions : Array, (k, d)
-            Measured positions in the frame of the world, metres.
-        tau : Array, (k,), or float
-            Precisions of the positions, per metre^2.
-
-        Raises
-        ------
-        GraphError
-            When there is no such pose, or as for `with_edges`.
+        The k `poses` have these positions, (k, d), in the frame of the world, metres. Precisions
+        and errors are those of `with_edges`.
 
         Examples
         --------
@@ -1059,6 +990,9 @@ class PoseGraph(ReadOnly):
     ) -> PoseGraph:
         """Return the graph with one more landmark; the ground truth is left out.
 
+        The estimate, if there is one, has the landmark where the first pose sees it. Errors are
+        those of `with_edges`.
+
         Parameters
         ----------
         seen_from : IntArray, (k,)
@@ -1069,17 +1003,6 @@ class PoseGraph(ReadOnly):
             Precisions of the positions, per metre^2.
         name : int, optional
             Id of the landmark; the first above all other ids unless given.
-
-        Returns
-        -------
-        PoseGraph
-            Graph with one more pose and k more edges. Its estimate, if there is one, has the
-            landmark where the first of these poses sees it.
-
-        Raises
-        ------
-        GraphError
-            When there is no such pose, not one position for each, or as for `with_edges`.
         """
         seen_from = self._checked_poses(seen_from)
         points = Poses.of_points(positions)

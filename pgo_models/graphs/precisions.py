@@ -91,12 +91,6 @@ def partial_edges(graph: PoseGraph) -> BoolArray:
     """Return which edges, (m,), measure rotations or positions in some directions alone.
 
     A block of their information matrix is singular and not zero.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import circle
-    >>> bool(partial_edges(circle(np.random.default_rng(0))).any())
-    False
     """
     if graph.information is None:
         return np.zeros(graph.num_edges, dtype=bool)
@@ -224,31 +218,10 @@ def indefinite_edges(graph: PoseGraph) -> BoolArray:
 
     Such a matrix has a negative eigenvalue beyond the rounding of its entries, so that its share of
     chi2 can be negative. `Weighting.INFORMATION` refuses such a matrix, and
-    `without_indefinite_coupling` leaves its coupling block out. F uses no coupling block.
+    `without_indefinite_coupling` leaves its coupling block out. F uses no coupling block. Matrices
+    without one are not checked here.
 
     Cholesky factors and eigenvalues decide where they are clear, exact arithmetic elsewhere.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        Any graph, with or without information matrices.
-
-    Returns
-    -------
-    BoolArray
-        (m,), true where r^T I r can be negative for a residual r of the edge. Matrices without a
-        coupling block are not checked here.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> from pgo_models.graphs.scenes import circle
-    >>> graph = circle(np.random.default_rng(0))
-    >>> information = matrices_of_edges(graph)
-    >>> information[5, 0, 3] = information[5, 3, 0] = 1e9
-    >>> coupled = replace(graph, information=information)
-    >>> np.flatnonzero(indefinite_edges(coupled)).tolist()
-    [5]
     """
     information = _symmetric_information(graph)
     _, is_indefinite = _semidefinite(information, graph.d)

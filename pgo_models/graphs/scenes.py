@@ -171,11 +171,6 @@ def random_geometric(
         Noise of the measurements and of the initial guess. The precisions are `noise.tau` and
         `noise.kappa(d)`.
 
-    Raises
-    ------
-    SettingError
-        For fewer than 2 poses, d other than 2 and 3, or a mean degree that is not positive.
-
     Examples
     --------
     >>> random_geometric(20, np.random.default_rng(0), d=2).is_connected
@@ -235,11 +230,6 @@ def victoria_park(
         `noise.kappa(2)`.
     reach : float
         Distance within which a tree is seen, metres.
-
-    Raises
-    ------
-    SettingError
-        For fewer than 20 poses, or a reach that is not positive.
 
     Examples
     --------

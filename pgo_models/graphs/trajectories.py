@@ -43,13 +43,6 @@ def write_tum(poses: Poses, path: Path | str, timestamps: Array | None = None) -
     timestamps : Array, (n,), optional
         Ascending seconds; 0, 1, .. unless given.
 
-    Raises
-    ------
-    GraphError
-        When there is not one finite time stamp for each pose, or they do not ascend.
-    PGOError
-        When the file cannot be written.
-
     Examples
     --------
     >>> import tempfile
@@ -78,18 +71,9 @@ def read_tum(path: Path | str, d: int = 3) -> Poses:
     A line is `timestamp tx ty tz qx qy qz qw`; `pgo_models.graphs.trajectories.read_times` reads
     the time stamps. Blank lines and comments (#) are skipped.
 
-    Parameters
-    ----------
-    path : Path or str
-        File to read.
-    d : int
-        Dimension of the poses: 3, or 2 for poses that lie in the x-y plane.
-
-    Raises
-    ------
-    FileFormatError
-        With file:line, for a row that is not 8 finite numbers, a zero quaternion, a position beyond
-        1e15 m, or, with d = 2, a pose out of the plane.
+    With d = 2 the poses have to lie in the x-y plane. A FileFormatError names the line of a row
+    that is not 8 finite numbers, of a zero quaternion, and of a pose out of the plane or beyond
+    1e15 m.
 
     Examples
     --------
@@ -145,27 +129,11 @@ def read_kitti(path: Path | str, d: int = 3) -> Poses:
 
     A line has 12 numbers: the 3 x 4 matrix (R_i, t_i) of a pose, row by row. There are no time
     stamps. The rotations are projected, since files of this format have few digits. Blank lines and
-    comments (#) are skipped.
+    comments (#) are skipped. Errors are those of `read_tum`, and a matrix that is no rotation even
+    to three digits.
 
-    Parameters
-    ----------
-    path : Path or str
-        File to read.
-    d : int
-        Dimension of the poses: 3, or 2 for poses that lie in the x-y plane. KITTI's own files have
-        z ahead of the camera and y down, so that their poses are not in the x-y plane.
-
-    Returns
-    -------
-    Poses
-        World from body, metres. The body of KITTI's own files is the left camera, and their world
-        is its first pose.
-
-    Raises
-    ------
-    FileFormatError
-        With file:line, for a row that is not 12 finite numbers, a matrix that is no rotation even
-        to three digits, a position beyond 1e15 m, or, with d = 2, a pose out of the plane.
+    The body of KITTI's own files is the left camera, and their world is its first pose, with z
+    ahead of the camera and y down, so that their poses are not in the x-y plane.
 
     References
     ----------

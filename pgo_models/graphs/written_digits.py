@@ -76,10 +76,7 @@ ALL_DIGITS = WrittenDigits(_ALL_DECIMALS, _ALL_SIGNIFICANT)
 def digits_of(numbers: Array) -> WrittenDigits:
     """The digits with which numbers are written, so many that they are enough for each of them.
 
-    Returns
-    -------
-    WrittenDigits
-        All digits where the numbers are not rounded in decimals.
+    They are all digits where the numbers are not rounded in decimals.
 
     Examples
     --------
@@ -114,18 +111,9 @@ def within_printing(x: Array, y: Array, x_units: Array, y_units: Array) -> BoolA
 def written_errors(measured: Array, digits: WrittenDigits) -> Array | None:
     """What half a unit of the last digit makes of measurements, (m, 2): ||t_ij||, ||R_ij||_F.
 
-    Parameters
-    ----------
-    measured : Array, (m, 3) or (m, 7)
-        Rows x y theta, or x y z and a quaternion.
-    digits : WrittenDigits
-        The digits of their file.
-
-    Returns
-    -------
-    Array or None
-        None unless the digits show a format. To first order: a rotation by a small angle is sqrt(2)
-        times that angle from the identity, and the angle is twice the change of the quaternion.
+    Rows are x y theta, (m, 3), or x y z and a quaternion, (m, 7). None unless the digits show a
+    format. To first order: a rotation by a small angle is sqrt(2) times that angle from the
+    identity, and the angle is twice the change of the quaternion.
     """
     if not digits.are_of_format:
         return None

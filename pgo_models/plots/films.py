@@ -46,6 +46,8 @@ def animate(
 
     In a page of `save_page` the arrow keys step and the space bar plays.
 
+    A film of more than 300 kB is refused.
+
     Parameters
     ----------
     frames : sequence of sequences of dict
@@ -61,14 +63,6 @@ def animate(
         Title of the figure.
     description : str
         What is to be seen, in words, for those who cannot see it.
-
-    Raises
-    ------
-    SettingError
-        When there are no frames, their labels are not as many, the frames have different numbers of
-        traces, or the film has more than 300 kB.
-    MissingExtraError
-        Without the extra `plot`.
 
     Examples
     --------
@@ -139,14 +133,6 @@ def animate_poses(
         For example `[soc.poses(problem, state) for state in islice(iterate(soc, problem), 30)]`.
     labels : sequence of str, optional
         What the slider says of each; `k = 0`, `k = 1`, .. unless given.
-
-    Raises
-    ------
-    GraphError
-        When there are no iterates, their labels are not as many, or they are not poses of the
-        graph.
-    MissingExtraError
-        Without the extra `plot`.
 
     Examples
     --------

@@ -214,23 +214,14 @@ def plot_graph(
 
     Parameters
     ----------
-    graph : PoseGraph
-        Graph to draw.
-    poses : Poses
-        Positions of its poses, metres.
+    graph, poses : PoseGraph, Poses
+        Graph to draw, and a pose for every pose of it.
     title : str
         Title of the figure; the name of the graph unless given.
     covariances : Array, (n, p, p), optional
         Covariances of the poses (`marginals`), drawn as ellipses that hold x and y with 95 %.
     residuals : EdgeResiduals, optional
         Residuals that decide which edges are misfits; those of F unless given.
-
-    Raises
-    ------
-    GraphError
-        When there is not one pose for every pose of the graph.
-    MissingExtraError
-        Without the extra `plot`.
 
     Examples
     --------
@@ -282,13 +273,6 @@ def compare_poses(
         Title and poses of every panel; poses alone are one panel without a title.
     residuals : EdgeResiduals, optional
         Residuals at the poses of the last panel, in which edges are marked by them.
-
-    Raises
-    ------
-    GraphError
-        When there is not one pose for every pose of the graph.
-    MissingExtraError
-        Without the extra `plot`.
 
     Examples
     --------

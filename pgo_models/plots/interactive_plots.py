@@ -56,30 +56,9 @@ def explore_graph(
 
     Poses and misfitting edges show their names under the pointer. Of a large graph, the lines that
     `lines_to_draw` leaves and some of the poses are drawn; one of a single robot is parted by time.
-    Positions are drawn to seven digits (float32).
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        Graph to draw.
-    poses : Poses
-        Positions of its poses, metres.
-    title : str
-        Title of the figure.
-    covariances : Array, (n, p, p), optional
-        Covariances of the poses (`marginals`), drawn as ellipses that hold x and y with 95 %.
-    residuals : EdgeResiduals, optional
-        Residuals that decide which edges are misfits; those of F unless given. Give those of the
-        problem that was solved.
-    before : Poses, optional
-        Other poses, such as the start of a solve, drawn in grey and aligned to `poses`.
-
-    Raises
-    ------
-    GraphError
-        When there is not one pose for every pose of the graph.
-    MissingExtraError
-        Without the extra `plot`.
+    Positions are drawn to seven digits (float32). Graph, poses, title, covariances and residuals
+    are as for `plot_graph`; `before` are other poses, such as the start of a solve, drawn in grey
+    and aligned to the poses.
 
     Examples
     --------
@@ -238,7 +217,7 @@ def _points(points: Array) -> Trace:
     return {"type": "scatter3d", "x": x, "y": y, "z": z}
 
 
-def _lines(t: Array, ends: IntArray, name: str, line: _Line, in_legend: bool = True) -> Trace:
+def _lines(t: Array, ends: IntArray, name: str, line: _Line) -> Trace:
     """One trace for many lines between poses, (l, 2): start, end, and a gap."""
     d = t.shape[1]
     points = np.full((len(ends), 3, d), np.nan)
@@ -250,7 +229,7 @@ def _lines(t: Array, ends: IntArray, name: str, line: _Line, in_legend: bool = T
         "line": {"color": line.colour, "width": width, "dash": line.dash},
         "name": name,
         "hoverinfo": "skip",
-        "showlegend": in_legend,
+        "showlegend": True,
     }
 
 

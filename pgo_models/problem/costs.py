@@ -90,28 +90,18 @@ class EdgeTerms:
 
 @dataclass(frozen=True, eq=False)
 class EdgeCost(EdgeArrays):
-    """Cost tau ||delta_t||^2 + tr(W delta_R delta_R^T) of every edge.
+    """Cost tau ||delta_t||^2 + tr(W delta_R delta_R^T) of every edge."""
 
-    Parameters
-    ----------
-    tau : (m,) array
-        Weights of the translation residuals, in 1/m^2; those of the padding (`rotation_cost`)
-        where rotations alone are the unknowns.
-    W : (m,) or (m, d, d) array
-        Symmetric weights of the rotation residuals, of either sign; (m,) are the kappa of W = kappa
-        I on every edge.
-    W_error : (m,) array
-        Bounds on the Frobenius norm of W_exact - W, zero where W is what is given.
-    d : int
-        Dimension of space: 2 or 3.
-    has_translations : bool
-        Whether translations are among the unknowns; else the cost is one of rotations alone.
-    """
-
+    # (m,): weights of the translation residuals, in 1/m^2; those of the padding (`rotation_cost`)
+    # where rotations alone are the unknowns.
     tau: Array
+    # (m,) or (m, d, d): symmetric weights of the rotation residuals, of either sign; (m,) are the
+    # kappa of W = kappa I on every edge.
     W: Array
+    # (m,): bounds on the Frobenius norm of W_exact - W, zero where W is what is given
     W_error: Array
     d: int
+    # whether translations are among the unknowns; else the cost is one of rotations alone
     has_translations: bool = field(default=True, kw_only=True)
 
     # Whether the cost is quadratic in the poses: tr(X^T M X) and a constant.
@@ -475,17 +465,9 @@ def rotation_cost(W: Array, W_error: Array, d: int) -> EdgeCost:
 
 @dataclass(frozen=True, eq=False)
 class ExcessCost(EdgeCost):
-    """chi2 of an edge: tau ||delta_t||^2 + tr(W delta_R delta_R^T) + excess(Z), Z = delta R_i.
+    """chi2 of an edge: tau ||delta_t||^2 + tr(W delta_R delta_R^T) + excess(Z), Z = delta R_i."""
 
-    Parameters
-    ----------
-    tau, W, W_error, d
-        The quadratic part, as of `EdgeCost`.
-    excess : Excess
-        The rest of chi2: a convex function of Z.
-    """
-
-    excess: Excess
+    excess: Excess  # the rest of chi2: a convex function of Z
 
     # R_i is in Z and in delta.
     is_quadratic: ClassVar[bool] = False
@@ -592,16 +574,9 @@ class TangentCost(EdgeCost):
     """A quadratic minorant of chi2: its quadratic part and the tangent of its excess.
 
     The cost is tau ||delta_t||^2 + tr(W delta_R delta_R^T) + value + 2 <C, Z - Z*> - loss.
-
-    Parameters
-    ----------
-    tau, W, W_error, d
-        The quadratic part, as of `EdgeCost`.
-    tangent : Tangent
-        Tangent of the excess of chi2 at Z*.
     """
 
-    tangent: Tangent
+    tangent: Tangent  # tangent of the excess of chi2 at Z*
 
     is_chi2: ClassVar[bool] = True
 

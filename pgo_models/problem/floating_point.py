@@ -85,12 +85,7 @@ def check_pivots(pivots: Array) -> None:
     for the entries off the diagonal, too. Entry L_ik enters pivot i by its square and is never left
     out of the sum, so that an L_ik that is nan, or whose square overflows, leaves a pivot that is
     nan or negative. SuperLU takes a product L_ik U_ki in place of the square; there
-    `backward_error` looks at all entries.
-
-    Parameters
-    ----------
-    pivots : (N,)
-        Diagonal of L in L L^T, or of U in L U.
+    `backward_error` looks at all entries. The pivots, (N,), are the diagonal of L, or of U in L U.
     """
     if not (np.isfinite(pivots).all() and (pivots > 0.0).all()):
         raise NotPositiveDefiniteError("the matrix has a pivot that is not positive and finite")

@@ -28,22 +28,9 @@ _SHARED = 10_000
 
 
 def odometry_start(graph: PoseGraph) -> Poses:
-    """Compose the measurements i -> i + 1 from pose 0 on; of repeated ones the first is used.
+    """Compose the measurements i -> i + 1 from pose 0 at (I, 0) on; of repeated ones the first.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        A graph with an edge from every pose to the next.
-
-    Returns
-    -------
-    Poses
-        The start, with pose 0 at (I, 0).
-
-    Raises
-    ------
-    GraphError
-        When a link i -> i + 1 is missing; `spanning_tree_start` does not need one.
+    A GraphError when such an edge is missing; `spanning_tree_start` does not need one.
 
     Examples
     --------
@@ -72,19 +59,8 @@ def odometry_start(graph: PoseGraph) -> Poses:
 def spanning_tree_start(graph: PoseGraph, root: int = 0) -> Poses:
     """Compose measurements along a breadth-first spanning tree, as the paper does for SLAM.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-        A connected graph.
-    root : int
-        The pose at (I, 0).
-
-    Raises
-    ------
-    GraphError
-        When the graph is not connected.
-    SettingError
-        When root is no pose.
+    The root is at (I, 0). A GraphError when the graph is not connected, a SettingError when the
+    root is no pose.
 
     Examples
     --------

@@ -68,22 +68,9 @@ class Marginals(ReadOnly):
     backend: CholeskyBackend | None = None
 
     def joint(self, *poses: int) -> Array:
-        """Return the joint covariance of some poses, by solves for its columns.
+        """Return the joint covariance of k poses, (k p, k p), in the order given.
 
-        Parameters
-        ----------
-        *poses : int
-            Any k poses.
-
-        Returns
-        -------
-        (k p, k p) array
-            Its rows and columns are in the order given.
-
-        Raises
-        ------
-        SettingError
-            When one of them is no pose.
+        Its columns are solved for.
         """
         self._check(*poses)
         chosen = list(poses)
@@ -101,19 +88,9 @@ class Marginals(ReadOnly):
         return 0.5 * (block + block.T)
 
     def joint_of_pairs(self, i: IntArray, j: IntArray) -> Array:
-        """Return the joint covariances of many pairs of poses, by selected inversion.
+        """Return the `joint` covariances of k pairs, (k, 2 p, 2 p), by selected inversion.
 
         The factor has the fill of an edge between the poses of each pair.
-
-        Parameters
-        ----------
-        i, j : (k,) arrays
-            The first and the second pose of every pair.
-
-        Returns
-        -------
-        (k, 2 p, 2 p) array
-            As `joint` of i and j.
         """
         self._check(*np.concatenate([i, j]).tolist())
         p = self.layout.side // self.layout.num_poses

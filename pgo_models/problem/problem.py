@@ -209,19 +209,9 @@ class PGOProblem(ReadOnly):
         return _SameGraph(self.graph, self.backend, cost, original=self)
 
     def check_quadratic(self, method: str, convex: bool = False) -> None:
-        """Raise an error where a method needs a cost that is quadratic, or convex, and it is not.
+        """Raise a SettingError, with a method's name, unless the cost is quadratic in (R, t).
 
-        Parameters
-        ----------
-        method : str
-            Name of the method, for the message.
-        convex : bool
-            Whether the cost has to be convex in (R, t), too.
-
-        Raises
-        ------
-        SettingError
-            When the cost is not what the method needs.
+        With `convex` it has to be convex, too.
         """
         if not self.is_quadratic or (convex and not self.weights.is_convex):
             kind = "convex and quadratic in (R, t)" if convex else "quadratic in (R, t)"
@@ -231,13 +221,7 @@ class PGOProblem(ReadOnly):
             )
 
     def check_positions(self, purpose: str) -> None:
-        """Raise an error where something needs positions, and rotations alone are the unknowns.
-
-        Raises
-        ------
-        SettingError
-            When the problem is one of rotations alone.
-        """
+        """Raise a SettingError where something needs positions of a problem of rotations alone."""
         if not self.has_translations:
             raise SettingError(
                 f"{purpose} needs positions, and the unknowns are rotations alone; "
@@ -249,30 +233,14 @@ class PGOProblem(ReadOnly):
 
         Its cost F(X) is at most chi2(X) for all poses, and has the value and the gradient of chi2
         at the given ones. A quadratic problem is its own tangent.
-
-        Returns
-        -------
-        PGOProblem
-            A new one, unless the cost is quadratic: its matrices are built when first asked for.
         """
         return self.at(poses).tangent
 
     def with_rotation_terms(self, i: IntArray, j: IntArray, R_ij: Array, W: Array) -> "PGOProblem":
         """Return the problem with terms tr(W delta_R delta_R^T), delta_R = R_j^T - R_ij^T R_i^T.
 
-        Parameters
-        ----------
-        i, j : (k,) array of int
-            The poses of every term; its block is in the pattern of M already.
-        R_ij : (k, d, d) array
-            Rotations, as measurements are.
-        W : (k, d, d) array
-            Symmetric weights of either sign.
-
-        Returns
-        -------
-        PGOProblem
-            Its cost is quadratic if that of this one is.
+        The k terms are of pairs of poses whose blocks are in the pattern of M already. R_ij are
+        rotations, and W symmetric weights of either sign, (k, d, d) both.
         """
         graph = self.graph
         ones = np.ones(len(i))
@@ -372,33 +340,15 @@ class PGOProblem(ReadOnly):
         return read_only(diagonal + from_diagonal)
 
     def with_pattern_of_M(self, data: Array) -> csc_array:
-        """Return the matrix that has the pattern of M and given values.
-
-        Parameters
-        ----------
-        data : (nnz,) array
-            Values of the entries, in the order of `M.data`.
-
-        Returns
-        -------
-        (N, N) csc_array
-            A sparse matrix that shares the pattern.
-        """
+        """Return the matrix, (N, N), with the pattern of M and values in the order of `M.data`."""
         matrix = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
         matrix.has_canonical_format = True
         return matrix
 
     def leave_out(self, data: Array, rows: IntArray, diagonal: Array | float) -> None:
-        """Overwrite rows and columns of a matrix with the pattern of M by a diagonal.
+        """Overwrite rows, (k,), and the same columns of a matrix by a diagonal, (k,) or one number.
 
-        Parameters
-        ----------
-        data : (nnz,) array
-            Stored values of the matrix, which are changed.
-        rows : (k,) array of int
-            The rows, and columns, to leave out.
-        diagonal : (k,) array or float
-            What their diagonal entries become.
+        `data` are the values of the matrix, which has the pattern of M. They are changed.
         """
         data[matrices.meets(self.M, rows)] = 0.0
         data[self.diagonal_positions[rows]] = diagonal
@@ -407,11 +357,6 @@ class PGOProblem(ReadOnly):
 
     def objective(self, poses: Poses) -> float:
         """Return the cost of poses: F (equation (16) of the paper, weighted), or chi2.
-
-        Raises
-        ------
-        GraphError
-            When the poses do not fit the graph.
 
         Examples
         --------
@@ -424,26 +369,13 @@ class PGOProblem(ReadOnly):
         return self.at(poses).value
 
     def edge_costs(self, poses: Poses) -> Array:
-        """Return the share of every edge in the cost.
-
-        Returns
-        -------
-        (m,) array
-            Their sum is the objective.
-        """
+        """Return the share of every edge in the cost, (m,). Their sum is the objective."""
         return self.at(poses).edge_costs
 
     def riemannian_gradient(self, poses: Poses) -> tuple[Array, Array]:
         """Return the gradient of F(R_i Exp(hat(w_i)), t_i + v_i) in (w, v) at zero.
 
-        With G = 2 M X it is (-2 vee(G_i R_i), G_{t_i}).
-
-        Returns
-        -------
-        (n, 1 or 3) array
-            Gradient in w, per radian.
-        (n, d) array
-            Gradient in v, per metre.
+        With G = 2 M X it is (-2 vee(G_i R_i), G_{t_i}): (n, 1 or 3) per radian, (n, d) per metre.
         """
         return self.at(poses).riemannian_gradient
 
@@ -455,22 +387,14 @@ class PGOProblem(ReadOnly):
         return TranslationSystem(self.M, self.pose_order, self.backend)
 
     def with_best_translations(self, R: Array) -> Poses:
-        """Return poses with given rotations and the translations that minimise F, with t_0 = 0.
-
-        Parameters
-        ----------
-        R : (n, d, d) array
-            Rotations.
-        """
+        """Return poses with rotations R, (n, d, d), and translations that minimise F, t_0 = 0."""
         return Poses(R, self.translations.best_for(stack_transposes(R)))
 
     def translation_factor(self, poses: Poses) -> CholeskyFactor | None:
-        """Factor the matrix of the translations where it depends on the rotations.
+        """Factor the matrix of the translations, for `at_best_translations`.
 
-        Returns
-        -------
-        CholeskyFactor or None
-            For `at_best_translations`; None of a quadratic cost, whose factor is kept.
+        None of a quadratic cost: its matrix does not depend on the rotations, and the factor is
+        kept.
         """
         of_edges = self.weights.translation_matrices(poses.R[self.graph.i])
         if of_edges is None:
@@ -514,25 +438,13 @@ class PGOProblem(ReadOnly):
         return poses.with_translations(poses.t - (step - step[0]))
 
     def seen_poses(self, poses: Poses) -> Poses:
-        """Return the poses that the cost is evaluated at.
-
-        Returns
-        -------
-        Poses
-            The given ones; in a problem of rotations alone with zeros for translations.
-        """
+        """Return the poses as the cost sees them: of rotations alone the translations are zero."""
         if self.has_translations or not poses.t.any():
             return poses
         return poses.with_translations(np.zeros_like(poses.t))
 
     def check_poses(self, poses: Poses) -> Poses:
-        """Return poses with the world pose, where the graph has one.
-
-        Raises
-        ------
-        GraphError
-            When they are no poses, or their number or dimension is not the graph's.
-        """
+        """Return poses with the world pose; a GraphError unless they are poses of the graph."""
         if not isinstance(poses, Poses):
             raise GraphError(
                 f"poses are a {type(poses).__name__}; "
@@ -548,15 +460,7 @@ class PGOProblem(ReadOnly):
     def at(self, poses: Poses) -> "EvaluatedPoses":
         """Return the cost at poses with what belongs to it: residuals, gradient, minorant.
 
-        Returns
-        -------
-        EvaluatedPoses
-            Each thing is computed when it is first asked for, and kept there.
-
-        Raises
-        ------
-        GraphError
-            When the poses do not fit the graph.
+        Each is computed when it is first asked for, and kept there.
 
         Examples
         --------
@@ -570,18 +474,10 @@ class PGOProblem(ReadOnly):
         return EvaluatedPoses(self, read_only(self.seen_poses(poses).stacked()), poses)
 
     def at_point(self, X: Array) -> "EvaluatedPoint":
-        """Return the cost at any X, as `at` does at poses.
+        """Return the cost at any X, (N, k), as `at` does at poses.
 
-        Parameters
-        ----------
-        X : (N, k) array
-            The rows t_i and then the rows of every R_i^T, or any others.
-
-        Returns
-        -------
-        EvaluatedPoint
-            Its value and gradient go by way of the residuals, which is accurate where the edges
-            fit, however large the translations are.
+        Value and gradient go by way of the residuals, which is accurate where the edges fit,
+        however large the translations are.
         """
         return EvaluatedPoint(self, X)
 
@@ -597,17 +493,10 @@ class EvaluatedPoint(ReadOnly):
 
     Nothing else evaluates a cost. What was computed is kept here: who asks several things of the
     same point holds on to this.
-
-    Parameters
-    ----------
-    problem : PGOProblem
-        The problem.
-    X : (N, k) array
-        The rows t_i and then the rows of every R_i^T, or any others.
     """
 
     problem: PGOProblem
-    X: Array
+    X: Array  # (N, k): the rows t_i and then the rows of every R_i^T, or any others
 
     @cached_property
     def point(self) -> EdgePoint:
@@ -651,27 +540,9 @@ class EvaluatedPoint(ReadOnly):
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedPoses(EvaluatedPoint):
-    """Poses with their cost in a problem, residuals and gradient, each computed when asked for.
+    """Poses with their cost in a problem, residuals and gradient; X stacks `seen_poses`."""
 
-    Parameters
-    ----------
-    problem : PGOProblem
-        The problem.
-    X : (N, d) array
-        The poses as the cost sees them (`PGOProblem.seen_poses`), stacked.
-    poses : Poses
-        One pose for every pose of its graph (`PGOProblem.at` checks that).
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> here = problem.at(problem.graph.truth)
-    >>> bool(here.value == problem.objective(problem.graph.truth))
-    True
-    """
-
-    poses: Poses
+    poses: Poses  # one for every pose of the graph, as `PGOProblem.at` checks
 
     @cached_property
     def tangent(self) -> PGOProblem:

@@ -19,18 +19,10 @@ from pgo_models.problem.costs import EdgeCost
 
 @dataclass(frozen=True, eq=False)
 class RightCosts:
-    """Distribution of the costs of right edges, alone and together: sums of w chi^2_1.
+    """Distribution of the costs of right edges, alone and together: sums of w chi^2_1."""
 
-    Parameters
-    ----------
-    sums : Array, (m, 3)
-        sum w, sum w^2 and sum w^3 of every edge.
-    rank : int
-        Number of all w that are not zero.
-    """
-
-    sums: Array
-    rank: int
+    sums: Array  # (m, 3): sum w, sum w^2 and sum w^3 of every edge
+    rank: int  # number of all w that are not zero
 
     @classmethod
     def of(cls, graph: PoseGraph, cost: EdgeCost, is_chi2: bool = False) -> RightCosts:
@@ -39,7 +31,8 @@ class RightCosts:
         `is_chi2` says that the cost is that of the information matrices.
         """
         w = _chi2_weights(graph, cost, is_chi2)
-        return cls(_power_sums(w), int(np.sum(w > 0.0)))
+        power_sums = np.stack([np.sum(w**k, axis=1) for k in (1, 2, 3)], axis=1)
+        return cls(power_sums, int(np.sum(w > 0.0)))
 
     def quantiles(self, quantile: float) -> Array:
         """Quantiles of the costs of single edges, (m,)."""
@@ -53,11 +46,6 @@ class RightCosts:
         this probability, however far the map moves.
         """
         return _quantiles_of_sums(groups.sums(self.sums), quantile)
-
-
-def _power_sums(w: Array) -> Array:
-    """Sums of w, w^2 and w^3, (m, 3)."""
-    return np.stack([np.sum(w**k, axis=1) for k in (1, 2, 3)], axis=1)
 
 
 def _quantiles_of_sums(sums: Array, quantile: float) -> Array:

@@ -27,39 +27,24 @@ FALSE_ALARM = 0.01
 
 @dataclass(frozen=True, eq=False)
 class EdgeResiduals(Summarised):
-    """Residuals and costs of every edge at some poses, with the thresholds of chi-square tests.
+    """Residuals and costs of every edge at some poses, with the thresholds of chi-square tests."""
 
-    Parameters
-    ----------
-    translation : Array, (m,)
-        ||t_j - t_i - R_i t_ij||, metres; zeros in a problem of rotations alone.
-    rotation : Array, (m,)
-        Angle of R_ij^T R_i^T R_j, radians.
-    cost : Array, (m,)
-        Summand of F, or of chi2.
-    allowed : Array, (m,)
-        Threshold of the cost: `chi2_thresholds` at 1 - FALSE_ALARM / m (Bonferroni), times `scale`.
-    scale : float
-        Median of the cost over its threshold at one half, at least 1. It is larger than 1 where the
-        information matrices are too large for the errors of most edges.
-    overall : float
-        Sum of the costs over its expectation, about 1 where errors have the covariances of the
-        matrices; 0 without redundancy. It is large where one wrong loop closure among few deforms
-        the odometry, so that no edge exceeds its own threshold.
-    overall_allowed : float
-        Bound that `overall` exceeds with probability FALSE_ALARM.
-    freedom : float
-        Degrees of freedom of the chi-square distribution that is taken for `overall`.
-    """
-
+    # (m,): ||t_j - t_i - R_i t_ij||, metres; zeros in a problem of rotations alone
     translation: Array
-    rotation: Array
-    cost: Array
+    rotation: Array  # (m,): angle of R_ij^T R_i^T R_j, radians
+    cost: Array  # (m,): summand of F, or of chi2
+    # (m,): threshold of the cost: `chi2_thresholds` at 1 - FALSE_ALARM / m (Bonferroni), times
+    # `scale`.
     allowed: Array
+    # Median of the cost over its threshold at one half, at least 1. It is larger than 1 where the
+    # information matrices are too large for the errors of most edges.
     scale: float
+    # Sum of the costs over its expectation, about 1 where errors have the covariances of the
+    # matrices; 0 without redundancy. It is large where one wrong loop closure among few deforms the
+    # odometry, so that no edge exceeds its own threshold.
     overall: float
-    overall_allowed: float
-    freedom: float
+    overall_allowed: float  # bound that `overall` exceeds with probability FALSE_ALARM
+    freedom: float  # degrees of freedom of the chi-square distribution that is taken for `overall`
 
     @property
     def share(self) -> Array:
@@ -93,19 +78,7 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
 
     The costs are the summands of the paper's equation (16). The expectation of their sum is sum_e
     sum w (1 - u / r), with r the rank of all information, u the number of unknowns, and w as in
-    `chi2_thresholds`.
-
-    Parameters
-    ----------
-    problem : PGOProblem or PoseGraph
-        The problem; for a graph the cost is F.
-    poses : Poses
-        One pose for every pose of the graph.
-
-    Raises
-    ------
-    GraphError
-        When the poses are not those of the graph.
+    `chi2_thresholds`. For a graph the cost is F.
 
     Examples
     --------
@@ -210,22 +183,7 @@ def chi2_thresholds(problem: PGOProblem, quantile: float = 0.99) -> Array:
     right maps with coupled matrices of condition 1e4, 29 % in the plane and 5 % in space have an
     edge beyond its threshold at 1 - 0.01 / m, and 0 % at condition 100. In chi2 1 % are doubted.
 
-    Parameters
-    ----------
-    problem : PGOProblem
-        The problem.
-    quantile : float
-        Between 0 and 1.
-
-    Returns
-    -------
-    (m,) array
-        Thresholds for `problem.edge_costs`.
-
-    Raises
-    ------
-    SettingError
-        Unless 0 < quantile < 1.
+    The thresholds, (m,), are for `problem.edge_costs`. A SettingError unless 0 < quantile < 1.
 
     Examples
     --------

@@ -29,20 +29,10 @@ from pgo_models.problem.ordering import row_order
 
 @dataclass(frozen=True, eq=False)
 class TranslationSystem:
-    """The rows of M for translations, factored when they are first solved with.
-
-    Parameters
-    ----------
-    M : (N, N) csc_array
-        Matrix M of a problem.
-    pose_order : (n,) array of int
-        Order of elimination of the poses.
-    backend : CholeskyBackend, optional
-        The sparse Cholesky to use.
-    """
+    """The rows of M for translations, factored when they are first solved with."""
 
     M: csc_array
-    pose_order: IntArray
+    pose_order: IntArray  # (n,): order of elimination of the poses
     backend: CholeskyBackend | None
 
     def solve(self, b: Array) -> Array:
@@ -95,22 +85,11 @@ class TranslationLaplacian:
     """Laplacians of a graph whose edges have weights of d x d numbers, with one pattern for all.
 
     They are the matrices of translations of chi2 where it is not quadratic in the poses.
-
-    Parameters
-    ----------
-    incidence : Incidence
-        The edges of every pose.
-    d : int
-        Dimension of space: 2 or 3.
-    pose_order : (n,) array of int
-        Order of elimination of the poses.
-    backend : CholeskyBackend, optional
-        The sparse Cholesky to use.
     """
 
     incidence: Incidence
     d: int
-    pose_order: IntArray
+    pose_order: IntArray  # (n,): order of elimination of the poses
     backend: CholeskyBackend | None
 
     def factorize(self, of_edges: Array) -> CholeskyFactor:

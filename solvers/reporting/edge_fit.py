@@ -40,27 +40,15 @@ class EdgeFit(Summarised):
 
     That cost is chi2 wherever the file has information matrices. F has only two precisions for an
     edge, so that it cannot see an error in a direction that only the matrix calls precise.
-
-    Parameters
-    ----------
-    cost : str
-        "F" or "chi2", of rotations alone "F(R)" or "chi2(R)".
-    residuals : EdgeResiduals
-        Residuals at the poses.
-    lowered : EdgeResiduals, optional
-        Residuals at poses of clearly lower chi2, if the poses minimise F and such poses were found
-        nearby.
-    places : sequence of str
-        file:line of every edge, if the graph is a file.
-    no_chi2 : str
-        Why the file has no chi2, if its matrices are indefinite.
     """
 
-    cost: str
-    residuals: EdgeResiduals
+    cost: str  # "F" or "chi2", of rotations alone "F(R)" or "chi2(R)"
+    residuals: EdgeResiduals  # residuals at the poses
+    # residuals at poses of clearly lower chi2, if the poses minimise F and such poses were found
+    # nearby.
     lowered: EdgeResiduals | None = None
-    places: Sequence[str] = ()
-    no_chi2: str = ""
+    places: Sequence[str] = ()  # file:line of every edge, if the graph is a file
+    no_chi2: str = ""  # why the file has no chi2, if its matrices are indefinite
 
     @property
     def suspected(self) -> EdgeResiduals:
@@ -74,17 +62,8 @@ class EdgeFit(Summarised):
     def advice_on_cost(self, solve: str) -> list[Advice]:
         """Return the advice to minimise chi2, or on matrices of which there is no chi2.
 
-        There is advice to minimise chi2 if it is clearly above its minimum.
-
-        Parameters
-        ----------
-        solve : str
-            Command that solves the graph, to which options are added.
-
-        Returns
-        -------
-        list of Advice
-            At most one piece.
+        There is advice to minimise chi2 if it is clearly above its minimum. `solve` is the command
+        that solves the graph, to which options are added, as below.
         """
         if self.no_chi2:
             text = (
@@ -100,18 +79,7 @@ class EdgeFit(Summarised):
         return [Advice(text, _for_own_cost(solve))]
 
     def advice_on_edges(self, solve: str) -> list[Advice]:
-        """Return the advice to look for wrong measurements, if the edges cost too much.
-
-        Parameters
-        ----------
-        solve : str
-            Command that solves the graph, to which options are added.
-
-        Returns
-        -------
-        list of Advice
-            Empty if the edges fit; else a robust solve, and to leave out the worst edge.
-        """
+        """Return the advice to solve robustly, and without the worst edge, if edges do not fit."""
         residuals = self.suspected
         if not residuals.is_doubtful:
             return []
@@ -131,15 +99,7 @@ class EdgeFit(Summarised):
     def advice_on_scale(self, doctor: str) -> list[Advice]:
         """Return the advice to look at the information matrices, if they claim far too little.
 
-        Parameters
-        ----------
-        doctor : str
-            Command that tries other readings of the graph.
-
-        Returns
-        -------
-        list of Advice
-            At most one piece.
+        `doctor` is the command that tries other readings of the graph.
         """
         residuals = self.suspected
         overall = residuals.overall
@@ -152,20 +112,7 @@ class EdgeFit(Summarised):
         return [Advice(text, doctor)]
 
     def advice(self, solve: str, is_robust: bool) -> list[Advice]:
-        """Return all advice; on edges only if the solve was not robust, else it has tried that.
-
-        Parameters
-        ----------
-        solve : str
-            Command that solves the graph, to which options are added.
-        is_robust : bool
-            Whether the solve was robust.
-
-        Returns
-        -------
-        list of Advice
-            Advice on the cost, then on the edges.
-        """
+        """Return the advice on the cost, then on the edges, which a robust solve has tried."""
         suggestions = self.advice_on_cost(solve)
         if not is_robust:
             suggestions += self.advice_on_edges(solve)
@@ -177,29 +124,8 @@ def judge_edges(
 ) -> EdgeFit:
     """Judge the edges at poses: by chi2 if the graph has matrices, else by the problem's cost.
 
-    If F was minimised, one more factorisation shows whether chi2 can be lowered.
-
-    Parameters
-    ----------
-    problem : PGOProblem
-        The problem that was solved.
-    poses : Poses
-        Its solution.
-    residuals : EdgeResiduals, optional
-        `edge_residuals` of both, where they are at hand.
-
-    Returns
-    -------
-    EdgeFit
-        Residuals at the poses, and at poses of lower chi2 if such were found.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from pgo_models.graphs.scenes import circle
-    >>> graph = circle(np.random.default_rng(0))
-    >>> judge_edges(PGOProblem(graph), graph.truth).cost
-    'F'
+    If F was minimised, one more factorisation shows whether chi2 can be lowered. The `residuals`
+    are the `edge_residuals` of problem and poses, where they are at hand.
     """
     residuals = residuals or edge_residuals(problem, poses)
     if problem.weighting is not Weighting.ISOTROPIC or problem.graph.information is None:

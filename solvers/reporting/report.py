@@ -66,15 +66,6 @@ def write_report(
     fit : EdgeFit, optional
         Result of `judge_edges`, which is called unless it is given.
 
-    Raises
-    ------
-    SettingError
-        If the name has another ending, or the solution is of rotations alone.
-    MissingExtraError
-        If plotly or Jinja2 is not installed.
-    FileFormatError
-        If the file cannot be written.
-
     Examples
     --------
     >>> import tempfile

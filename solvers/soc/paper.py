@@ -46,6 +46,7 @@ from pgo_models.summaries import Summarised
 from solvers.carry.registry import record
 from solvers.result import Measurement, Status
 from solvers.soc.penalty import (
+    BALANCED_RATIO,
     BalancedPenalty,
     BoydPenalty,
     MultiplierPenalty,
@@ -204,7 +205,7 @@ class CommonPenalty:
         if isinstance(rule, BoydPenalty):
             factor = rule.rescaling(primal, self.rho * change)
         elif isinstance(rule, BalancedPenalty) and steps_since >= _PATIENCE:
-            factor = rule.refactor_ratio
+            factor = BALANCED_RATIO
             may_fall = False
         else:
             factor = rule.rescaling(primal, change)
@@ -331,18 +332,8 @@ class PaperSOC:
     def as_published(cls) -> Self:
         """Return the settings nearest to the paper: its rule of rho, FISTA, its test of p_res.
 
-        The test stops where omega and R agree, at a stationary point or not.
-
-        Returns
-        -------
-        PaperSOC
-            One pose a robot, with the tolerance and the iterations of the default, which the paper
-            does not give.
-
-        Examples
-        --------
-        >>> PaperSOC.as_published().penalty
-        BoydPenalty(scale=1.0, imbalance=10.0, growth=2.0)
+        The test stops where omega and R agree, at a stationary point or not. Tolerance and
+        iterations, which the paper does not give, are those of the default.
         """
         return cls(penalty=BoydPenalty(), r_step=RStep.FISTA, stop=PaperStop.PRIMAL_RESIDUAL)
 

@@ -15,6 +15,7 @@ from solvers.carry.registry import record
 from solvers.soc.recursion_block import RecursionBlock, StepSettings, block_at, stationary_B
 
 _SMALLEST_RATIO = 1e-6  # of ||Lambda_i|| to m_i; M + D/2 keeps ten digits
+BALANCED_RATIO = 5.0  # by which a BalancedPenalty moves
 
 
 @record("PenaltyOrder")
@@ -58,38 +59,19 @@ class PenaltyRule(Protocol):
     """
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
-        """Return the first penalties, from ||Lambda_i||_2 / m_i.
+        """Return (per_norm, per_scale, least) of the first penalties.
 
-        Parameters
-        ----------
-        ratio : (n,) array
-            ||Lambda_i||_2 / m_i of all poses: the norm of the multiplier of a pose at the start,
-            over the mean diagonal of M over its rotation rows.
-
-        Returns
-        -------
-        tuple of three floats
-            (per_norm, per_scale, least), so that rho_i = max(per_norm ||Lambda_i||_2, per_scale
-            m_i, least).
+        They are rho_i = max(per_norm ||Lambda_i||_2, per_scale m_i, least). `ratio`, (n,), is
+        ||Lambda_i||_2 / m_i of all poses: the norm of the multiplier of a pose at the start, over
+        the mean diagonal of M over its rotation rows.
         """
 
     def rescaling(self, primal_residual: float, dual_residual: float) -> float:
         """Return the factor by which all penalties move before the next step.
 
-        Each factor other than 1 costs a factorisation. Once the safeguard has raised the penalties,
-        factors below 1 are left out.
-
-        Parameters
-        ----------
-        primal_residual : float
-            ||R - omega||, relative.
-        dual_residual : float
-            ||omega - omega_last||, relative.
-
-        Returns
-        -------
-        float
-            1 where the penalties stay.
+        The residuals ||R - omega|| and ||omega - omega_last|| are relative. Each factor other than
+        1 costs a factorisation. Once the safeguard has raised the penalties, factors below 1 are
+        left out.
         """
         return 1.0
 
@@ -196,21 +178,18 @@ class BalancedPenalty(PenaltyRule):
 
     It starts at `scale` times m_i, the mean diagonal of M over the rotation rows of the pose. The
     balance asks for rho times sqrt(primal / dual). To save factorisations rho only moves when that
-    factor reaches `refactor_ratio` or its inverse, and then by just this ratio: when one residual
-    is `refactor_ratio`^2 times the other. B is rescaled with it. A rise of the merit puts rho up
-    again (`solvers.soc.safeguard`).
+    factor reaches 5 or its inverse, and then by just this ratio: when one residual is 25 times the
+    other. B is rescaled with it. A rise of the merit puts rho up again (`solvers.soc.safeguard`).
 
     This is not the rule of Boyd et al. 2011, which is `BoydPenalty`: its dual residual has the
     factor rho, and so the unit of the weights. Here both are lengths of rotations: ||R - omega||
-    and, without rho, ||omega - omega_last||. They seldom differ by `refactor_ratio`^2; on the
-    paper's scenes rho stays where it starts.
+    and, without rho, ||omega - omega_last||. They seldom differ so much; on the paper's scenes rho
+    stays where it starts.
 
     Parameters
     ----------
     scale : float
         First rho_i over m_i.
-    refactor_ratio : float above 1
-        By what factor rho moves.
 
     References
     ----------
@@ -218,19 +197,17 @@ class BalancedPenalty(PenaltyRule):
     """
 
     scale: float = 0.3
-    refactor_ratio: float = 5.0
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=["scale"], above_one=["refactor_ratio"])
+        check_settings(self, positive=["scale"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, scale, 0), whatever the multipliers are."""
         return 0.0, self.scale, 0.0
 
     def rescaling(self, primal_residual: float, dual_residual: float) -> float:
-        """`refactor_ratio`, its inverse, or 1 where rho stays."""
-        ratio = self.refactor_ratio
-        return _balancing(ratio**2, ratio, primal_residual, dual_residual)
+        """Return `BALANCED_RATIO`, its inverse, or 1 where rho stays."""
+        return _balancing(BALANCED_RATIO**2, BALANCED_RATIO, primal_residual, dual_residual)
 
 
 @record("BoydPenalty")
@@ -238,18 +215,14 @@ class BalancedPenalty(PenaltyRule):
 class BoydPenalty(PenaltyRule):
     """One penalty for all poses that balances residuals as Boyd et al. 2011, (3.13); for PaperSOC.
 
-    rho <- growth rho where ||r|| > imbalance ||s||, and rho / growth where ||s|| > imbalance ||r||,
-    with r = R - omega and s = rho (omega - omega_last); B is rescaled with it. There is no
-    safeguard. s has the weights' unit: iterates vary with it.
+    rho <- 2 rho where ||r|| > 10 ||s||, and rho / 2 where ||s|| > 10 ||r||, with r = R - omega and
+    s = rho (omega - omega_last); B is rescaled with it. The numbers are Boyd's tau and mu. There is
+    no safeguard. s has the weights' unit: iterates vary with it.
 
     Parameters
     ----------
     scale : float
         First rho over the mean of m_i. Neither Boyd nor the paper gives one.
-    imbalance : float above 1
-        Ratio of the residuals from which on rho moves; Boyd's mu.
-    growth : float above 1
-        Factor by which rho moves; Boyd's tau.
 
     References
     ----------
@@ -258,16 +231,14 @@ class BoydPenalty(PenaltyRule):
     """
 
     scale: float = 1.0
-    imbalance: float = 10.0
-    growth: float = 2.0
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=["scale"], above_one=["imbalance", "growth"])
+        check_settings(self, positive=["scale"])
 
     def bounds(self, ratio: Array) -> tuple[float, float, float]:
         """(0, scale, 0), whatever the multipliers are."""
         return 0.0, self.scale, 0.0
 
     def rescaling(self, primal_residual: float, dual_residual: float) -> float:
-        """`growth`, its inverse, or 1 where rho stays, from ||r|| and ||s||."""
-        return _balancing(self.imbalance, self.growth, primal_residual, dual_residual)
+        """Return 2, 1 / 2, or 1 where rho stays, from ||r|| and ||s||."""
+        return _balancing(10.0, 2.0, primal_residual, dual_residual)

@@ -71,30 +71,16 @@ class ComparisonSettings:
 
 @dataclass(frozen=True, eq=False)
 class Comparison(Summarised):
-    """Methods compared on one graph.
-
-    Parameters
-    ----------
-    problem : PGOProblem
-        The problem that they solved.
-    optimum : float
-        Upper bound on the cost of the best known poses, from `solve` or one of the methods.
-    lower_bound : float
-        Proven lower bound on the cost.
-    trials : tuple of BenchmarkRun
-        Runs of the methods.
-    reasons : tuple of (BenchmarkMethod, str)
-        Methods without figures, and why.
-    is_complete : bool
-        Whether all methods were run; after Ctrl-C they were not.
-    """
+    """Methods compared on one graph."""
 
     problem: PGOProblem
+    # upper bound on the cost of the best known poses, from `solve` or one of the methods
     optimum: float
-    lower_bound: float
+    lower_bound: float  # proven
     trials: tuple[BenchmarkRun, ...]
+    # methods without figures, and why
     reasons: tuple[tuple[BenchmarkMethod, str], ...]
-    is_complete: bool = True
+    is_complete: bool = True  # whether all methods were run; after Ctrl-C they were not
 
     @property
     def curves(self) -> list[Curve]:
@@ -136,20 +122,7 @@ class Comparison(Summarised):
         return tuple(notes)
 
     def save_plot(self, path: Path | str) -> None:
-        """Write the gap over rounds, bytes and seconds as a picture, or for .html as a page.
-
-        Parameters
-        ----------
-        path : Path or str
-            File to write: .png, .svg, .pdf or .html.
-
-        Raises
-        ------
-        SettingError
-            If the file has another suffix, or there is nothing to draw.
-        PGOError
-            If the file cannot be written.
-        """
+        """Write the gap over rounds, bytes and seconds: .png, .svg, .pdf, or an .html page."""
         path = Path(path)
         check_plot_format(path)
         if path.suffix.lower() == ".html":
@@ -177,11 +150,6 @@ def compare_methods(
         Which methods, and their common settings.
     progress : bool, optional
         Whether to show a bar on stderr; if not given, it is shown on a terminal.
-
-    Raises
-    ------
-    PGOError
-        If the graph is not connected.
 
     Examples
     --------

@@ -46,24 +46,13 @@ _FARTHEST = 1e12  # factor on weights beyond which a kind of edges has no noise
 
 @dataclass(frozen=True)
 class NoiseLevel(Summarised):
-    """Noise of one kind of edges: standard deviations of every component.
+    """Noise of one kind of edges: standard deviations of every component."""
 
-    Parameters
-    ----------
-    name : str
-        "odometry", "closures", "landmarks", "priors", or "all edges".
-    num_edges : int
-        How many edges are of this kind.
-    translation_std : float
-        Metres, in the median over the edges; nan if they measure no translation.
-    rotation_std : float
-        Radians, in the median over the edges; nan if they measure no rotation.
-    """
-
-    name: str
-    num_edges: int
+    name: str  # "odometry", "closures", "landmarks", "priors", or "all edges"
+    num_edges: int  # how many edges are of this kind
+    # metres, in the median over the edges; nan if they measure no translation
     translation_std: float
-    rotation_std: float
+    rotation_std: float  # radians, in the median over the edges; nan if they measure no rotation
 
     def __str__(self) -> str:
         parts = []
@@ -76,18 +65,10 @@ class NoiseLevel(Summarised):
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate(Summarised):
-    """The noise of every kind of edges, and the graph with weights of this noise.
+    """The noise of every kind of edges, and the graph with weights of this noise."""
 
-    Parameters
-    ----------
-    levels : tuple of NoiseLevel
-        The kinds that the graph has.
-    graph : PoseGraph
-        The same measurements with diagonal information matrices.
-    """
-
-    levels: tuple[NoiseLevel, ...]
-    graph: PoseGraph
+    levels: tuple[NoiseLevel, ...]  # the kinds that the graph has
+    graph: PoseGraph  # the same measurements with diagonal information matrices
 
     def __str__(self) -> str:
         return "; ".join(map(str, self.levels))
@@ -101,18 +82,8 @@ def estimate_noise(graph: PoseGraph | PGOProblem) -> NoiseEstimate:
     the edges between poses of one robot with neighbouring ids. Wrong closures count as noise: find
     them first.
 
-    Parameters
-    ----------
-    graph : PoseGraph or PGOProblem
-        A connected graph, or the problem of one; its kappa and tau are where the iteration begins.
-
-    Raises
-    ------
-    GraphError
-        When the graph is not connected, or has no loops that tell of noise, or some edges fit
-        exactly.
-    SettingError
-        When something else is given.
+    The kappa and tau of the graph are where the iteration begins. A GraphError when the graph is
+    not connected, or has no loops that tell of noise, or some edges fit exactly.
 
     References
     ----------

@@ -147,21 +147,12 @@ class ReproducedRow:
 
 @dataclass(frozen=True)
 class Reproduction(Summarised):
-    """The reproduced tables.
-
-    Parameters
-    ----------
-    settings : ReproductionSettings
-        Settings of the runs.
-    rows : tuple of ReproducedRow
-        Rows, graph by graph: SE-Sync, DGS, SOC as in the paper, SOC consensus.
-    is_complete : bool
-        Whether all runs were done; after Ctrl-C they were not.
-    """
+    """The reproduced tables."""
 
     settings: ReproductionSettings
+    # rows, graph by graph: SE-Sync, DGS, SOC as in the paper, SOC consensus
     rows: tuple[ReproducedRow, ...]
-    is_complete: bool
+    is_complete: bool  # whether all runs were done; after Ctrl-C they were not
 
 
 def reproduce_tables(

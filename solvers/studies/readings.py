@@ -90,32 +90,21 @@ _QUESTIONS = {
 
 @dataclass(frozen=True)
 class ReadingFit(Summarised):
-    """How well the measurements of a file fit each other under a reading.
-
-    Parameters
-    ----------
-    reading : Reading
-        The reading.
-    num_changed : int
-        How many edges of the graph it changes.
-    cost : float
-        Least cost that was found, nan if the file cannot be read or solved like this.
-    times_expected : float
-        The cost over its expectation, if errors have the covariances of the matrices; 0 if there is
-        no redundancy.
-    evidence : float
-        Log-odds for this reading against the file as written, natural logarithm. Let c and c' be
-        the costs and f the degrees of freedom. For readings with the same weights it is f / 2
-        log(c / c'), whatever the scale of the noise. Where lengths or angles are made smaller, c'
-        is divided by the square of the factor first, as noise becomes smaller, too. Readings of the
-        matrices have other weights: with x and x' the costs over their expectations, it is f / 2
-        (h(x) - h(x')), h(x) = x - 1 - log x, by which the likelihoods of the scale 1 differ.
-    """
+    """How well the measurements of a file fit each other under a reading."""
 
     reading: Reading
-    num_changed: int
+    num_changed: int  # how many edges of the graph it changes
+    # least cost that was found, nan if the file cannot be read or solved like this
     cost: float = math.nan
+    # the cost over its expectation, if errors have the covariances of the matrices; 0 if there is
+    # no redundancy.
     times_expected: float = math.nan
+    # Log-odds for this reading against the file as written, natural logarithm. Let c and c' be the
+    # costs and f the degrees of freedom. For readings with the same weights it is f / 2 log(c /
+    # c'), whatever the scale of the noise. Where lengths or angles are made smaller, c' is divided
+    # by the square of the factor first, as noise becomes smaller, too. Readings of the matrices
+    # have other weights: with x and x' the costs over their expectations, it is f / 2 (h(x) -
+    # h(x')), h(x) = x - 1 - log x, by which the likelihoods of the scale 1 differ.
     evidence: float = -math.inf
 
     @property
@@ -134,31 +123,16 @@ class ReadingFit(Summarised):
 
 @dataclass(frozen=True)
 class ReadingComparison(Summarised):
-    """The readings of a file, and which of them fits it better than what is written.
+    """The readings of a file, and which of them fits it better than what is written."""
 
-    Parameters
-    ----------
-    cost_name : str
-        Name of the cost: chi2, or F where the file has no chi2.
-    written : ReadingFit
-        The file as written.
-    others : tuple of ReadingFit
-        The file under the other readings that change it.
-    proposed : tuple of ReadingFit
-        Those that fit better beyond chance, the best first. It is empty for files that mean what
-        they say, and where nothing can be told.
-    invalid : str
-        Why the file cannot be read as written; "" where it can.
-    is_misfit : bool
-        Whether the edges as written cost more together than chance allows.
-    """
-
-    cost_name: str
-    written: ReadingFit
-    others: tuple[ReadingFit, ...]
+    cost_name: str  # name of the cost: chi2, or F where the file has no chi2
+    written: ReadingFit  # the file as written
+    others: tuple[ReadingFit, ...]  # the file under the other readings that change it
+    # Those that fit better beyond chance, the best first. It is empty for files that mean what they
+    # say, and where nothing can be told.
     proposed: tuple[ReadingFit, ...]
-    invalid: str = ""
-    is_misfit: bool = False
+    invalid: str = ""  # why the file cannot be read as written; "" where it can
+    is_misfit: bool = False  # whether the edges as written cost more together than chance allows
 
     def sentence(self) -> str:
         """Return the costs as written and as proposed, and the question that they raise."""

@@ -29,28 +29,17 @@ class SweptScene(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class NoiseSweep(Summarised):
-    """Result of a sweep: which graphs were certified at which noise.
+    """Result of a sweep: which graphs were certified at which noise."""
 
-    Parameters
-    ----------
-    scene : SweptScene
-        The network.
-    rotation_std : ndarray, (levels,)
-        Standard deviation of the rotation noise, radians.
-    certified : ndarray of bool, (levels, graphs)
-        Whether `solvers.solve` without handedness terms certified its solution. If it did, the
-        relaxation is tight; if not, the relaxation is not tight or the solution not optimal.
-    gap : ndarray, (levels, graphs)
-        Gap of that solution; that of the relaxation is at most as large.
-    certified_with_terms : ndarray of bool, (levels, graphs)
-        Whether `solvers.solve` certified its solution, with handedness terms at its poses where it
-        needs them.
-    """
-
-    scene: SweptScene
-    rotation_std: Array
+    scene: SweptScene  # the network
+    rotation_std: Array  # (levels,): standard deviation of the rotation noise, radians
+    # (levels, graphs): whether `solvers.solve` without handedness terms certified its solution. If
+    # it did, the relaxation is tight; if not, the relaxation is not tight or the solution not
+    # optimal.
     certified: BoolArray
-    gap: Array
+    gap: Array  # (levels, graphs): gap of that solution; that of the relaxation is at most as large
+    # (levels, graphs): whether `solvers.solve` certified its solution, with handedness terms at its
+    # poses where it needs them.
     certified_with_terms: BoolArray
 
     @property
@@ -130,11 +119,6 @@ def noise_sweep(
         Number of graphs at every level.
     rng : numpy.random.Generator or int
         Source of the noise.
-
-    Raises
-    ------
-    SettingError
-        If the levels are not positive and ascending, or `graphs` is not positive.
 
     Examples
     --------

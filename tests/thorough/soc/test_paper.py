@@ -39,7 +39,7 @@ from solvers import (
     solve,
 )
 from solvers.soc.paper import PaperStop
-from solvers.soc.penalty import BoydPenalty, first_penalties
+from solvers.soc.penalty import BALANCED_RATIO, BoydPenalty, first_penalties
 
 SIZES = st.integers(2, 12)
 PAPER_TABLES = REFERENCE["paper_tables"]
@@ -185,7 +185,7 @@ def test_an_adapted_rho_keeps_the_unscaled_multiplier(
         if state.rho != before.rho:
             changes.append(state.rho / before.rho)
     for factor in changes:
-        assert max(factor, 1 / factor) == pytest.approx(rule.refactor_ratio)
+        assert max(factor, 1 / factor) == pytest.approx(BALANCED_RATIO)
 
 
 @settings(max_examples=examples(40))
