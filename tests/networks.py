@@ -103,9 +103,14 @@ def robots_of(
     sharing: solvers.Sharing = solvers.Sharing.INTERFACE,
     robust: solvers.GNC | None = None,
     pipeline: solvers.Pipeline | None = None,
+    owners: np.ndarray | None = None,
 ) -> dict[str, solvers.Robot]:
-    """A robot for every part of a graph, with its own poses and the edges that begin at them."""
-    owners = pgo.partition(graph, num_robots).robot
+    """A robot for every part of a graph, with its own poses and the edges that begin at them.
+
+    `owners`, (n,), are the parts, where they are given.
+    """
+    if owners is None:
+        owners = pgo.partition(graph, num_robots).robot
     names = [f"r{k}" for k in range(num_robots)]
     robots = {
         name: solvers.Robot(

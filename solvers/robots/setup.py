@@ -62,6 +62,19 @@ from solvers.soc.subgraph import place_poses, split_graph
 SOLVE_PARTS = "solve each part in a folder of its own"
 
 
+class ApartError(GraphError):
+    """A graph that is not connected; `parts` are the robots, by number, that edges join."""
+
+    def __init__(self, problem: str, parts: tuple[tuple[int, ...], ...]) -> None:
+        """Say what the `problem` is, and which robots are joined."""
+        super().__init__(problem)
+        self.parts = parts
+        self._given = (problem, parts)
+
+    def __reduce__(self) -> tuple[type[ApartError], tuple[str, tuple[tuple[int, ...], ...]]]:
+        return type(self), self._given
+
+
 def open_driver(
     problem: PGOProblem,
     robots: Partition,
@@ -326,7 +339,7 @@ def _check_claims(claims: Sequence[Claim], files: Sequence[OwnLines], owners: In
 
 
 def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: Path) -> None:
-    """Raise a GraphError unless the robots' graphs together are connected.
+    """Raise an ApartError unless the robots' graphs together are connected.
 
     `PoseGraph.check_connected` is for a graph that one process has; here none has the edges within
     the robots, which have reported the components of their own graphs.
@@ -349,4 +362,14 @@ def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: P
             count += connected_components(tied)[0]
         if count > 1:
             problem = f"the {what} into {count} parts, no edge between"
-            raise GraphError(f"{folder}: {problem}; {SOLVE_PARTS}")
+            joined = _joined_robots(robot, pose, len(borders))
+            raise ApartError(f"{folder}: {problem}; {SOLVE_PARTS}", joined)
+
+
+def _joined_robots(robot: IntArray, pose: IntArray, num_robots: int) -> tuple[tuple[int, ...], ...]:
+    """Parts of robots that edges join, of the shared poses that each knows, (k,) pairs."""
+    num_vertices = num_robots + int(pose.max(initial=-1)) + 1
+    tied = edge_counts(robot, num_robots + pose, num_vertices)
+    num_parts, part = connected_components(tied)
+    members = [np.flatnonzero(part[:num_robots] == k) for k in range(num_parts)]
+    return tuple(tuple(robots.tolist()) for robots in members)

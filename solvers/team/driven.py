@@ -1,7 +1,9 @@
 """Solves by robots that keep their measurements: one drives, and the others obey its orders.
 
 The robot whose name comes first among those that are awake and have measured anything drives, and
-the terms of solves only grow. What a robot brings into a solve is its `Member`.
+the terms of solves only grow. Where no edge joins some robots with the others, that is all that a
+solve finds. Then each part of robots that are joined solves as if the others were not there, until
+somebody has measured something else. What a robot brings into a solve is its `Member`.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class Following:
 
     `waiting` is an order that waits for letters of other robots, and `obeyed` one that the robot
     computes the answer to (`talk`); `members` are all by their places, and `own` is what the solve
-    has found of the robot's poses.
+    has found of the robot's poses. `is_over` says whether its outcome has come.
     """
 
     talk: Talk
@@ -58,12 +60,14 @@ class Following:
     waiting: Ask | None = None
     obeyed: Ask | None = None
     own: OwnAnswer | None = None
+    is_over: bool = False
 
 
 class DrivenTeam:
     """The solves that robots of a team carry out together.
 
-    `last` is how the last solve has ended, and `term` the last solve that is known of.
+    `last` is how the last solve has ended that is more than the parts which robots form, and `term`
+    the last solve that is known of.
     """
 
     def __init__(self, member: Member, session: Session) -> None:
@@ -73,6 +77,11 @@ class DrivenTeam:
         self._member = member
         self._session = session
         self._beside = session.beside
+        # The last solve that has found parts of robots, of which each solves for itself as long as
+        # no robot has other measurements.
+        self._apart: Ended | None = None
+        # Robots that are there and have measured anything, this one too.
+        self._present: dict[str, Revision] = {}
         # Of the others: the revisions of their measurements, and the terms of their outcomes.
         self._revisions: dict[str, Revision] = {}
         self._known: dict[str, Term] = {}
@@ -134,7 +143,9 @@ class DrivenTeam:
         outcome = self._member.outcome
         known = Term(0, "") if outcome is None else outcome.term
         session = self._session
-        return Hello(self._revision, self.term, known, call, session.twins, session.hears)
+        apart = Term(0, "") if self._apart is None else self._apart.term
+        twins, hears = session.twins, session.hears
+        return Hello(self._revision, self.term, known, call, twins, hears, apart)
 
     def take(self, sender: str, message: object, is_latest: bool) -> None:
         """Update what is known of the team by a message, or obey the order in it."""
@@ -156,13 +167,19 @@ class DrivenTeam:
             outcome = self._unheard.get(sender)
             if outcome is not None and outcome.term == message.term:
                 del self._unheard[sender]
+                self._known[sender] = message.term
 
     def _take_hello(self, sender: str, hello: Hello, is_latest: bool) -> None:
         if is_latest:
             self._session.reach[sender] = hello.hears
             self._revisions[sender] = hello.revision
             self._known[sender] = hello.known
-        self._learn_term(hello.term)
+            apart = self._apart
+            is_told = apart is not None and apart.revisions.get(sender) == hello.revision
+            if apart is not None and is_told and hello.apart < apart.term:
+                self._session.send(sender, apart, Priority.NORMAL)
+        if self._heeds(sender):
+            self._learn_term(hello.term)
         if self._drive is not None and self._drive.is_computed(sender, hello):
             self._waits_since = self._session.now
             self._sent_at[sender] = self._session.now
@@ -174,10 +191,11 @@ class DrivenTeam:
             for name in awake:
                 if name != self.name:
                     self._session.say_hello(name)
+        self._present = self._present_of(awake)
         if self._drive is not None:
             self._go_on_driving(awake)
         if self._drive is None:
-            self._begin_if_due(awake)
+            self._begin_if_due()
         self._unheard = {name: ended for name, ended in self._unheard.items() if name in awake}
         self._send_again(self._unheard, Priority.NORMAL)
 
@@ -204,6 +222,7 @@ class DrivenTeam:
     def _stop_following(self) -> None:
         """End the computation of this robot's part; its last answer can be sent again."""
         if self._following is not None:
+            self._following.is_over = True
             self._following.talk.give_up()
 
     def _give_up(self) -> None:
@@ -212,20 +231,62 @@ class DrivenTeam:
             self._drive = None
             self._tried = {}
 
-    # Driving
+    # Parts of the team
 
-    def _begin_if_due(self, awake: tuple[str, ...]) -> None:
-        """Begin a solve if this robot drives: it comes first of those that have measured anything.
-
-        Everybody is there or was waited for, and something is new: measurements, or a robot that
-        has begun anew. Where robots have gone, a solve would find less than what is known.
-        """
-        revisions = {}
+    def _present_of(self, awake: tuple[str, ...]) -> dict[str, Revision]:
+        """Robots that are awake and have measured anything, and what."""
+        present = {}
         for name in awake:
             own = self._revision if name == self.name else Revision()
             revision = self._revisions.get(name, own)
             if revision.num_lines:
-                revisions[name] = revision
+                present[name] = revision
+        return present
+
+    @property
+    def _parts(self) -> tuple[tuple[str, ...], ...]:
+        """Parts of the robots that are there; none where they may be joined."""
+        apart = self._apart
+        if apart is None or not self._present.items() <= apart.revisions.items():
+            return ()
+        parts = [tuple(name for name in part if name in self._present) for part in apart.parts]
+        return tuple(part for part in parts if part)
+
+    @property
+    def _part(self) -> dict[str, Revision]:
+        """The part that this robot is in: robots by name, and what they have measured.
+
+        While it takes part in a solve of others too, these may be joined: one of them knows more.
+        """
+        own = next((part for part in self._parts if self.name in part), tuple(self._present))
+        members = set(self._members_under_way)
+        if members <= self._present.keys() and not members <= set(own):
+            return self._present
+        return {name: self._present[name] for name in own}
+
+    @property
+    def _members_under_way(self) -> tuple[str, ...]:
+        """Robots of the solve that this one drives or takes part in; none where it is over."""
+        if self._drive is not None:
+            return self._drive.members
+        part = self._following
+        return () if part is None or part.is_over else part.members
+
+    def _heeds(self, sender: str) -> bool:
+        """Whether solves that a robot knows of may be ones that this robot takes part in."""
+        is_new = sender not in self._present
+        return is_new or sender in self._part or sender in self._members_under_way
+
+    # Driving
+
+    def _begin_if_due(self) -> None:
+        """Begin a solve if this robot drives: it comes first of those that have measured anything.
+
+        Everybody is there or was waited for, and something is new: measurements, or a robot that
+        has begun anew. Where robots have gone, a solve would find less than what is known, and
+        where all have what they would find, nothing.
+        """
+        revisions = self._part
         members = tuple(revisions)
         if not members or members[0] != self.name:
             return
@@ -238,17 +299,26 @@ class DrivenTeam:
                 has_map = self.last is not None and self._known.get(name) == self.last.term
                 tried[name] = (revision, before[1] if has_map else tried[name][1])
                 lacks_map |= not has_map
-        if self._member.has_more_than(revisions) and not lacks_map:
+        has_more = self._member.has_more_than(revisions, self._present)
+        if not lacks_map and (has_more or self._all_have_map_of(revisions)):
             return
-        if tried != self._tried and self._session.is_complete(members):
+        if tried != self._tried and self._session.is_complete(self._present):
             self._begin_drive(members, tried)
+
+    def _all_have_map_of(self, revisions: Mapping[str, Revision]) -> bool:
+        """Whether these robots have the outcome of these measurements, as they say."""
+        outcome = self._member.outcome
+        if outcome is None or outcome.revisions != revisions:
+            return False
+        return all(self._known.get(name) == outcome.term for name in revisions if name != self.name)
 
     def _begin_drive(
         self, members: tuple[str, ...], tried: dict[str, tuple[Revision, bytes]]
     ) -> None:
         self._tried = tried
         self._unheard.clear()  # of the last outcome: there will be another one
-        self.term = Term(self.term.number + 1, self.name)
+        number = max(self.term.number, 0 if self._apart is None else self._apart.term.number)
+        self.term = Term(number + 1, self.name)
         self._stop_following()
         self._following = None
         member = self._member
@@ -313,7 +383,12 @@ class DrivenTeam:
         self._drive = None
         absent = tuple(name for name in self._session.team if name not in drive.members)
         revisions = {name: revision for name, (revision, _) in self._tried.items()}
-        outcome = drive.ended(absent, revisions)
+        outcome = drive.ended(absent, revisions, self._parts)
+        if outcome.has_parts_alone:  # whoever misses it says so with the next hello
+            self._apart = outcome
+            for name in drive.members[1:]:
+                self._session.send(name, outcome, Priority.NORMAL)
+            return
         self._end_with(outcome, drive.own)
         self._unheard = dict.fromkeys(drive.members[1:], outcome)
         self._send_again(self._unheard, Priority.NORMAL)
@@ -449,8 +524,17 @@ class DrivenTeam:
             return
         self._send_letter(self._following, lost.term, name)
 
+    def _take_parts(self, found: Ended) -> None:
+        """Learn which robots are joined, from the one that drove, or from another that knows it."""
+        if self._apart is None or found.term > self._apart.term:
+            self._apart = found
+        if found.term == self.term:
+            self._stop_following()
+
     def _take_outcome(self, sender: str, outcome: Ended) -> None:
-        if outcome.term == self.term and outcome.term.driver == sender:
+        if outcome.has_parts_alone:
+            self._take_parts(outcome)
+        elif outcome.term == self.term and outcome.term.driver == sender:
             if self.last is None or self.last.term != outcome.term:
                 if self._following is None and outcome.solution is not None:
                     self._have_all_begin_again(outcome.term)  # its poses are lost

@@ -19,7 +19,7 @@ from solvers.carry.wire import Order
 from solvers.loop import RunMonitor
 from solvers.robots.agent import Agent, OwnLines
 from solvers.robots.own_file import READ_HERE
-from solvers.robots.setup import SOLVE_PARTS
+from solvers.robots.setup import SOLVE_PARTS, ApartError
 from solvers.robots_solution import RobotsSolution
 from solvers.solves.folder_solve import FilesOfRobots
 from solvers.team.beside import Line, result_or_error
@@ -42,7 +42,10 @@ def solve_with_team(
     own: Measurements,
     line: Line,
 ) -> tuple[RobotsSolution, OwnAnswer | None]:
-    """The solution of the term by these robots, the first of which has the measurements."""
+    """The solution of the term by these robots, the first of which has the measurements.
+
+    An ApartError where no edge joins some of them with the others.
+    """
     engine = _Team(term, members, _agent(0, settings.name, own), line)
     files = [OwnLines(place, _path_of(name)) for place, name in enumerate(members)]
     job = FilesOfRobots(
@@ -57,6 +60,8 @@ def solve_with_team(
     try:
         solution = job.solved(settings.pipeline, RunMonitor(progress=False))
     except PGOError as error:
+        if isinstance(error, ApartError) and len(error.parts) > 1:
+            raise
         raise PGOError(_with_ways_out_of_teams(str(error))) from error
     return solution.without_histories, answer_of(engine.agent)
 

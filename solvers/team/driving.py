@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from pgo_models.errors import PGOError
+from solvers.robots.setup import ApartError
 from solvers.robots_solution import RobotsSolution
 from solvers.team.beside import Beside
 from solvers.team.driven_solve import solve_with_team
@@ -80,9 +81,20 @@ class Drive:
         self.waiting = {}
         self._talk.give_up()
 
-    def ended(self, absent: tuple[str, ...], revisions: Mapping[str, Revision]) -> Ended:
-        """How the solve has ended, without `absent` robots, by members with these revisions."""
+    def ended(
+        self,
+        absent: tuple[str, ...],
+        revisions: Mapping[str, Revision],
+        parts: tuple[tuple[str, ...], ...],
+    ) -> Ended:
+        """How the solve has ended, without `absent` robots, by members with these revisions.
+
+        `parts` are those that were known before, one of which are the members.
+        """
         outcome = self.outcome
         if isinstance(outcome, RobotsSolution):
-            return Ended(self.term, revisions, absent, outcome)
+            return Ended(self.term, revisions, absent, outcome, parts=parts)
+        if isinstance(outcome, ApartError):
+            found = tuple(tuple(self.members[k] for k in part) for part in outcome.parts)
+            return Ended(self.term, revisions, absent, None, parts=found)
         return Ended(self.term, revisions, absent, None, failure=f"failed: {outcome}")

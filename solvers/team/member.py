@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from solvers.team.measurements import Measurements, Revision
@@ -31,19 +31,25 @@ class Member:
         """Which measurements it has, so that others notice when they change."""
         return self.measurements.revision
 
-    def has_more_than(self, revisions: Mapping[str, Revision]) -> bool:
-        """Whether what was certified holds for measurements of these revisions, and for more."""
+    def has_more_than(self, revisions: Mapping[str, Revision], present: Collection[str]) -> bool:
+        """Whether what was certified holds for measurements of these revisions, and for more.
+
+        Where all that it holds for are `present`, the others have measured something else since, so
+        that no edge joins them with these any more: then it does not.
+        """
         outcome = self.outcome
         if outcome is None or outcome.solution is None or not outcome.solution.is_certified:
             return False
-        return outcome.revisions.items() > revisions.items()
+        is_outdated = outcome.revisions.keys() <= set(present)
+        return outcome.revisions.items() > revisions.items() and not is_outdated
 
     def end_with(self, ended: Ended, own: OwnAnswer | None) -> None:
         """Keep an outcome and the poses with it, unless what was certified before holds for more.
 
         Where a solve has failed, those before it stay.
         """
-        if self.has_more_than(ended.revisions):
+        present = [name for part in ended.parts for name in part]
+        if self.has_more_than(ended.revisions, present):
             return
         if ended.solution is not None and own is not None:
             self.outcome = ended

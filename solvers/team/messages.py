@@ -48,7 +48,8 @@ class Hello:
 
     `known` is that of the outcome that it has, `computing` the order of the term that it computes
     the answer to, or -1; `twins` are names that two robots have, and `hears` are robots that it has
-    heard of lately, not through others.
+    heard of lately, not through others. `apart` is the solve by which it knows which robots no edge
+    joins.
     """
 
     revision: Revision
@@ -57,6 +58,7 @@ class Hello:
     computing: int = -1
     twins: tuple[str, ...] = ()
     hears: tuple[str, ...] = ()
+    apart: Term = Term(0, "")
 
 
 @record("Relayed")
@@ -125,6 +127,9 @@ class LetterLost:
 class Ended:
     """A solve of the team has ended.
 
+    Where no edge joins some of its robots with the others, it has found their `parts` alone, and
+    each part solves for itself.
+
     Parameters
     ----------
     term : Term
@@ -132,11 +137,13 @@ class Ended:
     revisions : dict of str to Revision
         Robots that took part, each with the revision of its measurements.
     absent : tuple of str
-        Robots of the team that were not heard of.
+        Robots of the team that were not heard of, or that no edge joins with these.
     solution : RobotsSolution, optional
-        What was found; None where the solve failed.
+        What was found; None where the solve failed, or has found parts.
     failure : str
         What went wrong; empty where nothing did.
+    parts : tuple of tuple of str
+        The robots that were there, in the parts that edges join, where there are several.
     """
 
     term: Term
@@ -144,6 +151,12 @@ class Ended:
     absent: tuple[str, ...]
     solution: RobotsSolution | None
     failure: str = ""
+    parts: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def has_parts_alone(self) -> bool:
+        """Whether it has found which robots are joined, and each part solves for itself."""
+        return self.solution is None and bool(self.parts)
 
     @property
     def covered(self) -> tuple[str, ...]:
@@ -184,14 +197,17 @@ def check_message(message: object, team: tuple[str, ...]) -> None:
     names: list[str] = []
     for each in ("members", "revisions", "absent", "twins", "has", "hears"):
         names += getattr(message, each, ())
+    for part in getattr(message, "parts", ()):
+        names += part
     if isinstance(message, News):
         names += [piece.owner for piece in message.pieces]
         numbers = [piece.before.num_lines for piece in message.pieces]
         numbers += [message.sent, message.answers]
     else:
-        names += [message.term.driver] if message.term.driver else []
+        terms = [getattr(message, each, message.term) for each in ("term", "apart")]
+        names += [term.driver for term in terms if term.driver]
         numbers = [getattr(message, each, 0) for each in ("call", "place", "computing")]
-        numbers.append(message.term.number)
+        numbers += [term.number for term in terms]
     if not set(names) <= set(team) or not all(-1 <= number < _MOST for number in numbers):
         raise WireError(f"a {type(message).__name__} with names or numbers of nobody")
     if isinstance(message, Ask) and message.members:
