@@ -108,7 +108,10 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
         return job.answer_by_consistency(robust.quantile)
     ending = job.make_attempts(robust)
     if ending not in OUT_OF_TIME:
-        job = job.with_odometry_doubted(robust)
+        try:
+            job = job.with_odometry_doubted(robust)
+        except KeyboardInterrupt:  # outside a run: runs end with a status instead
+            ending = Status.INTERRUPTED
     answer = job.answer_by_attempts(ending)
     return job.answer_with_larger_errors(answer, robust) or answer
 
@@ -385,7 +388,8 @@ class _RobustSolve:
             began=self.began,
         )
         try:
-            other.make_attempts(settings)
+            if other.make_attempts(settings) is Status.INTERRUPTED:
+                raise KeyboardInterrupt
         except FAILURES as error:
             self.failures.append(f"odometry could not be doubted ({error})")
             return self
@@ -474,13 +478,16 @@ class _RobustSolve:
     # Step 3: choice
 
     def answer_by_attempts(self, ending: Status) -> Solution:
-        """The solution of the edges kept by the cheapest attempt."""
+        """The solution of the edges kept by the cheapest attempt, as it is after an interrupt."""
+        try:
+            return self._answer_by_attempts(ending)
+        except KeyboardInterrupt:  # outside a run: runs end with a status instead
+            return self._answer_by_attempts(Status.INTERRUPTED)
+
+    def _answer_by_attempts(self, ending: Status) -> Solution:
         chosen = self.choice.cheapest
         if ending not in OUT_OF_TIME and self.new is None:
-            try:
-                chosen = self._finished(chosen)
-            except KeyboardInterrupt:  # outside a run: runs end with a status instead
-                ending = Status.INTERRUPTED
+            chosen = self._finished(chosen)
         is_out_of_time = ending in OUT_OF_TIME
         solution = chosen.solution if is_out_of_time else self._solution_of(chosen)
         stages = [estimate.stage for estimate in self.estimates]
