@@ -192,8 +192,7 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
 
     Returned are the gtsam.NonlinearFactorGraph, and gtsam.Values of the given poses or
     `graph.initial`, empty if there are none. Keys are the ids of the poses. A GraphError when the
-    graph has landmarks or an edge between poses whose matrix is singular, or the poses do not fit
-    it.
+    graph has landmarks, or the poses do not fit it.
     """
     gtsam = extra_module("gtsam", "peers")
     if len(graph.landmarks):
@@ -205,29 +204,23 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
     information = proper_information(graph)
     is_position = graph.is_prior & ~(graph.kappa > 0.0)
     d = graph.d
-    definite = are_definite(information, LEAST_SCALED)
-    definite[is_position] = are_definite(information[is_position, :d, :d], LEAST_SCALED)
-    if not definite.all():
-        edge = graph.edge_label(int(np.argmin(definite)))
-        raise GraphError(f"{edge}: its information matrix is singular; GTSAM needs definite ones")
     factors = gtsam.NonlinearFactorGraph()
     ids = graph.pose_ids
     t_ij = graph.t_ij + np.where(graph.is_prior[:, None], graph.world_point, 0.0)
     measured = poses_in_gtsam(gtsam, Poses(graph.R_ij, t_ij))
     in_order = np.roll(information, 3, axis=(1, 2)) if d == 3 else information
-    full_noise = gtsam.noiseModel.Gaussian.Information
     between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
     prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
     position = gtsam.GPSFactor if d == 3 else gtsam.PoseTranslationPrior2D
     for e in range(graph.num_edges):
         j = int(ids[graph.j[e]])
         if is_position[e]:
-            noise = full_noise(information[e, :d, :d])
-            factors.add(position(j, t_ij[e], noise))
+            factors.add(position(j, t_ij[e], _noise(gtsam, information[e, :d, :d])))
         elif graph.is_prior[e]:
-            factors.add(prior(j, measured[e], full_noise(in_order[e])))
+            factors.add(prior(j, measured[e], _noise(gtsam, in_order[e])))
         else:
-            factors.add(between(int(ids[graph.i[e]]), j, measured[e], full_noise(in_order[e])))
+            noise = _noise(gtsam, in_order[e])
+            factors.add(between(int(ids[graph.i[e]]), j, measured[e], noise))
     values = gtsam.Values()
     if poses is not None:
         shown = graph.in_files
@@ -236,6 +229,15 @@ def to_gtsam(graph: PoseGraph, poses: Poses | None = None) -> tuple[Any, Any]:
         ):
             values.insert(pose_id, pose)
     return factors, values
+
+
+def _noise(gtsam: ModuleType, information: Array) -> Any:  # noqa: ANN401
+    """Noise model of a matrix; `Gaussian.Information` factors singular ones wrongly in silence."""
+    if are_definite(information[None], LEAST_SCALED)[0]:
+        return gtsam.noiseModel.Gaussian.Information(information)
+    eigenvalues, axes = np.linalg.eigh(information)
+    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * axes.T
+    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root)[1])
 
 
 def poses_in_gtsam(gtsam: ModuleType, poses: Poses) -> list[Any]:

@@ -16,6 +16,7 @@ from pgo_models.geometry.rotations import Array, stack_transposes, vee
 from pgo_models.graphs.free_directions import with_free_directions_held
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
 from pgo_models.graphs.precisions import edge_precisions, partial_edges, proper_information
+from pgo_models.graphs.residuals import check_poses
 from pgo_models.problem import matrices
 from pgo_models.problem.cholesky import (
     CholeskyBackend,
@@ -450,12 +451,7 @@ class PGOProblem(ReadOnly):
                 f"poses are a {type(poses).__name__}; "
                 "give Poses(R, t), or use with_best_translations(R)"
             )
-        poses = self.graph.with_world_of(poses)
-        if (poses.num_poses, poses.d) != (self.num_poses, self.d):
-            raise GraphError(
-                f"{poses} beside {self}; give one pose for every pose of the graph, in its order"
-            )
-        return poses
+        return check_poses(self.graph, poses)
 
     def at(self, poses: Poses) -> "EvaluatedPoses":
         """Return the cost at poses with what belongs to it: residuals, gradient, minorant.

@@ -101,7 +101,7 @@ def edge_residuals(problem: PGOProblem | PoseGraph, poses: Poses) -> EdgeResidua
     quantile = 1.0 - FALSE_ALARM / max(graph.num_edges, 1)
     allowed = scale * right_costs.quantiles(quantile)
     sums = right_costs.sums.sum(axis=0)[:2]
-    unknowns = _num_unknowns(graph, has_translations)
+    unknowns = num_unknowns(graph, has_translations)
     fit = overall_fit(float(cost.sum()), sums, unknowns, right_costs.rank)
     return EdgeResiduals(translation, rotation, cost, allowed, scale, *fit)
 
@@ -151,13 +151,12 @@ def _median_ratio(cost: Array, right_costs: RightCosts) -> float:
     return max(1.0, float(np.median(ratios)))
 
 
-def _num_unknowns(graph: PoseGraph, has_translations: bool) -> int:
-    """Numbers of all poses but one."""
+def num_unknowns(graph: PoseGraph, has_translations: bool) -> int:
+    """Count the numbers of all poses but one, which is fixed."""
     d = graph.d if has_translations else 0
     p = tangent_dimension(graph.d)
     num_points = len(graph.landmarks)
     num_other_poses = graph.num_poses - num_points
-    # One pose is fixed.
     return (d + p) * (num_other_poses - 1) + d * num_points
 
 

@@ -17,6 +17,7 @@ it.
 
 import math
 import time
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -25,9 +26,9 @@ import numpy as np
 from pgo_models.errors import SettingError, extra_module
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, exp_map, project_to_rotations
-from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
+from pgo_models.graphs.gtsam_graphs import poses_in_gtsam, to_gtsam
 from pgo_models.graphs.pose_graph import isotropic_information
-from pgo_models.graphs.precisions import LEAST_SCALED, are_definite, proper_information
+from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.result import History, Measurement, Record, Run, Status
@@ -56,7 +57,9 @@ def run_gtsam(
     began = time.perf_counter()
     graph = factor_graph(problem, start)
     if start is not None:
-        values = _values(gtsam, start)
+        values = gtsam.Values()
+        for key, pose in enumerate(poses_in_gtsam(gtsam, start)):
+            values.insert(key, pose)
     elif problem.d == 3:
         values = gtsam.InitializePose3.initialize(graph)
     else:
@@ -88,9 +91,16 @@ def run_gtsam(
             best = (objective, poses)
             break
     objective, poses = best
-    name = "GTSAM Levenberg-Marquardt"
-    iterations = records[-1].k
-    return Run(name, objective, poses, status, iterations, History(tuple(records)), seconds, poses)
+    return Run(
+        "GTSAM Levenberg-Marquardt",
+        objective,
+        poses,
+        status,
+        records[-1].k,
+        History(tuple(records)),
+        seconds,
+        poses,
+    )
 
 
 def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noqa: ANN401 - GTSAM has no types
@@ -109,20 +119,13 @@ def factor_graph(problem: PGOProblem, start: Poses | None = None) -> Any:  # noq
             f"{graph.name} has edges without a rotation or position, "
             "which GTSAM is not given; solve()"
         )
-    information = _information(problem)
-    between = gtsam.BetweenFactorPose3 if d == 3 else gtsam.BetweenFactorPose2
-    prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
-    full_noise = gtsam.noiseModel.Gaussian.Information
-    factors = gtsam.NonlinearFactorGraph()
-    measured = poses_in_gtsam(gtsam, Poses(graph.R_ij, graph.t_ij))
-    edges = zip(graph.i.tolist(), graph.j.tolist(), measured, information, strict=True)
-    definite = are_definite(information, LEAST_SCALED).tolist()
-    for (i, j, pose, weight), is_definite in zip(edges, definite, strict=True):
-        noise = full_noise(weight) if is_definite else _semidefinite_noise(gtsam, weight)
-        factors.add(between(i, j, pose, noise))
+    matrices = _information(problem)
+    factors, _ = to_gtsam(replace(graph, ids=None, information=matrices, unheld=None, initial=None))
     pose_0 = Poses.identity(1, d) if start is None else start[:1]
-    largest_information = np.einsum("mkk->mk", information).max(axis=0)
-    noise = full_noise(np.diag(largest_information))
+    largest_information = np.einsum("mkk->mk", matrices).max(axis=0)
+    in_order = np.roll(largest_information, 3) if d == 3 else largest_information
+    noise = gtsam.noiseModel.Gaussian.Information(np.diag(in_order))
+    prior = gtsam.PriorFactorPose3 if d == 3 else gtsam.PriorFactorPose2
     factors.add(prior(0, poses_in_gtsam(gtsam, pose_0)[0], noise))
     return factors
 
@@ -131,28 +134,11 @@ def _information(problem: PGOProblem) -> Array:
     """Information matrices of all edges for GTSAM, whose cost has the factor one half."""
     graph = problem.graph
     if problem.weighting is Weighting.INFORMATION:
-        information = 2.0 * proper_information(graph)
-    else:
-        # The information of an angle is twice kappa. `isotropic_information` has this factor in
-        # space, and not in the plane.
-        kappa = graph.kappa if problem.d == 3 else 2.0 * graph.kappa
-        information = 2.0 * isotropic_information(kappa, graph.tau, problem.d)
-    # A tangent vector of Pose3 begins with the rotation, one of Pose2 with the translation.
-    return np.roll(information, 3, axis=(1, 2)) if problem.d == 3 else information
-
-
-def _semidefinite_noise(gtsam: ModuleType, information: Array) -> Any:  # noqa: ANN401
-    """Noise model of a singular matrix, which `Gaussian.Information` factors wrongly in silence."""
-    eigenvalues, axes = np.linalg.eigh(information)
-    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * axes.T
-    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root)[1])
-
-
-def _values(gtsam: ModuleType, poses: Poses) -> Any:  # noqa: ANN401
-    values = gtsam.Values()
-    for key, pose in enumerate(poses_in_gtsam(gtsam, poses)):
-        values.insert(key, pose)
-    return values
+        return 2.0 * proper_information(graph)
+    # The information of an angle is twice kappa. `isotropic_information` has this factor in space,
+    # and not in the plane.
+    kappa = graph.kappa if problem.d == 3 else 2.0 * graph.kappa
+    return 2.0 * isotropic_information(kappa, graph.tau, problem.d)
 
 
 def poses_of_values(gtsam: ModuleType, values: Any, d: int) -> Poses:  # noqa: ANN401

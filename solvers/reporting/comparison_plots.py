@@ -9,26 +9,25 @@ from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array
 from pgo_models.plots.interactive_plots import lay_out
-from pgo_models.plots.style import MARKERS, METHOD_COLOURS, column_figure, count_along_x, plotly
+from pgo_models.plots.style import MARKERS, METHOD_COLOURS, column_figure, plotly
 from solvers.reporting.convergence_plots import LINES, LOGARITHMIC, Curve, Effort
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from plotly.graph_objects import Figure as PlotlyFigure
 
-_PANELS = (Effort.ROUNDS, Effort.BYTES, Effort.SECONDS)
 _DASHES = ("solid", "dash", "dot", "dashdot")
 _MARKER_DISTANCE = 0.08  # of the diagonal of a panel
 _MAX_POINTS = 400  # of a curve in a page: thousands of sweeps would make it slow
 
 
-def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -> "Figure":
+def plot_efforts(curves: Sequence[Curve]) -> "Figure":
     """Figure of the gap of several methods over their effort, with a panel for each effort.
 
-    A panel shows the methods whose effort was counted. Axes are logarithmic, but for that of
-    iterations. Raises a SettingError if no method has a gap above zero.
+    A panel shows the methods whose effort was counted. Axes are logarithmic. Raises a SettingError
+    if no method has a gap above zero.
     """
-    panels = _panels(curves, efforts)
+    panels = _panels(curves)
     styles = _styles(curves, LINES)
     with column_figure(height=0.95, width=max(1.0, 0.9 * len(panels))) as figure:
         handles = {}
@@ -37,13 +36,10 @@ def plot_efforts(curves: Sequence[Curve], efforts: Sequence[Effort] = _PANELS) -
             for curve in shown:
                 colour, marker, line = styles[curve.name]
                 x, y = _visible_points(curve, effort)
-                draw = axes.semilogy if effort is Effort.ITERATIONS else axes.loglog
-                (handles[curve.name],) = draw(
+                (handles[curve.name],) = axes.loglog(
                     x, y, f"{marker}{line}", color=colour, markevery=_MARKER_DISTANCE
                 )
             axes.set_xlabel(effort.value)
-            if effort is Effort.ITERATIONS:
-                count_along_x(axes)
         grid[0].set_ylabel("relative gap")
         names = [curve.name for curve in curves if curve.name in handles]
         entries = [handles[name] for name in names]
@@ -57,7 +53,7 @@ def explore_efforts(curves: Sequence[Curve], title: str = "") -> "PlotlyFigure":
 
     An entry of the legend shows and hides a method in all panels.
     """
-    panels = _panels(curves, _PANELS)
+    panels = _panels(curves)
     styles = _styles(curves, _DASHES)
     figure = plotly("subplots").make_subplots(
         1, len(panels), shared_yaxes=True, horizontal_spacing=0.03
@@ -94,12 +90,11 @@ def _subsampled(x: Array, y: Array) -> tuple[Array, Array]:
     return x[kept], y[kept]
 
 
-def _panels(curves: Sequence[Curve], efforts: Sequence[Effort]) -> list[tuple[Effort, list[Curve]]]:
+def _panels(curves: Sequence[Curve]) -> list[tuple[Effort, list[Curve]]]:
     """Efforts that were counted, each with the curves that can be drawn over it."""
     panels = []
-    for effort in efforts:
-        counted = [curve for curve in curves if curve.counts(effort)]
-        shown = [curve for curve in counted if len(_visible_points(curve, effort)[0])]
+    for effort in Effort:
+        shown = [curve for curve in curves if len(_visible_points(curve, effort)[0])]
         if shown:
             panels.append((effort, shown))
     if not panels:
@@ -110,13 +105,13 @@ def _panels(curves: Sequence[Curve], efforts: Sequence[Effort]) -> list[tuple[Ef
 
 
 def _visible_points(curve: Curve, effort: Effort) -> tuple[Array, Array]:
-    """Points of a curve that logarithmic axes can show; that of iterations is linear."""
+    """Points of a curve that logarithmic axes can show; none where the effort was not counted."""
     x = curve.effort(effort)
+    if x is None:
+        return np.zeros(0), np.zeros(0)
     y = curve.gap
-    is_visible = np.isfinite(y) & (y > 0)
-    if effort is not Effort.ITERATIONS:
-        is_visible &= x > 0
-    return x[is_visible], y[is_visible]
+    is_visible = np.isfinite(y) & (y > 0) & (x > 0)
+    return np.asarray(x[is_visible], dtype=float), y[is_visible]
 
 
 def _styles(curves: Sequence[Curve], lines: Sequence[str]) -> dict[str, tuple[str, str, str]]:

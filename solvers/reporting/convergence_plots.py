@@ -37,7 +37,6 @@ LOGARITHMIC = {"type": "log", "exponentformat": "power", "gridcolor": "#eeeeee",
 class Effort(enum.Enum):
     """Effort over which methods are compared; the value is the label of the axis."""
 
-    ITERATIONS = "iterations"
     ROUNDS = "communication rounds"
     BYTES = "communication (bytes)"
     SECONDS = "time in steps (s)"
@@ -55,42 +54,20 @@ class Curve:
     num_bytes: Array | None = None
     place: int | None = None  # number of its colour; its position in the figure unless given
 
-    def __post_init__(self) -> None:
-        for label in ("rounds", "num_bytes"):
-            given: Array | None = getattr(self, label)
-            if given is not None and len(given) != len(self.history):
-                entries = f"{len(given)} entries for {len(self.history)} records"
-                raise SettingError(f"{label} of {self.name} has {entries}; give one each")
-
     @property
     def gap(self) -> Array:
         """(objective - lower_bound) / objective of every record."""
         gaps = [relative_gap(cost, self.lower_bound) for cost in self.history.objective]
         return np.array(gaps)
 
-    def counts(self, effort: Effort) -> bool:
-        """Whether the run has figures of this effort."""
-        return self._efforts[effort] is not None
-
-    def effort(self, effort: Effort) -> Array:
-        """Effort up to every record, (len(history),).
-
-        Raises a SettingError if the communication was not counted.
-        """
-        if not self.counts(effort):
-            raise SettingError(
-                f"{self.name} has no count of {effort.value}; give it to the Curve, or leave it out"
-            )
-        return np.asarray(self._efforts[effort], dtype=float)
-
-    @property
-    def _efforts(self) -> dict[Effort, Array | None]:
-        return {
-            Effort.ITERATIONS: self.history.k,
+    def effort(self, effort: Effort) -> Array | None:
+        """Effort up to every record, (len(history),); None where it was not counted."""
+        efforts = {
             Effort.ROUNDS: self.rounds,
             Effort.BYTES: self.num_bytes,
             Effort.SECONDS: self.history.seconds,
         }
+        return efforts[effort]
 
 
 def plot_convergence(

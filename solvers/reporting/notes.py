@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from pgo_models.certificates.certificate import Certificate, Verdict
-from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.graphs.pose_graph import PoseGraph, matrices_of_edges
 from pgo_models.graphs.precisions import (
     LEAST_SCALED,
@@ -15,6 +14,7 @@ from pgo_models.graphs.precisions import (
 )
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.thresholds import num_unknowns
 from pgo_models.problem.weighting import Weighting
 
 
@@ -40,18 +40,9 @@ def note_of_redundancy(problem: PGOProblem) -> str:
     num_nodes = graph.num_poses
     if graph.num_edges > num_nodes and graph.world is None:
         return ""  # as of most graphs, which have cycles
-    if _num_measured(problem) > _num_unknowns(problem):
+    if _num_measured(problem) > num_unknowns(graph, problem.has_translations):
         return ""
     return "no cycle: every measurement fits whatever it is, and nothing checks it"
-
-
-def _num_unknowns(problem: PGOProblem) -> int:
-    """Number of unknowns beyond the frame."""
-    graph = problem.graph
-    p = tangent_dimension(graph.d)
-    of_pose = p + (graph.d if problem.has_translations else 0)
-    num_poses = graph.num_poses - len(graph.landmarks)
-    return of_pose * (num_poses - 1) + graph.d * len(graph.landmarks)
 
 
 def _num_measured(problem: PGOProblem) -> int:

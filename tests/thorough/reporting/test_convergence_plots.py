@@ -8,7 +8,7 @@ from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import MissingExtraError, SettingError
 from pgo_models.graphs.published_results import PublishedRun
 from solvers import Measurement
-from solvers.reporting.convergence_plots import Curve, Effort, explore_convergence, plot_convergence
+from solvers.reporting.convergence_plots import Curve, explore_convergence, plot_convergence
 from solvers.result import History, Record
 
 pytest.importorskip("matplotlib")
@@ -30,12 +30,6 @@ def test_the_gap_is_held_against_the_bound():
     records = history(6)
     gap = Curve("x", records, 9.5).gap
     assert gap.tolist() == [relative_gap(value, 9.5) for value in records.objective]
-
-
-@pytest.mark.parametrize("effort", [Effort.ROUNDS, Effort.BYTES])
-def test_an_effort_that_was_not_counted_is_refused(effort):
-    with pytest.raises(SettingError, match=f"no count of {effort.value.split()[0]}"):
-        Curve("x", history(4), 9.5).effort(effort)
 
 
 def test_stages_follow_each_other_and_what_has_no_logarithm_is_left_out():
