@@ -48,7 +48,7 @@ class Following:
 
     `waiting` is an order that waits for letters of other robots, and `obeyed` one that the robot
     computes the answer to (`talk`); `members` are all by their places, and `own` is what the solve
-    has found of the robot's poses. `is_over` says whether its outcome has come.
+    has found of the robot's poses.
     """
 
     talk: Talk
@@ -60,7 +60,6 @@ class Following:
     waiting: Ask | None = None
     obeyed: Ask | None = None
     own: OwnAnswer | None = None
-    is_over: bool = False
 
 
 class DrivenTeam:
@@ -156,7 +155,7 @@ class DrivenTeam:
         elif isinstance(message, Ask):
             self._obey(sender, message)
         elif isinstance(message, Reply):
-            self._take_reply(sender, message)
+            self._take_reply(sender, message, is_latest)
         elif isinstance(message, Letter):
             self._take_letter(message)
         elif isinstance(message, LetterLost):
@@ -178,8 +177,9 @@ class DrivenTeam:
             is_told = apart is not None and apart.revisions.get(sender) == hello.revision
             if apart is not None and is_told and hello.apart < apart.term:
                 self._session.send(sender, apart, Priority.NORMAL)
-        if self._heeds(sender):
-            self._learn_term(hello.term)
+        asked = () if self._drive is None else self._drive.members
+        if sender in (*self._part, *asked) or sender not in self._present:
+            self._learn_term(hello.term)  # another part has its own solves
         if self._drive is not None and self._drive.is_computed(sender, hello):
             self._waits_since = self._session.now
             self._sent_at[sender] = self._session.now
@@ -222,7 +222,6 @@ class DrivenTeam:
     def _stop_following(self) -> None:
         """End the computation of this robot's part; its last answer can be sent again."""
         if self._following is not None:
-            self._following.is_over = True
             self._following.talk.give_up()
 
     def _give_up(self) -> None:
@@ -254,28 +253,9 @@ class DrivenTeam:
 
     @property
     def _part(self) -> dict[str, Revision]:
-        """The part that this robot is in: robots by name, and what they have measured.
-
-        While it takes part in a solve of others too, these may be joined: one of them knows more.
-        """
+        """The part that this robot is in: robots by name, and what they have measured."""
         own = next((part for part in self._parts if self.name in part), tuple(self._present))
-        members = set(self._members_under_way)
-        if members <= self._present.keys() and not members <= set(own):
-            return self._present
         return {name: self._present[name] for name in own}
-
-    @property
-    def _members_under_way(self) -> tuple[str, ...]:
-        """Robots of the solve that this one drives or takes part in; none where it is over."""
-        if self._drive is not None:
-            return self._drive.members
-        part = self._following
-        return () if part is None or part.is_over else part.members
-
-    def _heeds(self, sender: str) -> bool:
-        """Whether solves that a robot knows of may be ones that this robot takes part in."""
-        is_new = sender not in self._present
-        return is_new or sender in self._part or sender in self._members_under_way
 
     # Driving
 
@@ -366,7 +346,9 @@ class DrivenTeam:
                 Reply(ask.term, ask.call, self._revisions.get(name, Revision()), None, error),
             )
 
-    def _take_reply(self, sender: str, reply: Reply) -> None:
+    def _take_reply(self, sender: str, reply: Reply, is_latest: bool) -> None:
+        if is_latest and reply.call == 0:  # it may overtake the hello that says so
+            self._revisions[sender] = reply.revision
         drive = self._drive
         if drive is not None and reply.term == drive.term and sender in drive.members:
             self._tried[sender] = (reply.revision, self._session.boot_of(sender))
