@@ -8,8 +8,9 @@ somebody has measured something else. What a robot brings into a solve is its `M
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -35,6 +36,7 @@ from solvers.team.messages import (
     error_as_message,
 )
 from solvers.team.news import News
+from solvers.team.pace import Pace, clock
 from solvers.team.session import Session
 from solvers.team.sharing import OwnAnswer
 
@@ -85,7 +87,7 @@ class DrivenTeam:
         self._revisions: dict[str, Revision] = {}
         self._known: dict[str, Term] = {}
         self._sent_at: dict[str, float] = {}  # when the last ask or outcome was sent to each
-        self._num_sent: dict[str, int] = {}  # how often it was sent
+        self._paces: defaultdict[str, Pace] = defaultdict(Pace)
         self._waits_since: float | None = None  # for answers to the orders under way
         self._following: Following | None = None
         self._drive: Drive | None = None
@@ -123,7 +125,9 @@ class DrivenTeam:
         own = self._revision
         if not any(not end.absent and end.revisions.get(self.name) == own for end in ends):
             return False
-        return self._drive is None and not self._unheard
+        session = self._session
+        is_waited_for = any(session.is_awake(name) for name in self._unheard)
+        return self._drive is None and not is_waited_for
 
     @property
     def problems(self) -> list[str]:
@@ -196,18 +200,19 @@ class DrivenTeam:
             self._go_on_driving(awake)
         if self._drive is None:
             self._begin_if_due()
-        self._unheard = {name: ended for name, ended in self._unheard.items() if name in awake}
-        self._send_again(self._unheard, Priority.NORMAL)
+        # A robot that is out of reach may come back for the outcome.
+        unheard = {name: ended for name, ended in self._unheard.items() if name in awake}
+        self._send_again(unheard, Priority.NORMAL)
 
     def _send_again(self, waiting: Mapping[str, object], priority: Priority) -> None:
-        """Send what was not answered, by receiver, once and then ever more rarely."""
+        """Send what was not answered, by receiver, as often as the link to it lets expect."""
+        now = self._session.now
         for name, message in waiting.items():
-            num_sent = self._num_sent.get(name, 0)
-            waited = self._session.now - self._sent_at.get(name, -np.inf)
-            if waited >= self._session.pause(num_sent):
-                self._sent_at[name] = self._session.now
-                self._num_sent[name] = num_sent + 1
-                self._session.send(name, message, priority)
+            pause = self._paces[name].pause(self._session.silence_of(name), self._session.retry)
+            if now - self._sent_at.get(name, -np.inf) >= pause:
+                self._sent_at[name] = now
+                copy = replace(message, sent=clock(now)) if isinstance(message, Ask) else message
+                self._session.send(name, copy, priority)
 
     def _learn_term(self, term: Term) -> None:
         """Give up a solve that another robot has overtaken, and solve again if this one drives."""
@@ -352,13 +357,15 @@ class DrivenTeam:
         drive = self._drive
         if drive is not None and reply.term == drive.term and sender in drive.members:
             self._tried[sender] = (reply.revision, self._session.boot_of(sender))
+            if drive.waits_for(sender, reply):
+                session = self._session
+                self._paces[sender].note_answer(reply.answers, session.now, session.retry)
             drive.take(sender, reply)
 
     def _after_step(self, drive: Drive) -> None:
         """Send what the solve asks for, or its outcome if it has ended."""
         self._waits_since = None
         self._sent_at.clear()
-        self._num_sent.clear()
         self._send_again(drive.waiting, Priority.URGENT)
         if drive.outcome is None:
             return
@@ -424,7 +431,8 @@ class DrivenTeam:
                     self._session.send(part.members[name.other], message, Priority.URGENT)
             part.waiting = ask if lost else None
         elif ask.call == part.call and part.reply is not None:
-            self._session.send(ask.term.driver, part.reply, Priority.URGENT)
+            reply = replace(part.reply, answers=ask.sent)
+            self._session.send(ask.term.driver, reply, Priority.URGENT)
 
     def _have_all_begin_again(self, term: Term) -> None:
         """Tell the robot that drives that this one has begun anew and has lost its part."""
@@ -436,7 +444,7 @@ class DrivenTeam:
         completed = result_or_error(partial(part.letters.put_in, ask.request), UNKNOWN)
         if isinstance(completed, PGOError):
             failure = error_as_message(completed)
-            part.reply = Reply(ask.term, ask.call, part.revision, None, failure)
+            part.reply = Reply(ask.term, ask.call, part.revision, None, failure, ask.sent)
             part.call = ask.call
             self._session.send(ask.term.driver, part.reply, Priority.URGENT)
             return set()
@@ -462,7 +470,7 @@ class DrivenTeam:
         is_error = isinstance(found, PGOError)
         error = error_as_message(found) if is_error else None
         answer, letters = part.letters.take_out(ask.call, None if is_error else found)
-        part.reply = Reply(ask.term, ask.call, part.revision, answer, error)
+        part.reply = Reply(ask.term, ask.call, part.revision, answer, error, ask.sent)
         if part is not self._following:
             return
         send = partial(self._send_answer, part, ask.term, part.reply, letters)
@@ -471,7 +479,7 @@ class DrivenTeam:
             for name in letters:
                 del part.letters.sent[name]
             error = error_as_message(unsent)
-            part.reply = Reply(ask.term, ask.call, part.revision, None, error)
+            part.reply = Reply(ask.term, ask.call, part.revision, None, error, ask.sent)
             self._session.send(ask.term.driver, part.reply, Priority.URGENT)
 
     def _send_answer(

@@ -60,10 +60,14 @@ class Drive:
             self.outcome, self.own = result
         self._tell(self)
 
+    def waits_for(self, robot: str, reply: Reply) -> bool:
+        """Whether a robot has not yet given this answer, which the solve waits for."""
+        ask = self.waiting.get(robot)
+        return ask is not None and reply.call == ask.call
+
     def take(self, robot: str, reply: Reply) -> None:
         """Take an answer; with the last one the solve goes on."""
-        ask = self.waiting.get(robot)
-        if ask is None or reply.call != ask.call:
+        if not self.waits_for(robot, reply):
             return
         del self.waiting[robot]
         error = reply.error

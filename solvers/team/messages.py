@@ -18,6 +18,7 @@ from solvers.team.measurements import Revision
 from solvers.team.news import News
 
 _MOST = 1 << 62  # no number of a message is higher
+_NUMBERS = ("call", "place", "computing", "sent", "answers")
 _PLAIN_ERRORS = {
     kind.__name__: kind
     for kind in (errors.GraphError, errors.NotPositiveDefiniteError, errors.SettingError)
@@ -75,7 +76,8 @@ class Relayed:
 class Ask:
     """Order number `call` to a robot in a solve, with its request; `place` is the robot's number.
 
-    `members` are the robots of the solve by their places, in order number 0.
+    `members` are the robots of the solve by their places, in order number 0; `sent` is when this
+    copy was sent, by the `clock` of its sender.
     """
 
     term: Term
@@ -84,6 +86,7 @@ class Ask:
     order: Order
     request: Any
     members: tuple[str, ...] = ()
+    sent: int = 0
 
 
 @record("Reply")
@@ -91,7 +94,8 @@ class Ask:
 class Reply:
     """The answer to order number `call`, or what went wrong.
 
-    `revision` is that of the measurements that the robot takes part with.
+    `revision` is that of the measurements that the robot takes part with, `answers` when the copy
+    of the order was sent that has led to it.
     """
 
     term: Term
@@ -99,6 +103,7 @@ class Reply:
     revision: Revision
     answer: Any
     error: tuple[str, str] | None = None  # name and text of a PGOError
+    answers: int = 0
 
 
 @record("Letter")
@@ -202,12 +207,11 @@ def check_message(message: object, team: tuple[str, ...]) -> None:
     if isinstance(message, News):
         names += [piece.owner for piece in message.pieces]
         numbers = [piece.before.num_lines for piece in message.pieces]
-        numbers += [message.sent, message.answers]
     else:
         terms = [getattr(message, each, message.term) for each in ("term", "apart")]
         names += [term.driver for term in terms if term.driver]
-        numbers = [getattr(message, each, 0) for each in ("call", "place", "computing")]
-        numbers += [term.number for term in terms]
+        numbers = [term.number for term in terms]
+    numbers += [getattr(message, each, 0) for each in _NUMBERS]
     if not set(names) <= set(team) or not all(-1 <= number < _MOST for number in numbers):
         raise WireError(f"a {type(message).__name__} with names or numbers of nobody")
     if isinstance(message, Ask) and message.members:

@@ -234,21 +234,26 @@ class Session:
         self.beside.act()
         if self._began is None:
             self._began = now
-        awake = tuple(name for name in self.team if self._is_awake(name))
+        awake = tuple(name for name in self.team if self.is_awake(name))
         self.way.tick(awake)
         for name in self.team:
             if name != self.name and self._is_greeted(name, name in awake):
                 self.say_hello(name)
 
-    def _is_awake(self, name: str) -> bool:
+    def is_awake(self, name: str) -> bool:
         """Whether a robot was heard of lately, or is this one."""
-        silence = self.now - self._last_heard.get(name, -np.inf)
-        return name == self.name or silence <= self.patience
+        return name == self.name or self.silence_of(name) <= self.patience
+
+    def silence_of(self, name: str) -> float:
+        """Seconds since a robot was heard of."""
+        return float(self.now - self._last_heard.get(name, -np.inf))
 
     def _is_greeted(self, name: str, is_awake: bool) -> bool:
         """Whether it is time to say hello to a robot: at first often to those not awake."""
         when, num_sent = self._greeted.get(name, (-np.inf, 0))
         often = _SHARE_OF_PATIENCE * self.patience
+        if self._third_to(name) is not None:  # two ways to it, and each may lose the greeting
+            often = min(often, self.retry)
         pause = often if is_awake else min(self.pause(num_sent), often)
         is_due = self.now - when >= pause
         if is_due:

@@ -190,6 +190,32 @@ def test_a_late_copy_of_the_first_order_finds_a_robot_that_has_begun_anew() -> N
     assert_is_the_optimum(network.robots, graph)
 
 
+def test_the_outcome_reaches_a_robot_that_was_not_heard_when_it_was_found() -> None:
+    graph = world()
+    robots = robots_of(graph, 3)
+    ended_at: list[float] = []
+
+    def is_lost(sender: str, receiver: str, data: bytes) -> bool:
+        is_outcome = isinstance(message_in(data), Ended)
+        if is_outcome and not ended_at:
+            ended_at.append(network.now)
+        if not ended_at or network.now > ended_at[0] + 8.0:
+            return False
+        return sender == "r2" or (receiver == "r2" and is_outcome)
+
+    network = Network(robots, np.random.default_rng(0), is_lost=is_lost)
+    while not ended_at:
+        network.wait(0.1)
+    network.wait(7.0)
+    assert robots["r0"].is_settled  # nobody waits for a robot that has gone
+    assert robots["r2"].solution is None
+    before = robots["r0"].outcome
+    network.run(20.0)
+    assert network.is_settled
+    assert robots["r0"].outcome is before
+    assert_is_the_optimum(robots, graph)
+
+
 def test_nobody_repeats_an_outcome_that_another_one_has_followed() -> None:
     graph = world()
     loses, _ = losing(Heard, range(10**9), receiver="r1")
@@ -658,7 +684,7 @@ def test_poses_of_a_robot_that_no_edge_joins_with_its_others_are_told_in_a_sente
 
 @pytest.mark.parametrize("far", [{"r0", "r2"}, {"r1", "r2"}], ids=["the driver", "others"])
 @pytest.mark.parametrize("pipeline", [None, PEERS], ids=["SUBSTRUCTURED", "CONSENSUS"])
-@pytest.mark.parametrize("lost", [0.0, 0.05])
+@pytest.mark.parametrize("lost", [0.0, 0.4])
 def test_robots_that_hear_each_other_only_through_a_third_solve_together(
     pipeline: solvers.Pipeline | None, far: set[str], lost: float
 ) -> None:
