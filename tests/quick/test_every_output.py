@@ -22,7 +22,6 @@ from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.trajectories import read_kitti, read_tum
 from pgo_models.problem.cholesky import CholeskyBackend
 from solvers.cli.shell import save_then_show
-from solvers.reporting import result_files
 
 PICTURES = ["x.png", "x.svg", "x.pdf"]
 TRAJECTORIES = ["x.g2o", "x.tum", "x.txt", "x.kitti"]
@@ -132,6 +131,26 @@ def test_help_and_a_missing_argument_are_said(pgo_command):
         )
 
 
+def test_a_file_that_cannot_be_written_is_named_and_keeps_none_of_the_others(
+    pgo_command, tmp_path, monkeypatch
+):
+    taken = tmp_path / "x.tum"
+    first_step = solvers.Newton.init
+
+    def take_name_then_begin(*arguments: object) -> object:
+        taken.mkdir()
+        return first_step(*arguments)
+
+    monkeypatch.setattr(solvers.Newton, "init", take_name_then_begin)
+    outs = repeated("-o", tmp_path, ["x.g2o", "x.tum", "x.json"])
+    code, out, err = pgo_command("solve", "grid", *outs, "--report", tmp_path / "x.html")
+    assert (code, err.count("\n")) == (1, 1)
+    assert f"cannot write {taken}: " in err
+    assert sorted(os.listdir(tmp_path)) == ["x.g2o", "x.html", "x.json", "x.tum"]
+    assert "CERTIFIED" in out
+    assert out.count("written: ") == 3
+
+
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
@@ -142,20 +161,13 @@ def test_help_and_a_missing_argument_are_said(pgo_command):
         (MemoryError(), "there is not enough memory"),
     ],
 )
-def test_a_writer_that_fails_is_named_and_keeps_none_of_the_others(
-    error, reason, pgo_command, tmp_path, monkeypatch
-):
-    def fails(*_: object) -> None:
+def test_whatever_keeps_a_file_from_being_written_is_said(error, reason, tmp_path):
+    def fails(_: Path) -> None:
         raise error
 
-    monkeypatch.setattr(result_files, "write_tum", fails)
-    outs = repeated("-o", tmp_path, ["x.g2o", "x.tum", "x.json"])
-    code, out, err = pgo_command("solve", "grid", *outs, "--report", tmp_path / "x.html")
-    assert (code, err.count("\n")) == (1, 1)
-    assert f"cannot write {tmp_path / 'x.tum'}: {reason}" in err
-    assert sorted(os.listdir(tmp_path)) == ["x.g2o", "x.html", "x.json"]
-    assert "CERTIFIED" in out
-    assert out.count("written: ") == 3
+    path = tmp_path / "a"
+    with pytest.raises(PGOError, match=f"cannot write {path}: {reason}"):
+        save_then_show([(path, fails)], lambda: None)
 
 
 def test_a_defect_in_a_writer_comes_out_after_all_the_rest_is_done(tmp_path, capsys):
@@ -187,15 +199,14 @@ def test_a_graph_that_changes_or_goes_during_the_solve_loses_nothing(
     text, planar, pgo_command, tmp_path, monkeypatch
 ):
     path = tmp_path / "graph.g2o"
-    plain = solvers.solve
+    first_step = solvers.Newton.init
     path.write_bytes(locate(str(planar)).read_bytes())
 
-    def solve_then_change(*arguments: object, **settings: object) -> solvers.Solution:
-        solution = plain(*arguments, **settings)
-        path.unlink() if text is None else path.write_text(text)
-        return solution
+    def change_then_begin(*arguments: object) -> object:
+        path.unlink(missing_ok=True) if text is None else path.write_text(text)
+        return first_step(*arguments)
 
-    monkeypatch.setattr("solvers.cli.solve_command.solve", solve_then_change)
+    monkeypatch.setattr(solvers.Newton, "init", change_then_begin)
     code, out, err = pgo_command("solve", path, "--robust", "gnc", "-o", tmp_path / "x.tum")
     assert (code, err) == (0, "")
     assert "written: " in out

@@ -25,9 +25,14 @@ from hypothesis import given, settings, strategies as st
 from roads import road
 
 from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
-from pgo_models.certificates import lower_bound
+from pgo_models.certificates.definiteness import prove_definite
 from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
-from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models.certificates.lower_bound import (
+    grounded_bound,
+    pose_rows,
+    prove_bound,
+    quadratic_loss,
+)
 from pgo_models.certificates.rounding_errors import (
     evaluate_certificate,
     evaluate_edges,
@@ -232,20 +237,26 @@ def test_the_bound_with_eta_alone_is_below_its_two_terms(seed: int, n: int, d: i
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_the_bound_holds_wherever_it_is_grounded(d: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a move G is not rounding.
-
-    Its quadratic term is all that keeps the bound below F.
-    """
-    monkeypatch.setattr(lower_bound, "MOST_MOVES", 0)
+def test_the_bound_holds_wherever_it_is_grounded(d: int) -> None:
+    """Before a move G is not rounding: its quadratic term is all that keeps the bound below F."""
     problem = PGOProblem(varied_graph(0, 10, d))
     best = polish(problem, chordal_start(problem))
     F = ExactGraph.of_doubles(problem.graph).objective_of(best)
     for size in (1e-3, 1e-5, 1e-7):
         away = turned_away(problem, best, size, 0)
-        bound = prove_bound(problem, multipliers(problem, away), 0.0, away)
+        Lambda = multipliers(problem, away)
+        X = problem.at(away.moved(away.R[0].T, np.zeros(d))).X.copy()
+        X[: problem.num_poses] -= X[0]
+        proof = prove_definite(problem, Lambda, 0.0, pose_rows(0, 10, d))
+        assert proof is not None
+        at_X = evaluate_certificate(problem, Lambda, X, np.zeros((10, d)))
+        free = proof.free
+        lost = quadratic_loss(at_X.product[free], at_X.product_error[free], proof.slack[free])
+        unmoved = grounded_bound(at_X.value, at_X.value_error, lost, 0.0, 0.0)
+        assert unmoved.value <= F < at_X.value
+        bound = prove_bound(problem, Lambda, 0.0, away)
         assert bound is not None
-        assert bound <= F < ExactGraph.of_doubles(problem.graph).objective_of(away)
+        assert unmoved.value < bound <= F
 
 
 @pytest.mark.parametrize("d", [2, 3])

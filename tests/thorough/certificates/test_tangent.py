@@ -38,7 +38,7 @@ from pgo_models.certificates.shrunk_information import shrink_information
 from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.precisions import are_definite, proper_information, uncoupled_share
+from pgo_models.graphs.precisions import are_definite, proper_information
 from pgo_models.graphs.residuals import chi2
 from pgo_models.problem.costs import ExcessCost, TangentCost
 from pgo_models.problem.initialization import chordal_start
@@ -257,21 +257,6 @@ def test_smaller_matrices_are_below_in_exact_arithmetic(d: int) -> None:
         assert are_definite(rest, 0.0).all()
         # nothing was cut, so that rounding is seen
         assert coupled or np.abs(rest).max() <= 1e-9 * information.max()
-
-
-@pytest.mark.parametrize("d", [2, 3])
-def test_smaller_matrices_are_below_whatever_share_was_computed(
-    d: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    graph = informed(3, 8, d, coupled=True, spread=2.0)
-    information = proper_information(graph)
-    monkeypatch.setattr(
-        "pgo_models.certificates.shrunk_information.uncoupled_share",
-        lambda blocks, d: np.minimum(1.0, uncoupled_share(blocks, d) + 0.3),
-    )
-    softer = shrink_information(graph, 1e9).information
-    assert softer is not None
-    assert are_definite(information - softer, 0.0).all()
 
 
 def semidefinite(seed: int, n: int, d: int, rank: int, share: float = 1.0) -> PoseGraph:

@@ -2,6 +2,8 @@
 ones.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from budget import examples
@@ -24,10 +26,14 @@ from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
 from solvers.loop import Outcome
 from solvers.robots import handedness
 from solvers.robots.driver import Driver
+from solvers.robots.part import Interior
 from solvers.robots.proof import (
+    TermsAnswer,
     best_bound_with_terms as best_bound_by_robots,
+    prove_grounded,
     prove_with_eta,
     report_terms,
+    take_terms,
 )
 from solvers.studies.tightness import noisy_scene
 
@@ -109,9 +115,13 @@ def test_the_bound_with_terms_is_the_central_one(
     assert found.value == pytest.approx(central.value, rel=1e-9, abs=allowed)
 
 
-def test_the_loss_of_every_robot_is_taken_off_the_form_with_eta(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def with_rough_terms(robot: Interior, off: float) -> tuple[Interior, TermsAnswer]:
+    terms = robot.state.terms
+    assert terms is not None
+    return take_terms(robot, replace(terms, T=terms.T + off))
+
+
+def test_the_loss_of_every_robot_is_taken_off_both_forms() -> None:
     problem, poses = loose(0, 12)
     Pi = 1e-3 * random_multipliers(0, len(distinct_pairs(problem.graph)))
     driver = driver_with_terms(problem, partition(problem.graph, 3), poses, Pi)
@@ -119,14 +129,15 @@ def test_the_loss_of_every_robot_is_taken_off_the_form_with_eta(
     eta = 0.1 * problem.objective(poses) / (12 * problem.d)
     known = prove_with_eta(driver, eta, less_terms)
     assert known is not None
-    lost = 0.1 * known.value
-    assert lost > 0.0
-    monkeypatch.setattr(HandednessTerms, "loss", lambda terms: lost)
+    driver.ask(with_rough_terms, 1e-7, Count.OFF)
+    loss = collected_terms(driver).loss()
+    assert loss > 1e-10 * known.value > 0.0
     found = prove_with_eta(driver, eta, less_terms)
+    grounded = prove_grounded(driver, eta, less_terms)
     assert found is not None
-    num_robots = len(driver.robots_with_edges)
-    assert num_robots > 1
-    assert found.value == pytest.approx(known.value - num_robots * lost, rel=1e-9)
+    assert grounded is not None
+    assert found.value == pytest.approx(known.value - loss, rel=1e-13)
+    assert grounded.rounding >= loss
 
 
 def ascents(

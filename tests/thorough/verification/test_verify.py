@@ -40,9 +40,6 @@ from pgo_models.graphs.datasets import load, locate
 from pgo_models.graphs.g2o import read_g2o, write_g2o
 from pgo_models.graphs.residuals import chi2
 from pgo_models.graphs.scenes import victoria_park
-from pgo_models.verification import verify
-from pgo_models.verification.balls import arb
-from pgo_models.verification.costs import QuadraticForm, add_edge
 from pgo_models.verification.verify import verify_proof
 from solvers import SweptScene
 from solvers.riemannian.polish import polish
@@ -466,21 +463,6 @@ def test_landmarks_have_no_part_in_a_proof_of_rotations(tmp_path: Path) -> None:
     _, proof = proof_of(path)
     found = verify_proof(path, edited(proof, cost="rotations"))
     assert found.failure == "the poses: rotations alone are none of landmarks"
-
-
-def test_a_form_that_is_not_the_cost_is_said_to_be_a_defect(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = written(tmp_path, varied_graph(1, 5, 2))
-    _, proof = proof_of(path)
-
-    def one_more(form: QuadraticForm, *edge: object) -> arb:
-        return add_edge(form, *edge) + 1
-
-    monkeypatch.setattr(verify, "add_edge", one_more)
-    found = verify_proof(path, proof)
-    assert found.bound is None
-    assert found.failure.endswith("a defect of pgo verify")
 
 
 def test_the_proof_of_another_graph_fails(tmp_path: Path) -> None:
