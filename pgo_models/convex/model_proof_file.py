@@ -114,9 +114,10 @@ def _variable(block: Block, first: int, basic: Array, others: Array) -> dict[str
         multipliers["unit columns"] = basic.tolist()
     elif isinstance(kind, Orthonormal):
         multipliers["columns"] = basic.tolist()
-        num_rows = len(others) - (9 if isinstance(kind, Rotations) and block.shape == (3, 3) else 0)
+        n, p = block.shape if len(block.shape) == 2 else (block.size, 1)
+        num_rows = n * (n + 1) // 2 - 1 if n == p else 0
         multipliers["rows"] = others[:num_rows].tolist()
-        multipliers["cross"] = others[num_rows:].tolist()
+        multipliers["cross" if n == 3 else "minors"] = others[num_rows:].tolist()
     else:
         multipliers[variable["sets"][0]] = basic.tolist()
     multipliers = {key: values for key, values in multipliers.items() if values}

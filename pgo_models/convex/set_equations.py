@@ -2,8 +2,10 @@
 
 Columns are orthonormal, and rows, too, where X is square. In SO(3) every column is the cross
 product of the two others, which is linear beside quadratic and tells rotations from reflections
-(Briales & Gonzalez-Jimenez 2017). A rotation of the plane is (a, -b; b, a), so that only a^2 + b^2
-= 1 is left to say. An equality E_r u = 0 holds times each of its coordinates.
+(Briales & Gonzalez-Jimenez 2017). In SO(4) a minor of two rows and two columns is that of the other
+two rows and columns, up to a sign (Jacobi); of reflections the sign is the other one. A rotation of
+the plane is (a, -b; b, a), so that only a^2 + b^2 = 1 is left to say. An equality E_r u = 0 holds
+times each of its coordinates.
 
 Multipliers l of these equations make the Lagrangian u^T S u, S = Q - sum_k l_k A_k, which is J
 wherever the equations hold. Inequalities and hulls of the sets, and products of two of these
@@ -27,6 +29,7 @@ from pgo_models.graphs.pose_graph import IntArray
 Terms = list[tuple[int, int, float]]
 ONE = -1
 INEQUALITY = -2  # stands for an inequality among the positions of variables
+_EVEN = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))  # even permutations, one for each two pairs
 
 
 @dataclass(frozen=True)
@@ -242,6 +245,11 @@ def _equations_of(kind: object, shape: tuple[int, ...]) -> tuple[list[Terms], li
     if isinstance(kind, Rotations) and n == 3:
         for a in range(3):
             further += _cross_product(columns[a], columns[(a + 1) % 3], columns[(a + 2) % 3])
+    if isinstance(kind, Rotations) and n == 4:
+        swapped = [(c, d, a, b) for a, b, c, d in _EVEN]
+        for these_columns in _EVEN:
+            further += [_minors(columns, these_rows, these_columns) for these_rows in _EVEN]
+            further += [_minors(columns, these_rows, these_columns) for these_rows in swapped]
     return _orthonormal(columns), further
 
 
@@ -270,6 +278,15 @@ def _cross_product(
         minus = (first[c], second[b], -1.0)
         equations.append([plus, minus, (third[a], ONE, -1.0)])
     return equations
+
+
+def _minors(columns: Sequence[Sequence[int]], r: Sequence[int], c: Sequence[int]) -> Terms:
+    """The minor of rows r_0, r_1 and columns c_0, c_1 is that of r_2, r_3 and c_2, c_3."""
+    terms = []
+    for a, b, sign in ((0, 1, 1.0), (2, 3, -1.0)):
+        terms.append((columns[c[a]][r[a]], columns[c[b]][r[b]], sign))
+        terms.append((columns[c[a]][r[b]], columns[c[b]][r[a]], -sign))
+    return terms
 
 
 def _shifted(terms: Terms, start: int) -> Terms:

@@ -9,7 +9,8 @@ have orthonormal columns, are a rotation, or have unit columns or rows.
 
 **The theorem.** A z = b, and X = (a, -b; b, a) of a rotation of the plane, are solved for some
 entries of z. With any multipliers l_k of equations q_k that hold on the sets (columns and, of a
-square matrix, rows are orthonormal; in SO(3) a column is the cross product of the two others),
+square matrix, rows are orthonormal; in SO(3) a column is the cross product of the two others; in
+SO(4) a minor of two rows and two columns is that of the others, up to its sign),
 
     L(v) = objective - sum_k l_k q_k - sum_j <P_j, W_j>,
 
@@ -333,6 +334,8 @@ def equations(variable: dict[str, Any]) -> Iterable[tuple[float, Terms]]:
         known["cross"] = [
             terms for a in range(3) for terms in cross(*(columns[(a + k) % 3] for k in range(3)))
         ]
+    if "rotation" in kinds and n == p == 4:
+        known["minors"] = minors(columns)
     if kinds & {"unit columns", "rotation", "orthonormal"}:
         known["unit columns"] = [product(column, column, 1) for column in columns]
     if "unit rows" in kinds or "rows" in known:
@@ -363,6 +366,28 @@ def cross(first: list[int], second: list[int], third: list[int]) -> list[Terms]:
         plus = (first[b], second[c], fmpq(1))
         minus = (first[c], second[b], fmpq(-1))
         of_all.append([plus, minus, (third[a], ONE, fmpq(-1))])
+    return of_all
+
+
+def minors(columns: list[list[int]]) -> list[Terms]:
+    """Minors of two rows and two columns, less those of the other rows and columns.
+
+    Rows a, b and columns c, d come with the rest in the order in which all four are an even
+    permutation, so that no sign changes.
+    """
+    even = [(0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2)]
+    of_all = []
+    for c, d, g, h in even:
+        for a, b, e, f in even + [(k, m, i, j) for i, j, k, m in even]:
+            minor = [
+                (columns[c][a], columns[d][b], fmpq(1)),
+                (columns[c][b], columns[d][a], fmpq(-1)),
+            ]
+            of_rest = [
+                (columns[g][e], columns[h][f], fmpq(-1)),
+                (columns[g][f], columns[h][e], fmpq(1)),
+            ]
+            of_all.append(minor + of_rest)
     return of_all
 
 
