@@ -196,7 +196,9 @@ def is_in_range(entries: Array, diagonal: Array) -> bool:
     is nan.
     """
     is_diagonal_in_range = diagonal.min() >= _SMALLEST and diagonal.max() <= _LARGEST
-    are_entries_in_range = entries.min() >= -_LARGEST and entries.max() <= _LARGEST
+    are_entries_in_range = (
+        entries.min(initial=0.0) >= -_LARGEST and entries.max(initial=0.0) <= _LARGEST
+    )
     return bool(is_diagonal_in_range and are_entries_in_range)
 
 

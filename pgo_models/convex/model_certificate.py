@@ -13,6 +13,7 @@ from pgo_models.certificates.certificate import DEFAULT_GAP, Verdict
 from pgo_models.convex.hull_bound import HullBound
 from pgo_models.convex.model_bound import ModelBound
 from pgo_models.convex.model_proof_file import write_hull_proof, write_model_proof
+from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.convex.quadratic_form import QuadraticForm
 from pgo_models.errors import ProofError, SettingError
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
@@ -32,7 +33,8 @@ class ModelCertificate(ReadOnly):
     objective : float
         J of the values, projected onto the sets, with the best values of all other variables.
     objective_error : float
-        Bound on its rounding; 0 of a model that is not quadratic, whose J is taken as computed.
+        Bound on its rounding, and on what J gains where values violate constraints. Of a model that
+        is not quadratic J is taken as computed.
     bound : ModelBound, HullBound or None
         The proof; None where no bound was proven.
     is_exact : bool
@@ -43,6 +45,8 @@ class ModelCertificate(ReadOnly):
         The model; None where it is not quadratic.
     reason : str
         Why there is no bound, or none but that of the hulls.
+    is_nonnegative : bool
+        Whether J of a model that is not quadratic is never negative, by cvxpy's rules of signs.
     """
 
     objective: float
@@ -52,6 +56,7 @@ class ModelCertificate(ReadOnly):
     wanted_gap: float = DEFAULT_GAP
     form: QuadraticForm | None = None
     reason: str = ""
+    is_nonnegative: bool = False
 
     @property
     def lower_bound(self) -> float:
@@ -59,10 +64,11 @@ class ModelCertificate(ReadOnly):
 
         It is -inf where nothing is proven.
         """
-        if self.bound is not None:
-            return min(self.bound.value, self.objective)
         is_sum = self.form is not None and self.form.is_sum_of_squares
-        return 0.0 if is_sum else -math.inf
+        least = 0.0 if is_sum or self.is_nonnegative else -math.inf
+        if self.bound is not None:
+            least = max(least, self.bound.value)
+        return min(least, self.objective)
 
     @property
     def gap(self) -> float:
@@ -114,11 +120,11 @@ class ModelCertificate(ReadOnly):
 
     def facts(self) -> list[tuple[str, str]]:
         """Return the figures as they are printed, with their labels."""
-        if self.bound is None and self.reason:
+        if self.bound is None and self.reason and not self.is_nonnegative:
             return [("lower bound", f"none: {self.reason}")]
         bound = rounded_down(self.lower_bound) if math.isfinite(self.lower_bound) else "none"
-        rounding = ""
-        if self.bound is not None:
+        rounding = "   (J is never negative)" if self.lower_bound == 0.0 else ""
+        if self.bound is not None and not self.bound.value < self.lower_bound:
             of_hulls = "least J over the sets' hulls, " if self.reason else ""
             rounding = (
                 f"   ({of_hulls}proven, less {rounded_up(self.bound.rounding, 2)} for rounding)"
@@ -129,7 +135,11 @@ class ModelCertificate(ReadOnly):
             ("gap", "0: every residual is zero to rounding" if self.is_exact else gap),
             ("verdict", f"{self.verdict.name}: {_SENTENCES[self.verdict]}"),
         ]
-        if self.reason and not self.is_certified:
+        if self.is_certified:
+            return facts
+        if self.bound is not None and self.bound.value > self.objective:
+            facts.append(("no more, as", f"no J is below {self.bound.value:.6g}: {_VIOLATED}"))
+        if self.reason:
             facts.append(("no more, as", self.reason))
         return facts
 
@@ -142,6 +152,7 @@ class ModelCertificate(ReadOnly):
         return f"ModelCertificate(J={self.objective:.10g}, gap={gap}, {self.verdict.name})"
 
 
+_VIOLATED = "the values violate constraints, which may contradict each other on the sets"
 _SENTENCES = {
     Verdict.EXACT: "globally optimal: J is a sum of squares, and zero to rounding",
     Verdict.CERTIFIED: Verdict.CERTIFIED.value,
@@ -151,10 +162,22 @@ _SENTENCES = {
 
 
 def judge_by_hulls(
-    objective: float, bound: HullBound | None, reason: str, gap: float = DEFAULT_GAP
+    problem: OrthogonalProblem,
+    objective: float,
+    violation: float,
+    bound: HullBound | None,
+    reason: str,
+    gap: float = DEFAULT_GAP,
 ) -> ModelCertificate:
-    """Hold J of values against the bound by hulls; `reason` is why there is no other."""
-    return ModelCertificate(objective, 0.0, bound, False, gap, None, reason)
+    """Hold J of values against the bound by hulls; `reason` is why there is no other.
+
+    `violation` is the norm by which they violate constraints; the dual point says what J gains.
+    """
+    error = 0.0
+    if bound is not None:
+        error = violation * float(np.linalg.norm(bound.y[bound.program.of_model]))
+    is_nonnegative = bool(problem.J.is_nonneg())
+    return ModelCertificate(objective, error, bound, False, gap, None, reason, is_nonnegative)
 
 
 def judge_values(
@@ -173,9 +196,7 @@ def judge_values(
     # x is in the sets to a few roundings alone
     gradient = 2.0 * (form.Q @ u)
     error += 64.0 * float(np.finfo(float).eps) * float(abs(gradient) @ abs(u))
-    if bound is not None:
-        # constraints hold to rounding; the multipliers say what J gains by it
-        error += max(0.0, -float(np.sum(bound.equations.terms(bound.multipliers, u))))
+    error += gained(bound, u)
     level = form.rounding_level(u)
     is_exact = form.is_sum_of_squares and objective <= _ROUNDING_MULTIPLE * level
     if bound is not None and bound.value > objective + error:
@@ -184,3 +205,10 @@ def judge_values(
             f"{error:.2g}: a defect of pgo_models; please report it with the model"
         )
     return ModelCertificate(objective, error, bound, is_exact, gap, form)
+
+
+def gained(bound: ModelBound | None, u: Array) -> float:
+    """What J gains, by the multipliers of a bound, where a point violates equations."""
+    if bound is None:
+        return 0.0
+    return max(0.0, -float(np.sum(bound.equations.terms(bound.multipliers, u))))

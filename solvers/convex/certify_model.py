@@ -20,6 +20,7 @@ from pgo_models.convex.hulls import with_hull_products, with_inequalities
 from pgo_models.convex.model_bound import ModelBound, best_model_bound, prove_model_bound
 from pgo_models.convex.model_certificate import (
     ModelCertificate,
+    gained,
     judge_by_hulls,
     judge_values,
 )
@@ -43,18 +44,22 @@ def certify_model(
     problem: OrthogonalProblem, values: Sequence[Array], gap: float = DEFAULT_GAP
 ) -> ModelCertificate:
     """Judge anybody's values of the constrained variables; `solvers.certify` is its door."""
-    projected = problem.values(problem.near_point(values).copies)
+    copies = problem.near_point(values).copies
+    projected = problem.values(copies)
     try:
         form = with_gauge_held(quadratic_form(problem))
         equations = with_inequalities(form, set_equations(form))
     except NotQuadraticError as error:
-        objective = _with_best_others(problem, projected)[0]
-        return judge_by_hulls(objective, prove_hull_bound(problem), str(error), gap)
+        objective, others = _with_best_others(problem, projected)
+        violation = problem.infeasibility(copies, others)
+        bound_by_hulls = prove_hull_bound(problem)
+        return judge_by_hulls(problem, objective, violation, bound_by_hulls, str(error), gap)
     if form.limits_x:
         objective, others = _with_best_others(problem, projected)
         u = form.with_others(form.u_of(projected), others)
         bound, _ = best_bound(form, equations, u, gap)
-        return _or_by_hulls(problem, ModelCertificate(objective, 0.0, bound, False, gap, form))
+        judged = ModelCertificate(objective, gained(bound, u), bound, False, gap, form)
+        return _or_by_hulls(problem, judged, problem.infeasibility(copies, others))
     u = form.u_of(projected)
     bound, _ = best_bound(form, equations, u, gap)
     return judge_values(form, u, bound, gap)
@@ -76,30 +81,35 @@ def certified_feasible(
     form: QuadraticForm,
     values: Sequence[Array],
     others: Sequence[Array],
-    objective: float,
+    measured: tuple[float, float],
     gap: float = DEFAULT_GAP,
 ) -> tuple[ModelCertificate, Array | None]:
     """As `certified_point`, of a model with constraints beside its sets, which values hold.
 
     The point is None where none is found that holds them to rounding. The certificate then is of
-    the objective that is given.
+    the values that are given, whose J and violation of constraints are `measured`.
     """
     equations = with_inequalities(form, set_equations(form))
-    bound, u = best_bound(form, equations, form.with_others(form.u_of(values), others), gap)
-    is_found = is_feasible(equations, u)
-    judged = ModelCertificate(objective, 0.0, bound, False, gap, form)
-    if is_found:
-        judged = judge_values(form, u, bound, gap)
-    return _or_by_hulls(problem, judged), u if is_found else None
+    given = form.with_others(form.u_of(values), others)
+    bound, u = best_bound(form, equations, given, gap)
+    if is_feasible(equations, u):
+        return _or_by_hulls(problem, judge_values(form, u, bound, gap), 0.0), u
+    error = gained(bound, given)
+    objective, violation = measured
+    judged = ModelCertificate(objective, error, bound, False, gap, form)
+    return _or_by_hulls(problem, judged, violation), None
 
 
-def _or_by_hulls(problem: OrthogonalProblem, certificate: ModelCertificate) -> ModelCertificate:
+def _or_by_hulls(
+    problem: OrthogonalProblem, certificate: ModelCertificate, violation: float
+) -> ModelCertificate:
     """The certificate, or that of a bound by hulls, where it is better."""
     bound = None if certificate.is_certified else prove_hull_bound(problem)
     if bound is None or bound.value <= certificate.lower_bound:
         return certificate
     reason = "constraints beside the sets leave a gap in the relaxation"
-    return judge_by_hulls(certificate.objective, bound, reason, certificate.wanted_gap)
+    gap = certificate.wanted_gap
+    return judge_by_hulls(problem, certificate.objective, violation, bound, reason, gap)
 
 
 def _with_best_others(

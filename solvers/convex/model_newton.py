@@ -126,7 +126,7 @@ class ModelNewton(ReadOnly):
             column += basis.shape[1]
 
         def tangent_part(M: Array) -> Array:
-            parts = []
+            parts = [M[:0]]  # a held rotation may leave none
             for block, basis, its_rows in zip(blocks, bases, rows, strict=True):
                 parts.append(_tangent_part(block, u[block.coordinates], basis, M[its_rows]))
             return np.concatenate(parts)

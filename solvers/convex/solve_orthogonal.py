@@ -236,8 +236,9 @@ def _bounded_by_hulls(
         start = replace(method.point(problem, best.state), copies=problem.point(bound.point).copies)
         with contextlib.suppress(PGOError):  # where the solver cannot make its step (a)
             best = min(best, run(method, problem, start), key=_rank)
-    certificate = judge_by_hulls(best.objective, bound, reason)
     state = best.state
+    measured = state.split.measured(state.copies, state.others)
+    certificate = judge_by_hulls(problem, *measured, bound, reason)
     values = problem.values(state.copies), state.others
     point = method.point(problem, state)
     return _solution(problem, best, ends, certificate, values, point, state.split)
@@ -292,7 +293,8 @@ def _certified(
     values = problem.values(state.copies), state.others
     point = method.point(problem, state)
     if form.limits_x:
-        certificate, u = certified_feasible(problem, form, *values, best.objective)
+        measured = state.split.measured(state.copies, state.others)
+        certificate, u = certified_feasible(problem, form, *values, measured)
     else:
         certificate, u = certified_point(form, values[0])
         if _newton_for(split) is not None:

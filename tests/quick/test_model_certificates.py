@@ -16,6 +16,7 @@ SETS = [
     ("rotations", (3, 3), 1),
     ("rotations", (3, 3), 2),
     ("rotations", (2, 2), 1),
+    ("rotations", (4, 4), 1),
     ("orthogonal", (3, 3), 1),
     ("orthogonal", (4, 2), 1),
     ("unit_columns", (3, 2), 1),
@@ -54,6 +55,33 @@ def test_a_random_quadratic_of_one_rotation_is_certified(seed: int) -> None:
     solution = solvers.solve_orthogonal(random_model(seed, "rotations", (3, 3), 1), seed, starts=4)
     assert solution.verdict is Verdict.CERTIFIED
     assert solution.gap <= 1e-9
+
+
+def test_minors_tell_rotations_from_reflections_in_four_dimensions() -> None:
+    solution = solvers.solve_orthogonal(random_squares(2, "rotations", (4, 4), 1), 0)
+    assert solution.verdict is Verdict.CERTIFIED
+    assert solution.gap <= 1e-9
+
+
+@pytest.mark.parametrize("kind", ["rotations", "orthogonal", "unit_columns"])
+@pytest.mark.parametrize("cost", [0.0, 1e-9, 3.0])
+def test_a_cost_that_is_constant_on_the_sets_is_certified(cost: float, kind: str) -> None:
+    X = cp.Variable((3, 3))
+    for J in (cost / 3.0 * cp.sum_squares(X), cost + 0.0 * cp.sum(X)):
+        model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J)), **{kind: [X]})
+        solution = solvers.solve_orthogonal(model, starts=2)
+        assert solution.is_certified
+        assert solution.lower_bound <= solution.objective == pytest.approx(cost)
+
+
+def test_a_cost_that_is_no_quadratic_has_its_sign_as_a_bound() -> None:
+    X = cp.Variable((3, 3))
+    A = np.random.default_rng(0).standard_normal((3, 9))
+    for J in (cp.norm1(A @ cp.vec(X, order="F")), cp.norm(0.0 * X) + cp.sum(cp.exp(X))):
+        model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J)), rotations=[X])
+        solution = solvers.solve_orthogonal(model, starts=1)
+        assert solution.lower_bound == 0.0
+        assert "J is never negative" in str(solution)
 
 
 @pytest.mark.parametrize(
@@ -307,14 +335,16 @@ def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
         answer(squares + p * X[0, 0], rotations=[X])
     with pytest.raises(pgo.PGOError, match=r"nan or inf"):
         answer(cp.sum_squares(X - np.full((3, 3), np.nan)), rotations=[X])
-    none = answer(squares, sparse=[(X, 3)])
-    assert none.lower_bound == -np.inf
-    assert "Sparse" in str(none)
-    assert none.verdict is Verdict.TRIVIAL
-    of_norm = cp.norm(X - 2.0 * np.eye(3)[::-1])
+    for J, bound in ((squares, 0.0), (squares - cp.trace(X), -np.inf)):
+        none = answer(J, sparse=[(X, 3)])
+        assert none.lower_bound == bound
+        assert "Sparse" in str(none)
+        assert none.verdict is Verdict.TRIVIAL
+    misfits = X - 2.0 * np.eye(3)[::-1]
+    in_ball = [cp.norm(X[0] - 1.0) <= 1.5]
     by_hulls = {
-        "a constraint is not linear": answer(squares, [cp.norm(X[0] - 1.0) <= 1.5], rotations=[X]),
-        "is not quadratic": answer(of_norm, rotations=[X]),
+        "a constraint is not linear": answer(cp.sum_squares(misfits), in_ball, rotations=[X]),
+        "is not quadratic": answer(cp.norm(misfits), rotations=[X]),
     }
     for reason, solution in by_hulls.items():
         assert -np.inf < solution.lower_bound <= solution.objective
@@ -322,7 +352,7 @@ def test_what_cannot_be_bounded_says_why_in_one_sentence() -> None:
         assert "hulls" in str(solution)
 
 
-def test_variables_that_solvers_get_others_for_have_no_bound() -> None:
+def test_variables_that_solvers_get_others_for_have_no_bound_but_zero() -> None:
     target = np.ones((3, 3))
     for attribute in ("nonneg", "symmetric"):
         X = cp.Variable((3, 3), **{attribute: True})
@@ -331,7 +361,7 @@ def test_variables_that_solvers_get_others_for_have_no_bound() -> None:
             pgo.OrthogonalProblem(problem, orthogonal=[X]), 0, starts=1
         )
         assert solution.verdict is Verdict.TRIVIAL
-        assert solution.lower_bound == -np.inf
+        assert solution.lower_bound == 0.0
 
 
 @pytest.mark.parametrize("kind", ["unit_columns", "unit_rows"])

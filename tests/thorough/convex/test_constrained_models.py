@@ -59,6 +59,19 @@ def test_factors_of_equal_entries_are_added_where_the_sum_is_exact() -> None:
         pgo.quadratic_form(at_least_one(0.1, 1.9))
 
 
+@pytest.mark.parametrize("is_quadratic", [True, False])
+def test_constraints_that_no_rotation_holds_leave_nothing_certified(is_quadratic: bool) -> None:
+    R = cp.Variable((3, 3))
+    J = cp.sum_squares(R - np.eye(3)) if is_quadratic else cp.norm1(R - 0.5)
+    for constraints in ([R[0, 0] >= 2.0], [R[0, 0] >= 0.9, R[0, 1] >= 0.9]):
+        model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), constraints), rotations=[R])
+        soc = solvers.OrthogonalSOC(max_iterations=60)
+        solution = solvers.solve_orthogonal(model, soc=soc, starts=1)
+        assert not solution.is_certified
+        assert model.problem.status == cp.USER_LIMIT
+        assert "contradict each other on the sets" in str(solution)
+
+
 def test_values_that_are_feasible_and_not_the_best_are_not_certified() -> None:
     problem = constrained("a largest angle", 0)
     least = solvers.solve_orthogonal(problem, 0, starts=2)
