@@ -92,7 +92,8 @@ class ConeStep(ReadOnly):
         for columns, total in zip(self.entries, sums, strict=False):
             c[columns] -= rho * total
         P = csc_array(self.data["P"] + diags_array(rho * self.weights))
-        data = {**self.data, "P": P, "c": c}
+        unit = max(abs(P).max(), abs(c).max())  # of the cost: Clarabel's tolerances are for 1
+        data = {**self.data, "P": P / unit, "c": c / unit}
         solver = self.solver
         for tolerance in _TOLERANCES:
             almost = min(100.0 * tolerance, LOOSEST_TOLERANCE)

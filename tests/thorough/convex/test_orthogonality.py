@@ -231,3 +231,17 @@ def test_a_rotation_and_a_reflection_tie_where_a_singular_value_is_zero() -> Non
     model = procrustes(np.eye(3), flat)
     mirror = np.diag([1.0, 1.0, -1.0])
     assert model.objective([np.eye(3)]) == model.objective([mirror])
+
+
+def test_step_a_by_clarabel_does_not_depend_on_the_unit_of_the_cost() -> None:
+    rng = np.random.default_rng(0)
+    X = cp.Variable((3, 3))
+    misfits = rng.standard_normal((3, 9)) @ cp.vec(X, order="F") - rng.standard_normal(3)
+    J = cp.sum(cp.power(cp.abs(misfits), 3))
+    V = [rng.standard_normal((3, 3))]
+    of_units = []
+    for unit in (1.0, 2.0**20, 2.0**-20):
+        model = OrthogonalProblem(cp.Problem(cp.Minimize(unit * J)), rotations=[X])
+        of_units.append(model.split().solve(V, 10.0 * unit)[0][0])
+    np.testing.assert_array_equal(of_units[1], of_units[0])
+    np.testing.assert_array_equal(of_units[2], of_units[0])
