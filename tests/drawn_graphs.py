@@ -115,6 +115,24 @@ def positions(rng: np.random.Generator) -> PoseGraph:
     return graph.with_position_prior(chosen, t, tau=float(rng.uniform(0.1, 10.0)))
 
 
+def by_axis(rng: np.random.Generator) -> PoseGraph:
+    """Positions that are measured axis by axis, as by GPS without or with a poor height."""
+    n = int(rng.integers(6, 12))
+    graph = informed(seed_of(rng), n, 3, coupled=bool(rng.integers(2)), spread=0.2)
+    truth = graph.truth
+    assert truth is not None
+    chosen = np.sort(rng.permutation(n)[: int(rng.integers(4, n + 1))])
+    noise = rng.uniform(0.05, 0.5)
+    t = truth.t[chosen] + noise * rng.standard_normal((len(chosen), 3))
+    graph = graph.with_position_prior(chosen, t, tau=noise**-2)
+    weights = np.ones(3)
+    weights[rng.integers(3)] = rng.choice([0.0, 10.0 ** rng.uniform(-6.0, 1.0)])
+    assert graph.information is not None
+    information = graph.information.copy()
+    information[graph.is_prior, :3, :3] *= np.diag(weights)
+    return replace(graph, information=information)
+
+
 def landmarks(rng: np.random.Generator) -> PoseGraph:
     """Poses that see a few points."""
     graph = matrices(rng)
@@ -207,6 +225,7 @@ GRAPHS: tuple[Draw, ...] = (
     stiff_and_coupled,
     priors,
     positions,
+    by_axis,
     landmarks,
     coupled_points,
     handed,

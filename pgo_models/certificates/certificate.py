@@ -20,7 +20,9 @@ from pgo_models.certificates.lower_bound import (
     best_bound,
     best_bound_with_terms,
     has_complex_form,
+    less_terms,
     prove_at,
+    prove_by_axes,
 )
 from pgo_models.certificates.polished import Polished
 from pgo_models.certificates.rounding_errors import (
@@ -340,6 +342,8 @@ class Certificate(ReadOnly):
         if self.weights_error > 0.0:
             subtracted += f" and {rounded_up(self.weights_error, 2)} of it for that of the weights"
         numbers = ", with rotations as complex numbers" if self.bound.is_complex else ""
+        if self.bound.axes is not None:
+            numbers = ", with a matrix for every axis of the world"
         return f"proved {form}{numbers}{shift}{cap}{self._terms_text}, {subtracted}"
 
     @property
@@ -417,9 +421,32 @@ def _certificate_at(
     if not certificate.can_improve:
         return certificate
     if problem.d == 2:
-        return with_complex_numbers(problem, certificate, best)
-    terms = closed_form_terms(problem.tangent_at(best), best)
-    return certificate if terms is None else with_terms(problem, certificate, terms, best)
+        certificate = with_complex_numbers(problem, certificate, best)
+    else:
+        terms = closed_form_terms(problem.tangent_at(best), best)
+        if terms is not None:
+            certificate = with_terms(problem, certificate, terms, best)
+    return with_axes(problem, certificate, best) if certificate.can_improve else certificate
+
+
+def with_axes(problem: PGOProblem, certificate: Certificate, ground: Poses) -> Certificate:
+    """The certificate, or a better one with a matrix for every axis of the world.
+
+    Handedness terms of the certificate are taken off the cost here, too.
+    """
+    tangent = problem.tangent_at(ground)
+    terms = certificate.bound.terms
+    if terms is not None:
+        tangent = terms.taken_off(tangent)
+    Lambda = multipliers(problem, ground)
+    gap = certificate.wanted_gap
+    proven = prove_by_axes(tangent, Lambda, ground, gap, certificate.objective)
+    if proven is None:
+        return certificate
+    bound, Lambda = proven
+    if terms is not None:
+        bound = less_terms(bound, terms)
+    return with_better(problem, certificate, Lambda, bound)
 
 
 def with_terms(

@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -47,11 +47,18 @@ _SMALLEST = 1e-150
 _LARGEST = 1e150
 
 
+class Factor(Protocol):
+    """What solves with the matrix of a proof."""
+
+    def solve(self, right_hand_side: Array, /) -> Array:
+        """Solution of A x = b, (N, k)."""
+
+
 @dataclass(frozen=True, eq=False)
 class DefiniteProof:
     """The exact S + eta blockdiag(0, I) is at least diag(slack), but for some rows left out."""
 
-    factor: CholeskyFactor  # of the stored matrix with a margin subtracted
+    factor: Factor  # of the stored matrix with a margin subtracted
     slack: Array  # (N,): positive, and zero in the rows left out
 
     @property

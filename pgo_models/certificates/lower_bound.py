@@ -70,6 +70,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from pgo_models.certificates.axes import AxisTerms, AxisUnknowns, axis_terms, balanced
 from pgo_models.certificates.definiteness import (
     ETA_GROWTH,
     DefiniteProof,
@@ -133,6 +134,8 @@ class LowerBound(Summarised):
     is_complex : bool
         Whether the proof takes rotations of the plane as complex numbers
         (`pgo_models.certificates.unknowns`).
+    axes : AxisTerms or None
+        What a proof with a matrix for every axis of the world has beside Lambda.
     """
 
     value: float
@@ -143,6 +146,7 @@ class LowerBound(Summarised):
     is_definite: bool = False
     terms: HandednessTerms | MaybeNone = None
     is_complex: bool = False
+    axes: AxisTerms | MaybeNone = None
 
 
 NO_BOUND = LowerBound(0.0, math.nan, False, 0.0)
@@ -250,6 +254,51 @@ def prove_at(
     return max(proven, key=lambda bound: bound.value, default=None)
 
 
+def prove_by_axes(
+    problem: PGOProblem, Lambda: Array, poses: Poses, gap: float, objective: float
+) -> tuple[LowerBound, Array] | None:
+    """Bound with a matrix for every axis of the world, and its multipliers Lambda.
+
+    The problem is a tangent (`PGOProblem.tangent_at`), Lambda are its multipliers at the poses,
+    which change with gamma (`pgo_models.certificates.axes`). None where no position is measured
+    axis by axis, or the proof fails. Along an axis that no position is measured along, as a height,
+    the relief of the map may be stretched at no cost: there a proof needs the smallest shift eta
+    that follows from gap and objective.
+    """
+    terms = axis_terms(problem)
+    if terms is None:
+        return None
+    X, unknowns = _grounded_at_world(problem, poses, terms)
+    in_balance = balanced(unknowns, _symmetric(problem, Lambda), X)
+    if in_balance is None:
+        return None
+    terms, Lambda = in_balance
+    bound = prove_with_axes(problem, Lambda, poses, terms)
+    if bound is None:
+        eta = smallest_shift(gap, objective, 8 * problem.num_poses)
+        bound = prove_with_axes(problem, Lambda, poses, terms, eta)
+    return None if bound is None else (bound, Lambda)
+
+
+def prove_with_axes(
+    problem: PGOProblem, Lambda: Array, poses: Poses, axes: AxisTerms, eta: float = 0.0
+) -> LowerBound | None:
+    """Bound grounded at the world pose with given terms by axis; None where it is not proved."""
+    X, unknowns = _grounded_at_world(problem, poses, axes)
+    bound = _prove(problem, _symmetric(problem, Lambda), eta, _Ground(X, unknowns))
+    return None if bound is None else replace(bound, axes=axes)
+
+
+def _grounded_at_world(
+    problem: PGOProblem, poses: Poses, axes: AxisTerms
+) -> tuple[Array, AxisUnknowns]:
+    """X' of poses moved so that the world pose is at (0, I), and the unknowns of a proof there."""
+    world = problem.graph.world
+    assert world is not None  # axes have edges that begin there
+    rows = pose_rows(world, problem.num_poses, problem.d)
+    return _moved_to(problem, poses, world), AxisUnknowns(problem, rows, axes)
+
+
 def best_bound(
     problem: PGOProblem,
     Lambda: Array,
@@ -307,11 +356,16 @@ def best_bound_with_terms(
     What rounding can make of the terms (`HandednessTerms.loss`) is subtracted.
     """
     bound_of_rest = best_bound(terms.taken_off(problem), Lambda, poses, gap, objective)
+    return less_terms(bound_of_rest, terms)
+
+
+def less_terms(bound: LowerBound, terms: HandednessTerms) -> LowerBound:
+    """The bound on a cost, of one on the cost less handedness terms."""
     lost = terms.loss()
-    value = math.nextafter(bound_of_rest.value - lost, -math.inf)
+    value = math.nextafter(bound.value - lost, -math.inf)
     if not value > 0.0:
         return NO_BOUND
-    return replace(bound_of_rest, value=value, rounding=bound_of_rest.rounding + lost, terms=terms)
+    return replace(bound, value=value, rounding=bound.rounding + lost, terms=terms)
 
 
 def search_forms(
@@ -404,19 +458,26 @@ class _Ground:
 
 
 def _grounded_at(problem: PGOProblem, poses: Poses, is_complex: bool = False) -> _Ground:
-    """X' of poses turned and shifted so that a pose in the middle of the graph is at (0, I)."""
+    """X' of poses moved so that a pose in the middle of the graph is at (0, I)."""
     n = problem.num_poses
-    d = problem.d
     r = middle_pose(problem.graph)
-    X = problem.at(poses).X.copy()
-    X[:n] -= X[r]
-    X = X @ poses.R[r]
-    rows = pose_rows(r, n, d)
-    X[rows] = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    X = _moved_to(problem, poses, r)
+    rows = pose_rows(r, n, problem.d)
     if not problem.has_translations:
         rows = np.union1d(np.arange(n), rows)
     unknowns = ComplexUnknowns(problem, rows) if is_complex else RowUnknowns(problem, rows)
     return _Ground(unknowns.starting_point(X), unknowns)
+
+
+def _moved_to(problem: PGOProblem, poses: Poses, r: int) -> Array:
+    """X of poses that are turned and shifted so that pose r is at (0, I)."""
+    n = problem.num_poses
+    d = problem.d
+    X = problem.at(poses).X.copy()
+    X[:n] -= X[r]
+    X = np.asarray(X @ poses.R[r])
+    X[pose_rows(r, n, d)] = np.concatenate([np.zeros((1, d)), np.eye(d)])
+    return X
 
 
 def pose_rows(pose: int, n: int, d: int) -> IntArray:
@@ -480,10 +541,10 @@ def _prove_grounded(
     def move(point: _Point) -> tuple[_Point, float]:
         return _moved(unknowns, Lambda, proof, point)
 
-    point = move_until_settled(_first_point(problem, Lambda, ground.X), move)
+    point = move_until_settled(_first_point(unknowns, Lambda, ground.X), move)
     evaluation = point.evaluation
     if evaluation is None:
-        evaluation = evaluate_certificate(problem, Lambda, point.X, point.low)
+        evaluation = _evaluate(unknowns, Lambda, point.X, point.low)
     free = proof.free
     product, product_error = unknowns.gradient(evaluation.product, evaluation.product_error)
     # The bound is value - tr(G_r^T H^-1 G_r) - eta sum_i ||R_i^T - P_i V||_F^2 with G = S X' after
@@ -568,15 +629,26 @@ class _Point:
     quadratic: float = 0.0
 
 
-def _first_point(problem: PGOProblem, Lambda: Array, X: Array) -> _Point:
+def _first_point(unknowns: Unknowns, Lambda: Array, X: Array) -> _Point:
     """The point before any move; its S X' is computed without a bound on its error."""
+    problem = unknowns.problem
     n = problem.num_poses
     d = problem.d
     product = problem.at_point(X).half_gradient.copy()
     of_multipliers = Lambda @ X[n:].reshape(n, d, d)
     product[n:] -= of_multipliers.reshape(-1, d)
     no_move = np.zeros((n, d))
+    added = unknowns.added(X, no_move)
+    if added is not None:
+        product += added.product
     return _Point(X, no_move, product, None)
+
+
+def _evaluate(unknowns: Unknowns, Lambda: Array, X: Array, low: Array) -> Evaluation:
+    """`evaluate_certificate`, with what the unknowns have beside it."""
+    evaluation = evaluate_certificate(unknowns.problem, Lambda, X, low)
+    added = unknowns.added(X, low)
+    return evaluation if added is None else evaluation.plus(added)
 
 
 def _moved(
@@ -592,7 +664,7 @@ def _moved(
     X = point.X.copy()
     X[n:] -= Z[n:]
     low = point.low - Z[:n]
-    evaluation = evaluate_certificate(problem, Lambda, X, low)
+    evaluation = _evaluate(unknowns, Lambda, X, low)
     free = proof.free
     product, product_error = unknowns.gradient(evaluation.product, evaluation.product_error)
     slack = proof.slack[free]

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pgo_models.certificates.axes import AxisTerms
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
-from pgo_models.certificates.lower_bound import LowerBound, prove_at
+from pgo_models.certificates.lower_bound import LowerBound, prove_at, prove_with_axes
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError
 from pgo_models.figures import scaled_below
@@ -113,6 +114,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
     transposed = np.swapaxes(proven.Lambda, 1, 2)
     Lambda = 0.5 * (proven.Lambda + transposed)
     upper_triangle = np.triu_indices(d)
+    axes = certificate.bound.axes
     rows: list[dict[str, object]] = []
     for pose in range(graph.num_poses):
         row: dict[str, object] = {"id": _name(graph, pose)}
@@ -121,6 +123,8 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         if pose not in graph.landmarks:
             row["R"] = poses.R[pose].tolist()
             row["Lambda"] = Lambda[pose][upper_triangle].tolist()
+            if axes is not None and axes.gamma[pose].any():
+                row["gamma"] = axes.gamma[pose].tolist()
         rows.append(row)
     eta = None if math.isnan(certificate.eta) else certificate.eta
     record: dict[str, object] = {
@@ -130,7 +134,7 @@ def proof_json(problem: PGOProblem, certificate: Certificate) -> dict[str, objec
         "objective": max(objective, 0.0),
         "lower_bound": _claimed_bound(problem, at_bound, proven),
         "eta": eta,
-        "ground": _name(graph, _ground(graph)),
+        "ground": "world" if axes is not None else _name(graph, _ground(graph)),
         "poses": rows,
     }
     return record | _entries_of_some_proofs(problem, certificate.bound, graph)
@@ -152,7 +156,7 @@ def _entries_of_some_proofs(
         pose = _name(problem.graph, int(problem.graph.j[edge]))
         entries["held"] = {"id": pose, "weights": weights.tolist()}
     if isinstance(problem.weights, ExcessCost):
-        entries["splits"] = _rows_of_splits(problem.graph, problem.weights)
+        entries["splits"] = _rows_of_splits(problem.graph, problem.weights, bound.axes)
     return entries
 
 
@@ -204,8 +208,10 @@ def _rows_of_terms(graph: PoseGraph, terms: HandednessTerms) -> list[dict[str, o
     ]
 
 
-def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object]]:
-    """Rows of tau and J_ss of every edge, in the frame that was measured.
+def _rows_of_splits(
+    graph: PoseGraph, cost: ExcessCost, axes: AxisTerms | None
+) -> list[dict[str, object]]:
+    """Rows of tau, J_ss and D of every edge, in the frame that was measured.
 
     The rounding of J_ss by the turn is far below its distance from the least that is allowed
     (`pgo_models.problem.weighting`).
@@ -227,6 +233,9 @@ def _rows_of_splits(graph: PoseGraph, cost: ExcessCost) -> list[dict[str, object
         if J_ss is not None and J_ss[e].any():
             row["J_ss"] = J_ss[e][upper_triangle].tolist()
         rows.append(row)
+    if axes is not None:
+        for e, weights in zip(axes.edges, axes.weights, strict=True):
+            rows[e]["D"] = weights.tolist()
     return rows
 
 
@@ -268,8 +277,7 @@ def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
         tangent = problem.tangent_at(poses)
         if terms is not None:
             tangent = terms.taken_off(tangent)
-        is_complex = certificate.bound.is_complex
-        bound = prove_at(tangent, Lambda, poses, is_complex, certificate.eta)
+        bound = _proven_again(tangent, Lambda, poses, certificate)
         if bound is not None:
             lost = 0.0 if terms is None else terms.loss()
             candidates.append(_Proven(poses, Lambda, bound.value - lost))
@@ -277,6 +285,16 @@ def _proven_at(problem: PGOProblem, certificate: Certificate) -> _Proven:
         what = "the bound could not be proven from poses and multipliers as they would be written"
         raise SettingError(f"no proof to write: {what}; leave out --proof")
     return max(candidates, key=lambda proven: proven.bound)
+
+
+def _proven_again(
+    tangent: PGOProblem, Lambda: Array, poses: Poses, certificate: Certificate
+) -> LowerBound | None:
+    """Bound of the form of a certificate, from these poses and multipliers."""
+    axes = certificate.bound.axes
+    if axes is not None:
+        return prove_with_axes(tangent, Lambda, poses, axes, certificate.eta)
+    return prove_at(tangent, Lambda, poses, certificate.bound.is_complex, certificate.eta)
 
 
 def _claimed_bound(problem: PGOProblem, certificate: Certificate, proven: _Proven) -> float:

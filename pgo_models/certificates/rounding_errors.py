@@ -55,6 +55,15 @@ class Evaluation:
     product: Array  # S X, (N, d)
     product_error: Array  # bound on its error, entry by entry
 
+    def plus(self, other: "Evaluation") -> "Evaluation":
+        """The sum of both, whose errors add up; every sum is rounded once more."""
+        value = self.value + other.value
+        value_error = self.value_error + other.value_error + UNIT_ROUNDOFF * abs(value)
+        product = self.product + other.product
+        product_error = self.product_error + other.product_error
+        product_error += UNIT_ROUNDOFF * np.abs(product)
+        return Evaluation(value, OUTWARD * value_error, product, OUTWARD * product_error)
+
 
 def evaluate_edges(problem: PGOProblem, X: Array, low: Array) -> Evaluation:
     """tr(X^T M X) and M X, edge by edge: as accurate as the residuals, however large t is.

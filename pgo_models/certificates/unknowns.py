@@ -44,7 +44,7 @@ from pgo_models.certificates.definiteness import (
     prove_definite,
     prove_stored,
 )
-from pgo_models.certificates.rounding_errors import matrix_errors
+from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
@@ -99,6 +99,13 @@ class Unknowns(ABC):
     @abstractmethod
     def rows_of(self, unknowns: Array) -> Array:
         """Z, (N, d), of values of the unknowns."""
+
+    def added(self, X: Array, low: Array) -> Evaluation | None:
+        """What is bounded beside tr(X^T S X) + tr(Lambda), if anything.
+
+        It is taken at X with `low`, (n, d), added to its translations.
+        """
+        return None
 
 
 @dataclass(frozen=True, eq=False)

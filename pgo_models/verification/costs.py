@@ -26,6 +26,11 @@ value at Z' is <C, Z'>, and being convex it is at least its tangent 2 <C, Z> - <
 Any tau and J_ss will do that make J positive semidefinite, of which J_ss is a block. A proof may
 say which: its multipliers and its handedness terms belong to the form that follows from them.
 
+**Weights along the axes of the world.** Of a position measured from the world pose, in a frame that
+is not turned, a proof may keep more: with any D >= 0, (d), for which J - diag(D, 0) is positive
+semidefinite, the convex function is at least its tangent and sum_k D_k (r_k - r'_k)^2, r' being r
+at Z'. With the world pose at (0, I) this is a square of one coordinate along axis k.
+
 **A matrix that does not measure every direction** is semidefinite, and tau is zero where its I_tt
 is singular: J is then semidefinite, which is checked exactly.
 
@@ -56,7 +61,7 @@ from pgo_models.verification.balls import (
     sum_of,
     symmetric,
 )
-from pgo_models.verification.measurements import Edge
+from pgo_models.verification.measurements import WORLD, Edge
 from pgo_models.verification.proof import ROTATION_COSTS, UNIT_COSTS, Split
 
 RESOLUTION = 2.0**-26  # of a bisection, relative
@@ -81,6 +86,8 @@ class QuadraticForm:
 
     S: dict[int, dict[int, arb_mat]] = field(default_factory=dict)
     constant: arb = field(default_factory=arb)
+    # Of poses and landmarks: sums of D, what the squares along every axis add to the row of t.
+    D: dict[int, list[arb]] = field(default_factory=dict)
 
     def add(self, i: int, j: int, block: arb_mat) -> None:
         """Add a block to S_ij, and where i is not j its transpose to S_ji."""
@@ -95,6 +102,15 @@ class QuadraticForm:
         for i, row in self.S.items():
             product[i] = sum_of(block * X[j] for j, block in row.items())
         return product
+
+
+@dataclass(frozen=True, eq=False)
+class Weight:
+    """How chi2 of an edge is split: tau, J_ss, and D along the axes of the world."""
+
+    tau: fmpq
+    J_ss: fmpq_mat
+    D: tuple[fmpq, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +135,12 @@ def add_edge(
     begin, end = residual_matrices(edge, X[edge.j].nrows())
     tangent: Tangent | None = None
     if cost == "chi2":
-        share, W, tangent = information_cost(proper_edge(edge), X[edge.i], X[edge.j], splits)
+        edge = proper_edge(edge)
+        weight = translation_weight(edge, splits)
+        share, W, tangent = information_cost(edge, X[edge.i], X[edge.j], weight)
+        if any(weight.D):
+            sums = form.D.get(edge.j, [arb(0)] * edge.tag.d)
+            form.D[edge.j] = [old + arb(new) for old, new in zip(sums, weight.D, strict=True)]
     else:
         share, W = isotropic_cost(edge, cost, end * X[edge.j] - begin * X[edge.i])
     weighted_begin = begin.transpose() * W
@@ -213,7 +234,7 @@ def one_over_trace_of_inverse(rows: list[list[fmpq]]) -> fmpq:
 
 
 def information_cost(
-    edge: Edge, X_i: arb_mat, X_j: arb_mat, splits: Sequence[Split]
+    edge: Edge, X_i: arb_mat, X_j: arb_mat, weight: Weight
 ) -> tuple[arb, arb_mat, Tangent | None]:
     """Share of an edge in chi2, W, and the tangent of what W leaves of it, if anything."""
     d = edge.tag.d
@@ -222,7 +243,8 @@ def information_cost(
     axes = range(d, edge.tag.side)
     I_tt = edge.block(translation, translation)
     I_tr = edge.block(translation, axes)
-    tau, J_ss = translation_weight(edge, I_tr, splits)
+    tau = weight.tau
+    J_ss = weight.J_ss
     I_tt_less_tau = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
     # Translations: the residual r and I_tt - tau I, both in the frame of pose i.
     r = translation_residual(edge, X_i, X_j)
@@ -299,39 +321,60 @@ def proper_triangle(triangle: tuple[fmpq, ...], d: int, is_point: bool) -> tuple
     return tuple(rows[a][b] for a in range(side) for b in range(a, side))
 
 
-def translation_weight(
-    edge: Edge, I_tr: fmpq_mat, splits: Sequence[Split]
-) -> tuple[fmpq, fmpq_mat]:
-    """The tau and J_ss of an edge, of the first split that fits it, else of its own choice."""
+def translation_weight(edge: Edge, splits: Sequence[Split]) -> Weight:
+    """The weight of an edge, of the first split that fits it, else of its own choice."""
     d = edge.tag.d
     num_axes = edge.tag.side - d
     for split in splits:
         tau = exact(split.tau)
         J_ss = tuple(map(exact, split.J_ss)) or (fmpq(0),) * (num_axes * (num_axes + 1) // 2)
-        if fits(edge.triangle, d, edge.tag.is_point, tau, J_ss):
-            return tau, fmpq_mat(symmetric(J_ss, num_axes)) if J_ss else fmpq_mat(0, 0)
+        D = tuple(map(exact, split.D)) or (fmpq(0),) * d
+        if any(D) and not can_weigh_axes(edge):
+            continue
+        if fits(edge.triangle, d, edge.tag.is_point, tau, J_ss, D):
+            block = fmpq_mat(symmetric(J_ss, num_axes)) if J_ss else fmpq_mat(0, 0)
+            return Weight(tau, block, D)
     tau = own_translation_weight(edge.triangle, d, edge.tag.is_point)
+    translation = range(d)
+    axes = range(d, edge.tag.side)
+    I_tr = edge.block(translation, axes)
     if not any(I_tr.entries()):
-        return tau, fmpq_mat(num_axes, num_axes)
+        return Weight(tau, fmpq_mat(num_axes, num_axes))
     if tau == 0:
         # J is the matrix of the file: all of the edge is in the tangent.
-        axes = range(d, edge.tag.side)
-        return tau, edge.block(axes, axes)
-    translation = range(d)
+        return Weight(tau, edge.block(axes, axes))
     I_tt = edge.block(translation, translation)
     I_tt_less_tau = fmpq_mat(less_tau(I_tt.tolist(), tau, d))
-    return tau, I_tr.transpose() * I_tt_less_tau.inv() * I_tr
+    return Weight(tau, I_tr.transpose() * I_tt_less_tau.inv() * I_tr)
+
+
+def can_weigh_axes(edge: Edge) -> bool:
+    """Whether r of an edge has the axes of the world: it begins there and does not turn."""
+    d = edge.tag.d
+    differences = (edge.R - identity(d)).entries()
+    # A ball == 0 only where it is exactly zero.
+    return edge.i == WORLD and all(entry == 0 for entry in differences)
 
 
 @lru_cache(maxsize=KEPT)
 def fits(
-    triangle: tuple[fmpq, ...], d: int, is_point: bool, tau: fmpq, J_ss: tuple[fmpq, ...]
+    triangle: tuple[fmpq, ...],
+    d: int,
+    is_point: bool,
+    tau: fmpq,
+    J_ss: tuple[fmpq, ...],
+    D: tuple[fmpq, ...],
 ) -> bool:
-    """Whether tau and J_ss, an upper triangle, make J positive semidefinite, exactly."""
+    """Whether J - diag(D, 0), with J of tau and J_ss, is positive semidefinite, exactly.
+
+    J_ss is an upper triangle. D, (d), has to be zero or more.
+    """
     side = information_side(d, is_point)
-    if len(J_ss) != (side - d) * (side - d + 1) // 2:
+    if len(J_ss) != (side - d) * (side - d + 1) // 2 or not all(number >= 0 for number in D):
         return False
     J = less_tau(symmetric(triangle, side), tau, d)
+    for a, number in enumerate(D):
+        J[a][a] -= number
     if J_ss:
         for a, row in enumerate(symmetric(J_ss, side - d), d):
             J[a][d:] = row

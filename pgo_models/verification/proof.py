@@ -40,10 +40,11 @@ class HandednessTerm:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """The tau and J_ss by which chi2 of an edge is split into a quadratic and a convex part."""
+    """The tau, J_ss and D by which chi2 of an edge is split into quadratic and convex parts."""
 
     tau: float
     J_ss: tuple[float, ...]  # upper triangle, row by row; empty for a J_ss of zeros
+    D: tuple[float, ...] = ()  # weights along the axes of the world; empty for zeros
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +61,8 @@ class Proof:
     # Upper triangles, row by row. Where there are none, those of a stationary point are taken.
     Lambda: dict[int, list[float]]
     terms: list[HandednessTerm]
+    # Multipliers of the lengths of the rows of R, (d) of a pose; zero of poses without.
+    gamma: dict[int, list[float]] = field(default_factory=dict)
     is_complex: bool = False  # whether rotations of the plane are taken as complex numbers
     # Of the edges from a pose to another, in the order of the file of the graph. The verifier
     # chooses tau and J_ss itself where they are missing or do not fit.
@@ -79,6 +82,7 @@ def read_proof(path: Path, d: int) -> Proof:
     t: dict[int, list[float]] = {}
     R: dict[int, list[list[float]]] = {}
     Lambda: dict[int, list[float]] = {}
+    gamma: dict[int, list[float]] = {}
     poses = entry(path, record, "poses")
     if not isinstance(poses, list):
         poses = [poses]
@@ -92,6 +96,8 @@ def read_proof(path: Path, d: int) -> Proof:
             R[name] = numbers(path, pose["R"], f"R of pose {name}", d, d)
         if "Lambda" in pose:
             Lambda[name] = numbers(path, pose["Lambda"], f"Lambda of pose {name}", size_of_triangle)
+        if "gamma" in pose:
+            gamma[name] = numbers(path, pose["gamma"], f"gamma of pose {name}", d)
     return Proof(
         cost=cost,
         objective=number_entry(path, record, "objective"),
@@ -102,6 +108,7 @@ def read_proof(path: Path, d: int) -> Proof:
         R=R,
         Lambda=Lambda,
         terms=read_terms(path, record, d),
+        gamma=gamma,
         is_complex=read_is_complex(path, record, d),
         splits=read_splits(path, record, d),
         held=read_held(path, record, d),
@@ -167,7 +174,10 @@ def read_splits(path: Path, record: dict[str, Any], d: int) -> dict[tuple[int, i
         J_ss: list[float] = []
         if "J_ss" in row:
             J_ss = numbers(path, row["J_ss"], "J_ss of a split", size_of_triangle)
-        split = Split(number_entry(path, row, "tau"), tuple(J_ss))
+        D: list[float] = []
+        if "D" in row:
+            D = numbers(path, row["D"], "D of a split", d)
+        split = Split(number_entry(path, row, "tau"), tuple(J_ss), tuple(D))
         splits.setdefault((i, j), []).append(split)
     return splits
 

@@ -78,6 +78,15 @@ rotation E = T^T R_i^T R_j has the unit quaternion (w, v), Rodrigues' formula gi
 tr(delta^T W delta) = tr(W (2 I - E - E^T)) = v^T P v >= 0. A reflection is no such E: that is what
 these terms know, and S does not.
 
+**A matrix for every axis.** If the world pose is the one that is left out, V is the identity, for X
+has been moved so that this pose is at (0, I), and the columns of X are coordinates along the axes
+of the world. Then q may have other terms in every column k: the squares of
+`pgo_models.verification.costs` with the weights D_k, which are zero at X' together with their
+gradient; and with any numbers gamma_ik the terms gamma_ik (1 - |p_ik|^2), p_ik column k of P_i,
+which are zero for rotations, as their rows have length one. So H_k = H + diag(D_k) - diag(0,
+gamma_ik I) and column k of G, less gamma_ik p_ik in its rows of rotations, take the place of H and
+G, and the losses to the columns add up. (B) is as before.
+
 **Complex numbers.** In the plane a proof may ask less of H. Rotations are matrices (a, b; -b, a),
 and so are products, sums and transposes of such matrices. Thus all blocks of X, of X' V and of Z
 have this form, and the steps from Z to (A) and (B) hold if H is positive on such Z alone. Let the
@@ -119,6 +128,7 @@ from pgo_models.verification.balls import (
     beside,
     blocks_on_diagonal,
     ctx,
+    diagonal,
     exact,
     first_bad_pivot,
     fmpq,
@@ -313,6 +323,28 @@ def lower_bound(
         right_sides[pose] += beside(arb_mat(d + 1, d), eta_block * X[pose])
     del right_sides[proof.ground]
     H = without_pose(form.S, proof.ground)
+    if form.D or proof.gamma:
+        losses = [
+            losses_to_G(graph, proof, *along_axis(proof, form.D, H, right_sides, X, axis))
+            for axis in range(d)
+        ]
+        loss_to_G, loss_to_shifted_G = (
+            sum(of_axes, arb(0)) for of_axes in zip(*losses, strict=True)
+        )
+    else:
+        loss_to_G, loss_to_shifted_G = losses_to_G(graph, proof, H, right_sides)
+    bound_A = value_at_X - loss_to_G - FARTHEST * eta * (len(rotations) - 1)
+    bound_B = value_at_X - loss_to_shifted_G
+    return bound_A.max(bound_B)
+
+
+def losses_to_G(
+    graph: Graph,
+    proof: Proof,
+    H: dict[int, dict[int, arb_mat]],
+    right_sides: dict[int, arb_mat],
+) -> tuple[arb, arb]:
+    """tr(G_r^T H^-1 G_r) of G and of G', which are the right-hand sides; both are used up."""
     if is_of_rotations(graph, proof):
         H, right_sides = without_translations(H, right_sides)
     else:
@@ -321,14 +353,41 @@ def lower_bound(
     if proof.is_complex:
         H, right_sides = in_complex_numbers(H, right_sides)
     products = eliminate(H, right_sides)
-    width = 1 if proof.is_complex else d
+    width = products.ncols() // 2
     columns_of_G = range(width)
     columns_of_shifted_G = range(width, 2 * width)
     loss_to_G = part(products, columns_of_G, columns_of_G).trace()
-    loss_to_shifted_G = part(products, columns_of_shifted_G, columns_of_shifted_G).trace()
-    bound_A = value_at_X - loss_to_G - FARTHEST * eta * (len(rotations) - 1)
-    bound_B = value_at_X - loss_to_shifted_G
-    return bound_A.max(bound_B)
+    return loss_to_G, part(products, columns_of_shifted_G, columns_of_shifted_G).trace()
+
+
+def along_axis(
+    proof: Proof,
+    D: dict[int, list[arb]],
+    H: dict[int, dict[int, arb_mat]],
+    right_sides: dict[int, arb_mat],
+    X: dict[int, arb_mat],
+    axis: int,
+) -> tuple[dict[int, dict[int, arb_mat]], dict[int, arb_mat]]:
+    """H_k and the columns of G and G' for an axis k of the world; what is given stays as it is."""
+    if proof.ground != WORLD or proof.is_complex:
+        raise StepFailedError("the axes: weights along them need the world pose to be grounded")
+    d = X[WORLD].ncols()
+    H_k = {i: dict(row) for i, row in H.items()}
+    columns = {}
+    for node, block in right_sides.items():
+        rows = range(block.nrows())
+        both = (part(block, rows, range(column, column + 1)) for column in (axis, d + axis))
+        columns[node] = beside(*both)
+        weight = D[node][axis] if node in D else arb(0)
+        diagonal_block = diagonal([weight] + [arb(0)] * (len(rows) - 1))
+        if node in proof.gamma and node in proof.R:
+            gamma = arb(proof.gamma[node][axis])
+            of_lengths = blocks_on_diagonal(arb_mat(1, 1), identity(d) * gamma)
+            diagonal_block -= of_lengths
+            of_pose = of_lengths * part(X[node], rows, range(axis, axis + 1))
+            columns[node] -= beside(of_pose, of_pose)
+        H_k[node][node] = H_k[node][node] + diagonal_block
+    return H_k, columns
 
 
 def subtract_multipliers(

@@ -1,0 +1,307 @@
+"""Bounds with a matrix for every axis of the world, where positions are measured axis by axis.
+
+A position measured from the world costs w_k (t_k - p_k)^2 along axis k, as GPS with a poor height.
+The tangent of chi2 keeps the smallest w_k for all axes and takes the rest at its tangent, which has
+no curvature. The curvature is kept here. Ground the proof at the world pose: poses are moved so
+that it is at (0, I), and column k of X has the coordinates along axis k of the world. By columns
+
+    F(X) = sum_k x_k^T M x_k + constant,    x_k, (N,), column k of X,
+
+and M may differ from axis to axis.
+
+**Weights by axis.** Let r = R_0^T (t_j - t_0) - t_ij be the residual of an edge from the world,
+with R_ij = I, and let its excess u^T J u (`pgo_models.problem.excess`) have a J_tt that is diagonal
+and coupled with nothing. Above the tangent at Z* there remains (u - u*)^T J (u - u*), which is at
+least sum_k D_k (r_k - r*_k)^2 for any 0 <= D <= diag(J_tt). This is a quadratic function of column
+k alone, and zero with its gradient at Z*: value, gradient and multipliers stay what they are, and
+D_k is added to S in the row of t_j for axis k. The share `KEPT_SHARE` of J_tt is taken for D: what
+is left still makes up for the rounding of the tangent (`Tangent.loss`).
+
+**Multipliers gamma.** The rows of R_i have length one, too: |p_k| = 1 for column k of P_i = R_i^T.
+With multipliers gamma_ik, (n, d), of these the bound is that of
+
+    q(X) = tr(X^T M X) + sum_i <Lambda_i, I - P_i P_i^T> + sum_ik gamma_ik (1 - |p_ik|^2) + ..,
+
+whose matrix for axis k is S_k = S + diag(D_k) - diag(gamma_ik I). For any a, (d,), the multipliers
+
+    gamma_i = a,    Lambda_i - P^_i diag(a) P^_i^T
+
+have the same gradient and value at poses P^ as Lambda_i alone, and add sum_l (a_l - a_k) p^_l
+p^_l^T to the block of pose i in S_k: an axis with a small a_k gains what others lose. An axis that
+is hardly measured has an S_k that is hardly definite, or not at all, while others have more than
+enough. So weak axes have a_k = -c and the strong ones 0, with a share of the largest c for which
+the matrices of strong axes are definite: they keep a sixteenth of themselves at least.
+
+**The proof** is that of `pgo_models.certificates.lower_bound` with V = I. The unknowns are the
+columns of Z, one below the other, (N d, 1), and the matrix is blockdiag(S_1, .., S_d).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from pgo_models.certificates.definiteness import (
+    FIRST_MARGIN,
+    DefiniteProof,
+    Factor,
+    StoredMatrix,
+    etas_of_rotations,
+    is_in_range,
+    prove_stored,
+    shifted_certificate,
+)
+from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
+from pgo_models.certificates.unknowns import Unknowns
+from pgo_models.geometry.arrays import ReadOnly
+from pgo_models.geometry.rotations import Array
+from pgo_models.graphs.pose_graph import IntArray
+from pgo_models.problem.cholesky import CholeskyFactor
+from pgo_models.problem.costs import TangentCost
+from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, exact_sum, gamma as rounding
+from pgo_models.problem.matrices import rotation_columns
+from pgo_models.problem.problem import PGOProblem
+
+# Share of J_tt that D has. The loss of a tangent to the rounding of C is divided by the rest.
+KEPT_SHARE = 15.0 / 16.0
+# Bound on the rounding of an entry of J_tt, in roundings of the sizes that it is computed from.
+_ROUNDINGS_OF_J = 8.0
+_GIVEN_SHARE = 15.0 / 16.0  # of the largest c
+_EIGENVALUE_TOLERANCE = 1e-2  # relative, of that c: well below what strong axes keep
+
+
+@dataclass(frozen=True, eq=False)
+class AxisTerms(ReadOnly):
+    """What a proof by axes has beside the tangent and Lambda.
+
+    Parameters
+    ----------
+    edges : (k,) array of int
+        Edges from the world whose positions are weighed by axis.
+    weights : (k, d) array
+        D of these edges, zero or more.
+    gamma : (n, d) array
+        Multipliers of the lengths of the rows of every R_i.
+    """
+
+    edges: IntArray
+    weights: Array
+    gamma: Array
+
+
+def axis_terms(problem: PGOProblem) -> AxisTerms | None:
+    """Terms of a tangent problem with the largest D, and gamma = 0; None where no D is above zero.
+
+    None as well for a cost without a tangent, or without a world pose.
+    """
+    graph = problem.graph
+    cost = problem.weights
+    if not isinstance(cost, TangentCost) or graph.world is None:
+        return None
+    d = graph.d
+    excess = cost.tangent.excess
+    is_unturned = (graph.R_ij == np.eye(d)).all(axis=(1, 2))
+    rows = excess.J[:, :d].copy()
+    along_axes = np.einsum("maa->ma", rows[:, :, :d])
+    J_tt = along_axes.copy()
+    along_axes[:] = 0.0
+    chosen = (graph.i == graph.world) & is_unturned & ~rows.any(axis=(1, 2))
+    error = _ROUNDINGS_OF_J * UNIT_ROUNDOFF * excess.size[:, :1] ** 2
+    weights = KEPT_SHARE * (J_tt - error) / OUTWARD
+    weights = np.where(chosen[:, None], np.maximum(weights, 0.0), 0.0)
+    edges = np.flatnonzero(weights.any(axis=1))
+    if not len(edges):
+        return None
+    return AxisTerms(edges, weights[edges], np.zeros((graph.num_poses, d)))
+
+
+@dataclass(frozen=True, eq=False)
+class AxisUnknowns(Unknowns):
+    """The columns of Z one below the other, with a matrix for every axis of the world.
+
+    Parameters
+    ----------
+    problem, rows
+        As of `Unknowns`: a tangent problem, and the rows of the world pose.
+    terms : AxisTerms
+        Weights by axis and gamma.
+    """
+
+    terms: AxisTerms
+
+    @property
+    def is_complex(self) -> bool:
+        """False."""
+        return False
+
+    def starting_point(self, X: Array) -> Array:
+        """X' itself."""
+        return X
+
+    def prove_definite(self, Lambda: Array, eta: float, X: Array) -> DefiniteProof | None:
+        """Proof that the matrix of every axis is definite without the rows left out."""
+        proofs = []
+        for axis in range(self.problem.d):
+            matrix = self.stored_matrix(Lambda, eta, axis)
+            proof = None if matrix is None else prove_stored(matrix, turned=X)
+            if proof is None:
+                return None
+            proofs.append(proof)
+        slack = np.concatenate([proof.slack for proof in proofs])
+        return DefiniteProof(_FactorsOfAxes([proof.factor for proof in proofs]), slack)
+
+    def is_definite_in_doubles(self, Lambda: Array) -> bool:
+        """Whether the matrix of every axis has a Cholesky factor."""
+        return all(self.factor_of_axis(Lambda, axis) is not None for axis in range(self.problem.d))
+
+    def factor_of_axis(self, Lambda: Array, axis: int) -> CholeskyFactor | None:
+        """Cholesky factor of S_k less a margin, without the rows left out; None without one."""
+        matrix = self.stored_matrix(Lambda, 0.0, axis)
+        margin = np.full(self.problem.side, FIRST_MARGIN)
+        return None if matrix is None else matrix.factor_less(margin)
+
+    def gradient(self, product: Array, error: Array) -> tuple[Array, Array]:
+        """The columns of G, one below the other."""
+        return product.T.reshape(-1, 1), error.T.reshape(-1, 1)
+
+    def rows_of(self, unknowns: Array) -> Array:
+        """Z, (N, d)."""
+        return unknowns.reshape(self.problem.d, -1).T
+
+    def stored_matrix(self, Lambda: Array, eta: float, axis: int) -> StoredMatrix | None:
+        """S_k + eta blockdiag(0, I) without the rows left out; None where it is out of range.
+
+        D_k is summed rounding down. That gamma is added to Lambda, and D_k to the rows of
+        translations, rounds the diagonal alone: `matrix_errors` counts 4 d roundings in a row of a
+        block, of which Lambda, eta and a margin make 3 d.
+        """
+        problem = self.problem
+        n = problem.num_poses
+        ends = problem.graph.j[self.terms.edges]
+        shifts = np.zeros(problem.side)
+        np.add.at(shifts, ends, self.terms.weights[:, axis])
+        shifts[:n] /= OUTWARD
+        added = np.repeat(etas_of_rotations(problem, eta), problem.d)
+        multipliers = Lambda + self.terms.gamma[:, axis, None, None] * np.eye(problem.d)
+        shifts[n:] = added
+        stored, diagonal = shifted_certificate(problem, multipliers, shifts)
+        diagonal[self.rows] = np.maximum(diagonal[self.rows], 1.0)
+        if not is_in_range(stored.data, diagonal):
+            return None
+        problem.leave_out(stored.data, self.rows, 2.0 * diagonal[self.rows])
+        entries = matrix_errors(problem, diagonal)
+        positions = problem.diagonal_positions
+        return StoredMatrix(stored, diagonal, self.rows, entries, problem.analysis, positions)
+
+    def added(self, X: Array, low: Array) -> Evaluation:
+        """The terms by axis at X, half their gradient, and bounds on the errors of both.
+
+        They are sum D_k (r_k - r*_k)^2 + sum gamma_ik (1 - |p_ik|^2), less what the tangents of
+        these edges may lose to rounding with the share of J_tt that D leaves.
+        """
+        problem = self.problem
+        n = problem.num_poses
+        d = problem.d
+        terms = self.terms
+        cost = problem.weights
+        assert isinstance(cost, TangentCost)
+        ends = problem.graph.j[terms.edges]
+        t = X[ends]
+        low = low[ends]
+        offset = problem.graph.t_ij[terms.edges]
+        at_contact = cost.tangent.Z[terms.edges, 0]
+        residual = t - offset
+        residual_error = UNIT_ROUNDOFF * np.abs(residual)
+        for summand in (low, -at_contact):
+            residual = residual + summand
+            residual_error = residual_error + UNIT_ROUNDOFF * np.abs(residual)
+        of_positions = terms.weights * residual
+        position_error = terms.weights * residual_error + UNIT_ROUNDOFF * np.abs(of_positions)
+        value = of_positions * residual
+        value_error = position_error * np.abs(residual) + np.abs(of_positions) * residual_error
+        value_error += position_error * residual_error + UNIT_ROUNDOFF * value
+        P = X[n:].reshape(n, d, d)
+        lengths = np.einsum("nak,nak->nk", P, P)
+        of_lengths = terms.gamma * (1.0 - lengths)
+        length_error = np.abs(terms.gamma) * rounding(d + 3) * (1.0 + lengths)
+        product = np.zeros_like(X)
+        product_error = np.zeros_like(X)
+        np.add.at(product, ends, of_positions)
+        np.add.at(product_error, ends, position_error)
+        most = int(np.bincount(ends).max())
+        sizes = np.zeros_like(X)
+        np.add.at(sizes, ends, np.abs(of_positions))
+        product_error += rounding(most) * sizes
+        of_P = -terms.gamma[:, None, :] * P
+        product[n:] = of_P.reshape(-1, d)
+        product_error[n:] = UNIT_ROUNDOFF * np.abs(product[n:])
+        lost = (1.0 / (1.0 - KEPT_SHARE) - 1.0) * float(np.sum(cost.tangent.loss[terms.edges]))
+        total = exact_sum([*value.ravel(), *of_lengths.ravel(), -OUTWARD * lost])
+        error = float(np.sum(value_error) + np.sum(length_error))
+        return Evaluation(total, OUTWARD * error, product, OUTWARD * product_error)
+
+
+class _FactorsOfAxes:
+    """Factors of the matrices of all axes, as one of the matrix with these blocks."""
+
+    def __init__(self, factors: list[Factor]) -> None:
+        self._factors = factors
+
+    def solve(self, right_hand_side: Array) -> Array:
+        """Solution, (N d, 1), of the columns one below the other."""
+        columns = right_hand_side.reshape(len(self._factors), -1)
+        solved = [f.solve(column) for f, column in zip(self._factors, columns, strict=True)]
+        return np.concatenate(solved)[:, None]
+
+
+def balanced(unknowns: AxisUnknowns, Lambda: Array, X: Array) -> tuple[AxisTerms, Array] | None:
+    """The terms and multipliers with what strong axes have given to weak ones.
+
+    An axis is strong if its matrix has a Cholesky factor; None where none is. X are poses with the
+    world pose at (0, I), where value and gradient stay what they are.
+    """
+    problem = unknowns.problem
+    n = problem.num_poses
+    d = problem.d
+    factors = [unknowns.factor_of_axis(Lambda, axis) for axis in range(d)]
+    strong = [factor for factor in factors if factor is not None]
+    if len(strong) in (0, d):
+        return (unknowns.terms, Lambda) if strong else None
+    is_weak = np.array([factor is None for factor in factors])
+    P = X[n:].reshape(n, d, d)
+    turns = np.ones(n)
+    turns[problem.graph.landmarks] = 0.0
+    turns[problem.graph.world] = 0.0
+    lost = turns[:, None, None] * P[:, :, is_weak]
+    c = _GIVEN_SHARE * min(_most_given(factor, lost) for factor in strong)
+    gamma = -c * turns[:, None] * is_weak
+    changed = Lambda - (P * gamma[:, None, :]) @ np.swapaxes(P, 1, 2)
+    Lambda = 0.5 * (changed + np.swapaxes(changed, 1, 2))
+    return replace(unknowns.terms, gamma=gamma), Lambda
+
+
+def _most_given(factor: CholeskyFactor, lost: Array) -> float:
+    """Largest c for which S_k - c B is definite in doubles, with B = sum of v v^T.
+
+    The vectors v are the columns of `lost`, (n, d, k), in the rows of every pose. 1 / c is the
+    largest eigenvalue of V^T S_k^-1 V, V the matrix of all v; the factor is that of S_k.
+    """
+    n, d, k = lost.shape
+    rotation_rows = rotation_columns(np.arange(n), n, d)
+
+    def apply(coefficients: Array) -> Array:
+        vector = np.zeros((d + 1) * n)
+        vector[rotation_rows] = np.einsum("ndk,nk->nd", lost, coefficients.reshape(n, k))
+        solved = factor.solve(vector)
+        return np.asarray(np.einsum("ndk,nd->nk", lost, solved[rotation_rows]).ravel())
+
+    operator = LinearOperator((n * k, n * k), matvec=apply, dtype=np.float64)
+    largest = eigsh(
+        operator,
+        k=1,
+        which="LA",
+        tol=_EIGENVALUE_TOLERANCE,
+        v0=np.ones(n * k),
+        return_eigenvectors=False,
+    )
+    return 1.0 / float(largest[0])
