@@ -426,7 +426,7 @@ def _certificate_at(
         terms = closed_form_terms(problem.tangent_at(best), best)
         if terms is not None:
             certificate = with_terms(problem, certificate, terms, best)
-    return with_axes(problem, certificate, best) if certificate.can_improve else certificate
+    return with_axes(problem, certificate, best)
 
 
 def with_axes(problem: PGOProblem, certificate: Certificate, ground: Poses) -> Certificate:
@@ -434,6 +434,8 @@ def with_axes(problem: PGOProblem, certificate: Certificate, ground: Poses) -> C
 
     Handedness terms of the certificate are taken off the cost here, too.
     """
+    if problem.graph.world is None or not certificate.can_improve:
+        return certificate
     tangent = problem.tangent_at(ground)
     terms = certificate.bound.terms
     if terms is not None:

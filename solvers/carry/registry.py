@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from pgo_models.certificates.axes import AxisTerms
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.fit import Fit
 from pgo_models.certificates.handedness import HandednessTerms
@@ -23,7 +24,7 @@ from pgo_models.graphs.written_digits import WrittenDigits
 from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.low_rank import LiftedPoses
 
-VERSION = 26
+VERSION = 27
 T = TypeVar("T")
 
 
@@ -65,6 +66,7 @@ class _Names:
 _records = _Names(
     "record",
     {  # of a package that knows nothing of messages
+        "AxisTerms": AxisTerms,
         "BoundSource": BoundSource,
         "Certificate": Certificate,
         "Fit": Fit,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from pgo_models.certificates.certificate import BoundSource, certify_with
+from pgo_models.certificates.certificate import BoundSource, certify_with, with_axes
 from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
@@ -273,7 +273,7 @@ class PlaceOfRobots(Place):
         """Prove the certificate of the current poses by driver and robots.
 
         Where this process has the graph, the poses are collected, and the whole problem serves for
-        their cost alone.
+        their cost, and for a proof by axes where the bound of the robots leaves too wide a gap.
         """
         driver = self.driver
         goes_on = self.is_on_the_way and not attempt.is_out_of_time
@@ -287,6 +287,7 @@ class PlaceOfRobots(Place):
             certificate = certify_with(
                 here.problem, poses, Lambda, here.gap, attempt.decrement, BoundSource.GIVEN, bound
             )
+            certificate = with_axes(here.problem, certificate, poses)
         if self.faults is not None and isinstance(attempt, AttemptWithFaults):
             # A robot may have fallen silent since SOC ended.
             attempt.check_heard(self.faults, self.ledger.rounds)
