@@ -7,6 +7,7 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import CholeskyFactor
+from pgo_models.problem.matrices import ground
 from pgo_models.problem.problem import EvaluatedPoses, PGOProblem
 
 
@@ -120,6 +121,5 @@ def factorize_certificate(problem: PGOProblem, Lambda: Array, eta: float) -> Cho
     it has a negative eigenvalue, or a zero one beside that of the common shift.
     """
     shifted = certificate_matrix(problem, Lambda, eta)
-    position_of_t_0 = problem.diagonal_positions[0]
-    shifted.data[position_of_t_0] *= 2.0
+    ground(shifted, [0])
     return problem.analysis.factorize(shifted)

@@ -49,7 +49,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF
-from pgo_models.problem.matrices import diagonal_positions, meets
+from pgo_models.problem.matrices import diagonal_positions, ground, meets
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
@@ -203,7 +203,7 @@ class ComplexUnknowns(Unknowns):
         return analyze(self.M, self.problem.backend, order)
 
     def factorize_shifted(self, shift: float) -> CholeskyFactor:
-        """Factor of U^* M U with a shift of the numbers r, t_0 grounded by doubling its diagonal.
+        """Factor of U^* M U with a shift of the numbers r, t_0 grounded.
 
         A NotPositiveDefiniteError when there is none.
         """
@@ -211,9 +211,9 @@ class ComplexUnknowns(Unknowns):
         data = self.M.data.copy()
         positions = diagonal_positions(self.M)
         data[positions[2 * n :]] += shift
-        data[positions[:2]] *= 2.0
         shifted = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
         shifted.has_canonical_format = True
+        ground(shifted, [0, 1])
         return self.analysis.factorize(shifted)
 
     @cached_property

@@ -21,6 +21,7 @@ from pgo_models.problem.incidence import Incidence
 from pgo_models.problem.matrices import (
     assemble,
     block_entries,
+    ground,
     rotation_columns,
     short,
 )
@@ -162,21 +163,14 @@ def riemannian_hessian(here: EvaluatedPoses, Lambda: Array | None) -> csc_array:
     return assemble(blocks, layout.side)
 
 
-def ground_pose(matrix: csc_array, problem: PGOProblem) -> None:
-    """Double the diagonal of pose 0, so that the matrix is not singular.
+def ground_pose(matrix: csc_array, layout: TangentLayout) -> None:
+    """Ground pose 0, which a Newton step near a stationary point then leaves where it is.
 
-    Rigid motions do not change F, so that a Newton step with the grounded matrix does not move pose
-    0 near a stationary point.
+    Rigid motions do not change F there to second order, nor anywhere to first.
     """
-    layout = TangentLayout(problem.num_poses, problem.d)
     pose_0 = np.zeros(1, dtype=np.int64)
-    columns_v = layout.translations(pose_0)[0]
-    columns_w = layout.rotations(pose_0)[0]
-    for column in np.concatenate([columns_v, columns_w]):
-        begin = matrix.indptr[column]
-        end = matrix.indptr[column + 1]
-        position = begin + np.searchsorted(matrix.indices[begin:end], column)
-        matrix.data[position] += abs(matrix.data[position])
+    ground(matrix, layout.translations(pose_0)[0])
+    ground(matrix, layout.rotations(pose_0)[0])
 
 
 def _curvature_blocks(

@@ -9,6 +9,7 @@ R_i^T.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -295,6 +296,19 @@ def diagonal_positions(matrix: csc_array) -> IntArray:
     """Positions in `matrix.data` of the diagonal, (N,), of which every entry is stored."""
     columns = np.repeat(short(np.arange(matrix.shape[1])), np.diff(matrix.indptr))
     return np.flatnonzero(matrix.indices == columns)
+
+
+def ground(matrix: csc_array, columns: Iterable[int]) -> None:
+    """Double the diagonal of columns, in place, so that the matrix is definite.
+
+    A motion of all poses together costs nothing, so that the matrix is singular along it, and
+    right-hand sides are orthogonal to it: the solution with the larger diagonal is zero in these
+    columns, and solves the system as it was, too.
+    """
+    for column in columns:
+        begin, end = matrix.indptr[column : column + 2]
+        position = begin + np.searchsorted(matrix.indices[begin:end], column)
+        matrix.data[position] += abs(matrix.data[position])
 
 
 def meets(matrix: csc_array, rows: IntArray) -> BoolArray:

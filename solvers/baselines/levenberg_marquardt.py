@@ -141,8 +141,9 @@ def _linearized(
     analysis: SymbolicCholesky | None = None,
 ) -> LevenbergMarquardtState:
     matrix = riemannian_hessian(problem.at(poses), None)
-    ground_pose(matrix, problem)
-    gradient = TangentLayout(problem.num_poses, problem.d).join(*problem.riemannian_gradient(poses))
+    layout = TangentLayout(problem.num_poses, problem.d)
+    ground_pose(matrix, layout)
+    gradient = layout.join(*problem.riemannian_gradient(poses))
     if analysis is None:
         analysis = analyze(matrix, problem.backend, tangent_order(problem))
     state = LevenbergMarquardtState(

@@ -198,7 +198,7 @@ class CentralAlgebra:
             if order.eta:
                 Lambda = Lambda - order.eta * np.eye(problem.d)
         matrix = riemannian_hessian(here, Lambda)
-        ground_pose(matrix, problem)
+        ground_pose(matrix, self.layout)
         if problem.has_partial_edges:
             diagonal = matrix.diagonal()
             sizes = np.maximum(np.abs(diagonal), np.median(np.abs(diagonal)))

@@ -357,10 +357,8 @@ class Driver:
     def grounding_block(self) -> list[tuple[IntArray, Array]]:
         """Block that doubles the (t_0, t_0) entry of M, if pose 0 is in the cover.
 
-        A shift of all translations costs nothing, so that the matrix of the translations is
-        singular. The larger entry makes it positive definite. The right-hand sides of all
-        translations sum to zero, so that the solution has t_0 = 0 and solves the system without the
-        block, too. If pose 0 is not in the cover, the robot whose interior it is in does the same.
+        See `pgo_models.problem.matrices.ground`. If pose 0 is not in the cover, the robot whose
+        interior it is in does the same.
         """
         column = self.columns_of_pose_0(1)
         if column.size == 0:

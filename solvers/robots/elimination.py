@@ -23,7 +23,7 @@ from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, column_error
-from pgo_models.problem.matrices import columns_of, inner
+from pgo_models.problem.matrices import columns_of, ground, inner
 from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN
 from solvers.robots.subdomain_blocks import SubdomainBlocks, Widths
@@ -276,8 +276,7 @@ class FactoredPart:
         p = problem.num_poses
         M_tt = problem.M[:p, :p].tocsc()
         if self.grounds:
-            # As in `Driver.grounding_block`: M_tt alone is singular, a shift of all costs nothing.
-            M_tt[0, 0] *= 2.0
+            ground(M_tt, [0])
         following, elimination = self.eliminate(M_tt, (1,))
         return replace(following, known_laplacian=elimination)
 

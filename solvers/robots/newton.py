@@ -27,7 +27,7 @@ from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
-from pgo_models.problem.hessian import TangentLayout
+from pgo_models.problem.hessian import TangentLayout, ground_pose
 from pgo_models.relaxations.low_rank import (
     LiftedPoses,
     gradient_at,
@@ -355,21 +355,12 @@ def reduce_model(robot: Interior, order: ModelOrder) -> tuple[Interior, Reduced 
         Lambda = robot.multipliers() - order.eta * identity
         Lambda[robot.part.boundary] = 0.0  # the driver knows the whole force there
     H = hessian_at(robot.at(robot.poses), Lambda)
-    layout = _layout(robot)
-    diagonal = H.diagonal()
-    grounded = diagonal.copy()
     if robot.factored.grounds:
-        # A motion of all poses together changes no cost, so that H is singular, and the gradient
-        # orthogonal to it: with pose 0 stiffer the solution leaves that pose where it is, and,
-        # without damping, solves the system without the stiffness, too.
-        zero = np.zeros(1, dtype=np.int64)
-        v = layout.translations(zero)[0]
-        w = layout.rotations(zero)[0]
-        of_pose = np.concatenate([v, w])
-        grounded[of_pose] += abs(diagonal[of_pose])
+        ground_pose(H, _layout(robot))
+    diagonal = H.diagonal()
     widths = tangent_widths(robot.poses.R)
     interior = robot.factored.cut(widths).interior
-    diagonal[interior] = grounded[interior] * (1.0 + order.damping)
+    diagonal[interior] *= 1.0 + order.damping
     H.setdiag(diagonal)
     try:
         eliminated, system = robot.eliminate(H, widths, _gradient(robot, robot.poses))

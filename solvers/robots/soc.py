@@ -30,6 +30,7 @@ import numpy as np
 
 from pgo_models.certificates.dual_variables import multiplier_norms
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
+from pgo_models.problem.matrices import ground
 from solvers.carry.counted_pool import Count
 from solvers.carry.moments import Moment
 from solvers.carry.registry import order, record
@@ -360,10 +361,9 @@ def _factorized(
     data = problem.M.data.copy()
     positions = problem.diagonal_positions[robot.interior_rows]
     data[positions] += 0.5 * block.rho
-    if robot.factored.grounds:
-        # As in `Driver.grounding_block`: a shift of all translations costs nothing.
-        data[problem.diagonal_positions[0]] *= 2.0
     K = problem.with_pattern_of_M(data)
+    if robot.factored.grounds:
+        ground(K, [0])
     eliminated, system = robot.eliminate(K, robot.widths, _pull(robot, block))
     following = eliminated.in_session(RecursionSession(system=system, block=block, x=x))
     return following, system.reduced(system.right)

@@ -15,7 +15,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 
 from pgo_models.geometry.rotations import Array, stack_transposes, unstack_transposes
 from pgo_models.problem.cholesky import CholeskyBackend, CholeskyFactor, SymbolicCholesky, factorize
-from pgo_models.problem.matrices import entry_positions
+from pgo_models.problem.matrices import diagonal_positions, ground
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import quotient
 from pgo_models.summaries import Summarised
@@ -66,16 +66,12 @@ class RSubproblem(Summarised):
     @cached_property
     def matrix(self) -> csc_array:
         """M + D/2, grounded where needed, positive definite; the pattern of M."""
-        rows = np.arange(self.M.shape[0])
-        diagonal = entry_positions(self.M, rows, rows)
         data = self.M.data.copy()
-        data[diagonal] += 0.5 * self.rho
-        if self.needs_ground:
-            # The right-hand sides of all translations sum to zero, so that the solution with the
-            # larger entry has t_0 = 0 and solves the system without it, too.
-            data[diagonal[0]] *= 2.0
+        data[diagonal_positions(self.M)] += 0.5 * self.rho
         matrix = csc_array((data, self.M.indices, self.M.indptr), shape=self.M.shape)
         matrix.has_canonical_format = True  # as M: scipy need not look
+        if self.needs_ground:
+            ground(matrix, [0])
         return matrix
 
 
