@@ -89,24 +89,8 @@ def chi2(
 
     The rotation block of I is taken to be of the rotation vector, in radians, also where g2o takes
     it to be of the quaternion. Matrices that are only semidefinite count whole, too
-    (`proper_information`).
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        Measurements with their information matrices; those of kappa and tau where it has none.
-    poses : Poses
-        A pose for every pose of the graph, metres.
-    convention : Chi2Convention
-        How the rotation is read.
-
-    Raises
-    ------
-    GraphError
-        When an information matrix is indefinite (`indefinite_edges`), or the poses are not those of
-        the graph.
-    SettingError
-        When `convention` is no Chi2Convention.
+    (`proper_information`). Where the graph has none, I is that of kappa and tau. A GraphError when
+    an information matrix is indefinite (`indefinite_edges`).
 
     Examples
     --------
@@ -180,7 +164,7 @@ def _sum_of_forms(left: Array, blocks: Array, right: Array) -> float:
 def check_poses(graph: PoseGraph, poses: Poses) -> Poses:
     """The poses, with the world pose; a GraphError unless there is one for every other pose."""
     poses = graph.with_world_of(poses)
-    if poses.t.shape != (graph.num_poses, graph.d):
+    if (poses.num_poses, poses.d) != (graph.num_poses, graph.d):
         raise GraphError(f"{poses} beside {graph!r}; give one pose for every pose of the graph")
     return poses
 
