@@ -200,15 +200,11 @@ def _array(value: object, number: type[np.generic]) -> object:
     if array.dtype.kind not in kinds and array.size:
         raise MisfitError
     is_exact = issubclass(array.dtype.type, number)
-    return array if is_exact else array.astype(_concrete(number))
+    return array if is_exact else array.astype(np.int64 if number is np.integer else number)
 
 
 def _kind_of(number: type[np.generic]) -> tuple[str, str]:
     return next(words for kind, words in _ARRAYS.items() if issubclass(number, kind))
-
-
-def _concrete(number: type[np.generic]) -> type[np.generic]:
-    return np.int64 if number is np.integer else number
 
 
 def _sequence(value: object, kind: type, entries: tuple[object, ...]) -> object:

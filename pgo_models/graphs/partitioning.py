@@ -26,24 +26,12 @@ class PartitionMethod(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class Partition(ReadOnly):
-    """Which robot owns which pose.
+    """Which robot owns which pose."""
 
-    Parameters
-    ----------
-    robot : IntArray, (n,)
-        Owner of every pose, kept as a read-only copy. The robots are 0 .. num_robots - 1, and each
-        owns a pose.
-    method : PartitionMethod
-        How the partition was made.
-
-    Raises
-    ------
-    SettingError
-        When a robot is left out in the numbering.
-    """
-
+    # Owner of every pose, kept as a read-only copy. The robots are 0 .. num_robots - 1, and each
+    # owns a pose.
     robot: IntArray
-    method: PartitionMethod
+    method: PartitionMethod  # how the partition was made
 
     def __post_init__(self) -> None:
         robot = whole_array(self.robot, "robot", SettingError)

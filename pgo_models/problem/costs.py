@@ -282,16 +282,7 @@ class EdgeCost(EdgeArrays):
         are not among them. Where W = kappa I, R_ij R_ij^T is taken to be the identity; the
         difference is counted in the bound on the rounding of M.
 
-        Returns
-        -------
-        translation_coupling : (m, d) array
-            c of every edge.
-        diagonal_i : (m, d, d) array
-            D_i.
-        rotation_coupling : (m, d, d) array
-            D_ij.
-        diagonal_j : (m, d, d) array
-            D_j.
+        Returned are c, (m, d), D_i, D_ij and D_j, (m, d, d), of every edge.
         """
         offset = self.seen_offsets(t_ij)
         translation_coupling = self.tau[:, None] * offset

@@ -41,30 +41,15 @@ class Marginals(ReadOnly):
 
     The p = 3 or 6 numbers (v_i, w_i) of a pose are in metres and radians: v is in the world frame,
     w in the frame of the pose. Of rotations alone there are the p = 1 or 3 numbers w_i. GTSAM and
-    g2o use R_i^T v_i in place of v_i, and Pose3 of GTSAM has it after w.
-
-    Parameters
-    ----------
-    hessian : (n p, n p) csc_array
-        The second derivative of a cost without a factor 1/2, such as `riemannian_hessian`.
-    layout : TangentLayout
-        The unknowns of its rows.
-    anchor : int
-        The pose that does not move, the gauge; its covariances are zero.
-    backend : CholeskyBackend, optional
-        The sparse Cholesky to use; `default_backend()` unless given.
-
-    Raises
-    ------
-    SettingError
-        When the anchor, or a requested pose, is not one of the poses.
-    NotPositiveDefiniteError
-        When a covariance is requested and the Hessian is not that of a strict minimum.
+    g2o use R_i^T v_i in place of v_i, and Pose3 of GTSAM has it after w. A
+    NotPositiveDefiniteError when a covariance is requested and the Hessian is not that of a strict
+    minimum.
     """
 
+    # (n p, n p): the second derivative of a cost without a factor 1/2, as `riemannian_hessian`.
     hessian: csc_array
-    layout: TangentLayout
-    anchor: int = 0
+    layout: TangentLayout  # of its rows
+    anchor: int = 0  # the pose that does not move, the gauge; its covariances are zero
     backend: CholeskyBackend | None = None
 
     def joint(self, *poses: int) -> Array:

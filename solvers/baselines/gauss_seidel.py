@@ -93,22 +93,8 @@ class GaussSeidel:
     w_last|| over the root of n (radians) and ||v - v_last|| / ||v||. A run that ends early may
     return an iterate of the first stage with the best translations, which are off the ledger.
 
-    Parameters
-    ----------
-    robots : Partition or None
-        Who owns which pose; one pose a robot unless given.
-    alpha : float in (0, 2)
-        Over-relaxation.
-    gauss_newton_steps : int, at least 1
-        Number of linearisations in the second stage, one in the paper that the method is from.
-    tolerance : float
-        On the change of a sweep; it ends a stage.
-    max_iterations : int
-        Sweeps of all stages together, at most.
-
-    References
-    ----------
-    Choudhary et al., Distributed mapping with privacy and communication constraints, 2017.
+    The method is from Choudhary et al., Distributed mapping with privacy and communication
+    constraints, 2017.
 
     Examples
     --------
@@ -118,11 +104,11 @@ class GaussSeidel:
     'CONVERGED'
     """
 
-    robots: Partition | None = None
-    alpha: float = 1.0
-    gauss_newton_steps: int = 1
-    tolerance: float = 1e-5
-    max_iterations: int = 5000
+    robots: Partition | None = None  # who owns which pose; one pose a robot unless given
+    alpha: float = 1.0  # over-relaxation, in (0, 2)
+    gauss_newton_steps: int = 1  # linearisations in the second stage, one in the paper
+    tolerance: float = 1e-5  # on the change of a sweep; it ends a stage
+    max_iterations: int = 5000  # sweeps of all stages together, at most
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], relaxation=["alpha"])

@@ -58,18 +58,8 @@ class LevenbergMarquardt:
     """Levenberg-Marquardt on the full poses: one factorisation a step, and F never rises.
 
     `dual_residual` is the relative decrement of the damped step: half of -<g, h>, less the rounding
-    level of F, over F.
-
-    Parameters
-    ----------
-    tolerance : float
-        On the decrement, once the damping is small.
-    max_iterations : int
-        Steps at most; refused steps count.
-
-    References
-    ----------
-    Madsen, Nielsen & Tingleff, Methods for non-linear least squares problems, 2004.
+    level of F, over F. Damping follows Madsen, Nielsen & Tingleff, Methods for non-linear least
+    squares problems, 2004.
 
     Examples
     --------
@@ -79,8 +69,8 @@ class LevenbergMarquardt:
     'CONVERGED'
     """
 
-    tolerance: float = STATIONARY_DECREMENT
-    max_iterations: int = 200
+    tolerance: float = STATIONARY_DECREMENT  # on the decrement, once the damping is small
+    max_iterations: int = 200  # refused steps count
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])

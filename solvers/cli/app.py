@@ -19,7 +19,7 @@ from typer.core import TyperGroup
 
 from solvers.cli.help import Helpful
 from solvers.cli.shell import run_command
-from solvers.reporting.distribution import text_of_version
+from solvers.reporting.distribution import installed_version
 
 # BLAS reads these once, when a command imports it.
 _NUMBERS_OF_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -190,7 +190,7 @@ def pgo(
 ) -> None:
     """Pose graph optimisation by splitting, with a certified distance to the global optimum."""
     if version:
-        typer.echo(text_of_version())
+        typer.echo(f"pgo {installed_version()}")
 
 
 def main(arguments: list[str] | None = None) -> None:

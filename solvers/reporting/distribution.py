@@ -7,11 +7,6 @@ from importlib import metadata
 DISTRIBUTION = "pgo-splitting"
 
 
-def text_of_version() -> str:
-    """What `pgo --version` prints."""
-    return f"pgo {installed_version()}"
-
-
 def installed_version(distribution: str = DISTRIBUTION) -> str:
     """Version of an installed distribution, or "missing"."""
     with suppress(metadata.PackageNotFoundError):

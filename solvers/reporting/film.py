@@ -56,7 +56,8 @@ def film(
     The picture shows the graph at the poses of an iterate. The curves below show on a logarithmic
     axis how far its cost is above the least cost of the film, and how far the best lower bound so
     far is below it. A bound is proven at the poses of the iterate (`certify_at`), and holds for all
-    poses, so that the best one counts from then on.
+    poses, so that the best one counts from then on. The figure, of plotly, has at most 16 iterates,
+    and a notebook shows it by itself. Pictures of one's own are filmed by `pgo_models.animate`.
 
     Parameters
     ----------
@@ -67,22 +68,6 @@ def film(
         chi2 that is not convex and quadratic.
     start : Poses, optional
         Where the first method starts; along a spanning tree unless given.
-
-    Returns
-    -------
-    plotly.graph_objects.Figure
-        Figure of at most 16 iterates, which a notebook shows by itself.
-
-    Raises
-    ------
-    SettingError
-        When there are no methods, or the problem has no translations to draw.
-    MissingExtraError
-        Without the extra `plot`.
-
-    See Also
-    --------
-    pgo_models.animate : Film of pictures of one's own.
 
     Examples
     --------

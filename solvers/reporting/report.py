@@ -30,14 +30,7 @@ from solvers.carry.ledger import Ledger
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
 from solvers.reporting.fit_plots import explore_fit
-from solvers.reporting.report_text import (
-    Solved,
-    advice,
-    advice_in_doubt,
-    headline,
-    meaning,
-    robust_headline,
-)
+from solvers.reporting.report_text import Solved, advice, advice_in_doubt, headline, meaning
 from solvers.reporting.versions import installed_versions
 from solvers.soc.soc import SOC
 
@@ -115,7 +108,9 @@ def report_page(solution: Solved, *, source: str | None = None, fit: EdgeFit | N
     chi2 = fit.residuals.cost.sum() if fit.cost != certificate.cost else None
     robust = solution.robust
     content = {
-        "headline": headline(certificate) if robust is None else robust_headline(robust),
+        "headline": (
+            headline(certificate) if robust is None else f"{robust.headline}. {robust.conditional}"
+        ),
         "verdict": certificate.verdict if robust is None else robust.standing,
         "fit": solution.fit_text,
         "is_doubtful": robust is None and solution.is_doubtful,

@@ -121,11 +121,6 @@ def headline(certificate: Certificate) -> str:
     )
 
 
-def robust_headline(robust: Rejection) -> str:
-    """Return the verdict of a robust solve: on the edges kept, and on the poses for these edges."""
-    return f"{robust.headline}. {robust.conditional}"
-
-
 def meaning(certificate: Certificate) -> list[str]:
     """Return the meaning of the figures in a few sentences, which need no further reading."""
     cost = (

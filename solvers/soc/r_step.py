@@ -79,18 +79,7 @@ class RotationStep(Protocol):
     """A back end that is ready for many shifts."""
 
     def solve(self, V: Array) -> Array:
-        """Solve the subproblem for a shift.
-
-        Parameters
-        ----------
-        V : Array, (N, d)
-            The shift.
-
-        Returns
-        -------
-        Array, (N, d)
-            The minimiser X.
-        """
+        """Return the minimiser X, (N, d), for a shift V, (N, d)."""
 
 
 class CustomRStep(Protocol):

@@ -100,12 +100,6 @@ class SOCSettings:
 
     # What the recursions are given.
 
-    @property
-    def step_settings(self) -> StepSettings:
-        """The settings that every robot needs for its steps."""
-        memory = 0 if self.acceleration is None else self.acceleration.memory
-        return StepSettings(self.alpha, memory, self.local_passes, self.bytes_per_number)
-
     def penalty_order(self, ratio: Array, is_stationary: bool) -> PenaltyOrder:
         """Rule of rho, from ||Lambda_i||_2 / m_i of all poses, (n,)."""
         bounds = self.penalty.bounds(ratio)
@@ -114,7 +108,9 @@ class SOCSettings:
                 f"{type(self.penalty).__name__}.bounds returned {bounds}; give three numbers that "
                 "are not negative: (per_norm, per_scale, least)"
             )
-        return PenaltyOrder(*bounds, is_stationary, self.step_settings)
+        memory = 0 if self.acceleration is None else self.acceleration.memory
+        of_steps = StepSettings(self.alpha, memory, self.local_passes, self.bytes_per_number)
+        return PenaltyOrder(*bounds, is_stationary, of_steps)
 
     def separator_penalty_for(self, translation_penalty: float) -> float:
         """Least penalty of separator rotations over m_i, given that of their translations."""

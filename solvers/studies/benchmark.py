@@ -41,22 +41,13 @@ class BenchmarkMethod(enum.Enum):
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """Settings of all contenders.
+    """Settings of all contenders."""
 
-    Parameters
-    ----------
-    num_robots : int
-        Robots of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and of the second stages; at most as many
-        as poses. The first stage of PAPER has one robot for every pose, as in the paper.
-    max_rounds : int, optional
-        Maximal number of rounds of PAPER, both stages together; at least 2.
-    time_limit : float
-        Seconds for each contender.
-    """
-
+    # Robots of CONSENSUS, SUBSTRUCTURED, GAUSS_SEIDEL and of the second stages; at most as many as
+    # poses. The first stage of PAPER has one robot for every pose, as in the paper.
     num_robots: int = 5
-    max_rounds: int | None = None
-    time_limit: float = math.inf
+    max_rounds: int | None = None  # of PAPER, both stages together; at least 2
+    time_limit: float = math.inf  # seconds for each contender
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["time_limit"], at_least_one=["num_robots"])

@@ -42,17 +42,9 @@ _COLUMNS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """Methods to compare, and their common settings.
+    """Methods to compare, and their common settings."""
 
-    Parameters
-    ----------
-    contenders : tuple of BenchmarkMethod
-        Methods; all that can be run here unless given. GTSAM has to be installed.
-    trial : BenchmarkSettings
-        Common settings.
-    """
-
-    contenders: tuple[BenchmarkMethod, ...] = ()
+    contenders: tuple[BenchmarkMethod, ...] = ()  # all that can be run here unless given
     trial: BenchmarkSettings = field(default_factory=BenchmarkSettings)
 
     def __post_init__(self) -> None:
@@ -140,16 +132,8 @@ def compare_methods(
     """Run methods on a graph, and compare them with a proven lower bound.
 
     For a method that fails the result has the reason. After Ctrl-C the result has the methods that
-    have ended; before the bound is known, Ctrl-C raises a KeyboardInterrupt.
-
-    Parameters
-    ----------
-    problem : PGOProblem or PoseGraph
-        The problem.
-    settings : ComparisonSettings, optional
-        Which methods, and their common settings.
-    progress : bool, optional
-        Whether to show a bar on stderr; if not given, it is shown on a terminal.
+    have ended; before the bound is known, Ctrl-C raises a KeyboardInterrupt. `progress` is whether
+    to show a bar on stderr; if not given, it is shown on a terminal.
 
     Examples
     --------

@@ -35,29 +35,13 @@ TABLE_CONTENDERS = (
 
 @dataclass(frozen=True)
 class ReproductionSettings:
-    """Which rows are reproduced, and how.
+    """Which rows are reproduced, and how."""
 
-    Parameters
-    ----------
-    only : tuple of str
-        Names of the rows; all unless given.
-    num_seeds : int
-        Number of draws of the random scenes: those of `numpy.random.default_rng(0)`, `(1)`, ...
-    num_robots : int
-        Number of robots, as in `BenchmarkSettings`.
-    download : bool
-        Whether to download graphs that are not here. Otherwise their row says how to get them.
-
-    Raises
-    ------
-    SettingError
-        If a row is unknown, or a number is out of its range.
-    """
-
-    only: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()  # names of the rows; all unless given
+    # Draws of the random scenes: those of `numpy.random.default_rng(0)`, `(1)`, ...
     num_seeds: int = 20
     num_robots: int = BenchmarkSettings.num_robots
-    download: bool = False
+    download: bool = False  # of graphs that are not here; else their row says how to get them
 
     def __post_init__(self) -> None:
         check_settings(self, at_least_one=["num_seeds", "num_robots"])

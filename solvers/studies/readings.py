@@ -177,21 +177,12 @@ def compare_readings(
     """Solve a g2o file as written and under every other `Reading`, and compare the costs.
 
     Each reading is solved once, by Newton's method from its usual start. Where none of them fits
-    better and the cost is far off, pairs of readings are tried.
-    Nothing is claimed of a file whose edges all fit as closely as its numbers can tell, and nothing
-    that chance could explain. Of a graph in parts the largest component is compared.
+    better and the cost is far off, pairs of readings are tried. Nothing is claimed of a file whose
+    edges all fit as closely as its numbers can tell, and nothing that chance could explain. Of a
+    graph in parts the largest component is compared.
 
-    Parameters
-    ----------
-    name_or_path : str or Path
-        As for `load`; a JSON robot log leaves no choice.
-    unit_weights, skip_unknown, trust_folder : bool
-        As for `read_g2o`.
-
-    Raises
-    ------
-    PGOError
-        As for `load` and `solve`, when the file can neither be read as written nor otherwise.
+    Arguments are as for `load`; a JSON robot log leaves no choice. Raises the errors of `load` and
+    `solve` when the file can neither be read as written nor otherwise.
 
     Examples
     --------
