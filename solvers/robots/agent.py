@@ -117,6 +117,7 @@ class Agent:
         self.copies: Copies | None = None
         self.moments: dict[int, Held] = {}
         self.record: object = None  # what the last order has left that is about its own lines
+        self.left_out: IntArray = np.zeros(0, dtype=np.int64)  # ids of poses that it leaves out
         self._own_lines: OwnLines | None = None
         self._subgraph: Subgraph | None = None
         if isinstance(source, Subgraph):

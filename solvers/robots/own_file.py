@@ -1,10 +1,10 @@
 """A robot that loads its own file: what it knows, order by order, until it is one like any other.
 
 The orders stand below in the sequence in which they are given: `read_file`, `number_poses`,
-`join_neighbours`, those of `consistency` where edges are judged, `take_cost`, `place_cover`;
-then, after the solve, `keep_answer`, `return_to_answer`, `move_answer` and `write_answer`. Where
-edges are judged again those of `revision` follow `keep_answer`, and go on with `take_cost`.
-`solvers.robots.setup` gives them.
+`join_neighbours`, `leave_out` where poses are joined with no others, those of `consistency` where
+edges are judged, `take_cost`, `place_cover`; then, after the solve, `keep_answer`,
+`return_to_answer`, `move_answer` and `write_answer`. Where edges are judged again those of
+`revision` follow `keep_answer`, and go on with `take_cost`. `solvers.robots.setup` gives them.
 """
 
 from __future__ import annotations
@@ -115,6 +115,20 @@ class Border:
     has_indefinite: bool  # whether the share of an edge in chi2 can be negative
 
 
+_NONE = np.zeros(0, dtype=np.int64)
+_WITHOUT_EDGES = Border(
+    counts=(0, 0),
+    pairs=_NONE.reshape(0, 2),
+    owners=_NONE.reshape(0, 2),
+    num_edges=_NONE,
+    poses=_NONE,
+    labels=_NONE.reshape(3, 0),
+    alone=np.zeros(3, dtype=np.int64),
+    middle=-1,
+    is_isotropic=True,
+    has_indefinite=False,
+)
+
 NO_ROUNDING = ObjectiveRounding(0.0, 0.0, FITS_WITHOUT_EDGES)  # of no edges
 
 
@@ -195,7 +209,7 @@ def read_file(agent: Agent, _: None) -> Claim:
 
     Errors are those of `read_lines`, and a GraphError for priors and landmarks.
     """
-    lines = agent.own_lines.read()
+    lines = lines_without(agent.own_lines.read(), agent.left_out)
     if len(lines.landmarks) or (lines.edge_ids == WORLD_ID).any():
         raise GraphError(
             f"{agent.own_lines.path} has priors or landmarks, which all robots share; {READ_HERE}"
@@ -250,7 +264,8 @@ def join_neighbours(
     """Make the graph of the robot: its own edges, and those that others have of its poses.
 
     Return its border, and how many edges of its poses stand in another file with another last digit
-    (an edge between two robots counts with the first of them).
+    (an edge between two robots counts with the first of them). A GraphError where it has no edge;
+    a robot of a team has a border without poses then.
 
     FIX lines of its own poses count. The request is what others told the robot, and whether the
     folder is trusted, so that nothing is asked that `read_g2o` would ask.
@@ -268,6 +283,8 @@ def join_neighbours(
     ids_of_ends, rows, numbers_of_ends, owners_of_ends, num_copies = _joined_edges(
         lines.d, parts, agent.robot
     )
+    if not len(rows) and agent.own_lines.text is not None:  # a robot of a team, in no part of it
+        return _WITHOUT_EDGES, num_copies
     if not len(rows):
         raise GraphError(
             f"{agent.own_lines.path}: no edge touches a pose of this robot; "
@@ -362,6 +379,48 @@ def border_of(robot: int, joined: OwnGraph) -> Border:
         middle=-1 if len(poses) else int(numbers[middle_pose(graph)]),
         is_isotropic=is_isotropic(graph),
         has_indefinite=bool(indefinite_edges(graph).any()),
+    )
+
+
+@order("files.leave_out")
+def leave_out(agent: Agent, components: IntArray) -> Claim:
+    """Leave out the poses that no edge joins with most of the robot's own; read what is left.
+
+    `components`, (h,), are those of the poses at its border in the graph of all robots.
+    """
+    own = agent.known(OwnGraph)
+    graph = own.graph
+    is_own = own.owners == agent.robot
+    ends = np.stack([graph.i, graph.j], axis=1)
+    border = np.unique(ends[is_own[graph.i] != is_own[graph.j]])
+    _, label = connected_components(edge_counts(graph.i, graph.j, graph.num_poses))
+    component = label + 1 + components.max(initial=0)  # those without a pose at the border
+    for pose, number in zip(border.tolist(), components.tolist(), strict=True):
+        component[label == label[pose]] = number
+    numbers, counts = np.unique(component[is_own], return_counts=True)
+    kept = graph.pose_ids[is_own & (component == numbers[np.argmax(counts)])]
+    own_ids = np.union1d(agent.own_lines.read().vertex_ids, graph.pose_ids[is_own])
+    agent.left_out = np.setdiff1d(own_ids, kept)
+    return read_file(agent, None)
+
+
+def lines_without(lines: G2OLines, left_out: IntArray) -> G2OLines:
+    """Lines without those of some poses."""
+    if not len(left_out):
+        return lines
+    vertices = ~np.isin(lines.vertex_ids, left_out)
+    edges = ~np.isin(lines.edge_ids, left_out).any(axis=1)
+    fixed = ~np.isin(lines.fixed, left_out)
+    return replace(
+        lines,
+        vertex_ids=lines.vertex_ids[vertices],
+        vertex_lines=lines.vertex_lines[vertices],
+        vertices=lines.vertices[vertices],
+        edge_ids=lines.edge_ids[edges],
+        edges=lines.edges[edges],
+        edge_lines=lines.edge_lines[edges],
+        fixed=lines.fixed[fixed],
+        fixed_lines=lines.fixed_lines[fixed],
     )
 
 

@@ -49,6 +49,7 @@ from solvers.robots.own_file import (
     Claim,
     OwnedRuns,
     join_neighbours,
+    leave_out,
     number_poses,
     place_cover,
     read_file,
@@ -141,8 +142,12 @@ def open_files(
     weighting: Weighting,
     trust_folder: bool = False,
     robust: GNC | PCM | None = None,
+    leaves_out: bool = False,
 ) -> OpenedFiles:
     """Have robots read these files, and agree on the cost that `weighting` stands for.
+
+    With `leaves_out` each leaves out what no edge joins with most of its poses, where edges join
+    the robots.
 
     In a robust solve they leave out edges that do not agree pairwise. GNC judges these again later.
     It begins with the edges of `strongest_neighbours` if they connect the graph, and otherwise with
@@ -156,16 +161,17 @@ def open_files(
     network = CountedPool(engine.open(Agent, files), len(files))
     try:
         claims = network.ask(read_file, [None] * len(files), Count.ROUND)
-        runs, num_poses, num_absent = number_ids(claims, files)
-        sent = network.ask(number_poses, runs, Count.PIGGYBACKED)
-        received = [(lines, trust_folder) for lines in network.exchange(sent)]
-        joined = network.ask(join_neighbours, received, Count.PIGGYBACKED)
-        borders = [border for border, _ in joined]
-        num_copies = sum(count for _, count in joined)
+        joined = _joined(network, files, claims, trust_folder)
+        components = _components_to_leave_out(*joined[:2]) if leaves_out else None
+        if components is not None:
+            claims = network.ask(leave_out, components, Count.PIGGYBACKED)
+            joined = _joined(network, files, claims, trust_folder)
+        borders, num_poses, num_absent, num_copies = joined
         has_indefinite = any(border.has_indefinite for border in borders)
         if weighting is Weighting.OWN:
             weighting = _own_weighting(borders)
         folder = files[0].path.parent
+        _check_connected(borders, num_poses, folder)
         if num_copies:
             message = f"{printable(str(folder))}: {copies_within_printing(num_copies)}"
             warnings.warn(message, GraphWarning, stacklevel=2)
@@ -201,6 +207,25 @@ def open_files(
         raise
 
 
+def _joined(
+    network: CountedPool, files: Sequence[OwnLines], claims: Sequence[Claim], trust_folder: bool
+) -> tuple[list[Border], int, int, int]:
+    """Have robots number the ids of these claims, and join the edges between them.
+
+    Borders, numbers of poses and of absent ones as of `number_ids`, and how many edges stand in two
+    files.
+    """
+    runs, num_poses, num_absent = number_ids(claims, files)
+    sent = network.ask(number_poses, runs, Count.PIGGYBACKED)
+    received = [(lines, trust_folder) for lines in network.exchange(sent)]
+    joined = network.ask(join_neighbours, received, Count.PIGGYBACKED)
+    borders = [border for border, _ in joined]
+    if not any(border.counts[1] for border in borders):
+        folder = files[0].path.parent
+        raise GraphError(f"{folder}: nobody has measured an edge; there is nothing to solve")
+    return borders, num_poses, num_absent, sum(count for _, count in joined)
+
+
 def _placed(
     network: CountedPool,
     borders: Sequence[Border],
@@ -214,7 +239,7 @@ def _placed(
     Where the cost that is solved is not convex and quadratic for some robot, SOC runs on another.
     """
     sizes = np.array([border.counts for border in borders]).T
-    _check_connected(borders, num_poses - int(sizes[0].sum()), folder)
+    _check_connected(borders, num_poses, folder)
     pairs = np.concatenate([border.pairs for border in borders])
     owners = np.concatenate([border.owners for border in borders])
     placements = place_poses(pairs, owners, len(borders), borders[0].middle)
@@ -338,38 +363,59 @@ def _check_claims(claims: Sequence[Claim], files: Sequence[OwnLines], owners: In
             raise FileFormatError(file.path, None, problem)
 
 
-def _check_connected(borders: Sequence[Border], num_without_edge: int, folder: Path) -> None:
+def _check_connected(borders: Sequence[Border], num_poses: int, folder: Path) -> None:
     """Raise an ApartError unless the robots' graphs together are connected.
 
     `PoseGraph.check_connected` is for a graph that one process has; here none has the edges within
     the robots, which have reported the components of their own graphs.
-    Positions have to be connected by edges with tau > 0, rotations by edges with kappa > 0. A
-    component of one robot that has a shared pose is a vertex, as the shared poses are; the rest are
-    components of their own.
+    Positions have to be connected by edges with tau > 0, rotations by edges with kappa > 0.
     """
-    shared = np.concatenate([border.poses for border in borders])
-    poses, pose = np.unique(shared, return_inverse=True)
-    num_shared = [len(border.poses) for border in borders]
-    robot = np.repeat(np.arange(len(borders)), num_shared)
     whats = ("graph falls", "positions fall", "rotations fall")
     for kind, what in enumerate(whats):
-        label = np.concatenate([border.labels[kind] for border in borders])
-        parts, part = np.unique(np.stack([robot, label]), axis=1, return_inverse=True)
-        num_vertices = len(poses) + parts.shape[1]
-        tied = edge_counts(pose, len(poses) + part.ravel(), num_vertices)
-        count = num_without_edge + sum(int(border.alone[kind]) for border in borders)
-        if len(poses):
-            count += connected_components(tied)[0]
+        count, _ = _components(borders, num_poses, kind)
         if count > 1:
             problem = f"the {what} into {count} parts, no edge between"
-            joined = _joined_robots(robot, pose, len(borders))
-            raise ApartError(f"{folder}: {problem}; {SOLVE_PARTS}", joined)
+            raise ApartError(f"{folder}: {problem}; {SOLVE_PARTS}", _joined_robots(borders))
 
 
-def _joined_robots(robot: IntArray, pose: IntArray, num_robots: int) -> tuple[tuple[int, ...], ...]:
-    """Parts of robots that edges join, of the shared poses that each knows, (k,) pairs."""
+def _components(borders: Sequence[Border], num_poses: int, kind: int) -> tuple[int, list[IntArray]]:
+    """How many components a graph has, by one of three kinds, and those of every robot's border.
+
+    A component of one robot that has a shared pose is a vertex, as the shared poses are; the rest
+    are components of their own.
+    """
+    robot, pose = _shared_poses(borders)
+    label = np.concatenate([border.labels[kind] for border in borders])
+    parts, part = np.unique(np.stack([robot, label]), axis=1, return_inverse=True)
+    num_shared = int(pose.max(initial=-1)) + 1
+    tied = edge_counts(pose, num_shared + part.ravel(), num_shared + parts.shape[1])
+    count, component = connected_components(tied) if num_shared else (0, pose)
+    count += num_poses - sum(border.counts[0] for border in borders)
+    count += sum(int(border.alone[kind]) for border in borders)
+    return count, [component[pose[robot == each]] for each in range(len(borders))]
+
+
+def _components_to_leave_out(borders: Sequence[Border], num_poses: int) -> list[IntArray] | None:
+    """Components of every robot's border, where edges join all robots and not all of their poses.
+
+    Robots that no edge joins are parts (`ApartError`), each of which solves for itself.
+    """
+    count, components = _components(borders, num_poses, kind=0)
+    return components if count > 1 and len(_joined_robots(borders)) == 1 else None
+
+
+def _shared_poses(borders: Sequence[Border]) -> tuple[IntArray, IntArray]:
+    """Every robot and every pose at its border, (k,) each; robots and poses count from 0."""
+    robot = np.repeat(np.arange(len(borders)), [len(border.poses) for border in borders])
+    shared = np.concatenate([border.poses for border in borders])
+    return robot, np.unique(shared, return_inverse=True)[1]
+
+
+def _joined_robots(borders: Sequence[Border]) -> tuple[tuple[int, ...], ...]:
+    """Parts of robots that edges join, as two that have the same pose at their borders are."""
+    robot, pose = _shared_poses(borders)
+    num_robots = len(borders)
     num_vertices = num_robots + int(pose.max(initial=-1)) + 1
-    tied = edge_counts(robot, num_robots + pose, num_vertices)
-    num_parts, part = connected_components(tied)
+    num_parts, part = connected_components(edge_counts(robot, num_robots + pose, num_vertices))
     members = [np.flatnonzero(part[:num_robots] == k) for k in range(num_parts)]
     return tuple(tuple(robots.tolist()) for robots in members)

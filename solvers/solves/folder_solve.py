@@ -139,7 +139,8 @@ def solve_folder(
 class FilesOfRobots:
     """Files that robots read, each where it runs, under one name, to be solved for one cost.
 
-    `engine` runs the robots, `memory` are the bytes that the driver may take.
+    `engine` runs the robots, `memory` are the bytes that the driver may take. `leaves_out` is as of
+    `open_files`.
     """
 
     name: str
@@ -149,6 +150,7 @@ class FilesOfRobots:
     weighting: Weighting
     trust_folder: bool = False
     robust: GNC | PCM | None = None
+    leaves_out: bool = False
 
     def solved(
         self, pipeline: Pipeline, monitor: RunMonitor, out: Path | None = None
@@ -156,7 +158,13 @@ class FilesOfRobots:
         """The solution, which robots write to the folder `out`, if it is given."""
         table = StageTable()
         opened = open_files(
-            self.files, self.engine, self.memory, self.weighting, self.trust_folder, self.robust
+            self.files,
+            self.engine,
+            self.memory,
+            self.weighting,
+            self.trust_folder,
+            self.robust,
+            self.leaves_out,
         )
         name = f"{self.name}, {FILES_HERE}" if opened.num_absent else self.name
         journal = Journal(None, {}, table)

@@ -131,12 +131,16 @@ class DrivenTeam:
 
     @property
     def problems(self) -> list[str]:
-        """Robots that share more than this one, a sentence each."""
-        return [
+        """Robots that share more than this one, and poses without a map, a sentence each."""
+        problems = [
             f"{name} shares its measurements, and {self.name} its interface alone; give all robots "
             "the same sharing"
             for name in sorted(self._share_more)
         ]
+        known = self._member.known
+        if known is not None and known.num_apart:
+            problems.append(f"no edge joins {known.num_apart} poses of {self.name} with its others")
+        return problems
 
     def greeting(self) -> Hello:
         """What tells others that this robot is there."""

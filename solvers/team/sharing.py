@@ -37,11 +37,14 @@ class OwnAnswer:
         The poses.
     rejected : IntArray, (q, 2)
         Ids of the ends of the edges at its poses that a robust solve has left out.
+    num_apart : int
+        Poses of the robot that no edge joins with its others: the solve is without them.
     """
 
     ids: IntArray
     poses: Poses
     rejected: IntArray
+    num_apart: int = 0
 
     @classmethod
     def of(cls, solution: Solution, is_own: BoolArray) -> OwnAnswer:
@@ -63,4 +66,5 @@ def answer_of(agent: Agent) -> OwnAnswer | None:
         return None
     own_poses = np.flatnonzero(agent.subgraph.is_own)
     ids = agent.record.graph.pose_ids[own_poses]
-    return OwnAnswer(ids, agent.record.answer[own_poses], agent.record.rejected)
+    answer = agent.record.answer[own_poses]
+    return OwnAnswer(ids, answer, agent.record.rejected, len(agent.left_out))

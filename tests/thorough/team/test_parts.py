@@ -196,3 +196,79 @@ def test_parts_come_and_go_and_messages_are_lost(seed: int) -> None:
     network.wait(60.0)
     assert_has_own_map(robots, 0, 1)
     assert_has_own_map(robots, 2, 3)
+
+
+# Poses that nothing joins.
+
+AHEAD = np.array([1.0, 0.0])
+
+
+def small_team(edges: Sequence[tuple[str, int, int]], **settings: object) -> Robots:
+    """Robots with edges of these two poses, the first of which each has."""
+    names = sorted({name for name, _, _ in edges})
+    keeps = solvers.Sharing.INTERFACE
+    robots = {
+        name: solvers.Robot(name, names, KEY, sharing=keeps, patience=5.0, **settings)
+        for name in names
+    }
+    for name, i, j in edges:
+        robots[name].add_pose(i, np.eye(2), i * AHEAD)
+        if i != j:
+            robots[name].add_edge(i, j, np.eye(2), AHEAD, kappa=1.0, tau=1.0)
+    return robots
+
+
+PAIR = [("a", 0, 1), ("a", 1, 2), ("b", 10, 11), ("b", 11, 0)]
+
+
+def test_poses_that_no_edge_joins_with_a_robots_others_take_the_map_from_nobody() -> None:
+    robots = small_team([*PAIR, ("a", 5, 6), ("b", 77, 77)])  # tracking was lost, or begins
+    network = Network(robots, np.random.default_rng(0))
+    network.run(20.0)
+    assert network.is_settled
+    for name, poses, num_apart in (("a", [0, 1, 2], 2), ("b", [10, 11], 1)):
+        robot = robots[name]
+        assert robot.is_certified
+        assert sorted(robot.poses) == poses
+        assert robot.problems == [f"no edge joins {num_apart} poses of {name} with its others"]
+    robots["b"].add_edge(77, 10, np.eye(2), AHEAD, kappa=1.0, tau=1.0)
+    network.wait(1.0)
+    network.run(20.0)
+    assert sorted(robots["b"].poses) == [10, 11, 77]
+    assert robots["b"].problems == []
+
+
+def test_a_robot_whose_poses_are_in_two_parts_goes_with_the_larger_one() -> None:
+    robots = small_team([*PAIR, ("a", 5, 6), ("c", 20, 21), ("c", 21, 5)])
+    Network(robots, np.random.default_rng(0)).wait(20.0)
+    assert robots["a"].covered == robots["b"].covered == ("a", "b")
+    assert robots["c"].covered == ("c",)
+    for name, poses in (("a", [0, 1, 2]), ("b", [10, 11]), ("c", [5, 20, 21])):
+        assert robots[name].is_certified
+        assert sorted(robots[name].poses) == poses
+
+
+def test_positions_that_nothing_joins_are_told_in_a_sentence() -> None:
+    robots = small_team([("a", 0, 1), ("b", 10, 11)])
+    robots["b"].add_edge(11, 0, np.eye(2), AHEAD, kappa=1.0, tau=0.0)
+    Network(robots, np.random.default_rng(0)).wait(20.0)
+    for robot in robots.values():
+        assert robot.outcome is None
+        assert robot.failure == (
+            "failed: team: the positions fall into 2 parts, no edge between; an edge between them "
+            "joins them"
+        )
+
+
+@pytest.mark.parametrize("robust", [None, solvers.GNC()])
+@pytest.mark.parametrize("name", ["0", "c"])  # the first of all, and the last
+def test_a_robot_with_poses_and_no_edge_takes_the_map_from_nobody(
+    name: str, robust: solvers.GNC | None
+) -> None:
+    robots = small_team([*PAIR, (name, 30, 30), (name, 31, 31)], robust=robust)
+    Network(robots, np.random.default_rng(0)).wait(20.0)
+    assert robots["a"].covered == robots["b"].covered == ("a", "b")
+    assert robots[name].outcome is None
+    assert robots[name].failure == (
+        "failed: team: nobody has measured an edge; there is nothing to solve"
+    )

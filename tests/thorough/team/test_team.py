@@ -663,25 +663,6 @@ def test_a_robot_is_saved_before_its_lines_tell_the_dimension(d: int) -> None:
         once_more.add_edge(0, 1, np.eye(5 - d), np.ones(5 - d), kappa=1.0, tau=2.0)
 
 
-def test_poses_of_a_robot_that_no_edge_joins_with_its_others_are_told_in_a_sentence() -> None:
-    names = ["a", "b"]
-    robots = {name: solvers.Robot(name, names, KEY, sharing=Sharing.INTERFACE) for name in names}
-    ahead = np.array([1.0, 0.0])
-    for name, i, j in (("a", 0, 1), ("a", 5, 6), ("b", 10, 11), ("b", 11, 0)):
-        robots[name].add_pose(i)
-        robots[name].add_edge(i, j, np.eye(2), ahead, kappa=1.0, tau=1.0)
-    network = Network(robots, np.random.default_rng(0))
-    network.wait(20.0)
-    for robot in robots.values():
-        assert robot.outcome is None
-        assert robot.failure == (
-            "failed: team: the graph falls into 2 parts, no edge between; an edge between them "
-            "joins them; with sharing=Sharing.MEASUREMENTS each has a map"
-        )
-        assert robot.poses == {}
-        assert robot.covered == ()
-
-
 @pytest.mark.parametrize("far", [{"r0", "r2"}, {"r1", "r2"}], ids=["the driver", "others"])
 @pytest.mark.parametrize("pipeline", [None, PEERS], ids=["SUBSTRUCTURED", "CONSENSUS"])
 @pytest.mark.parametrize("lost", [0.0, 0.4])
