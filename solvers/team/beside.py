@@ -18,7 +18,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, MutableMapping
 from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -32,6 +33,7 @@ _CANNOT_BEGIN = (
     "settings of a robot are to be in a module, as the process that computes does not run the main "
     "script"
 )
+_GIVEN_UP = pickle.dumps(None)  # what tells a computation that it is given up
 _COMPUTING = threading.Lock()  # of the computation of the other process that does not wait
 
 
@@ -131,7 +133,8 @@ class OtherProcess:
     """The process that computes for all robots of this one, one computation at a time.
 
     It starts when it is first needed, and anew after it has died. It never runs the main script of
-    this process. It ends with this process, however that ends, as its input does.
+    this process. It ends with this process, however that ends, as its input does. It knows
+    computations as long as their robots do: with a robot its computations are given up.
     """
 
     def __init__(self) -> None:
@@ -142,7 +145,7 @@ class OtherProcess:
         self._lock = threading.Lock()  # of what follows
         self._process: subprocess.Popen[bytes] | None = None
         self._reader: threading.Thread | None = None
-        self._talks: dict[int, Talk] = {}
+        self._talks: MutableMapping[int, Talk] = weakref.WeakValueDictionary()
         self._to_write: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
         self._numbers = itertools.count()
 
@@ -162,7 +165,7 @@ class OtherProcess:
             start_new_session=True,  # Ctrl-C is for the process that the person has started
         )
         self._process = process
-        talks: dict[int, Talk] = {}
+        talks: MutableMapping[int, Talk] = weakref.WeakValueDictionary()
         to_write: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
         self._talks = talks
         self._to_write = to_write
@@ -187,11 +190,13 @@ class OtherProcess:
             self._talks[number] = talk
             talk.send = lambda data: to_write.put((number, data))
             talk.send(job)
+            # A computation that has ended takes no notice.
+            weakref.finalize(talk, to_write.put, (number, _GIVEN_UP)).atexit = False
 
     def _read(
         self,
         process: subprocess.Popen[bytes],
-        talks: dict[int, Talk],
+        talks: MutableMapping[int, Talk],
         to_write: queue.SimpleQueue[tuple[int, bytes] | None],
     ) -> None:
         """Hand on what a process tells, until it ends; that ends its computations."""
@@ -199,10 +204,9 @@ class OtherProcess:
         with suppress(OSError, EOFError, pickle.UnpicklingError), process.stdout:
             while True:
                 number, kind, data = pickle.load(process.stdout)
-                message = result_or_error(partial(pickle.loads, data), "an odd answer")
-                talks[number].hear(kind, message)
+                _hand_on(talks.get(number), kind, data)
                 if kind is Kind.ENDS:
-                    del talks[number]
+                    talks.pop(number, None)
         with suppress(subprocess.TimeoutExpired):
             process.wait(_SECONDS_TO_END)
         process.kill()
@@ -227,6 +231,12 @@ class OtherProcess:
         if process is not None and reader is not None:
             process.kill()
             reader.join(_SECONDS_TO_END)
+
+
+def _hand_on(talk: Talk | None, kind: Kind, data: bytes) -> None:
+    """Hand on what a computation tells, unless its robot is gone."""
+    if talk is not None:
+        talk.hear(kind, result_or_error(partial(pickle.loads, data), "an odd answer"))
 
 
 def _write(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
 import sys
 import time
+import weakref
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -169,6 +172,35 @@ def test_a_driver_may_take_longer_for_its_part_than_all_others() -> None:
         step(robots)
     assert [robot.failure for robot in robots.values()] == ["", ""]
     assert all(robot.is_certified for robot in robots.values())
+
+
+@pytest.mark.skipif(not CHILDREN.exists(), reason="/proc names the children of a process")
+@pytest.mark.parametrize("num_messages", [12, 30])
+def test_robots_that_nobody_has_any_more_leave_no_computation(num_messages: int) -> None:
+    gc.collect()  # robots of tests before
+    alone = robots_of(world(n=10), 1)["r0"]
+    compute(alone)
+    (tasks,) = (Path(f"/proc/{pid}/task") for pid in pids_that_compute())
+    time.sleep(0.1)
+    before = len(list(tasks.iterdir()))
+    robots = robots_of(world(n=30), 3)
+    count = 0
+    while count < num_messages:
+        count += step(robots)
+    wait_until(lambda: len(list(tasks.iterdir())) > before)
+    gone = weakref.ref(robots["r1"])
+    del robots
+    gc.collect()
+    assert gone() is None
+    wait_until(lambda: len(list(tasks.iterdir())) <= before)
+
+
+def wait_until(is_true: Callable[[], bool]) -> None:
+    """Wait for something that happens in another process."""
+    until = time.monotonic() + SECONDS
+    while not is_true():
+        assert time.monotonic() < until
+        time.sleep(1e-2)
 
 
 def compute(robot: solvers.Robot) -> None:
