@@ -29,11 +29,12 @@ def serialize(value: object) -> dict[str, NDArray[Any]]:
 
     The value is None, a number, a string, an array, a record that has a name, a sequence of such,
     or a mapping of strings or integers to such. A sequence comes back as a tuple, and a mapping as
-    a dict unless it is `Messages`. Raises a TypeError if it contains anything else.
+    a dict unless it is `Messages`. Raises a TypeError if it contains anything else. The arrays are
+    those of the value, and no copies.
     """
     arrays: _Arrays = {}
     tree = json.dumps(_describe(value, arrays))
-    numbered = {str(number): array.copy() for number, array in arrays.values()}
+    numbered = {str(number): array for number, array in arrays.values()}
     return {_TREE: np.array(tree), **numbered}
 
 

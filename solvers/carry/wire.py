@@ -92,13 +92,31 @@ def as_bytes(message: object) -> bytes:
 
 def from_bytes(data: bytes, kind: type[K]) -> K:
     """The message that the bytes are, one of the given kinds; else a WireError."""
+    plain = inflated(data, MOST_BYTES)
+    if plain is None:
+        raise WireError("a message that is too long")
+    return from_plain(plain, kind)
+
+
+def inflated(data: bytes, most_bytes: int) -> bytes | None:
+    """Bytes that were `deflated`; None for more than so many, and a WireError for others."""
+    unpacker = zlib.decompressobj(_NO_HEADER, _COMMON)
     try:
-        unpacker = zlib.decompressobj(_NO_HEADER, _COMMON)
-        plain = unpacker.decompress(data, MOST_BYTES)
-        if not unpacker.eof:
-            raise WireError("a message that is too long")
+        plain = unpacker.decompress(data, most_bytes)
+    except zlib.error as error:
+        raise WireError(f"a message that cannot be read: {error}") from error
+    if unpacker.eof:
+        return plain
+    if len(plain) < most_bytes:
+        raise WireError("a message that is cut")
+    return None
+
+
+def from_plain(plain: bytes, kind: type[K]) -> K:
+    """The message of which `packed` made the bytes, one of the given kinds; else a WireError."""
+    try:
         message = deserialize(unpacked(plain, _MOST_DESCRIBED))
-    except (zlib.error, ValueError) as error:
+    except ValueError as error:
         raise WireError(f"a message that cannot be read: {error}") from error
     if not isinstance(message, kind):
         raise WireError(f"a {type(message).__name__} is no message")
@@ -142,7 +160,7 @@ def _cut(data: bytes, *lengths: int) -> list[bytes]:
 def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Bytes of arrays: the length of a head in JSON, the head, and the numbers."""
     head: list[tuple[str, str, tuple[int, ...]]] = []
-    parts = []
+    parts: list[bytes | memoryview] = []
     for name, array in arrays.items():
         if array.dtype.kind == "U":  # a text, which has four bytes a letter
             text = str(array).encode("utf-8")
@@ -153,7 +171,7 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
             raise TypeError(f"cannot send an array of {array.dtype}")
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         head.append((name, little.dtype.str, array.shape))
-        parts.append(little.tobytes())
+        parts.append(little.data)
     described = json.dumps(head).encode("utf-8")
     return len(described).to_bytes(_LENGTH_BYTES, "little") + described + b"".join(parts)
 

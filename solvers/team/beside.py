@@ -20,6 +20,7 @@ import sys
 import threading
 import weakref
 from collections.abc import Callable, MutableMapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -43,6 +44,8 @@ class Beside:
     def __init__(self) -> None:
         self._talks: list[Talk] = []
         self._to_do: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._thread: ThreadPoolExecutor | None = None
+        self._in_thread: list[Future[None]] = []
 
     def __reduce__(self) -> tuple[type[Beside], tuple[()]]:
         """A copy has no computations: they belong to one robot."""
@@ -51,7 +54,8 @@ class Beside:
     @property
     def is_busy(self) -> bool:
         """Whether something is computed; what waits for other robots is not."""
-        return any(talk.is_busy for talk in self._talks)
+        is_thread_busy = not all(future.done() for future in self._in_thread)
+        return is_thread_busy or any(talk.is_busy for talk in self._talks)
 
     def begin(
         self,
@@ -71,6 +75,23 @@ class Beside:
         self._talks.append(talk)
         OTHER_PROCESS.begin(talk, compute, failure)
         return talk
+
+    def begin_in_thread(
+        self, compute: Callable[[], T], end: Callable[[T | PGOError], None]
+    ) -> None:
+        """Compute in a thread of this process, and act on the result, or on an error.
+
+        It is for compression and for sums of bytes, which do not hold Python's lock.
+        """
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(max_workers=1)
+
+        def run() -> None:
+            result = result_or_error(compute, "it cannot be computed")
+            self._to_do.put(lambda: end(result))
+
+        self._in_thread = [future for future in self._in_thread if not future.done()]
+        self._in_thread.append(self._thread.submit(run))
 
     def act(self) -> None:
         """Act on all that was told."""

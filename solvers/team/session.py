@@ -9,19 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from solvers.carry.wire import MARK, WireError, opened, sealed
+from pgo_models.errors import PGOError
+from solvers.carry.wire import MOST_BYTES, WireError
 from solvers.team.beside import OTHER_PROCESS, Beside
-from solvers.team.messages import Priority, Relayed, check_message
-from solvers.team.speakers import Envelope, Speakers, Word
+from solvers.team.messages import Priority, Relayed
+from solvers.team.speakers import Reading, Speakers, Word, read
 
 PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
 RETRY = 1.0  # seconds after which a message without an answer is sent again, at first
 # Share of its patience after which a robot says again that it is there, where it says nothing else.
 _SHARE_OF_PATIENCE = 0.3
+# Bytes of a message, not compressed, that are written or read in a call; more are beside the calls.
+_IN_A_CALL = 1 << 16
 _MOST_STRANGERS = 8  # sentences on messages of nobody in the team
 
 
@@ -119,6 +123,12 @@ class Session:
         self.reach: dict[str, tuple[str, ...]] = {}  # whom others hear, as they say
         self._greeted: dict[str, tuple[float, int]] = {}  # when, and how often without an answer
         self._out: list[Message] = []
+        # Long messages that are sealed beside the calls, and bytes of those that are read there, as
+        # they have arrived, and their contents: all that were read, and those taken.
+        self._num_sealing = 0
+        self._num_waiting = 0
+        self._num_read = 0
+        self._num_taken = 0
         self._speakers = Speakers(name, patience)
         self._strangers: dict[str, None] = {}  # sentences on messages of nobody in the team
         OTHER_PROCESS.start()
@@ -137,7 +147,7 @@ class Session:
     @property
     def is_settled(self) -> bool:
         """Whether nothing is to be solved or to be sent."""
-        return self.way.is_settled and not self._out
+        return self.way.is_settled and not self._out and not self._num_sealing
 
     @property
     def problems(self) -> list[str]:
@@ -162,33 +172,52 @@ class Session:
         self.beside.act()
         self._take(data, is_direct=True)
 
-    def _envelope_in(self, data: bytes) -> Envelope | None:
-        """A message of another robot of the team to this one; None where it is dropped."""
-        try:
-            envelope = Envelope.from_bytes(opened(self._key, data))
-        except WireError as error:
-            self._drop("", "" if data[:3] != MARK else f"{error}; see whether all have the same")
-            return None
-        sender = envelope.sender
-        if envelope.receiver != self.name or sender == self.name:
-            self._drop("", "")
-            return None
-        if sender not in self.team:
-            sentence = f"{sender!r:.80} has the key of the team, and is not in it; name it for all"
-            self._drop("", sentence)
-            return None
-        return envelope
-
     def _take(self, data: bytes, *, is_direct: bool) -> None:
-        """Take a message that has come from its sender, or through a third robot."""
-        envelope = self._envelope_in(data)
+        """Take a message that has come from its sender, or through a third robot.
+
+        A long one is read beside the calls.
+        """
+        if len(data) <= _IN_A_CALL:
+            reading = self._read(data, _IN_A_CALL)
+            if not reading.is_long:
+                self._take_read(data, is_direct, reading)
+                return
+        if self._num_waiting + len(data) > MOST_BYTES:
+            self._drop("", "")
+            return
+        self._num_waiting += len(data)
+        self.beside.begin_in_thread(
+            lambda: self._read_long(data), partial(self._take_long, data, is_direct)
+        )
+
+    def _read(self, data: bytes, most_bytes: int) -> Reading:
+        return read(self._key, self.name, self.team, data, most_bytes)
+
+    def _read_long(self, data: bytes) -> Reading:
+        """Read a message, in the thread beside the calls.
+
+        Those that wait to be taken, and this one, have `MOST_BYTES` at most.
+        """
+        reading = self._read(data, MOST_BYTES - (self._num_read - self._num_taken))
+        self._num_read += reading.num_bytes
+        return reading
+
+    def _take_long(self, data: bytes, is_direct: bool, reading: Reading | PGOError) -> None:
+        self._num_waiting -= len(data)
+        if isinstance(reading, PGOError):
+            self._drop("", "")
+            return
+        self._num_taken += reading.num_bytes
+        self._take_read(data, is_direct, reading)
+
+    def _take_read(self, data: bytes, is_direct: bool, reading: Reading) -> None:
+        """Take a message that was read."""
+        envelope, message = reading.envelope, reading.message
         if envelope is None:
+            self._drop("", reading.sentence)
             return
         sender = envelope.sender
-        try:
-            message = envelope.message
-            check_message(message, self.team)
-        except WireError:
+        if message is None:
             self._drop(sender, "")
             return
         is_relayed_twice = isinstance(message, Relayed) and not is_direct
@@ -295,9 +324,22 @@ class Session:
         self._send(to, message, priority, self._speakers.boot_of(to))
 
     def _send(self, to: str, message: object, priority: Priority, heard: bytes) -> None:
-        """Send a message to a robot, to its run `heard`."""
-        envelope = self._speakers.addressed(to, message, heard)
-        data = sealed(self._key, envelope.as_bytes())
+        """Send a message to a robot, to its run `heard`; a long one is sealed beside the calls."""
+        writing = self._speakers.addressed(to, message, heard)
+        seal = partial(writing.sealed, self._key)
+        if len(writing.plain) <= _IN_A_CALL:
+            self._post(to, priority, seal())
+        else:
+            self._num_sealing += 1
+            self.beside.begin_in_thread(seal, partial(self._post_long, to, priority))
+
+    def _post_long(self, to: str, priority: Priority, data: bytes | PGOError) -> None:
+        self._num_sealing -= 1
+        if not isinstance(data, PGOError):
+            self._post(to, priority, data)
+
+    def _post(self, to: str, priority: Priority, data: bytes) -> None:
+        """Put a sealed message with those that are handed out, or send it through a third robot."""
         third = self._third_to(to)
         if third is None:
             self._out.append(Message(to, data, priority))

@@ -12,10 +12,22 @@ from __future__ import annotations
 import enum
 import secrets
 import struct
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
-from solvers.carry.wire import WireError, as_bytes, from_bytes
+from solvers.carry.serialization import serialize
+from solvers.carry.wire import (
+    MARK,
+    MOST_BYTES,
+    WireError,
+    deflated,
+    from_plain,
+    inflated,
+    opened,
+    packed,
+    sealed,
+)
+from solvers.team.messages import check_message
 from solvers.team.news import News
 
 _BOOT_BYTES = 8
@@ -43,8 +55,22 @@ class Envelope:
     @property
     def message(self) -> Any:  # noqa: ANN401 - a message of any kind
         """The message; a WireError for bytes that are none."""
+        plain = self.plain(MOST_BYTES)
+        if plain is None:
+            raise WireError("a message that is too long")
+        return self.message_of(plain)
+
+    def plain(self, most_bytes: int) -> bytes | None:
+        """The content, not compressed; None for more than so many bytes."""
         kind, content = self.content[:1], self.content[1:]
-        return News.from_bytes(content) if kind == _NEWS else from_bytes(content, object)
+        if kind == _NEWS:
+            return content if len(content) <= most_bytes else None
+        return inflated(content, most_bytes)
+
+    def message_of(self, plain: bytes) -> Any:  # noqa: ANN401 - a message of any kind
+        """The message of the plain content; a WireError for bytes that are none."""
+        is_news = self.content[:1] == _NEWS
+        return News.from_bytes(plain) if is_news else from_plain(plain, object)
 
     def as_bytes(self) -> bytes:
         """Bytes of which `from_bytes` makes the envelope."""
@@ -66,6 +92,58 @@ class Envelope:
             raise WireError(f"a message without addresses: {error}") from error
         sender, receiver = names
         return cls(sender, receiver, boot, heard, number, data[begins:])
+
+
+class Writing(NamedTuple):
+    """A message that is to be sent: its address, its plain content, and how that is packed."""
+
+    address: Envelope
+    kind: bytes
+    plain: bytes
+
+    def sealed(self, key: bytes) -> bytes:
+        """Bytes of the message, compressed and sealed."""
+        packed_content = self.plain if self.kind == _NEWS else deflated(self.plain)
+        envelope = replace(self.address, content=self.kind + packed_content)
+        return sealed(key, envelope.as_bytes())
+
+
+class Reading(NamedTuple):
+    """What has arrived: who has sealed it, and the message, or None and why it is dropped.
+
+    `is_long` says that the message was not read, as it has more than so many bytes; `num_bytes` are
+    those of its plain content.
+    """
+
+    envelope: Envelope | None = None
+    message: Any = None
+    sentence: str = ""
+    is_long: bool = False
+    num_bytes: int = 0
+
+
+def read(key: bytes, name: str, team: tuple[str, ...], data: bytes, most_bytes: int) -> Reading:
+    """A message to the robot `name` of the team, of so many bytes at most."""
+    try:
+        envelope = Envelope.from_bytes(opened(key, data))
+    except WireError as error:
+        is_ours = data[:3] == MARK
+        return Reading(sentence=f"{error}; see whether all have the same" if is_ours else "")
+    sender = envelope.sender
+    if envelope.receiver != name or sender == name:
+        return Reading()
+    if sender not in team:
+        sentence = f"{sender!r:.80} has the key of the team, and is not in it; name it for all"
+        return Reading(sentence=sentence)
+    try:
+        plain = envelope.plain(most_bytes)
+        if plain is None:
+            return Reading(envelope, is_long=True)
+        message = envelope.message_of(plain)
+        check_message(message, team)
+    except WireError:
+        return Reading(envelope)
+    return Reading(envelope, message, num_bytes=len(plain))
 
 
 class Word(enum.Enum):
@@ -119,14 +197,13 @@ class Speakers:
         """The boot of another robot, or none before it was heard."""
         return self._runs[robot].boot if robot in self._runs else NO_BOOT
 
-    def addressed(self, receiver: str, message: object, heard: bytes) -> Envelope:
+    def addressed(self, receiver: str, message: object, heard: bytes) -> Writing:
         """A message to the run `heard` of a robot."""
         self._num_sent += 1
+        address = Envelope(self.name, receiver, self.boot, heard, self._num_sent, b"")
         if isinstance(message, News):
-            content = _NEWS + message.as_bytes()
-        else:
-            content = _OTHER + as_bytes(message)
-        return Envelope(self.name, receiver, self.boot, heard, self._num_sent, content)
+            return Writing(address, _NEWS, message.as_bytes())
+        return Writing(address, _OTHER, packed(serialize(message)))
 
     def word_of(self, envelope: Envelope, now: float) -> Word:
         """What a message is worth, which is remembered."""

@@ -92,10 +92,18 @@ def _headed(head: list[Any]) -> bytes:
     return len(described).to_bytes(4, "little") + described
 
 
+def hand_on(robot: solvers.Robot) -> list[object]:
+    """What a robot hands out once all is read and written that it has begun with."""
+    while robot.is_computing:
+        time.sleep(1e-3)
+    return [message_in(message.data) for message in robot.outbox()]
+
+
 @pytest.mark.parametrize("what", WRONG)
 def test_what_is_no_message_is_dropped_and_counted_with_the_name(what: str) -> None:
     robot = solvers.Robot("r0", ["r0", "r1"], KEY)
     robot.receive(WRONG[what](), 0.0)
+    hand_on(robot)
     assert robot.ledger.dropped_by == {"r1": 1}
     assert robot.ledger.received == {}
 
@@ -126,23 +134,50 @@ def test_what_has_come_through_a_third_is_read_once_and_passed_on_to_nobody_else
     assert {message.to for message in robot.outbox()} <= {"r1"}
 
 
-def as_r0(robot: solvers.Robot) -> Callable[[object], None]:
-    """A function that has r0 send a message to r1, this robot, at time 0."""
+def test_long_messages_are_read_and_written_beside_the_calls() -> None:
+    robot = solvers.Robot("r0", ["r0", "r1", "r2"], KEY)
+    made = messages_to(robot)
+    robot.receive(made("r2", HELLO), 0.0)
+    data = np.random.default_rng(0).integers(0, 256, 1 << 20, dtype=np.uint8)
+    robot.receive(made("r1", Relayed("r2", data)), 0.0)
+    assert robot.heard == ("r2",)
+    assert not any(isinstance(message, Relayed) for message in hand_on(robot))
+    assert robot.heard == ("r2", "r1")
+    (passed_on,) = hand_on(robot)
+    assert isinstance(passed_on, Relayed)
+    np.testing.assert_array_equal(passed_on.data, data)
+
+
+def test_messages_that_wait_to_be_read_or_taken_are_bounded() -> None:
+    robot = solvers.Robot("r0", ["r0", "r1", "r2"], KEY)
+    made = messages_to(robot)
+    robot.receive(bytes((1 << 27) + 1), 0.0)
+    assert robot.ledger.dropped_by == {"": 1}
+    blown_up = Relayed("r2", np.zeros(9 << 23, np.uint8))  # a hundredth of it as it arrives
+    for data in [made("r1", blown_up) for _ in range(3)]:
+        robot.receive(data, 0.0)
+    hand_on(robot)
+    assert robot.ledger.dropped_by == {"": 1, "r1": 2}
+
+
+def messages_to(robot: solvers.Robot) -> Callable[[str, object], bytes]:
+    """A function that makes bytes of a message of a robot of the team to this one."""
     robot.tick(0.0)
     boot = Envelope.from_bytes(opened(KEY, robot.outbox()[0].data)).boot
     numbers = count(1)
 
-    def send(message: object) -> None:
+    def made(sender: str, message: object) -> bytes:
         content = b"O" + deflated(packed(serialize(message)))
-        envelope = Envelope("r0", "r1", b"8 bytes.", boot, next(numbers), content)
-        robot.receive(sealed(KEY, envelope.as_bytes()), 0.0)
+        envelope = Envelope(sender, robot.name, b"8 bytes.", boot, next(numbers), content)
+        return sealed(KEY, envelope.as_bytes())
 
-    return send
+    return made
 
 
-def messages_of(robot: solvers.Robot) -> list[object]:
-    """What a robot hands out."""
-    return [message_in(message.data) for message in robot.outbox()]
+def as_r0(robot: solvers.Robot) -> Callable[[object], None]:
+    """A function that has r0 send a message to r1, this robot, at time 0."""
+    made = messages_to(robot)
+    return lambda message: robot.receive(made("r0", message), 0.0)
 
 
 @pytest.mark.parametrize("owner", [2, 7, 0.0, 1.5])
@@ -157,7 +192,7 @@ def test_an_order_to_tell_robots_that_are_not_there_is_answered_with_an_error(ow
         send(Ask(Term(1, "r0"), call, 1, Order.of(order), request, members))
         while robot.is_computing:
             time.sleep(1e-3)
-        (reply,) = messages_of(robot)
+        (reply,) = hand_on(robot)
         assert isinstance(reply, Reply)
         assert reply.call == call
         return reply
@@ -168,7 +203,7 @@ def test_an_order_to_tell_robots_that_are_not_there_is_answered_with_an_error(ow
     assert error is not None
     assert "it cannot compute what it was asked" in error[1]
     send(LetterLost(Term(1, "r0"), 1, int(owner)))
-    assert Term(2, "r1") in [getattr(message, "term", None) for message in messages_of(robot)]
+    assert Term(2, "r1") in [getattr(message, "term", None) for message in hand_on(robot)]
 
 
 def test_a_robot_whose_computation_has_ended_begins_anew_with_the_next_order() -> None:
@@ -180,10 +215,10 @@ def test_a_robot_whose_computation_has_ended_begins_anew_with_the_next_order() -
     term, order = Term(1, "r0"), Order.of(read_file)
     send(Ask(term, 0, 1, order, None, ("r0", "r1")))
     OTHER_PROCESS.close()
-    (reply,) = messages_of(robot)
+    (reply,) = hand_on(robot)
     assert isinstance(reply, Reply)
     send(Ask(term, 1, 1, order, None))
-    (hello,) = messages_of(robot)
+    (hello,) = hand_on(robot)
     assert isinstance(hello, Hello)
     assert hello.term > term
     assert not robot.is_computing
