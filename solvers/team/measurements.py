@@ -102,18 +102,22 @@ class Measurements:
         if num_lines < len(self.lines):
             del self.lines[num_lines:]
             del self._digests[num_lines + 1 :]
-        self.lines += more
+        self._add(more)
+
+    def _add(self, lines: list[str]) -> None:
+        """Add lines, and their digests here: calls of `tick` and `receive` are to be short."""
+        self.lines += lines
+        self.revision_at(len(self.lines))
 
     def add_pose(self, pose_id: int, R: Array | None, t: Array | None, fixed: bool) -> None:
         """Add a pose, as `Robot.add_pose` has it."""
         _check_ids(pose_id)
         if R is None or t is None:
-            self.lines.append(f"{_WITHOUT_ESTIMATE} {pose_id}\n")
+            lines = [f"{_WITHOUT_ESTIMATE} {pose_id}\n"]
         else:
             tag = _VERTEX_TAGS[self._dimension_of(t)]
-            self.lines += lines_of(tag, np.array([[pose_id]]), _numbers(R, t))
-        if fixed:
-            self.lines.append(f"FIX {pose_id}\n")
+            lines = list(lines_of(tag, np.array([[pose_id]]), _numbers(R, t)))
+        self._add([*lines, f"FIX {pose_id}\n"] if fixed else lines)
 
     def add_edge(
         self,
@@ -138,13 +142,13 @@ class Measurements:
         except FileFormatError as error:
             self.d = before
             raise GraphError(f"{error}; it is not added") from error
-        self.lines += lines
+        self._add(lines)
 
     def remove_edge(self, i: int, j: int) -> None:
         """Take measurements back, as `Robot.remove_edge` has it."""
         if not any(_is_edge(line, i, j) for line in _standing(self.lines)):
             raise GraphError(f"there is no edge {i} -> {j} to remove; add_edge adds one")
-        self.lines.append(f"{_TAKEN_BACK} {i} {j}\n")
+        self._add([f"{_TAKEN_BACK} {i} {j}\n"])
 
     def read(self, path: Path) -> None:
         """Add the lines of a file, which `read_g2o` could read."""
@@ -152,7 +156,7 @@ class Measurements:
         if not text.endswith("\n"):
             text += "\n"
         self.d = parse_lines(path, [text]).d
-        self.lines += text.splitlines(keepends=True)
+        self._add(text.splitlines(keepends=True))
 
     def text(self, d: int | None = None) -> str:
         """All lines that stand, in which a pose without an estimate is at the origin."""

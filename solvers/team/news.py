@@ -142,8 +142,8 @@ class _Reader:
         return tuple(name for k, name in enumerate(names) if number >> k & 1)
 
     def items(self) -> range:
-        """As many numbers as there are items; at least as many bytes follow."""
+        """As many numbers as there are items: robots, which a number chooses, or their pieces."""
         count = self.number()
-        if count > len(self._data):
+        if count > _MOST_BITS:
             raise ValueError(f"{count} items")
         return range(count)

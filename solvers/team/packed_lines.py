@@ -23,7 +23,10 @@ from solvers.carry.wire import WireError
 MOST_LINES = 1024  # that are packed at once
 _IN_AN_INTEGER = 512  # symbols, as each takes a division of the integer
 _LENGTH_BYTES = 2  # of the length of an integer
-_BEFORE = 64  # how many lines before tell what is probable
+_BEFORE, _MOST_BEFORE = 64, 1 << 15  # how many lines before, and bytes, tell what is probable
+# Steps after which the lines that are packed at once end, as all of them are read in one call. A
+# symbol takes one for each that it may be, and as long as so many for itself.
+_MOST_STEPS, _STEPS_A_SYMBOL = 1 << 18, 64
 _FEWEST_LETTERS = 12  # of a number that is taken out: text has about half a byte a digit
 _NUMBER, _ID, _TEXT = "\0", "\1", "\2"  # begin words in place of numbers and ids, and any like them
 _FIRST_ID, _SECOND_ID = 2, 4  # places of words and spaces in a line
@@ -47,18 +50,23 @@ class PackedLines(NamedTuple):
 
 
 def packed_lines(lines: Sequence[str], before: Sequence[str]) -> PackedLines:
-    """Lines as bytes; those before, which the receiver has, help."""
+    """Lines as bytes; those before, which the receiver has, help.
+
+    Where they are too many to be read in one call, it is the first ones.
+    """
     coder = _Coder(before)
     dictionary = coder.text_of_forms(0)
     num_forms = len(coder.forms)
-    for line in lines:
-        coder.write(line)
+    num_lines = 0
+    while num_lines < len(lines) and coder.symbols.num_steps <= _MOST_STEPS:
+        coder.write(lines[num_lines])
+        num_lines += 1
     packer = zlib.compressobj(9, zlib.DEFLATED, -15, zdict=dictionary)
     text = coder.text_of_forms(num_forms)
     forms = packer.compress(text) + packer.flush() if text else b""
     digits = "".join(coder.mantissas)
     mantissas = bytes.fromhex(digits + "0" * (len(digits) % 2))
-    return PackedLines(len(lines), coder.symbols.as_bytes(), forms, mantissas)
+    return PackedLines(num_lines, coder.symbols.as_bytes(), forms, mantissas)
 
 
 def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) -> list[str]:
@@ -71,6 +79,7 @@ def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) 
     coder.mantissas = [digits[end - _MANTISSA_DIGITS : end] for end in reversed(ends)]
     coder.symbols.unread = packed.symbols
     lines: list[str] = []
+    coder.symbols.most_steps = 2 * _MOST_STEPS  # the last line may have many
     try:
         new_forms = _forms(packed.forms, coder.text_of_forms(0), most_bytes)
         for _ in range(packed.num_lines):
@@ -106,10 +115,12 @@ class _Symbols:
 
     def __init__(self) -> None:
         self._counts: defaultdict[Hashable, dict[int, int]] = defaultdict(dict)
+        self.most_steps = math.inf
         self.begin()
 
     def begin(self) -> None:
         """Begin to write or to read, with the probabilities so far."""
+        self.num_steps = 0
         self.state = 1
         self.unread = b""
         self._num_symbols = 0
@@ -161,6 +172,9 @@ class _Symbols:
 
     def _among(self, counts: Mapping[int, int], symbol: int | None) -> int | None:
         """Code a symbol that has come before; else an escape, which is None."""
+        self.num_steps += _STEPS_A_SYMBOL + len(counts)
+        if self.num_steps > self.most_steps:
+            raise WireError("lines of too many symbols")
         num_known = sum(counts.values())
         total = num_known + max(1, len(counts))
         place = total if symbol is not None else self.state % total
@@ -200,7 +214,7 @@ class _Coder:
         self._last_id = 0
         self._first_ids: dict[str, int] = {}  # of the last line, by its first word
         self._seen: set[str] = set()
-        for line in before[-_BEFORE:]:
+        for line in _last(before):
             self.write(line)
         self.symbols.begin()
         self.mantissas.clear()
@@ -280,6 +294,18 @@ class _Coder:
             digits = bits % (1 << _MANTISSA_BITS)
             self.mantissas.append(f"{digits:0{_MANTISSA_DIGITS}x}")
         return word if word is not None else repr(_DOUBLE.unpack(_BITS.pack(bits))[0])
+
+
+def _last(before: Sequence[str]) -> Sequence[str]:
+    """The last lines, as many as tell what is probable."""
+    begins = len(before)
+    num_bytes = 0
+    while begins > max(0, len(before) - _BEFORE):
+        num_bytes += len(before[begins - 1])
+        if num_bytes > _MOST_BEFORE:
+            break
+        begins -= 1
+    return before[begins:]
 
 
 def _root(words: Sequence[str]) -> int:

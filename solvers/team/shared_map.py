@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pgo_models.errors import PGOError
+from solvers.carry.wire import WireError
 from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, Priority, Term
@@ -70,6 +71,7 @@ class SharedMap:
         # The lines that were packed last, and between which revisions: most are for all others.
         self._packed_between: tuple[str, Revision, Revision] | None = None
         self._packed: PackedLines
+        self._turn = ""  # the robot that lines were packed for last: others come first
         # What the others were told beside revisions, and when they are told again.
         self._told: dict[str, tuple[bytes, tuple[str, ...], tuple[str, ...]]] = {}
         self._tell_again: dict[str, float] = {}
@@ -104,7 +106,8 @@ class SharedMap:
         self.saved = self._member.revision
         for name, saved in others.items():
             if name in self._session.team:
-                self.logs[name] = Measurements(list(saved.lines), saved.d)
+                self.logs[name] = Measurements()
+                self.logs[name].restore(saved)
 
     @property
     def problems(self) -> list[str]:
@@ -168,6 +171,8 @@ class SharedMap:
             self._keep_theirs.add(sender)
         if not isinstance(message, News):
             return
+        if len(message.pieces) > 1:  # nobody sends more, as each takes its time to be read
+            raise WireError(f"{len(message.pieces)} pieces")
         pace = self._paces[sender]
         for piece in message.pieces:
             self._learn(sender, piece, is_latest)
@@ -226,7 +231,7 @@ class SharedMap:
         """Give a robot that was restored from an older state its lines since then."""
         log = self.logs.get(owner)
         if log is not None and log.begins_with(saved) and len(log.lines) > saved.num_lines:
-            piece = self._piece(owner, log, saved.num_lines, owner)
+            piece = self._piece(owner, log, saved.num_lines, owner, may_pack=True)
             if piece is not None:
                 self._session.send(owner, self._news(owner, (piece,)), Priority.NORMAL)
 
@@ -234,25 +239,27 @@ class SharedMap:
         """Send what others lack, and solve where something is new."""
         self._near &= set(awake)
         self._owed = {name: when for name, when in self._owed.items() if name in awake}
-        for name, has in self._has.items():
-            pieces = self._pieces_for(name, has, awake)
+        before = self._packed_between
+        for name in sorted(self._near, key=lambda name: (name <= self._turn, name)):
+            # Lines are packed once in a tick, as that takes its time; the next robot has the next.
+            may_pack = self._packed_between == before
+            piece = self._piece_for(name, awake, may_pack)
             # Where lines for the robot are being collected, they take the answer along.
             sent = self._flights[name, self.name]
             is_coming = (
                 bool(sent) and sent[-1].is_last and sent[-1].ends < len(self.logs[self.name].lines)
             )
             delay = self._session.pause(1) / 2 if is_coming else 0.0
-            if pieces or self._owed.get(name, np.inf) + delay <= self._session.now:
+            if piece is not None or self._owed.get(name, np.inf) + delay <= self._session.now:
                 self._owed.pop(name, None)
-                priority = Priority.NORMAL if pieces else Priority.HELLO
-                self._session.send(name, self._news(name, tuple(pieces)), priority)
+                priority = Priority.HELLO if piece is None else Priority.NORMAL
+                pieces = () if piece is None else (piece,)
+                self._session.send(name, self._news(name, pieces), priority)
         self._solve_if_due()
 
-    def _pieces_for(
-        self, to: str, has: Mapping[str, Revision], awake: tuple[str, ...]
-    ) -> list[Piece]:
-        """Lines that a robot lacks: this robot's, and those of others that it does not hear."""
-        pieces = []
+    def _piece_for(self, to: str, awake: tuple[str, ...], may_pack: bool) -> Piece | None:
+        """Lines that a robot lacks: this robot's, or those of another that it does not hear."""
+        has = self._said[to].has
         for owner, log in self.logs.items():
             known = has.get(owner, Revision())
             if owner == to or known == log.revision or not log.lines:
@@ -263,10 +270,10 @@ class SharedMap:
                 continue
             if owner == self.name and self._takes_back and not log.begins_with(known):
                 continue
-            piece = self._piece(to, log, begins, owner)
+            piece = self._piece(to, log, begins, owner, may_pack)
             if piece is not None:
-                pieces.append(piece)
-        return pieces
+                return piece
+        return None
 
     def _passes_on(self, to: str, owner: str, known: Revision, awake: tuple[str, ...]) -> bool:
         """Whether to tell a robot what a third one has measured, which it does not hear.
@@ -283,8 +290,13 @@ class SharedMap:
         is_due = self._session.now - since >= rank * self._session.patience / 2
         return is_due and log.begins_with(known)
 
-    def _piece(self, to: str, log: Measurements, known: int, owner: str) -> Piece | None:
-        """Lines after those known, cut to a length; None where it is not yet time."""
+    def _piece(
+        self, to: str, log: Measurements, known: int, owner: str, may_pack: bool
+    ) -> Piece | None:
+        """Lines after those known, cut to a length; None where it is not yet time.
+
+        They are those packed last, unless others may be packed.
+        """
         flights = self._on_their_way(to, owner, known)
         if flights is None:
             return None
@@ -296,12 +308,16 @@ class SharedMap:
             ends += 1
         if ends == begins:
             return None
-        is_last = ends == len(log.lines)
-        self._flights[to, owner] = [*flights, _Flight(begins, ends, self._session.now, is_last)]
         before, after = log.revision_at(begins), log.revision_at(ends)
         if (owner, before, after) != self._packed_between:
+            if not may_pack:
+                return None
+            self._turn = to
             self._packed = packed_lines(log.lines[begins:ends], log.lines[:begins])
             self._packed_between = (owner, before, after)
+        ends = begins + self._packed.num_lines
+        is_last = ends == len(log.lines)
+        self._flights[to, owner] = [*flights, _Flight(begins, ends, self._session.now, is_last)]
         return Piece(owner, before, self._packed, is_last)
 
     def _on_their_way(self, to: str, owner: str, known: int) -> list[_Flight] | None:

@@ -22,6 +22,8 @@ from solvers.robots.own_file import OwnedRuns, number_poses, read_file
 from solvers.team.beside import OTHER_PROCESS
 from solvers.team.measurements import Revision
 from solvers.team.messages import Ask, Hello, LetterLost, Relayed, Reply, Term
+from solvers.team.news import News, Piece
+from solvers.team.packed_lines import packed_lines
 from solvers.team.speakers import NO_BOOT, Envelope
 
 HELLO = Hello(Revision(1, "0"), Term(0, ""), Term(0, ""))
@@ -160,6 +162,27 @@ def test_messages_that_wait_to_be_read_or_taken_are_bounded() -> None:
     assert robot.ledger.dropped_by == {"": 1, "r1": 2}
 
 
+def test_one_piece_is_read_and_one_is_packed_in_a_call() -> None:
+    robot = solvers.Robot("r0", ["r0", "r1", "r2", "r3"], KEY)
+    made = messages_to(robot)
+    revisions = [robot.revision]
+    for pose in range(3):
+        robot.add_pose(pose)
+        revisions.append(robot.revision)
+    piece = Piece("r1", Revision(), packed_lines(["POSE 7\n"], []), is_last=True)
+    robot.receive(made("r1", News({}, (), (piece, piece))), 0.0)
+    assert robot.ledger.dropped_by == {"r1": 1}
+    for k in (1, 2, 3):
+        robot.receive(made(f"r{k}", News({"r0": revisions[k - 1]}, ())), 0.0)
+    with_pieces: list[str] = []
+    for num_told in (1, 2, 3):
+        robot.tick(0.0)
+        messages = [(message.to, message_in(message.data)) for message in robot.outbox()]
+        with_pieces += [to for to, news in messages if news.pieces]
+        assert len(with_pieces) == num_told
+    assert sorted(with_pieces) == ["r1", "r2", "r3"]
+
+
 def messages_to(robot: solvers.Robot) -> Callable[[str, object], bytes]:
     """A function that makes bytes of a message of a robot of the team to this one."""
     robot.tick(0.0)
@@ -167,7 +190,9 @@ def messages_to(robot: solvers.Robot) -> Callable[[str, object], bytes]:
     numbers = count(1)
 
     def made(sender: str, message: object) -> bytes:
-        content = b"O" + deflated(packed(serialize(message)))
+        is_news = isinstance(message, News)
+        packed_content = deflated(packed(serialize(message))) if not is_news else message.as_bytes()
+        content = (b"N" if is_news else b"O") + packed_content
         envelope = Envelope(sender, robot.name, b"8 bytes.", boot, next(numbers), content)
         return sealed(KEY, envelope.as_bytes())
 

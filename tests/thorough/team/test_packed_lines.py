@@ -72,6 +72,30 @@ def test_bytes_that_are_no_lines_are_refused(seed: int) -> None:
         unpacked_lines(right, [], 100)
 
 
+def test_lines_that_would_take_long_to_be_read_come_one_part_after_the_other() -> None:
+    rng = np.random.default_rng(0)
+    ids = rng.integers(1 << 60, size=(1000, 2)).tolist()
+    lines = [f"EDGE {i} {j}\n" for i, j in ids]
+    received: list[str] = []
+    while len(received) < len(lines):
+        packed = packed_lines(lines[len(received) :], received)
+        assert 0 < packed.num_lines < 500
+        received += unpacked_lines(packed, received, MOST)
+    assert received == lines
+    numbers = " ".join(map(repr, rng.normal(size=9000).tolist()))
+    with pytest.raises(WireError, match="too many symbols"):
+        unpacked_lines(packed_lines([f"EDGE 1 2 {numbers}\n"], []), [], MOST)
+
+
+@pytest.mark.parametrize(("num_letters", "is_known"), [(500, True), (1000, False)])
+def test_long_lines_before_are_forgotten_sooner(num_letters: int, is_known: bool) -> None:
+    line = "EDGE 1 2 once\n"
+    before = [line, *(f"# {'x' * num_letters}\n" for _ in range(40))]
+    packed = packed_lines([line], before)
+    assert (packed.forms == b"") == is_known
+    assert unpacked_lines(packed, before, MOST) == [line]
+
+
 @pytest.mark.parametrize("seed", range(examples(20)))
 def test_messages_come_out_of_their_bytes_and_changed_bytes_are_messages_or_refused(
     seed: int,
