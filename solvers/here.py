@@ -132,7 +132,8 @@ class Here(Place):
         """Find the dual certificate at the poses as they are."""
         poses = attempt.known_poses
         with self.monitor.showing("certificate", self.problem.side):
-            certificate = certify_at(self.problem, poses, self.gap, attempt.decrement)
+            deadline = self.proof_deadline(attempt)
+            certificate = certify_at(self.problem, poses, self.gap, attempt.decrement, deadline)
         return replace(attempt, certificate=certificate)
 
     def run_gnc(self, gnc: GNC, start: Poses | None) -> Inliers:
@@ -194,7 +195,7 @@ class Here(Place):
                     starts,
                     best.known_poses,
                     best.proof.objective,
-                    self.monitor.seconds_left,
+                    self.monitor.deadline,
                 )
             if not found.num_tried:
                 continue

@@ -211,12 +211,14 @@ class RunMonitor:
             raise SettingError(f"time_limit is {self.time_limit}; give positive seconds")
 
     @property
-    def seconds_left(self) -> float:
-        """Seconds that are left, always positive.
+    def deadline(self) -> float:
+        """When the time limit ends, by `time.perf_counter`."""
+        return self.began + self.time_limit
 
-        A run compares them with the clock after its first state.
-        """
-        return max(self.time_limit - (time.perf_counter() - self.began), 1e-9)
+    @property
+    def is_late(self) -> bool:
+        """Whether the time limit has ended."""
+        return time.perf_counter() > self.deadline
 
     @contextmanager
     def showing(self, name: str, side: int = 0) -> Iterator[None]:
@@ -301,7 +303,7 @@ class RunMonitor:
 
     def _ending(self, method: Method[P, X, S], state: S, record: Record) -> Status | None:
         """Why the run ends at a state, or None where it goes on."""
-        is_late = time.perf_counter() - self.began > self.time_limit
+        is_late = self.is_late
         if self.callback is not None and self.callback(state, record):
             return Status.STOPPED
         if not math.isfinite(record.measurement.objective):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import enum
 import math
+import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,9 @@ if TYPE_CHECKING:  # what a plain solve does not need
     from solvers.robust.gnc import GNC, Inliers
 
 BROKEN_OFF = (*OUT_OF_TIME, Status.STOPPED)
+# Of the search for a bound after the time limit or Ctrl-C; then the first eta that proves something
+# ends it.
+SECONDS_FOR_BOUND = 0.1
 
 
 class Automatic(enum.Enum):
@@ -174,6 +178,8 @@ class Place(ABC):
         if best.proof.is_certified:
             return ""
         sentences = list(best.failures)
+        if best.is_out_of_time and self.traits.has_driver and best.proof.can_improve:
+            sentences.append("time ended the search for a bound; a longer one may prove more")
         skipped: dict[str, list[str]] = {}
         for stage in self.table.stages:
             if not stage.was_taken:
@@ -204,6 +210,12 @@ class Place(ABC):
     @abstractmethod
     def run_newton(self, attempt: Attempt, newton: Newton) -> Attempt:
         """Run Newton down to rounding level, on the cost that is asked for."""
+
+    def proof_deadline(self, attempt: Attempt) -> float:
+        """When the search for a bound ends: soon after the time limit, or after Ctrl-C."""
+        is_interrupted = attempt.status is Status.INTERRUPTED
+        ended = time.perf_counter() if is_interrupted else self.monitor.deadline
+        return ended + SECONDS_FOR_BOUND
 
     @abstractmethod
     def certify(self, attempt: Attempt) -> Attempt:

@@ -7,7 +7,8 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
 1. A start: given poses, or else the chordal relaxation. In the plane its rotations are averaged
    where no SOC is asked for. PaperSOC starts at a spanning tree.
 2. SOC, the splitting of orthogonality constraints, until Newton can take over. `soc_to_run` says
-   where it is left out.
+   where it is left out; one that nobody asked for is left out, too, where the start took all the
+   time.
 3. Newton, down to rounding level.
 4. The certificate of the poses. Steps 1 to 4 are an attempt.
 5. Another attempt, from a start that grows: prefixes of the graph, each solved from the one before.
@@ -94,7 +95,8 @@ def attempt(place: Place, asked: FirstStage, newton: Newton, start: Poses | None
     current = place.start(_start_of(asked, soc, place.traits, start), soc)
     if current.has_certificate:  # a checkpoint has the outcome
         return current
-    if soc is not None and not current.is_out_of_time:
+    has_time = asked is not AUTO or place.traits.has_robots or not place.monitor.is_late
+    if soc is not None and has_time and not current.is_out_of_time:
         current = place.run_soc(current, soc)
     return newton_and_certificate(place, newton, current)
 

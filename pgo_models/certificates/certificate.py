@@ -11,6 +11,7 @@ import enum
 import math
 from dataclasses import dataclass, replace
 
+from pgo_models.certificates.definiteness import is_over
 from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
 from pgo_models.certificates.fit import NO_FIT, Fit
 from pgo_models.certificates.handedness import HandednessTerms, closed_form_terms
@@ -354,7 +355,11 @@ class Certificate(ReadOnly):
 
 
 def certify_at(
-    problem: PGOProblem, poses: Poses, gap: float = DEFAULT_GAP, stationarity: float = math.nan
+    problem: PGOProblem,
+    poses: Poses,
+    gap: float = DEFAULT_GAP,
+    stationarity: float = math.nan,
+    deadline: float = math.inf,
 ) -> Certificate:
     """Judge poses by the bound of the multipliers at these poses as they are.
 
@@ -373,6 +378,9 @@ def certify_at(
         The relative gap to certify.
     stationarity : float
         The relative decrement there, which is reported as it is; nan where it was not measured.
+    deadline : float
+        When the search for a bound ends, by `time.perf_counter`: after it, with the first eta that
+        proves something. The bound holds, but a longer search may prove more.
 
     Returns
     -------
@@ -400,12 +408,12 @@ def certify_at(
     poses = problem.graph.completed(poses)  # a landmark has no rotation of its own
     if problem.graph.has_far_priors:
         near = problem.graph.near_zero(poses)
-        return judge(problem, poses, _certificate_at(problem, near, gap, stationarity))
-    return _certificate_at(problem, poses, gap, stationarity)
+        return judge(problem, poses, _certificate_at(problem, near, gap, stationarity, deadline))
+    return _certificate_at(problem, poses, gap, stationarity, deadline)
 
 
 def _certificate_at(
-    problem: PGOProblem, poses: Poses, gap: float, stationarity: float
+    problem: PGOProblem, poses: Poses, gap: float, stationarity: float, deadline: float
 ) -> Certificate:
     """`certify_at` for poses that are not far from zero."""
     best = poses if stationarity <= STATIONARY_DECREMENT else problem.at_best_translations(poses)
@@ -417,8 +425,9 @@ def _certificate_at(
         stationarity,
         BoundSource.GIVEN,
         ground=best,
+        deadline=deadline,
     )
-    if not certificate.can_improve:
+    if not certificate.can_improve or is_over(deadline):
         return certificate
     if problem.d == 2:
         certificate = with_complex_numbers(problem, certificate, best)
@@ -502,13 +511,14 @@ def certify_with(
     bound: LowerBound | None = None,
     ground: Poses | None = None,
     terms: HandednessTerms | None = None,
+    deadline: float = math.inf,
 ) -> Certificate:
     """Certificate of poses with multipliers from anywhere: the proof asks nothing of them.
 
     Unless a bound is given that was proved with these multipliers already, it is found here,
     grounded at one of the poses `ground`: the given ones with their best translations, unless
-    given. Handedness terms, if any, are taken off the cost. A SettingError when gap is not positive
-    and finite, or Lambda has the wrong shape.
+    given, and the search ends after the `deadline`. Handedness terms, if any, are taken off the
+    cost. A SettingError when gap is not positive and finite, or Lambda has the wrong shape.
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
@@ -521,7 +531,7 @@ def certify_with(
         if rounding.fit.is_to_rounding:
             bound = NO_BOUND
         elif terms is None:
-            bound = best_bound(tangent, Lambda, ground, gap, objective)
+            bound = best_bound(tangent, Lambda, ground, gap, objective, deadline=deadline)
         else:
             bound = best_bound_with_terms(tangent, Lambda, ground, gap, objective, terms)
     weighting = (

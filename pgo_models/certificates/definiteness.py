@@ -11,6 +11,7 @@ Chaykin & Keil 2007, VSDP). The word shift is for eta, which is added to the row
 
 import itertools
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -42,6 +43,8 @@ ATTEMPTS = 3
 # Bisections of log(eta) in a step of ETA_GROWTH leave a factor of 10^(1/8) = 1.33.
 ETA_GROWTH = 10.0
 ETA_BISECTIONS = 3
+# Once time is over, the eta that is tried, as a share of the one that leaves no bound.
+LATE_SHARE = 0.5
 # of diagonal entries: nothing that counts underflows
 _SMALLEST = 1e-150
 _LARGEST = 1e150
@@ -247,6 +250,7 @@ def smallest_eta(
     eta: float,
     below: float = math.inf,
     too_small: float | None = None,
+    deadline: float = math.inf,
 ) -> tuple[float, T] | None:
     """A shift eta near the smallest for which `attempt` succeeds, and the value of `attempt`.
 
@@ -256,6 +260,9 @@ def smallest_eta(
     Eta grows from the one given by factors of ten until an attempt succeeds. The last step is then
     bisected, to within a third of the smallest such eta. An eta of zero cannot grow, so that
     nothing but zero is tried. `too_small` is an eta below the first that is known to fail.
+
+    After the `deadline`, by `time.perf_counter`, one proof is tried at most, with half the limit
+    `below` where nothing is proved yet, and nothing is bisected.
     """
     most = ETA_BISECTIONS + 1
     if 0.0 < eta < below < math.inf:
@@ -265,6 +272,8 @@ def smallest_eta(
     while proof is None:
         if not eta < below:
             return None
+        if is_over(deadline):
+            eta = max(eta, LATE_SHARE * below)
         with doing(next(shifts)):
             proof = attempt(eta)
         if proof is None:
@@ -273,7 +282,7 @@ def smallest_eta(
             too_small = eta
             eta = ETA_GROWTH * eta
     for _ in range(ETA_BISECTIONS):
-        if too_small is None:
+        if too_small is None or is_over(deadline):
             break
         middle = math.sqrt(too_small * eta)
         with doing(next(shifts)):
@@ -284,3 +293,8 @@ def smallest_eta(
             eta = middle
             proof = better
     return eta, proof
+
+
+def is_over(deadline: float) -> bool:
+    """Whether a deadline by `time.perf_counter` has passed."""
+    return time.perf_counter() > deadline

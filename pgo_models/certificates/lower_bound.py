@@ -75,6 +75,7 @@ from pgo_models.certificates.definiteness import (
     ETA_GROWTH,
     DefiniteProof,
     etas_of_rotations,
+    is_over,
     prove_definite,
     smallest_eta,
 )
@@ -306,12 +307,14 @@ def best_bound(
     gap: float,
     objective: float,
     is_complex: bool = False,
+    deadline: float = math.inf,
 ) -> LowerBound:
     """Best bound from multipliers: the one grounded at a pose with eta = 0 if it is above zero.
 
     Otherwise it is the better of both forms, each with the smallest eta found. Without poses only
     the form with eta alone is tried, in complex numbers only the grounded one. The smallest eta
-    that is tried follows from gap and objective.
+    that is tried follows from gap and objective. After the `deadline` the search ends early
+    (`search_forms`).
 
     The problem has to be quadratic: for chi2 the caller passes the tangent at the poses. The poses
     are taken as they are; the bound is sharpest if the caller has given them their best
@@ -328,7 +331,7 @@ def best_bound(
         return _prove(problem, Lambda, eta, None)
 
     if poses is None:
-        return search_forms([prove_with_eta], smallest, trace, count)
+        return search_forms([prove_with_eta], smallest, trace, count, deadline)
     ground = _grounded_at(problem, poses, is_complex)
 
     def prove_grounded(eta: float) -> LowerBound | None:
@@ -338,7 +341,9 @@ def best_bound(
     if without_shift is not None and without_shift.value > 0.0:
         return without_shift
     forms = [prove_grounded] if is_complex else [prove_with_eta, prove_grounded]
-    best = search_forms(forms, smallest, trace, count)
+    best = search_forms(forms, smallest, trace, count, deadline)
+    if is_over(deadline):
+        return best
     is_definite = ground.unknowns.is_definite_in_doubles(Lambda)
     return replace(best, is_definite=is_definite)
 
@@ -373,19 +378,32 @@ def search_forms(
     smallest: float,
     trace: float,
     count: int,
+    deadline: float = math.inf,
 ) -> LowerBound:
     """Return the best bound of the given forms, each with the smallest eta found.
 
     A form takes an eta to a bound, or to None where the matrix cannot be shown to be positive
     definite with it. The search begins with the eta `smallest`; trace and count are tr(Lambda) and
     n d. `NO_BOUND` where no form gives a bound above zero, as where tr(Lambda) - eta n d is not.
+
+    After the `deadline`, by `time.perf_counter`, the form under way takes the first eta that proves
+    something, half of one that leaves no bound, and no other form is tried.
     """
-    bounds = [_search_bound(prove, smallest, trace, count) for prove in forms]
-    return max([NO_BOUND, *bounds], key=lambda bound: bound.value)
+    best = NO_BOUND
+    for prove in forms:
+        bound = _search_bound(prove, smallest, trace, count, deadline)
+        best = max(best, bound, key=lambda known: known.value)
+        if is_over(deadline):
+            break
+    return best
 
 
 def _search_bound(
-    prove: Callable[[float], LowerBound | None], smallest: float, trace: float, count: int
+    prove: Callable[[float], LowerBound | None],
+    smallest: float,
+    trace: float,
+    count: int,
+    deadline: float,
 ) -> LowerBound:
     """Bound of one form of `search_forms`.
 
@@ -398,13 +416,15 @@ def _search_bound(
     useless_eta = trace / count
     if not first < useless_eta:
         return NO_BOUND
-    bound = prove(first)
-    if bound is not None:
-        return bound if bound.value > 0.0 else NO_BOUND
-    if prove(useless_eta) is None:
-        return NO_BOUND
-    second = ETA_GROWTH * first
-    eta_and_bound = smallest_eta(prove, second, below=useless_eta, too_small=first)
+    second = first
+    if not is_over(deadline):
+        bound = prove(first)
+        if bound is not None:
+            return bound if bound.value > 0.0 else NO_BOUND
+        if not is_over(deadline) and prove(useless_eta) is None:
+            return NO_BOUND
+        second = ETA_GROWTH * first
+    eta_and_bound = smallest_eta(prove, second, useless_eta, first, deadline)
     if eta_and_bound is None:
         return NO_BOUND
     _, bound = eta_and_bound

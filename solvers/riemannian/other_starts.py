@@ -63,16 +63,16 @@ def best_of_starts(
     starts: Iterator[tuple[str, Poses]],
     best: Poses,
     objective: float,
-    seconds_left: float,
+    deadline: float,
 ) -> FoundStart:
     """The cheapest poses that the starts lead to, or the best ones where none are cheaper.
 
-    A cost below zero is zero but for rounding. No start begins when the time is up.
+    A cost below zero is zero but for rounding. No start begins after the deadline, by
+    `time.perf_counter`.
     """
-    began = time.perf_counter()
     cheapest = FoundStart("none is better", best, objective, 0)
     for name, start in starts:
-        if time.perf_counter() - began > seconds_left:
+        if time.perf_counter() > deadline:
             break
         poses = polish(problem, start, TRIAL_STEPS)
         cost = problem.objective(poses)

@@ -279,7 +279,8 @@ class PlaceOfRobots(Place):
         goes_on = self.is_on_the_way and not attempt.is_out_of_time
         most_lost = self.holder.gap * driver.current.objective if goes_on else None
         with self.monitor.showing("certificate"):
-            bound = best_bound_distributed(driver, self.holder.gap, most_lost)
+            deadline = self.proof_deadline(attempt)
+            bound = best_bound_distributed(driver, self.holder.gap, most_lost, deadline)
             if isinstance(self.holder, AnswerAtRobots):
                 return self.holder.certify(driver, attempt, bound)
             here = self.holder

@@ -70,13 +70,14 @@ class InterfaceProof:
 
 
 def best_bound_distributed(
-    driver: Driver, gap: float, most_lost: float | None = None
+    driver: Driver, gap: float, most_lost: float | None = None, deadline: float = math.inf
 ) -> LowerBound:
     """Return the bound at the current poses, as `central.best_bound` does in one place.
 
     It is grounded without eta where that goes through, with handedness terms in closed form where
     it goes through with these, else the better form with the smallest eta found. The search ends
     where eta n d, which eta takes from tr(Lambda), reaches `most_lost`, or F if that is not given.
+    It ends early after the `deadline`, as `central.search_forms` does.
     """
     is_near_zero = driver.current.objective <= driver.current.rounding_level
     if is_near_zero and all(driver.ask(fits_part, None, Count.ROUND)):
@@ -86,12 +87,12 @@ def best_bound_distributed(
     if driver.is_final:
         driver.describe(Count.PIGGYBACKED)
     try:
-        return _best_form(driver, gap, most_lost)
+        return _best_form(driver, gap, most_lost, deadline)
     finally:
         driver.diagonal = diagonal  # of the cost that SOC has, which may run again
 
 
-def _best_form(driver: Driver, gap: float, most_lost: float | None) -> LowerBound:
+def _best_form(driver: Driver, gap: float, most_lost: float | None, deadline: float) -> LowerBound:
     """The bound of the form without eta, with terms, or with the smallest eta that is found."""
     has_scale = bool((driver.diagonal > 0.0).all())
     grounded = prove_grounded(driver, 0.0) if has_scale else None
@@ -103,7 +104,9 @@ def _best_form(driver: Driver, gap: float, most_lost: float | None) -> LowerBoun
             with_terms = _bound_with_terms(driver, diagonal_less_terms(driver, described))
             if with_terms is not None:
                 return with_terms
-    return _search_forms(driver, gap, most_lost=most_lost) if has_scale else central.NO_BOUND
+    if not has_scale:
+        return central.NO_BOUND
+    return _search_forms(driver, gap, most_lost=most_lost, deadline=deadline)
 
 
 def best_bound_with_terms(driver: Driver, gap: float, less_terms: Array) -> LowerBound:
@@ -123,7 +126,11 @@ def diagonal_less_terms(driver: Driver, described: Sequence[TermsAnswer]) -> Arr
 
 
 def _search_forms(
-    driver: Driver, gap: float, less_terms: Array | None = None, most_lost: float | None = None
+    driver: Driver,
+    gap: float,
+    less_terms: Array | None = None,
+    most_lost: float | None = None,
+    deadline: float = math.inf,
 ) -> LowerBound:
     """Return the better of both forms of the bound, each with the smallest eta found."""
     count = driver.num_poses * driver.d
@@ -137,6 +144,7 @@ def _search_forms(
         smallest,
         driver.current.objective if most_lost is None else most_lost,
         count,
+        deadline,
     )
 
 

@@ -473,7 +473,8 @@ class _RobustSolve:
 
     def _has_time(self) -> bool:
         monitor = self.places.request.monitor
-        return monitor.seconds_left >= _LAST_SHARE * monitor.time_limit
+        seconds_left = monitor.deadline - time.perf_counter()
+        return seconds_left >= _LAST_SHARE * monitor.time_limit
 
     # Step 3: choice
 

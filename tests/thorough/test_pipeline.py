@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -139,6 +140,35 @@ def test_a_time_limit_ends_the_run_with_its_status_and_a_valid_bound():
     solution = solvers.solve(problem, time_limit=1e-9)
     assert solution.status is solvers.Status.TIME_LIMIT
     assert solution.lower_bound <= optimum * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("robots", [None, 2])
+def test_out_of_time_the_search_for_a_bound_ends_with_its_first_proof_and_says_so(
+    robots, monkeypatch
+):
+    monkeypatch.setattr("time.perf_counter", itertools.count().__next__)  # a second a call
+    noise = NoiseModel(0.2, 0.2)
+    problem = pgo.PGOProblem(pgo.random_geometric(1001, np.random.default_rng(0), noise=noise))
+    cut = solvers.solve(problem, time_limit=1e-9, robots=robots)
+    assert cut.status is solvers.Status.TIME_LIMIT
+    assert "time ended the search for a bound" in cut.note
+    best_translations = problem.at_best_translations(cut.poses)
+    half_of_trace = 0.5 * problem.objective(best_translations)
+    assert cut.lower_bound == pytest.approx(half_of_trace, rel=0.01)
+    if robots is None:  # a SOC that was not asked for sets up nothing after the time limit
+        assert [stage.name for stage in cut.stages] == ["chordal start", "Newton"]
+
+
+def test_a_search_for_a_bound_that_takes_no_time_is_not_cut_by_the_time_limit(monkeypatch):
+    seconds = itertools.count()
+    monkeypatch.setattr("time.perf_counter", lambda: 1e-6 * next(seconds))
+    noise = NoiseModel(0.3, 0.3)
+    problem = pgo.PGOProblem(pgo.random_geometric(300, np.random.default_rng(0), noise=noise))
+    solution = solvers.solve(problem, time_limit=1e-9)
+    assert solution.status is solvers.Status.TIME_LIMIT
+    full = pgo.certify_at(problem, solution.poses)
+    assert full.eta > 0.0
+    assert solution.lower_bound == pytest.approx(full.lower_bound, rel=1e-12)
 
 
 def test_a_disconnected_graph_is_refused_with_its_components_named():

@@ -30,7 +30,7 @@ from pgo_models.certificates.lower_bound import best_bound, prove_bound
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import exp_map, random_rotations
-from pgo_models.graphs.scenes import MILD_NOISE, circle, grid, observe
+from pgo_models.graphs.scenes import MILD_NOISE, circle, grid, observe, random_geometric
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
@@ -336,6 +336,24 @@ def test_a_gap_below_rounding_is_not_certified_but_bounded() -> None:
     assert not certificate.is_certified
     assert certificate.gap <= 1e-13
     assert_holds_together(problem, poses, certificate, rounded_up(problem, poses))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_after_the_deadline_the_first_shift_that_proves_something_ends_the_search(
+    seed: int,
+) -> None:
+    problem = PGOProblem(
+        random_geometric(60, np.random.default_rng(seed), noise=NoiseModel(0.3, 0.3))
+    )
+    start = chordal_start(problem)
+    full = certify_at(problem, start)
+    cut = certify_at(problem, start, deadline=0.0)
+    optimum = polish(problem, start)
+    assert full.eta > 0.0
+    assert 0.0 < cut.lower_bound <= full.lower_bound <= problem.objective(optimum)
+    half_of_trace = 0.5 * problem.objective(problem.at_best_translations(start))
+    assert cut.lower_bound == pytest.approx(half_of_trace, rel=1e-9)
+    assert certify_at(problem, optimum, deadline=0.0).is_certified
 
 
 def test_other_poses_are_judged_against_a_certificate() -> None:
