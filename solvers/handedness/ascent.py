@@ -26,7 +26,6 @@ from solvers.result import Measurement, Status
 POSITIVE = 1e-9  # of the mean diagonal of M: an eigenvalue above that is no rounding
 _AIM = 0.05  # of the best eigenvalue so far: how far beyond zero a step aims,
 _LEAST_AIM = 0.02  # and of the first one at least,
-_LEAST_AIM_OF_SCALE = 1e-6  # or of the mean diagonal of M: the first one may be zero
 _SOFTNESS = 0.1  # temperature of the soft minimum, as a share of the smallest eigenvalue
 _WINDOW = 10  # last steps, whose rise tells whether those that are left can reach zero
 
@@ -103,7 +102,8 @@ class HandednessAscent:
     def step(self, first: T, state: AscentState[T]) -> AscentState[T]:
         """One step along the derivative of the soft minimum."""
         best = state.best[-1]
-        least = max(_LEAST_AIM * abs(state.best[0]), _LEAST_AIM_OF_SCALE * first.scale)
+        # The first one may be zero.
+        least = max(_LEAST_AIM * abs(state.best[0]), POSITIVE * first.scale)
         values = state.point.values
         smallest = state.smallest
         aim = max(_AIM * abs(best), least)

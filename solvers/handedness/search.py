@@ -25,8 +25,6 @@ from solvers.result import Outcome, Stage
 
 S = TypeVar("S")
 
-_ROUNDING = 2.0**-40  # share of a diagonal, above the rounding of a factorisation
-
 
 @dataclass(frozen=True)
 class HandednessSearch:
@@ -101,8 +99,6 @@ def terms_can_help(problem: PGOProblem, poses: Poses, lower_bound: float) -> boo
     of_ground = np.concatenate([layout.translations(ground)[0], layout.rotations(ground)[0]])
     free = np.delete(np.arange(layout.side), of_ground)
     hessian = csc_array(riemannian_hessian(tangent.at(poses), Lambda)[free][:, free])
-    # A pivot that is zero but for rounding counts as zero.
-    hessian.setdiag((1.0 - _ROUNDING) * hessian.diagonal())
     try:
         factorize(hessian, problem.backend)
     except NotPositiveDefiniteError:

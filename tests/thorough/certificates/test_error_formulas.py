@@ -228,6 +228,10 @@ def test_errors_of_an_elimination(backend: CholeskyBackend) -> None:
     assert plain.factor is not None
     beside = (plain.factor.half_solve(plain.K_IG.toarray()) != 0).sum(axis=1)
     assert (verified.interior_error >= ENOUGH * plain.factor.backward_error(beside)).all()
+    b = np.random.default_rng(0).standard_normal((12, 3))
+    K_II = K.toarray()[2:11, 2:11]
+    energy = np.vdot(b[2:11], np.linalg.solve(K_II, b[2:11]))
+    assert plain.reduce(b)[1] == pytest.approx(energy, rel=1e-12)
 
 
 @pytest.mark.parametrize(("num_interior", "num_boundary"), [(150, 3), (3, 150)])

@@ -23,6 +23,7 @@ from robots import (
     Partitioner,
     contiguous,
     driver_at,
+    interface_of,
     leaving,
     metis,
     star,
@@ -39,6 +40,7 @@ from pgo_models import (
 )
 from pgo_models.certificates.lower_bound import pose_rows
 from pgo_models.certificates.rounding_errors import evaluate_multipliers
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.floating_point import gamma
 from pgo_models.problem.matrices import columns_of
@@ -211,6 +213,14 @@ def test_the_form_with_eta_has_the_constants_of_chi2_s_tangent() -> None:
         found = prove_with_eta(driver, eta)
         assert found is not None
         assert found.value == pytest.approx(central, rel=1e-9)
+
+
+def test_numbers_that_are_not_finite_are_not_positive_definite() -> None:
+    touched = (np.array([0, 1]),)
+    interface = interface_of(touched, 2, (1,))
+    for bad in (np.nan, np.inf):
+        with pytest.raises(NotPositiveDefiniteError, match="nan or inf"):
+            interface.factorize([np.array([1.0, bad, 1.0])])
 
 
 def test_weights_that_could_underflow_prove_nothing_by_robots_either() -> None:
