@@ -13,7 +13,6 @@ What robots do is in `solvers.robots.own_file`.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,9 +21,8 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.errors import FileFormatError, GraphError, GraphWarning, printable
+from pgo_models.errors import FileFormatError, GraphError
 from pgo_models.geometry.rotations import Array, BoolArray
-from pgo_models.graphs.g2o_folder import copies_within_printing
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray, edge_counts, least_tree
 from pgo_models.graphs.written_digits import most_digits
@@ -111,6 +109,7 @@ class OpenedFiles:
     weighting: Weighting  # the cost that is solved: ISOTROPIC or INFORMATION
     has_indefinite: bool  # whether the share of any edge in chi2 can be negative
     num_absent: int  # number of poses of robots without a file, as `PoseGraph.absent`
+    num_copies: int  # edges of two files that count once, as they differ by printing alone
     num_rejected: int = 0  # edges that robots have left out, as they do not agree with others
     # factor on the thresholds of GNC, below 1 where the closures within robots have clearly smaller
     # errors than their files claim
@@ -172,9 +171,6 @@ def open_files(
             weighting = _own_weighting(borders)
         folder = files[0].path.parent
         _check_connected(borders, num_poses, folder)
-        if num_copies:
-            message = f"{printable(str(folder))}: {copies_within_printing(num_copies)}"
-            warnings.warn(message, GraphWarning, stacklevel=2)
         scale = 1.0  # of the errors
         if isinstance(robust, GNC):
             scale = _error_scale(network, weighting, robust.quantile)
@@ -189,6 +185,7 @@ def open_files(
                 weighting,
                 has_indefinite,
                 num_absent,
+                num_copies,
                 num_rejected,
                 threshold_scale(scale),
             )

@@ -18,7 +18,7 @@ from typing import Any
 from pgo_models.errors import SettingError
 from pgo_models.graphs.datasets import locate
 from pgo_models.graphs.g2o import check_g2o_folder, g2o_files
-from pgo_models.graphs.g2o_folder import FILES_HERE
+from pgo_models.graphs.g2o_folder import FILES_HERE, copies_within_printing
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.counted_pool import Count
 from solvers.carry.process import Engine, InProcess, restarted
@@ -208,11 +208,12 @@ def _text_of_rejected(opened: OpenedFiles, kept: EdgesKept, rejected_by: str) ->
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:
-    """Note of a solution: absent robots, why the cost is F in place of chi2, and `note`."""
+    """Note of a solution: absent robots, copies, why the cost is F in place of chi2, and `note`."""
     reason = ""
     if weighting is Weighting.OWN and opened.has_indefinite:
         reason = "the cost is F, as some information matrices are indefinite: chi2 can be negative"
-    return joined_notes(note_of_absence(opened.num_absent), reason, note)
+    copies = copies_within_printing(opened.num_copies) if opened.num_copies else ""
+    return joined_notes(note_of_absence(opened.num_absent), copies, reason, note)
 
 
 def _check_first_stage(soc: FirstStage) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import pickle
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from solvers.carry.ledger import Ledger
 from solvers.growing import extend
 from solvers.loop import RunMonitor
 from solvers.pipeline import solution_for
+from solvers.reporting.notes import joined_notes
 from solvers.request import Pipeline, SolveRequest
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
@@ -66,9 +67,10 @@ class TeamSettings:
         What cannot be read, or does not fit to the robot's own, is left out. A PGOError where it
         cannot solve its own.
         """
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", GraphWarning)
             # Poses of absent robots have no estimate, which the outcome says in its own way.
-            warnings.simplefilter("ignore", GraphWarning)
+            warnings.filterwarnings("ignore", ".* have no VERTEX line", GraphWarning)
             files, problems = _files_of(lines)
             if self.name not in files:
                 raise PGOError(problems[0])
@@ -84,8 +86,9 @@ class TeamSettings:
             problems.append(f"no edge joins {num_apart} poses of {self.name} with its others")
         own = OwnAnswer.of(solution, is_own)
         sizes = _sizes_in(part, [files[name] for name in covered])
-        found = RobotsSolution.of(solution, Ledger(len(covered)), sizes)
-        found = found.without_histories
+        found = RobotsSolution.of(solution, Ledger(len(covered)), sizes).without_histories
+        of_files = dict.fromkeys(str(warning.message) for warning in caught)
+        found = replace(found, note=joined_notes(*of_files, found.note))
         return SharedAnswer(found, pickle.dumps(solution), own, tuple(covered), tuple(problems))
 
     def _graph(self, files: Mapping[str, G2OLines]) -> tuple[PoseGraph, dict[str, PGOError]]:

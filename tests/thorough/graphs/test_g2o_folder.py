@@ -5,11 +5,13 @@ Each is asked about where the files are read together, and where robots read the
 
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from networks import Network, robots_with_files
 
 import pgo_models as pgo
 import solvers
@@ -166,12 +168,15 @@ def test_copies_that_differ_in_the_last_printed_digit_are_one_edge(
 ) -> None:
     """With all files, and a robot that hears of the copies of its own edges alone."""
     num_copies = reprinted(tmp_path / "in", units=1)
-    with pytest.warns(GraphWarning, match=f"{num_copies} edges of two files differ in no more tha"):
-        opened = DOORS[door](tmp_path / "in")
-    with pytest.warns(GraphWarning, match="each counts once"):
+    sentence = f"{num_copies} edges of two files differ in no more than the last printed digit"
+    with pytest.warns(GraphWarning, match=f"{sentence}: each counts once"):
         graph = read_g2o(tmp_path / "in", trust_folder=True)
     assert graph.num_edges == read_g2o(ROBOTS).num_edges
+    is_told = pytest.warns(GraphWarning, match=sentence) if door == "whole" else nullcontext()
+    with is_told:
+        opened = DOORS[door](tmp_path / "in")
     if isinstance(opened, RobotsSolution):
+        assert sentence in opened.note
         assert opened.sizes[1].sum() == graph.num_edges
         expected = solvers.solve(graph)
         assert opened.objective == pytest.approx(expected.objective, rel=1e-9)
@@ -199,6 +204,21 @@ def test_copies_with_other_matrices_or_few_digits_are_a_question(tmp_path: Path)
         (folder / "1.g2o").write_text("".join(places[2:]) + own[1] + second)
         with pytest.raises(FileFormatError, match="the edge from 0 to 2 is nearly that at"):
             read_g2o(folder)
+
+
+@pytest.mark.parametrize("sharing", solvers.Sharing)
+def test_a_team_says_that_copies_count_once(sharing: solvers.Sharing, tmp_path: Path) -> None:
+    num_copies = reprinted(tmp_path / "in", units=1)
+    team = robots_with_files(tmp_path / "in", 4, sharing=sharing)
+    network = Network(team, np.random.default_rng(0))
+    network.run(30.0)
+    expected = solvers.solve_folder(tmp_path / "in")
+    for robot in team.values():
+        assert robot.is_certified
+        assert robot.problems == []
+        assert robot.solution is not None
+        assert robot.solution.objective == pytest.approx(expected.objective, rel=1e-9)
+        assert f"{num_copies} edges of two files differ" in dict(robot.facts())["note"]
 
 
 def test_what_one_file_measures_twice_within_printing_counts_twice(tmp_path: Path) -> None:
