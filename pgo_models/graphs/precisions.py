@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from pgo_models.errors import GraphError, SettingError
+from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import PoseGraph, connecting_edges, matrices_of_edges
 
@@ -63,12 +63,8 @@ def edge_precisions(
     marginal information; blocks of zeros give 0. Of a singular block a direction without
     information counts as if it had `UNMEASURED_SHARE` of the largest entry of its diagonal: F has
     one precision for all directions. The units are those of the matrices, per radian^2 and per
-    metre^2. A SettingError when `weights` is no RotationWeight.
+    metre^2.
     """
-    if not isinstance(weights, RotationWeight):
-        raise SettingError(
-            f"weights is {weights!r}; give RotationWeight.SE_SYNC or RotationWeight.GAUSSIAN"
-        )
     if information.shape[-1] == 3:
         factor = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
         kappa = factor * information[:, 2, 2]

@@ -31,13 +31,6 @@ class TablePart:
     # Heads of the columns that are text, aligned to the left; figures are aligned to the right.
     texts: tuple[str, ...] = ("graph", "method", "remark")
 
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.heads):
-                raise SettingError(
-                    f"row {row} has {len(row)} cells for {len(self.heads)} heads; give one each"
-                )
-
     @property
     def markdown(self) -> list[str]:
         """Lines of Markdown."""

@@ -30,7 +30,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 
 TOLERANCE = 1e-12  # well below the 1e-8 to which the back ends of step (a) agree
@@ -48,13 +47,11 @@ def minimize_with_fista(
 ) -> Array:
     """Solution x of H x = b by FISTA, to `tolerance` on ||H x - b|| / ||b||.
 
-    `apply_H` is symmetric and positive semidefinite with eigenvalues of at most `lipschitz` > 0,
-    else a SettingError; a lipschitz that is too small diverges. `b` and `start` have one shape.
+    `apply_H` is symmetric and positive semidefinite with eigenvalues of at most `lipschitz` > 0; a
+    lipschitz that is too small diverges. `b` and `start` have one shape.
     Where `max_iterations` are not enough the last iterate is returned, and a RuntimeWarning says
     which accuracy was reached and what to do.
     """
-    if not lipschitz > 0:
-        raise SettingError(f"need lipschitz > 0, got {lipschitz}")
     scheme = _Scheme("FISTA", lipschitz, _fista_momenta(), restarts=False)
     return _minimize(scheme, apply_H, b, start, tolerance, max_iterations)
 
@@ -70,13 +67,8 @@ def minimize_with_nesterov(
 ) -> Array:
     """Solution x of H x = b by Nesterov's constant momentum, otherwise as `minimize_with_fista`.
 
-    The eigenvalues of `apply_H` are in [strong_convexity, lipschitz], lipschitz >= strong_convexity
-    > 0, else a SettingError.
+    The eigenvalues of `apply_H` are in [strong_convexity, lipschitz], strong_convexity > 0.
     """
-    if not lipschitz >= strong_convexity > 0:
-        raise SettingError(
-            f"need lipschitz >= strong_convexity > 0, got {lipschitz} and {strong_convexity}"
-        )
     root = math.sqrt(strong_convexity / lipschitz)
     constant = itertools.repeat((1.0 - root) / (1.0 + root))
     scheme = _Scheme("Nesterov's method", lipschitz, constant, restarts=True)
