@@ -178,7 +178,6 @@ class DrivenTeam:
 
     def _take_hello(self, sender: str, hello: Hello, is_latest: bool) -> None:
         if is_latest:
-            self._session.reach[sender] = hello.hears
             self._revisions[sender] = hello.revision
             self._known[sender] = hello.known
             apart = self._apart
@@ -306,8 +305,7 @@ class DrivenTeam:
     ) -> None:
         self._tried = tried
         self._unheard.clear()  # of the last outcome: there will be another one
-        number = max(self.term.number, 0 if self._apart is None else self._apart.term.number)
-        self.term = Term(number + 1, self.name)
+        self.term = Term(self.term.number + 1, self.name)
         self._stop_following()
         self._following = None
         member = self._member

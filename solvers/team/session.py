@@ -17,7 +17,7 @@ import numpy as np
 from pgo_models.errors import PGOError
 from solvers.carry.wire import MOST_BYTES, WireError
 from solvers.team.beside import OTHER_PROCESS, Beside
-from solvers.team.messages import Priority, Relayed
+from solvers.team.messages import Hello, Priority, Relayed
 from solvers.team.speakers import Reading, Speakers, Word, read
 
 PATIENCE = 10.0  # seconds without a sign of a robot, after which it counts as absent
@@ -120,7 +120,7 @@ class Session:
         self._began: float | None = None
         self._last_heard: dict[str, float] = {}
         self._heard_directly: dict[str, float] = {}
-        self.reach: dict[str, tuple[str, ...]] = {}  # whom others hear, as they say
+        self._reach: dict[str, tuple[str, ...]] = {}  # whom others hear, as they say
         self._greeted: dict[str, tuple[float, int]] = {}  # when, and how often without an answer
         self._out: list[Message] = []
         # Long messages that are sealed beside the calls, and bytes of those that are read there, as
@@ -237,6 +237,8 @@ class Session:
             self._relay(message)
             return
         self._speakers.twins.update(getattr(message, "twins", ()))
+        if isinstance(message, Hello) and word is Word.NEW:
+            self._reach[sender] = message.hears
         try:
             self.way.take(sender, message, word is Word.NEW)
         except WireError:
@@ -351,4 +353,4 @@ class Session:
         hears = self.hears
         if to in hears or self._began is None or self.now - self._began < self.patience:
             return None
-        return next((name for name in hears if to in self.reach.get(name, ())), None)
+        return next((name for name in hears if to in self._reach.get(name, ())), None)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from budget import examples
 from networks import (
     KEY,
     Network,
@@ -57,6 +58,17 @@ def assert_has_own_map(robots: Robots, *numbers: int) -> None:
 def test_each_part_has_the_map_of_its_own(pipeline: solvers.Pipeline | None, lost: float) -> None:
     robots = team((0, 1), (2, 3), pipeline=pipeline)
     Network(robots, np.random.default_rng(0), lost).wait(30.0)
+    assert_has_own_map(robots, 0, 1)
+    assert_has_own_map(robots, 2, 3)
+
+
+def test_two_robots_that_only_one_of_another_part_hears_have_their_map_through_it() -> None:
+    robots = team((0, 1), (2, 3))
+
+    def is_far(sender: str, receiver: str, data: bytes) -> bool:
+        return {sender, receiver} == {"r2", "r3"}
+
+    Network(robots, np.random.default_rng(0), lost=0.05, is_lost=is_far).wait(40.0)
     assert_has_own_map(robots, 0, 1)
     assert_has_own_map(robots, 2, 3)
 
@@ -116,7 +128,9 @@ def test_a_robot_that_goes_and_comes_back_takes_nothing_from_its_part(gone: str)
 def test_what_a_part_measures_does_not_have_others_solve_again() -> None:
     robots = team((0, 1), (2, 3))
     network = Network(robots, np.random.default_rng(0))
-    network.wait(10.0)
+    while not all(robot.outcome for robot in robots.values()):
+        network.wait(0.02)
+    network.wait(0.2)
     outcomes = {name: robot.outcome for name, robot in robots.items()}
     i, j = sorted(robots["r1"].poses)[:2]
     robots["r1"].add_edge(i, j, np.eye(2), np.array([1.0, 0.0]), kappa=1e-3, tau=1e-3)
@@ -184,18 +198,30 @@ def test_whoever_misses_which_robots_are_joined_is_told_again() -> None:
     assert_has_own_map(robots, 2, 3)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_parts_come_and_go_and_messages_are_lost(seed: int) -> None:
+@pytest.mark.parametrize("seed", range(examples(4)))
+def test_robots_come_and_go_and_messages_are_lost(seed: int) -> None:
     robots = team((0, 1), (2, 3))
     rng = np.random.default_rng(seed)
     network = Network(robots, rng, lost=0.2, repeated=0.2, delay=0.1)
-    for _ in range(10):
-        network.wait(rng.uniform(0.5, 6.0))
-        network.asleep = {f"r{rng.integers(4)}"} if rng.random() < 0.5 else set()
+
+    def let_robots_come_and_go() -> None:
+        for _ in range(6):
+            network.wait(rng.uniform(0.5, 6.0))
+            network.asleep = {f"r{rng.integers(4)}"} if rng.random() < 0.5 else set()
+
+    let_robots_come_and_go()
     network.asleep = set()
     network.wait(60.0)
     assert_has_own_map(robots, 0, 1)
     assert_has_own_map(robots, 2, 3)
+    for e in np.flatnonzero(crossing((0, 1), (2, 3))).tolist():
+        give_edge(robots[f"r{rng.integers(4)}"], GRAPH, e)
+        let_robots_come_and_go()
+    network.asleep = set()
+    network.wait(5.0)
+    network.run(200.0)
+    assert network.is_settled
+    assert_is_the_optimum(robots, GRAPH)
 
 
 # Poses that nothing joins.
