@@ -40,9 +40,10 @@ _COMMON = (
     b'{"items": []}}}'
 )
 # A message may not unpack to more, nor its description, each byte of which may become an object:
-# whoever has the key could else fill the memory of the others.
+# whoever has the key could else fill the memory of the others, and hold their calls up. The
+# description of the outcome of 16 robots has 8 kB, and others are shorter.
 MOST_BYTES = 1 << 27
-_MOST_DESCRIBED = 1 << 20
+_MOST_DESCRIBED = 1 << 17
 K = TypeVar("K")
 
 

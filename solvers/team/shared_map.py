@@ -28,6 +28,7 @@ from solvers.team.session import Session
 from solvers.team.shared_solve import SharedAnswer
 
 _MOST_FLIGHTS = 4  # pieces on their way to a robot that has not answered the first of them
+_MOST_PACKED = 8  # pieces that are kept for others
 _FORGOTTEN = 10.0  # patiences without a sign, after which a robot is not waited for any more
 
 
@@ -68,9 +69,9 @@ class SharedMap:
         # What the others have last said, also those that are out of reach, and who is within it.
         self._said: dict[str, _Said] = {}
         self._near: set[str] = set()
-        # The lines that were packed last, and between which revisions: most are for all others.
-        self._packed_between: tuple[str, Revision, Revision] | None = None
-        self._packed: PackedLines
+        # Lines that were packed last, by owner and revisions between which they are: most are for
+        # all others, of which some are a little ahead.
+        self._packed: dict[tuple[str, Revision, Revision], PackedLines] = {}
         self._turn = ""  # the robot that lines were packed for last: others come first
         # What the others were told beside revisions, and when they are told again.
         self._told: dict[str, tuple[bytes, tuple[str, ...], tuple[str, ...]]] = {}
@@ -239,10 +240,10 @@ class SharedMap:
         """Send what others lack, and solve where something is new."""
         self._near &= set(awake)
         self._owed = {name: when for name, when in self._owed.items() if name in awake}
-        before = self._packed_between
+        before = next(reversed(self._packed), None)
         for name in sorted(self._near, key=lambda name: (name <= self._turn, name)):
             # Lines are packed once in a tick, as that takes its time; the next robot has the next.
-            may_pack = self._packed_between == before
+            may_pack = next(reversed(self._packed), None) == before
             piece = self._piece_for(name, awake, may_pack)
             # Where lines for the robot are being collected, they take the answer along.
             sent = self._flights[name, self.name]
@@ -309,16 +310,19 @@ class SharedMap:
         if ends == begins:
             return None
         before, after = log.revision_at(begins), log.revision_at(ends)
-        if (owner, before, after) != self._packed_between:
+        packed = self._packed.get((owner, before, after))
+        if packed is None:
             if not may_pack:
                 return None
             self._turn = to
-            self._packed = packed_lines(log.lines[begins:ends], log.lines[:begins])
-            self._packed_between = (owner, before, after)
-        ends = begins + self._packed.num_lines
+            packed = packed_lines(log.lines[begins:ends], log.lines[:begins])
+            self._packed[owner, before, after] = packed
+            if len(self._packed) > _MOST_PACKED:
+                del self._packed[next(iter(self._packed))]
+        ends = begins + packed.num_lines
         is_last = ends == len(log.lines)
         self._flights[to, owner] = [*flights, _Flight(begins, ends, self._session.now, is_last)]
-        return Piece(owner, before, self._packed, is_last)
+        return Piece(owner, before, packed, is_last)
 
     def _on_their_way(self, to: str, owner: str, known: int) -> list[_Flight] | None:
         """Pieces that lines may follow now, after those known; None where they may not yet.

@@ -81,6 +81,7 @@ WRONG: dict[str, Callable[[], bytes]] = {
     "too long a text": lambda: with_content(
         packed({"tree": np.array("[" + "1," * (1 << 20) + "1]")})
     ),
+    "a long list of names": lambda: with_field("twins", {"items": ["r1"] * 30_000}),
     "a negative length": lambda: with_content(_headed([["0", "<f8", [-1]]])),
     "lengths whose product is small": lambda: with_content(_headed([["0", "<f8", [1 << 40, 0]]])),
     "a kind of objects": lambda: with_content(_headed([["0", "O", [1]]])),
