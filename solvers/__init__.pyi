@@ -12,7 +12,7 @@ from solvers.convex.bregman import (
     TwoLineBregman as TwoLineBregman,
 )
 from solvers.convex.extended_soc import ExtendedSOC as ExtendedSOC
-from solvers.convex.orthogonal import OrthogonalSOC as OrthogonalSOC, XStep as XStep
+from solvers.convex.orthogonal import OrthogonalSOC as OrthogonalSOC
 from solvers.convex.solve_orthogonal import solve_orthogonal as solve_orthogonal
 from solvers.growing import extend as extend
 from solvers.loop import Solver as Solver, iterate as iterate, run as run
@@ -104,7 +104,7 @@ __all__ += ["GNC", "IRLS", "PCM", "Known", "RobustLoss", "prove_outliers"]
 __all__ += ["GaussSeidel", "LevenbergMarquardt"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "RayEngine"]
 __all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]
-__all__ += ["ExtendedSOC", "OrthogonalSOC", "XStep", "solve_orthogonal"]
+__all__ += ["ExtendedSOC", "OrthogonalSOC", "solve_orthogonal"]
 __all__ += [
     "compare_methods",
     "noise_sweep",

@@ -31,6 +31,7 @@ from pgo_models.convex.constraint_sets import Orthonormal, UnitColumns
 from pgo_models.convex.convex_solver import has_attributes
 from pgo_models.convex.hulls import Affine, Hull, hulls_of
 from pgo_models.convex.model_bound import is_proven_definite, prove_matrix
+from pgo_models.convex.model_relaxation import matrix_of_triangle
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.convex.quadratic_form import Block
 from pgo_models.convex.set_equations import ONE
@@ -255,7 +256,8 @@ class HullProgram(ReadOnly):
         for place, side in enumerate(self.dims.psd):
             last = first + side * (side + 1) // 2
             is_of_model = place < len(self.dims_of_model.psd)
-            to_matrix = _to_matrix(int(side), np.sqrt(0.5) if is_of_model else 1.0)
+            factor = np.sqrt(0.5) if is_of_model else 1.0
+            to_matrix = matrix_of_triangle(*np.tril_indices(int(side)), factor)
             matrices.append((to_matrix @ y[first:last]).reshape(side, side))
             first = last
         return matrices
@@ -281,7 +283,7 @@ class HullProgram(ReadOnly):
             constraints.append(cp.norm(y[first + 1 : last]) + margin <= y[first])
         for side in self.dims.psd:
             first, last = last, last + side * (side + 1) // 2
-            to_matrix = _to_matrix(int(side), np.sqrt(0.5))
+            to_matrix = matrix_of_triangle(*np.tril_indices(int(side)), np.sqrt(0.5))
             Y = cp.reshape(to_matrix @ y[first:last], (side, side), order="F")
             constraints.append(Y - margin * np.eye(side) >> 0)
         try:
@@ -345,20 +347,6 @@ class HullProgram(ReadOnly):
             if not is_proven_definite(Y - OUTWARD * (delta + rounding) * np.eye(len(Y))):
                 return False
         return True
-
-
-def _to_matrix(side: int, off_diagonal: float) -> csc_array:
-    """To a matrix from its upper triangle, column by column, with a factor off the diagonal.
-
-    Where it is the root of 1/2, the norms of triangle and matrix are the same.
-    """
-    columns, rows = np.tril_indices(side)
-    k = np.arange(len(rows))
-    off = rows != columns
-    factors = np.where(off, off_diagonal, 1.0)
-    entries = np.concatenate([rows + side * columns, (columns + side * rows)[off]])
-    data = np.concatenate([factors, factors[off]])
-    return csc_array((data, (entries, np.concatenate([k, k[off]]))), shape=(side**2, len(k)))
 
 
 def _least_singular_value(A: csc_array) -> float | None:

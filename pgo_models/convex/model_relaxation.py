@@ -25,7 +25,7 @@ from pgo_models.graphs.pose_graph import IntArray
 LARGEST = 108  # coordinates of x, those of twelve rotations: half a minute of a solver
 _PENALTY = 100.0  # of equalities, as a multiple of the largest entry of Q
 _ZERO = 1e-6  # eigenvalues of W(u*), whose others are of the order of the largest
-_DEFINITE = 1e-13  # what is added to P, as a share of its largest eigenvalue
+_DEFINITE = 2e-14  # what is added to P, as a share of its side times its largest eigenvalue
 _DAMPING = 1e-14  # of the normal equations, as a share of their diagonal
 
 
@@ -77,7 +77,7 @@ def definite_multipliers(equations: SetEquations, multipliers: Array) -> Array:
     definite = multipliers.copy()
     for product in equations.products:
         values, vectors = np.linalg.eigh(product.matrix(multipliers))
-        values = np.maximum(values, 0.0) + _DEFINITE * max(abs(values).max(), 1e-300)
+        values = np.maximum(values, 0.0) + _DEFINITE * len(values) * max(abs(values).max(), 1e-300)
         definite[product.entries] = _triangle((vectors * values) @ vectors.T)
     return definite
 
@@ -132,7 +132,8 @@ def solve_model_relaxation(form: QuadraticForm, equations: SetEquations) -> tupl
     is_semidefinite = M >> 0
     constraints = [is_semidefinite]
     for product in equations.products:
-        P = _from_triangle(product.side) @ multipliers[product.entries]
+        of_triangle = matrix_of_triangle(*np.triu_indices(product.side))
+        P = of_triangle @ multipliers[product.entries]
         constraints.append(cp.reshape(P, (product.side, product.side), order="F") >> 0)
     model = cp.Problem(cp.Maximize(g), constraints)
     solve_compiled(model, "relaxation", tolerance=1e-10, accepted=cp.OPTIMAL_INACCURATE)
@@ -152,14 +153,18 @@ def _reduction(form: QuadraticForm) -> Array:
     return D
 
 
-def _from_triangle(side: int) -> csc_array:
-    """Matrix from the upper triangle of P to all of P."""
-    rows, columns = np.triu_indices(side)
+def matrix_of_triangle(rows: IntArray, columns: IntArray, off_diagonal: float = 1.0) -> csc_array:
+    """To a symmetric matrix from the entries of a triangle, with a factor off the diagonal.
+
+    Where it is the root of 1/2, the norms of triangle and matrix are the same.
+    """
+    side = int(rows.max()) + 1
     k = np.arange(len(rows))
     off = rows != columns
+    factors = np.where(off, off_diagonal, 1.0)
     entries = np.concatenate([rows + side * columns, (columns + side * rows)[off]])
-    of = np.concatenate([k, k[off]])
-    return csc_array((np.ones(len(entries)), (entries, of)), shape=(side**2, len(k)))
+    data = np.concatenate([factors, factors[off]])
+    return csc_array((data, (entries, np.concatenate([k, k[off]]))), shape=(side**2, len(k)))
 
 
 def _scale(form: QuadraticForm) -> float:

@@ -398,7 +398,9 @@ class QuadraticForm(ReadOnly):
         is_slope = abs(residual[:num_others]) > _INCONSISTENT * scale
         if is_slope.any():
             if self.G.shape[0]:
-                raise NotQuadraticError("the objective is bounded below by inequalities alone")
+                raise NotQuadraticError(
+                    "inequalities alone bound the objective, as the pieces of |x| or Huber's loss"
+                )
             steepest = self.free_others[np.argmax(is_slope.any(axis=1))]
             raise SettingError(
                 f"the objective is not bounded below in {self.name_of(int(steepest))}; "

@@ -11,7 +11,7 @@ A variable may be in two sets; it then has a copy P and a multiplier B for each.
 Ebrahimi & Deghat, Algorithm 1; Lai & Osher 2014, Algorithm 1.
 """
 
-import enum
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from pgo_models.convex.orthogonality import (
     SplitProblem,
     norm_of_all,
 )
-from pgo_models.convex.quadratic_form import NotQuadraticError, QuadraticForm, quadratic_form
+from pgo_models.convex.quadratic_form import NotQuadraticError, quadratic_form
 from pgo_models.convex.quadratic_split import QuadraticSplit
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.geometry.rotations import Array
@@ -52,14 +52,6 @@ _RAISE_EVERY = 50
 _HANDED_OVER = 6  # the iterate before which Newton takes its steps
 
 AnySplit = SplitProblem | QuadraticSplit
-
-
-class XStep(enum.Enum):
-    """What makes step (a)."""
-
-    AUTOMATIC = "matrices of a quadratic model, unless a solver is named; else the convex solver"
-    FACTORIZED = "matrices, factored once; for quadratic models without constraints on the matrices"
-    CONVEX_SOLVER = "the convex solver"
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +122,10 @@ class OrthogonalSOC:
     max_iterations : int
         Iterations at most.
     solver : ConvexSolver or str
-        Solver of step (a); Clarabel without warm start unless given.
-    x_step : XStep, SplitProblem or QuadraticSplit
-        What makes step (a), or step (a) of the problem itself, compiled or factored.
+        Solver of step (a). Unless one is given, matrices of a quadratic model make step (a), and
+        Clarabel without warm start that of others.
+    x_step : SplitProblem, QuadraticSplit or None
+        Step (a) of the problem, compiled or factored, in place of the one that `solver` gives.
     newton : ModelNewton or None
         Newton for the same quadratic model. It moves an early iterate to the stationary point
         nearby, which is a fixed point of SOC with the multipliers that it has there. SOC alone
@@ -166,7 +159,7 @@ class OrthogonalSOC:
     tolerance: float = 1e-6
     max_iterations: int = 1000
     solver: ConvexSolver | str = COLD
-    x_step: XStep | AnySplit = XStep.AUTOMATIC
+    x_step: AnySplit | None = None
     newton: ModelNewton | None = None
 
     def __post_init__(self) -> None:
@@ -223,19 +216,14 @@ class OrthogonalSOC:
         return Status.CONVERGED if worst <= self.tolerance else None
 
     def split(self, problem: OrthogonalProblem) -> AnySplit:
-        """Make step (a) of a problem: matrices of a quadratic model, or the convex solver.
-
-        A NotQuadraticError where matrices are asked for and the model is not quadratic.
-        """
-        if not isinstance(self.x_step, XStep):
+        """Make step (a) of a problem: matrices of a quadratic model, or the convex solver."""
+        if self.x_step is not None:
             return self.x_step
-        is_solver_named = self.x_step is XStep.AUTOMATIC and self.solver != COLD
-        if not is_solver_named and self.x_step is not XStep.CONVEX_SOLVER:
-            try:
-                return QuadraticSplit(problem, _form_of_step(problem))
-            except NotQuadraticError:
-                if self.x_step is XStep.FACTORIZED:
-                    raise
+        if self.solver == COLD:
+            with contextlib.suppress(NotQuadraticError):
+                form = quadratic_form(problem)
+                if not form.limits_x:  # constraints beside the sets are left to a convex solver
+                    return QuadraticSplit(problem, form)
         return problem.split(self.solver)
 
     def _handed_over(
@@ -307,14 +295,6 @@ class OrthogonalSOC:
             if dual > _BALANCE_RATIO * primal:
                 return max(0.5 * state.rho, least)
         return max(state.rho, least)
-
-
-def _form_of_step(problem: OrthogonalProblem) -> QuadraticForm:
-    """The form of a model without constraints on its matrices."""
-    form = quadratic_form(problem)
-    if form.limits_x:
-        raise NotQuadraticError("constraints beside the sets are left to a convex solver")
-    return form
 
 
 def _probed_gradient(split: AnySplit, point: OrthogonalPoint) -> Array:

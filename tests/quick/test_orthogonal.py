@@ -117,10 +117,10 @@ class Rule:
         return 1.5 if self.asked == 3 else 1.0
 
 
-@pytest.mark.parametrize("x_step", solvers.XStep)
-def test_a_rule_of_ones_own_sets_the_penalty(x_step):
+@pytest.mark.parametrize("solver", [{}, {"solver": "CLARABEL"}])
+def test_a_rule_of_ones_own_sets_the_penalty(solver):
     model, rule = nearest(np.diag([3.0, 2.0]), orthogonal=True), Rule()
-    soc = solvers.OrthogonalSOC(penalty=rule, x_step=x_step)
+    soc = solvers.OrthogonalSOC(penalty=rule, **solver)
     turned = np.array([[0.6, -0.8], [0.8, 0.6]])
     outcome = solvers.run(soc, model, model.point([turned]))
     assert outcome.status.is_success
@@ -136,10 +136,10 @@ def test_settings_that_come_out_of_a_pickle_make_the_same_step():
     assert type(copied.split(model)) is type(settings.split(model))
 
 
-@pytest.mark.parametrize("x_step", ["automatic", "convex_solver"])
+@pytest.mark.parametrize("solver", [{}, {"solver": "CLARABEL"}])
 @pytest.mark.parametrize("cost", [cp.norm1, cp.sum_squares])
-def test_missing_and_broken_data_get_one_sentence(x_step, cost):
-    soc = solvers.OrthogonalSOC(x_step=x_step)
+def test_missing_and_broken_data_get_one_sentence(solver, cost):
+    soc = solvers.OrthogonalSOC(**solver)
     X, A = cp.Variable((2, 2)), cp.Parameter((2, 2), name="A")
     unset = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(cost(A @ X))), orthogonal=[X])
     with pytest.raises(pgo.PGOError, match=r"^the Parameter A has no value; set it first$"):

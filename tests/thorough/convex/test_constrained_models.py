@@ -59,6 +59,22 @@ def test_factors_of_equal_entries_are_added_where_the_sum_is_exact() -> None:
         pgo.quadratic_form(at_least_one(0.1, 1.9))
 
 
+def test_products_of_large_sides_are_proven_definite() -> None:
+    rng = np.random.default_rng(3)
+    X = cp.Variable((3, 2), name="X")
+    R = cp.Variable((4, 4), name="R")
+    entries = cp.hstack([cp.vec(X, order="F"), cp.vec(R, order="F")])
+    J = cp.sum_squares(rng.standard_normal((22, 22)) @ entries - rng.standard_normal(22))
+    sets = {"rotations": [R], "unit_columns": [X]}
+    without_limits = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J)), **sets)
+    drawn = [rng.standard_normal((3, 2)), rng.standard_normal((4, 4))]
+    values = without_limits.point(drawn[::-1]).copies[::-1]
+    inside = np.concatenate([value.reshape(-1, order="F") for value in values])
+    limits = [a @ entries >= a @ inside - 0.1 for a in rng.standard_normal((2, 22))]
+    model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), limits), **sets)
+    assert solvers.solve_orthogonal(model, starts=2).gap < 0.1
+
+
 @pytest.mark.parametrize("is_quadratic", [True, False])
 def test_constraints_that_no_rotation_holds_leave_nothing_certified(is_quadratic: bool) -> None:
     R = cp.Variable((3, 3))
