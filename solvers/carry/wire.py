@@ -2,8 +2,9 @@
 
 A message is a record (`solvers.carry.serialization`): a tree in JSON, and the arrays in it. Its
 bytes are a mark, a version, the HMAC-SHA256 of what follows (RFC 2104), and the record,
-compressed. Who does not have the key can neither make a message nor change one. Messages are not
-encrypted: a transport may do that.
+compressed. Who does not have the key can neither make a message nor change one. What both ends know
+of a message need not be sent: the seal is of it, too. Messages are not encrypted: a transport may
+do that.
 """
 
 from __future__ import annotations
@@ -28,6 +29,10 @@ from solvers.carry.serialization import deserialize, serialize
 MARK = b"PGO"
 _VERSION = VERSION.to_bytes(1, "big")
 _SEAL_BYTES = 16  # of HMAC-SHA256, the first 128 bits
+_SHORT_SEAL_BYTES = 12  # where the ends are implied, as in IPsec (RFC 2404)
+_IMPLIED = b"END"  # in place of the mark, which is not sent
+_HINT = 0x80  # bit of the first byte of messages whose ends are implied
+MOST_BITS = 63  # of a number
 _LENGTH_BYTES = 4  # of the length of the description, which precedes it
 _LEVEL = 1  # of the compression: numbers hardly shrink, trees do
 _NO_HEADER = -15  # of the compression: the seal has a checksum already
@@ -147,6 +152,53 @@ def opened(key: bytes, data: bytes) -> bytes:
     if not hmac.compare_digest(seal, expected[:_SEAL_BYTES]):
         raise WireError("a message that was not sealed with the key of the team")
     return body
+
+
+def implied_ends(description: bytes) -> bytes:
+    """What stands for two ends of a line in the seals of what goes from one to the other."""
+    return hashlib.sha256(description).digest()
+
+
+def hint_of(ends: bytes) -> int:
+    """First byte of messages between two ends, which tells them from most others."""
+    return _HINT | ends[0]
+
+
+def sealed_between(key: bytes, ends: bytes, body: bytes) -> bytes:
+    """Bytes with a hint at the ends that their seal implies, and the seal."""
+    seal = hmac.digest(key, _IMPLIED + _VERSION + ends + body, hashlib.sha256)
+    return bytes([hint_of(ends)]) + seal[:_SHORT_SEAL_BYTES] + body
+
+
+def opened_between(key: bytes, ends: bytes, data: bytes) -> bytes | None:
+    """The bytes under a seal that implies these ends; None where it does not."""
+    _, seal, body = _cut(data, 1, _SHORT_SEAL_BYTES)
+    expected = hmac.digest(key, _IMPLIED + _VERSION + ends + body, hashlib.sha256)
+    return body if hmac.compare_digest(seal, expected[:_SHORT_SEAL_BYTES]) else None
+
+
+def leb128(number: int) -> bytes:
+    """A natural number, seven bits a byte, the lowest first; all bytes but the last have bit 8."""
+    data = bytearray()
+    while number > 127:
+        data.append(128 | number & 127)
+        number >>= 7
+    return bytes([*data, number])
+
+
+def read_leb128(data: bytes, begins: int) -> tuple[int, int]:
+    """The number that begins at a place, and where it ends.
+
+    An IndexError where the bytes end before, a ValueError for a number of more than 63 bits.
+    """
+    number = 0
+    for shift in range(0, MOST_BITS, 7):
+        byte = data[begins]
+        begins += 1
+        number |= (byte & 127) << shift
+        if byte < 128:
+            return number, begins
+    raise ValueError("a number of too many bytes")
 
 
 def _cut(data: bytes, *lengths: int) -> list[bytes]:

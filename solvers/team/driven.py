@@ -142,7 +142,7 @@ class DrivenTeam:
             problems.append(f"no edge joins {known.num_apart} poses of {self.name} with its others")
         return problems
 
-    def greeting(self) -> Hello:
+    def greeting(self, to: str = "") -> Hello:
         """What tells others that this robot is there."""
         part = self._following
         is_computing = part is not None and part.obeyed is not None

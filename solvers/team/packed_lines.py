@@ -1,11 +1,11 @@
 """Lines of measurements as few bytes, of which lines of the same form come again.
 
 A line is its form, in which marks stand for ids and for numbers of many digits, and these. Forms
-that have come before, changes of ids, and sign and exponent of a number are symbols. They are as
-probable as they were so far, and one integer has many (asymmetric numeral systems, Duda 2013).
-The mantissa of a number follows as it is. The last number of a unit quaternion is the root that the
-other three leave, up to a few units in its last place. Other forms are compressed (RFC 1951) with
-those before as a dictionary.
+that have come before, changes of ids, and exponents, signs and first four bits of numbers are
+symbols. They are as probable as they were so far, and one integer has many (asymmetric numeral
+systems, Duda 2013). The rest of a mantissa is as it is; all are after the integers, the first one
+last. The last number of a unit quaternion is the root that the other three leave, up to a few units
+in its last place. Other forms are compressed (RFC 1951) with those before as a dictionary.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from solvers.carry.wire import WireError
+from solvers.carry.wire import WireError, leb128, read_leb128
 
 MOST_LINES = 1024  # that are packed at once
 _IN_AN_INTEGER = 512  # symbols, as each takes a division of the integer
-_LENGTH_BYTES = 2  # of the length of an integer
-_BEFORE, _MOST_BEFORE = 64, 1 << 15  # how many lines before, and bytes, tell what is probable
+_BEFORE, _MOST_BEFORE = 128, 1 << 15  # how many lines before, and bytes, tell what is probable
 # Steps after which the lines that are packed at once end, as all of them are read in one call. A
 # symbol takes one for each that it may be, and as long as so many for itself.
 _MOST_STEPS, _STEPS_A_SYMBOL = 1 << 18, 64
@@ -32,21 +31,30 @@ _NUMBER, _ID, _TEXT = "\0", "\1", "\2"  # begin words in place of numbers and id
 _FIRST_ID, _SECOND_ID = 2, 4  # places of words and spaces in a line
 _LONGEST_ID = 19  # digits
 _SPACE = re.compile(r"(\s)")
+# What most forms have in common, for their compression; a change of it is one of `VERSION`.
+_COMMON = (
+    "EDGE_SE2 \1 \1 \0 \0 \0 1.0 0.0 0.0 1.0 0.0 1.0\n"
+    "EDGE_SE3:QUAT \1 \1 \0 \0 \0 \0 \0 \0 \0 "
+    "1.0 0.0 0.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0 0.0 0.0 1.0 0.0 1.0\n"
+    "POSE \1\n"
+)
 _DOUBLE, _BITS = struct.Struct("<d"), struct.Struct("<Q")
-_MANTISSA_BITS, _MANTISSA_DIGITS = 52, 13  # the digits are of base 16
+_MANTISSA_BYTES = 6  # of a mantissa without its first four bits
+_FIRST_BITS = 1 << 8 * _MANTISSA_BYTES
+_ONE = 1 << 52  # of the bits of an exponent, which are before the mantissa
+_LARGE = 1022  # exponent of a half: the first bits of larger numbers are often those near one
 _NEGATIVE = 1 << 63
-_ROOT = 1 << 12  # in place of sign and exponent
+_ROOT = 1 << 11  # in place of an exponent
 _MOST_UNITS = 1 << 24  # in the last place, between a number and a root
 _MOST_BITS = 128  # of a symbol
 
 
 class PackedLines(NamedTuple):
-    """How many lines, their symbols, forms that have not come before, and mantissas."""
+    """How many lines, forms that have not come before, and symbols and mantissas."""
 
     num_lines: int
-    symbols: bytes
     forms: bytes
-    mantissas: bytes
+    numbers: bytes
 
 
 def packed_lines(lines: Sequence[str], before: Sequence[str]) -> PackedLines:
@@ -55,7 +63,7 @@ def packed_lines(lines: Sequence[str], before: Sequence[str]) -> PackedLines:
     Where they are too many to be read in one call, it is the first ones.
     """
     coder = _Coder(before)
-    dictionary = coder.text_of_forms(0)
+    dictionary = _dictionary(coder)
     num_forms = len(coder.forms)
     num_lines = 0
     while num_lines < len(lines) and coder.symbols.num_steps <= _MOST_STEPS:
@@ -64,9 +72,8 @@ def packed_lines(lines: Sequence[str], before: Sequence[str]) -> PackedLines:
     packer = zlib.compressobj(9, zlib.DEFLATED, -15, zdict=dictionary)
     text = coder.text_of_forms(num_forms)
     forms = packer.compress(text) + packer.flush() if text else b""
-    digits = "".join(coder.mantissas)
-    mantissas = bytes.fromhex(digits + "0" * (len(digits) % 2))
-    return PackedLines(num_lines, coder.symbols.as_bytes(), forms, mantissas)
+    mantissas = reversed(coder.mantissas)
+    return PackedLines(num_lines, forms, b"".join([coder.symbols.as_bytes(), *mantissas]))
 
 
 def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) -> list[str]:
@@ -74,14 +81,13 @@ def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) 
     if packed.num_lines > MOST_LINES or max(map(len, packed[1:])) > most_bytes:
         raise WireError(f"{packed.num_lines} lines of {sum(map(len, packed[1:]))} bytes")
     coder = _Coder(before)
-    digits = packed.mantissas.hex()
-    ends = range(_MANTISSA_DIGITS, len(digits) + 1, _MANTISSA_DIGITS)
-    coder.mantissas = [digits[end - _MANTISSA_DIGITS : end] for end in reversed(ends)]
-    coder.symbols.unread = packed.symbols
+    coder.symbols.unread = packed.numbers
+    places = range(len(packed.numbers) % _MANTISSA_BYTES, len(packed.numbers), _MANTISSA_BYTES)
+    coder.mantissas = [packed.numbers[place : place + _MANTISSA_BYTES] for place in places]
     lines: list[str] = []
     coder.symbols.most_steps = 2 * _MOST_STEPS  # the last line may have many
     try:
-        new_forms = _forms(packed.forms, coder.text_of_forms(0), most_bytes)
+        new_forms = _forms(packed.forms, _dictionary(coder), most_bytes)
         for _ in range(packed.num_lines):
             lines.append(coder.read(new_forms))
             most_bytes -= len(lines[-1])
@@ -89,9 +95,15 @@ def unpacked_lines(packed: PackedLines, before: Sequence[str], most_bytes: int) 
                 raise WireError("lines of too many bytes")
     except (zlib.error, struct.error, ValueError, LookupError, StopIteration) as error:
         raise WireError(f"lines that cannot be read: {error}") from error
-    if coder.symbols.state != 1 or coder.symbols.unread:
+    num_read = len(places) - len(coder.mantissas)
+    if coder.symbols.state != 1 or len(coder.symbols.unread) != num_read * _MANTISSA_BYTES:
         raise WireError("lines that go on after their end")
     return lines
+
+
+def _dictionary(coder: _Coder) -> bytes:
+    """What new forms have in common with those before, and most have with each other."""
+    return _COMMON.encode("utf-8") + coder.text_of_forms(0)
 
 
 def _forms(data: bytes, dictionary: bytes, most_bytes: int) -> Iterator[str]:
@@ -115,11 +127,8 @@ class _Symbols:
 
     def __init__(self) -> None:
         self._counts: defaultdict[Hashable, dict[int, int]] = defaultdict(dict)
+        self.is_begun = False  # before, symbols are counted alone
         self.most_steps = math.inf
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin to write or to read, with the probabilities so far."""
         self.num_steps = 0
         self.state = 1
         self.unread = b""
@@ -135,8 +144,7 @@ class _Symbols:
             for begins, width, total in reversed(steps):
                 state = state // width * total + begins + state % width
             num_bytes = (state.bit_length() + 7) // 8
-            parts.append(num_bytes.to_bytes(_LENGTH_BYTES, "little"))
-            parts.append(state.to_bytes(num_bytes, "little"))
+            parts += [leb128(num_bytes), state.to_bytes(num_bytes, "little")]
         return b"".join(parts)
 
     def _next_integer(self, is_read: bool) -> None:
@@ -146,16 +154,21 @@ class _Symbols:
             return
         if self.state != 1:
             raise WireError("symbols that go on after their end")
-        ends = _LENGTH_BYTES + int.from_bytes(self.unread[:_LENGTH_BYTES], "little")
-        self.state = int.from_bytes(self.unread[_LENGTH_BYTES:ends], "little")
-        self.unread = self.unread[ends:]
+        num_bytes, begins = read_leb128(self.unread, 0)
+        self.state = int.from_bytes(self.unread[begins : begins + num_bytes], "little")
+        self.unread = self.unread[begins + num_bytes :]
 
     def code(self, context: Hashable, symbol: int | None) -> int:
         """Write a symbol, or read it where there is None."""
+        counts = self._counts[context]
+        if symbol is not None and not self.is_begun:
+            if symbol not in counts:
+                self._count(self._counts["bits", context], symbol.bit_length())
+            self._count(counts, symbol)
+            return symbol
         if self._num_symbols % _IN_AN_INTEGER == 0:
             self._next_integer(symbol is None)
         self._num_symbols += 1
-        counts = self._counts[context]
         coded = self._among(counts, symbol)
         if coded is None:
             sizes = self._counts["bits", context]
@@ -163,12 +176,15 @@ class _Symbols:
             num_bits = self._among(sizes, size)
             if num_bits is None:
                 num_bits = self._plain(size, _MOST_BITS)
-            sizes[num_bits] = sizes.get(num_bits, 0) + 1
+            self._count(sizes, num_bits)
             least = 1 << num_bits >> 1
             more = self._plain(None if symbol is None else symbol - least, max(1, least))
             coded = least + more
-        counts[coded] = counts.get(coded, 0) + 1
+        self._count(counts, coded)
         return coded
+
+    def _count(self, counts: dict[int, int], symbol: int) -> None:
+        counts[symbol] = counts.get(symbol, 0) + 1
 
     def _among(self, counts: Mapping[int, int], symbol: int | None) -> int | None:
         """Code a symbol that has come before; else an escape, which is None."""
@@ -208,7 +224,7 @@ class _Coder:
 
     def __init__(self, before: Sequence[str]) -> None:
         self.symbols = _Symbols()
-        self.mantissas: list[str] = []  # those to be read are in reverse order
+        self.mantissas: list[bytes] = []  # those that were written, or the last is the next to read
         self.forms: dict[str, int] = {}
         self._last_form = 0
         self._last_id = 0
@@ -216,7 +232,7 @@ class _Coder:
         self._seen: set[str] = set()
         for line in _last(before):
             self.write(line)
-        self.symbols.begin()
+        self.symbols.is_begun = True
         self.mantissas.clear()
 
     def text_of_forms(self, first: int) -> bytes:
@@ -277,22 +293,30 @@ class _Coder:
 
     def _number(self, context: Hashable, word: str | None, root: int) -> str:
         """A number as sign, exponent and mantissa, or as its distance to the bits of a root."""
-        head = distance = None
+        exponent = distance = sign = mantissa = None
         if word is not None:
             (bits,) = _BITS.unpack(_DOUBLE.pack(float(word)))
-            units = bits % _NEGATIVE - root
-            distance = 4 * abs(units) + 2 * (units < 0) + bits // _NEGATIVE
-            head = _ROOT if abs(units) < _MOST_UNITS else bits >> _MANTISSA_BITS
-        head = self.symbols.code(context, head)
-        if head == _ROOT:
-            distance = self.symbols.code(("units", root >> _MANTISSA_BITS), distance)
+            sign, size = divmod(bits, _NEGATIVE)
+            units = size - root
+            distance = 4 * abs(units) + 2 * (units < 0) + sign
+            exponent, mantissa = divmod(size, _ONE)
+            if abs(units) < _MOST_UNITS:
+                exponent = _ROOT
+        exponent = self.symbols.code(context, exponent)
+        if exponent == _ROOT:
+            distance = self.symbols.code(("units", root // _ONE), distance)
             units = -(distance // 4) if distance & 2 else distance // 4
             bits = root + units + (distance & 1) * _NEGATIVE
-        elif word is None:
-            bits = head << _MANTISSA_BITS | int(self.mantissas.pop(), 16)
         else:
-            digits = bits % (1 << _MANTISSA_BITS)
-            self.mantissas.append(f"{digits:0{_MANTISSA_DIGITS}x}")
+            sign = self.symbols.code(("sign", context), sign)
+            digit = None if mantissa is None else mantissa // _FIRST_BITS
+            digit = self.symbols.code(exponent if exponent >= _LARGE else 0, digit)
+            if mantissa is None:
+                mantissa = digit * _FIRST_BITS + int.from_bytes(self.mantissas.pop(), "little")
+            else:
+                rest = mantissa % _FIRST_BITS
+                self.mantissas.append(rest.to_bytes(_MANTISSA_BYTES, "little"))
+            bits = sign * _NEGATIVE + exponent * _ONE + mantissa
         return word if word is not None else repr(_DOUBLE.unpack(_BITS.pack(bits))[0])
 
 

@@ -84,8 +84,8 @@ class Way(Protocol):
     def problems(self) -> list[str]:
         """What is wrong, a sentence each."""
 
-    def greeting(self) -> object:
-        """The message that tells others that this robot is there."""
+    def greeting(self, to: str = "") -> object:
+        """The message that tells others that this robot is there; short where one robot knows."""
 
     def take(self, sender: str, message: object, is_latest: bool) -> None:
         """Take a message; the latest one of its sender, or one that others have overtaken."""
@@ -191,7 +191,7 @@ class Session:
         )
 
     def _read(self, data: bytes, most_bytes: int) -> Reading:
-        return read(self._key, self.name, self.team, data, most_bytes)
+        return read(self._key, self.name, self.team, self._speakers.ends_at, data, most_bytes)
 
     def _read_long(self, data: bytes) -> Reading:
         """Read a message, in the thread beside the calls.
@@ -316,7 +316,7 @@ class Session:
 
     def say_hello(self, to: str) -> None:
         """Tell a robot that this one is there."""
-        self.send(to, self.way.greeting(), Priority.HELLO)
+        self.send(to, self.way.greeting(to), Priority.HELLO)
 
     def send(self, to: str, message: object, priority: Priority) -> None:
         """Send a message to a robot."""
@@ -327,7 +327,7 @@ class Session:
 
     def _send(self, to: str, message: object, priority: Priority, heard: bytes) -> None:
         """Send a message to a robot, to its run `heard`; a long one is sealed beside the calls."""
-        writing = self._speakers.addressed(to, message, heard)
+        writing = self._speakers.addressed(to, message, heard, self.now)
         seal = partial(writing.sealed, self._key)
         if len(writing.plain) <= _IN_A_CALL:
             self._post(to, priority, seal())

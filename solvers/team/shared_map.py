@@ -22,7 +22,7 @@ from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, Priority, Term
 from solvers.team.news import News, Piece
-from solvers.team.pace import MOST_IN_A_PIECE, Pace, clock
+from solvers.team.pace import MOST_IN_A_PIECE, Talk
 from solvers.team.packed_lines import MOST_LINES, PackedLines, packed_lines, unpacked_lines
 from solvers.team.session import Session
 from solvers.team.shared_solve import SharedAnswer
@@ -73,12 +73,9 @@ class SharedMap:
         # all others, of which some are a little ahead.
         self._packed: dict[tuple[str, Revision, Revision], PackedLines] = {}
         self._turn = ""  # the robot that lines were packed for last: others come first
-        # What the others were told beside revisions, and when they are told again.
-        self._told: dict[str, tuple[bytes, tuple[str, ...], tuple[str, ...]]] = {}
-        self._tell_again: dict[str, float] = {}
         # What is on its way, by receiver and owner, and the last piece of all.
         self._flights: defaultdict[tuple[str, str], list[_Flight]] = defaultdict(list)
-        self._paces: defaultdict[str, Pace] = defaultdict(Pace)
+        self._talks: defaultdict[tuple[str, bytes], Talk] = defaultdict(Talk)  # by robot and run
         self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
         # When an answer is owed to robots whose pieces have come: they are collected, too.
         self._owed: dict[str, float] = {}
@@ -141,26 +138,58 @@ class SharedMap:
 
     # Lines
 
-    def greeting(self) -> News:
-        """What tells others that this robot is there."""
+    def greeting(self, to: str = "") -> News:
+        """What tells others that this robot is there; short where one robot knows the rest."""
+        if to:
+            return self._news(to, ())
         return News(self.revisions, tuple(self._has), (), self._takes_back, self._session.twins)
 
-    def _news(self, to: str, pieces: tuple[Piece, ...]) -> News:
-        """The greeting to a robot, with pieces, and as the answer to those that have come.
+    def _talk(self, to: str) -> Talk:
+        return self._talks[to, self._session.boot_of(to)]
 
-        It is short where the robot was told the rest of late, and new lines of this one go along.
-        """
-        sent = clock(self._session.now)
-        answers, self._paces[to].heard = self._paces[to].heard, -1
-        news = replace(self.greeting(), pieces=pieces, sent=sent, answers=answers)
-        told = (self._session.boot_of(to), news.hears, news.twins)
-        is_told = self._told.get(to) == told and self._session.now < self._tell_again[to]
-        if not is_told or [piece.is_last for piece in pieces if piece.owner == self.name] != [True]:
-            self._told[to] = told
-            self._tell_again[to] = self._session.now + self._session.patience
+    def _news(self, to: str, pieces: tuple[Piece, ...]) -> News:
+        """The greeting to a robot, with pieces, and as the answer to those that have come."""
+        now = self._session.now
+        talk = self._talk(to)
+        theirs = self.logs[to].revision if to in self.logs else Revision()
+        has_all = talk.heard >= 0 and talk.num_told == theirs.num_lines == talk.num_checked
+        news = replace(
+            self.greeting(),
+            pieces=pieces,
+            answers=talk.heard,
+            is_prompt=not talk.is_answered,
+            has_all=has_all,
+        )
+        talk.is_answered = True
+        if self._is_told(to, news):
+            has = {} if has_all or not theirs.num_lines else {to: theirs}
+            news = replace(news, has=has, hears=(), twins=(), is_short=True)
+        if news.is_short and not pieces:
             return news
-        has = {name: revision for name, revision in news.has.items() if name == to}
-        return replace(news, has=has, hears=(), twins=(), is_short=True)
+        return replace(news, sent=talk.number(replace(news, pieces=()), self._num_lines, now))
+
+    def _is_told(self, to: str, news: News) -> bool:
+        """Whether a robot has answered a message with all of this one but a last piece of lines.
+
+        Lines of others are told again now and then only where this robot does not hear them: those
+        who do would pass them on.
+        """
+        talk = self._talk(to)
+        told = {(each.hears, each.twins) for each in talk.told}
+        if told != {(news.hears, news.twins)} or news.takes_back:
+            return False
+        if not news.pieces:
+            return all(each.has == news.has for each in talk.told)
+        is_of_all = len(news.hears) == len(self._session.team) - 1
+        if not is_of_all and self._session.now >= talk.told_at + self._session.patience:
+            return False
+        known = self._said[to].has.get(self.name, Revision())
+        is_last = [piece.is_last for piece in news.pieces if piece.owner == self.name] == [True]
+        return is_last and len(news.pieces) == 1 and known.num_lines <= talk.num_known
+
+    @property
+    def _num_lines(self) -> int:
+        return len(self._member.measurements.lines)
 
     @property
     def _takes_back(self) -> bool:
@@ -174,17 +203,12 @@ class SharedMap:
             return
         if len(message.pieces) > 1:  # nobody sends more, as each takes its time to be read
             raise WireError(f"{len(message.pieces)} pieces")
-        pace = self._paces[sender]
         for piece in message.pieces:
             self._learn(sender, piece, is_latest)
             pause = self._session.pause(1) / 2 if piece.is_last else 0.0
             when = min(self._session.now + pause, self._owed.get(sender, np.inf))
             self._owed[sender] = when
         if is_latest:
-            if message.pieces:
-                pace.heard = message.sent
-            if message.answers >= 0:
-                pace.note_answer(message.answers, self._session.now, self._session.pause(1))
             self._said[sender] = self._said_in(sender, message)
             self._near.add(sender)
             if message.takes_back:
@@ -193,16 +217,28 @@ class SharedMap:
     def _said_in(self, sender: str, news: News) -> _Said:
         """What a robot has and hears; of its own it has all lines that a short message brings."""
         now = self._session.now
+        talk = self._talk(sender)
+        has = dict(news.has)
+        hears = news.hears
+        num_known = talk.note_answer(news, now, self._session.pause(1))
+        if num_known is not None:
+            has[self.name] = self._member.measurements.revision_at(num_known)
+        log = self.logs.get(sender, Measurements())
+        if not news.is_short and log.begins_with(has.get(sender, Revision())):
+            talk.num_checked = max(talk.num_checked, has.get(sender, Revision()).num_lines)
         before = self._said.get(sender)
-        if not news.is_short or before is None:
-            return _Said(news.has, news.hears, now)
-        own = {}
-        for piece in news.pieces:
-            if piece.owner == sender:
-                revision = self.logs[sender].revision
+        if news.is_short and before is not None:
+            for piece in news.pieces:
                 ends = piece.before.num_lines + piece.lines.num_lines
-                own[sender] = revision if revision.num_lines == ends else Revision(ends)
-        return _Said({**before.has, **news.has, **own}, before.hears, now)
+                revision = log.revision
+                has[sender] = revision if revision.num_lines == ends else Revision(ends)
+            has = {**before.has, **has}
+            hears = before.hears
+        if news.sent >= 0:
+            talk.heard = news.sent
+            talk.num_told = has.get(sender, Revision()).num_lines
+            talk.is_answered = talk.is_answered and not news.pieces
+        return _Said(has, hears, now)
 
     def _learn(self, sender: str, piece: Piece, is_latest: bool) -> None:
         """Add lines to those of a robot; of its own that robot alone decides which stand."""
@@ -213,12 +249,15 @@ class SharedMap:
                 self.saved = self._member.revision
             return
         log = self.logs.setdefault(piece.owner, Measurements())
-        if not log.begins_with(piece.before):
-            return
+        talk = self._talk(sender)
         begins = piece.before.num_lines
+        is_own = sender == piece.owner
+        is_checked = is_own and not piece.before.digest and begins <= talk.num_checked
+        if not is_checked and not log.begins_with(piece.before):
+            return
         lines = _lines_of(piece, log)
         known = log.lines[begins : begins + len(lines)]
-        is_final = sender == piece.owner and is_latest
+        is_final = is_own and is_latest
         ends = begins + len(lines)
         if known != lines[: len(known)]:
             if is_final:
@@ -227,6 +266,8 @@ class SharedMap:
             log.end_at(begins + len(known), lines[len(known) :])
         elif is_final and piece.is_last and len(log.lines) > ends:
             log.end_at(ends, [])
+        if is_own and log.lines[begins:ends] == lines:
+            talk.num_checked = max(talk.num_checked, ends)
 
     def _give_back(self, owner: str, saved: Revision) -> None:
         """Give a robot that was restored from an older state its lines since then."""
@@ -304,7 +345,7 @@ class SharedMap:
         begins = ends = flights[-1].ends if flights else known
         num_bytes = 0
         most = min(len(log.lines), begins + MOST_LINES)
-        while ends < most and num_bytes < self._paces[to].num_bytes:
+        while ends < most and num_bytes < self._talk(to).pace.num_bytes:
             num_bytes += len(log.lines[ends])
             ends += 1
         if ends == begins:
@@ -334,7 +375,7 @@ class SharedMap:
         flights = [flight for flight in sent if known < flight.ends]
         if flights and known < flights[0].begins:
             flights = []
-        pace = self._paces[to]
+        pace = self._talk(to).pace
         pause = pace.pause(now - self._said[to].when, self._session.pause(1))
         if flights and now - flights[0].when >= pause:
             pace.shorten()

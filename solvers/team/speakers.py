@@ -4,14 +4,17 @@ The key says that a robot of the team made a message, not when. So every run of 
 number, its boot, and a message names the boot of its sender and that of its receiver, as the sender
 has heard it. A message is of this mission if it names the boot of its receiver, which nobody could
 know before; one that does not is answered by a greeting, and believed in nothing. Messages of a run
-are numbered, and each number counts once.
+are numbered, and each number counts once. Where both know both boots, these and the names are in
+the seal alone; where there were two runs of a name, they are sent once in each patience, too, which
+tells the others of that name who is spoken to.
 """
 
 from __future__ import annotations
 
 import enum
+import math
 import secrets
-import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -22,19 +25,23 @@ from solvers.carry.wire import (
     WireError,
     deflated,
     from_plain,
+    hint_of,
+    implied_ends,
     inflated,
+    leb128,
     opened,
+    opened_between,
     packed,
+    read_leb128,
     sealed,
+    sealed_between,
 )
 from solvers.team.messages import check_message
 from solvers.team.news import News
 
 _BOOT_BYTES = 8
 NO_BOOT = bytes(_BOOT_BYTES)  # before another robot was heard
-# Boots of the sender and of the receiver, number of the message, and lengths of the two names.
-_HEAD = struct.Struct(f"<{_BOOT_BYTES}s{_BOOT_BYTES}sIHH")
-_NEWS, _OTHER = b"N", b"O"  # kinds of content
+_OTHER = b"O"  # begins content that is no News, which begins with another byte
 _WINDOW = 4096  # a message that comes later than so many after it counts as repeated
 
 
@@ -62,50 +69,70 @@ class Envelope:
 
     def plain(self, most_bytes: int) -> bytes | None:
         """The content, not compressed; None for more than so many bytes."""
-        kind, content = self.content[:1], self.content[1:]
-        if kind == _NEWS:
-            return content if len(content) <= most_bytes else None
-        return inflated(content, most_bytes)
+        if self.content[:1] == _OTHER:
+            return inflated(self.content[1:], most_bytes)
+        return self.content if len(self.content) <= most_bytes else None
 
     def message_of(self, plain: bytes) -> Any:  # noqa: ANN401 - a message of any kind
         """The message of the plain content; a WireError for bytes that are none."""
-        is_news = self.content[:1] == _NEWS
-        return News.from_bytes(plain) if is_news else from_plain(plain, object)
+        if self.content[:1] == _OTHER:
+            return from_plain(plain, object)
+        return News.from_bytes(plain, self.sender, self.receiver)
+
+    @property
+    def ends(self) -> bytes:
+        """What stands for the two runs that it goes from and to."""
+        return implied_ends(replace(self, number=0, content=b"").as_bytes())
 
     def as_bytes(self) -> bytes:
         """Bytes of which `from_bytes` makes the envelope."""
-        names = [name.encode("utf-8") for name in (self.sender, self.receiver)]
-        head = _HEAD.pack(self.boot, self.heard, self.number, *map(len, names))
-        return b"".join([head, *names, self.content])
+        parts = [self.boot, self.heard, leb128(self.number)]
+        for name in (self.sender.encode("utf-8"), self.receiver.encode("utf-8")):
+            parts += [leb128(len(name)), name]
+        return b"".join([*parts, self.content])
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Envelope:
         """Return the envelope that bytes are; a WireError for others."""
+        boot, heard = data[:_BOOT_BYTES], data[_BOOT_BYTES : 2 * _BOOT_BYTES]
+        names = []
         try:
-            boot, heard, number, *lengths = _HEAD.unpack_from(data)
-            begins = _HEAD.size
-            names = []
-            for length in lengths:
+            number, begins = read_leb128(data, 2 * _BOOT_BYTES)
+            for _ in range(2):
+                length, begins = read_leb128(data, begins)
                 names.append(data[begins : begins + length].decode("utf-8"))
                 begins += length
-        except (struct.error, ValueError) as error:
+        except (IndexError, ValueError) as error:
             raise WireError(f"a message without addresses: {error}") from error
         sender, receiver = names
         return cls(sender, receiver, boot, heard, number, data[begins:])
 
 
 class Writing(NamedTuple):
-    """A message that is to be sent: its address, its plain content, and how that is packed."""
+    """A message that is to be sent: its address, its plain content, and how that is packed.
+
+    `is_short` says that the seal alone has the address.
+    """
 
     address: Envelope
-    kind: bytes
+    is_news: bool
     plain: bytes
+    is_short: bool
 
     def sealed(self, key: bytes) -> bytes:
         """Bytes of the message, compressed and sealed."""
-        packed_content = self.plain if self.kind == _NEWS else deflated(self.plain)
-        envelope = replace(self.address, content=self.kind + packed_content)
-        return sealed(key, envelope.as_bytes())
+        content = self.plain if self.is_news else _OTHER + deflated(self.plain)
+        if self.is_short:
+            number = leb128(self.address.number)
+            return sealed_between(key, self.address.ends, number + content)
+        return sealed(key, replace(self.address, content=content).as_bytes())
+
+
+class Ends(NamedTuple):
+    """An address without a number and content, and what stands for it in seals."""
+
+    address: Envelope
+    ends: bytes
 
 
 class Reading(NamedTuple):
@@ -122,10 +149,20 @@ class Reading(NamedTuple):
     num_bytes: int = 0
 
 
-def read(key: bytes, name: str, team: tuple[str, ...], data: bytes, most_bytes: int) -> Reading:
-    """A message to the robot `name` of the team, of so many bytes at most."""
+def read(
+    key: bytes,
+    name: str,
+    team: tuple[str, ...],
+    ends_at: Callable[[int], Sequence[Ends]],
+    data: bytes,
+    most_bytes: int,
+) -> Reading:
+    """A message to the robot `name` of the team, of so many bytes at most.
+
+    `ends_at` has the runs that speak to this one in messages with a hint.
+    """
     try:
-        envelope = Envelope.from_bytes(opened(key, data))
+        envelope = _envelope_in(key, ends_at, data)
     except WireError as error:
         is_ours = data[:3] == MARK
         return Reading(sentence=f"{error}; see whether all have the same" if is_ours else "")
@@ -144,6 +181,18 @@ def read(key: bytes, name: str, team: tuple[str, ...], data: bytes, most_bytes: 
     except WireError:
         return Reading(envelope)
     return Reading(envelope, message, num_bytes=len(plain))
+
+
+def _envelope_in(key: bytes, ends_at: Callable[[int], Sequence[Ends]], data: bytes) -> Envelope:
+    for address, ends in ends_at(data[0]) if data else ():
+        body = opened_between(key, ends, data)
+        if body is not None:
+            try:
+                number, begins = read_leb128(body, 0)
+            except (IndexError, ValueError) as error:
+                raise WireError(f"a message without a number: {error}") from error
+            return replace(address, number=number, content=body[begins:])
+    return Envelope.from_bytes(opened(key, data))
 
 
 class Word(enum.Enum):
@@ -191,19 +240,32 @@ class Speakers:
         self._patience = patience
         self._runs: dict[str, _Run] = {}
         self._former: dict[str, dict[bytes, _Run]] = {}
+        self._ends: dict[int, tuple[Ends, ...]] = {}  # of all runs that were heard, by hint
+        self._named_until: dict[tuple[str, bytes], float] = {}  # since names and boots were sent
         self._num_sent = 0
 
     def boot_of(self, robot: str) -> bytes:
         """The boot of another robot, or none before it was heard."""
         return self._runs[robot].boot if robot in self._runs else NO_BOOT
 
-    def addressed(self, receiver: str, message: object, heard: bytes) -> Writing:
+    def ends_at(self, hint: int) -> tuple[Ends, ...]:
+        """The runs that speak to this one in messages with a hint."""
+        return self._ends.get(hint, ())
+
+    def addressed(self, receiver: str, message: object, heard: bytes, now: float) -> Writing:
         """A message to the run `heard` of a robot."""
         self._num_sent += 1
         address = Envelope(self.name, receiver, self.boot, heard, self._num_sent, b"")
+        # Where it answers a message of that run, which named this one, both know both ends.
+        is_short = isinstance(message, News) and message.answers >= 0
+        if self._former.get(receiver) and now >= self._named_until.get(
+            (receiver, heard), -math.inf
+        ):
+            is_short = False
+            self._named_until[receiver, heard] = now + self._patience
         if isinstance(message, News):
-            return Writing(address, _NEWS, message.as_bytes())
-        return Writing(address, _OTHER, packed(serialize(message)))
+            return Writing(address, True, message.as_bytes(), is_short)
+        return Writing(address, False, packed(serialize(message)), is_short)
 
     def word_of(self, envelope: Envelope, now: float) -> Word:
         """What a message is worth, which is remembered."""
@@ -222,6 +284,9 @@ class Speakers:
             if run is not None:
                 former[run.boot] = run
             run = self._runs[envelope.sender] = _Run(envelope.boot, now)
+            address = replace(envelope, number=0, content=b"")
+            hint = hint_of(envelope.ends)
+            self._ends[hint] = (*self.ends_at(hint), Ends(address, envelope.ends))
         highest = run.highest
         if not run.takes(envelope.number):
             return Word.REPEATED

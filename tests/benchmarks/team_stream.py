@@ -1,11 +1,12 @@
 """A mission of a team whose measurements are a stream: bytes, and how long a closure takes to all.
 
-    python tests/benchmarks/team_stream.py [SHARING] [POSES] [SECONDS] [BITS]
+    python tests/benchmarks/team_stream.py [SHARING] [POSES] [SECONDS] [BITS] [LOST] [IDLE]
 
 Four robots drive through a grid world; the clock of the network is that of the machine, and every
-robot sends at most so many bits a second, in the order of its outbox. The last line has the bytes
-of all messages, those of the measurements as text compressed at once (zlib, level 9), and the time
-from a last closure to the moment that all robots have a certified map with it.
+robot sends at most so many bits a second, in the order of its outbox, of whose messages the share
+LOST does not arrive. The last line has the bytes of all messages, also of those that are lost, and
+of the measurements as text compressed at once (zlib, level 9), the time from a last closure to the
+moment that all robots have a certified map with it, and the bytes of IDLE seconds after that.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class Mission:
     sharing: solvers.Sharing
     seconds: float
     bits: float
-    carried: int = 0  # bytes that have arrived
+    lost: float
+    carried: int = 0  # bytes that were sent
     longest: float = 0.0  # seconds of a call
     # CPU seconds of all threads during a call, or a pause, in which one may hold Python's lock.
     busiest: float = 0.0
@@ -57,6 +59,7 @@ class Mission:
         self.free_at = dict.fromkeys(names, 0.0)
         self.began = time.monotonic()
         self.count = 0
+        self.rng = np.random.default_rng(0)
 
     def measured(self) -> list[tuple[float, bool, int]]:
         """When each pose is reached, and each edge but the last closure measured."""
@@ -87,11 +90,12 @@ class Mission:
                 message = self.queues[name].popleft()
                 self.free_at[name] = now + 8 * len(message.data) / self.bits
                 self.count += 1
+                self.carried += len(message.data)
                 arrival = (self.free_at[name], self.count, message.to, message.data)
-                heapq.heappush(self.arriving, arrival)
+                if self.rng.random() >= self.lost:
+                    heapq.heappush(self.arriving, arrival)
         while self.arriving and self.arriving[0][0] <= now:
             _, _, name, data = heapq.heappop(self.arriving)
-            self.carried += len(data)
             self.timed(self.robots[name].receive, data, now)
         self.timed(time.sleep, 0.005)
         return now
@@ -110,9 +114,11 @@ class Mission:
         return sizes == [num_edges] * 4
 
 
-def main(sharing: str, num_poses: int, seconds: float, bits: float) -> None:
+def main(
+    sharing: str, num_poses: int, seconds: float, bits: float, lost: float, idle: float
+) -> None:
     graph = replace(pgo.grid_world(4, num_poses // 4, 3), information=None)
-    mission = Mission(graph, solvers.Sharing[sharing], seconds, bits)
+    mission = Mission(graph, solvers.Sharing[sharing], seconds, bits, lost)
     events = deque(mission.measured())
     while events or not mission.has_map(graph.num_edges - 1):
         now = mission.step()
@@ -123,11 +129,16 @@ def main(sharing: str, num_poses: int, seconds: float, bits: float) -> None:
     closed_at = now
     while not mission.has_map(graph.num_edges):
         now = mission.step()
+    ended_at, carried = now, mission.carried
+    while now < ended_at + idle:
+        now = mission.step()
+    edges = compressed_edges(graph)
     print(
-        f"{sharing}, {graph.num_poses} poses, {graph.num_edges} edges: "
-        f"{mission.carried / 1e3:.0f} kB carried in {now:.0f} s, the edges compressed are "
-        f"{compressed_edges(graph) / 1e3:.0f} kB; the last closure took {now - closed_at:.2f} s "
-        f"and {(mission.carried - carried_before) / 1e3:.1f} kB; the longest call took "
+        f"{sharing}, {graph.num_poses} poses, {graph.num_edges} edges: {carried / 1e3:.1f} kB in "
+        f"{ended_at:.0f} s, {carried / edges:.2f} times the {edges / 1e3:.1f} kB of the edges "
+        f"compressed; the last closure took {ended_at - closed_at:.2f} s and "
+        f"{(carried - carried_before) / 1e3:.1f} kB, and {idle:.0f} seconds after it "
+        f"{(mission.carried - carried) / 1e3:.1f} kB; the longest call took "
         f"{mission.longest * 1e3:.0f} ms, the busiest {mission.busiest * 1e3:.0f} ms of CPU"
     )
 
@@ -143,5 +154,6 @@ def compressed_edges(graph: pgo.PoseGraph) -> int:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:] + ["MEASUREMENTS", "4000", "60", "1e6"][len(sys.argv) - 1 :]
-    main(given[0], int(given[1]), float(given[2]), float(given[3]))
+    defaults = ["MEASUREMENTS", "4000", "60", "1e6", "0", "0"]
+    given = sys.argv[1:] + defaults[len(sys.argv) - 1 :]
+    main(given[0], int(given[1]), *map(float, given[2:]))

@@ -192,8 +192,7 @@ def messages_to(robot: solvers.Robot) -> Callable[[str, object], bytes]:
 
     def made(sender: str, message: object) -> bytes:
         is_news = isinstance(message, News)
-        packed_content = deflated(packed(serialize(message))) if not is_news else message.as_bytes()
-        content = (b"N" if is_news else b"O") + packed_content
+        content = message.as_bytes() if is_news else b"O" + deflated(packed(serialize(message)))
         envelope = Envelope(sender, robot.name, b"8 bytes.", boot, next(numbers), content)
         return sealed(KEY, envelope.as_bytes())
 

@@ -44,8 +44,7 @@ def test_an_edge_takes_the_mantissas_of_six_numbers_and_little_else(tmp_path: ob
         lines = [line for line in file if line.startswith("EDGE")]
     odometry = lines[:150]
     packed = packed_lines(odometry[100:], odometry[:100])
-    assert len(packed.mantissas) <= 50 * 6 * 52 / 8 + 1
-    assert len(packed.symbols) <= 50 * 6
+    assert len(packed.numbers) <= 50 * 6 * 52 / 8 + 50 * 5
     assert packed.forms == b""
     assert unpacked_lines(packed, odometry[:100], MOST) == odometry[100:]
 
@@ -56,12 +55,14 @@ def test_bytes_that_are_no_lines_are_refused(seed: int) -> None:
     right = packed_lines(["EDGE_SE2 1 2 0.1234567890123 0.5 0.25\n"] * 30, [])
     noise = bytes(rng.integers(0, 256, 40, dtype=np.uint8))
     wrong = [
-        right._replace(symbols=noise),
-        right._replace(symbols=right.symbols[:-1]),
+        right._replace(numbers=noise),
+        right._replace(numbers=right.numbers[:-1]),
+        right._replace(numbers=right.numbers[1:]),
+        right._replace(numbers=right.numbers + b"0"),
+        right._replace(numbers=b""),
+        right._replace(numbers=bytes(MOST + 1)),
         right._replace(forms=noise),
         right._replace(forms=right.forms[:-1]),
-        right._replace(mantissas=b""),
-        right._replace(mantissas=bytes(MOST + 1)),
         right._replace(num_lines=29),
         right._replace(num_lines=1 << 20),
     ]
@@ -104,17 +105,20 @@ def test_messages_come_out_of_their_bytes_and_changed_bytes_are_messages_or_refu
     before = Revision(200, "0123456789abcdef")
     has = {"anna": before, "\u00e9": Revision(1 << 40, "00ff")}
     pieces = (
-        Piece("ben", Revision(), PackedLines(2, b"\x00symbols", b"", b"n"), True),
-        Piece("anna", before, PackedLines(0, b"", b"f", b""), False),
+        Piece("ben", Revision(), PackedLines(2, b"", b"\x00numbers"), True),
+        Piece("anna", before, PackedLines(0, b"f", b""), False),
     )
-    news = News(has, ("ben", "dora"), pieces, True, ("anna",), 12345678, 0)
-    data = news.as_bytes()
-    assert vars(News.from_bytes(data)) | {"pieces": ()} == vars(news) | {"pieces": ()}
-    assert [vars(piece) for piece in News.from_bytes(data).pieces] == [*map(vars, pieces)]
-    short = News({"anna": before}, (), pieces, sent=3, is_short=True)
-    assert vars(News.from_bytes(short.as_bytes())) | {"pieces": pieces} == vars(short)
-    for _ in range(100):
-        changed = bytearray(data)
-        changed[rng.integers(len(data))] = rng.integers(256)
-        with suppress(WireError):
-            News.from_bytes(bytes(changed[: rng.integers(len(data)) + 1]))
+    news = News(has, ("ben", "dora"), pieces, True, ("anna",), 12345678, 0, is_prompt=True)
+    own = Piece("ben", Revision(9), PackedLines(2, b"", b"numbers"), True)
+    short = News({}, (), (own,), sent=300, answers=7, has_all=True, is_short=True)
+    without = News({"anna": before}, (), answers=128, is_prompt=True, is_short=True)
+    for message in (news, short, without):
+        data = message.as_bytes()
+        read = News.from_bytes(data, "ben", "anna")
+        assert vars(read) | {"pieces": ()} == vars(message) | {"pieces": ()}
+        assert [*map(vars, read.pieces)] == [*map(vars, message.pieces)]
+        for _ in range(100):
+            changed = bytearray(data)
+            changed[rng.integers(len(data))] = rng.integers(256)
+            with suppress(WireError):
+                News.from_bytes(bytes(changed[: rng.integers(len(data) + 1)]), "ben", "anna")

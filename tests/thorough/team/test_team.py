@@ -30,7 +30,7 @@ from pgo_models.errors import FileFormatError, GraphError, SettingError
 from pgo_models.graphs.g2o import write_g2o_folder
 from solvers import Sharing
 from solvers.carry.messages import Token
-from solvers.carry.wire import Order
+from solvers.carry.wire import MARK, Order
 from solvers.robots.own_file import NumberedLines
 from solvers.soc.copies import NeighbourMessage
 from solvers.soc.rounding import RowChange
@@ -256,7 +256,10 @@ def test_a_robot_that_begins_anew_from_an_older_save_gets_a_map_at_once() -> Non
 # Who speaks.
 
 
-def test_replays_of_an_earlier_mission_are_dropped_and_wake_nobody() -> None:
+@pytest.mark.parametrize("sharing", solvers.Sharing)
+def test_replays_of_an_earlier_mission_are_dropped_and_wake_nobody(
+    sharing: solvers.Sharing,
+) -> None:
     graph = world()
     recorded: list[tuple[str, bytes]] = []
 
@@ -264,11 +267,12 @@ def test_replays_of_an_earlier_mission_are_dropped_and_wake_nobody() -> None:
         recorded.append((receiver, data))
         return False
 
-    network = Network(robots_of(graph, 3), np.random.default_rng(0), is_lost=record)
+    yesterdays = robots_of(graph, 3, sharing=sharing)
+    network = Network(yesterdays, np.random.default_rng(0), is_lost=record)
     network.run(60.0)
     yesterday = list(recorded)
     last = np.arange(graph.num_edges) >= graph.num_edges - 2
-    today = robots_of(graph.without_edges(last), 3)
+    today = robots_of(graph.without_edges(last), 3, sharing=sharing)
     network = Network(today, np.random.default_rng(1), asleep={"r2"})
     for receiver, data in yesterday:
         network.wait(0.02)
@@ -283,7 +287,8 @@ def test_replays_of_an_earlier_mission_are_dropped_and_wake_nobody() -> None:
     assert today["r0"].covered == ("r0", "r1")
 
 
-def test_messages_of_a_run_that_is_over_are_dropped() -> None:
+@pytest.mark.parametrize("sharing", solvers.Sharing)
+def test_messages_of_a_run_that_is_over_are_dropped(sharing: solvers.Sharing) -> None:
     graph = world()
     recorded: list[bytes] = []
 
@@ -291,9 +296,9 @@ def test_messages_of_a_run_that_is_over_are_dropped() -> None:
         recorded.extend([data] * ((sender, receiver) == ("r1", "r0")))
         return False
 
-    network = Network(robots_of(graph, 2), np.random.default_rng(0), is_lost=record)
+    robots = robots_of(graph, 2, sharing=sharing)
+    network = Network(robots, np.random.default_rng(0), is_lost=record)
     network.run(60.0)
-    robots = network.robots
     network.asleep = {"r1"}
     dropped = robots["r0"].ledger.dropped
     num_recorded = len(recorded)
@@ -322,10 +327,46 @@ def test_names_that_are_wrong_are_told_in_a_sentence() -> None:
     assert "'zed' has the key of the team, and is not in it" in name
 
 
-def test_two_robots_of_one_name_are_told_of_each_other() -> None:
+def test_a_short_message_counts_once_for_the_run_that_it_is_sealed_for() -> None:
     graph = world()
-    robots = robots_of(graph, 2)
-    twin = robots_of(graph, 2)["r0"]
+    recorded: list[bytes] = []
+
+    def record(sender: str, receiver: str, data: bytes) -> bool:
+        is_short = (sender, receiver) == ("r1", "r0") and data[:3] != MARK
+        recorded.extend([data] * is_short)
+        return False
+
+    robots = robots_of(graph, 2, sharing=solvers.Sharing.MEASUREMENTS)
+    network = Network(robots, np.random.default_rng(0), is_lost=record)
+    network.wait(20.0)
+    network.asleep = {"r1"}
+    edge = (min(robots["r1"].poses), max(robots["r1"].poses))
+    robots["r1"].add_edge(*edge, np.eye(2), np.zeros(2), kappa=1e-9, tau=1e-9)
+    robots["r1"].tick(network.now)
+    (data,) = [message.data for message in robots["r1"].outbox() if message.to == "r0"]
+    assert data[:3] != MARK
+    for place in range(len(data)):
+        changed = data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+        robots["r0"].receive(changed, network.now)
+        robots["r1"].receive(data, network.now)  # its own
+    assert robots["r0"].ledger.dropped_by == {"": len(data)}
+    assert robots["r1"].ledger.dropped_by == {"": len(data)}
+    restarted = robots_of(graph, 2, sharing=solvers.Sharing.MEASUREMENTS)["r0"]
+    for each in (*recorded, data):
+        restarted.receive(each, network.now)
+    assert restarted.heard == ()
+    assert restarted.problems == []
+    robots["r0"].receive(data, network.now)
+    assert robots["r0"].ledger.dropped_by == {"": len(data)}
+    robots["r0"].receive(data, network.now)
+    assert robots["r0"].ledger.dropped_by == {"": len(data), "r1": 1}
+
+
+@pytest.mark.parametrize("sharing", solvers.Sharing)
+def test_two_robots_of_one_name_are_told_of_each_other(sharing: solvers.Sharing) -> None:
+    graph = world()
+    robots = robots_of(graph, 2, sharing=sharing)
+    twin = robots_of(graph, 2, sharing=sharing)["r0"]
     twins = [robots["r0"], twin]
     now = 0.0
     while now < 30.0:
