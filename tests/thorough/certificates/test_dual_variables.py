@@ -3,11 +3,9 @@ import pytest
 from graphs import DIMENSIONS, SEEDS, SIZES, random_poses, rounding_of_objective, varied_problem
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem
-from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
+from pgo_models import PGOProblem, certificate_matrix, chordal_start, multipliers
 from pgo_models.geometry.rotations import Array
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 
 def symmetric(seed: int, n: int, d: int, scale: float = 1.0) -> Array:

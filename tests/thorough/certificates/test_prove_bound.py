@@ -15,17 +15,22 @@ from graphs import (
 )
 from hypothesis import assume, given, settings, strategies as st
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    chordal_start,
+    multipliers,
+    prove_bound,
+)
 from pgo_models.activity import Activity, watched_by
 from pgo_models.certificates.definiteness import smallest_eta
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import prove_bound
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.scenes import MILD_NOISE
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE, NoiseModel(0.5, 0.8), NoiseModel(0.1, 2.0)])
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)

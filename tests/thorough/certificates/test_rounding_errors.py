@@ -24,15 +24,19 @@ from graphs import DIMENSIONS, SEEDS, exact_graph, turned_away, varied_graph, wo
 from hypothesis import given, settings, strategies as st
 from roads import road
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses
-from pgo_models.certificates.definiteness import prove_definite
-from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
-from pgo_models.certificates.lower_bound import (
-    grounded_bound,
-    pose_rows,
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    certificate_matrix,
+    chordal_start,
+    multipliers,
     prove_bound,
-    quadratic_loss,
+    random_rotations,
 )
+from pgo_models.certificates.definiteness import prove_definite
+from pgo_models.certificates.lower_bound import grounded_bound, pose_rows, quadratic_loss
 from pgo_models.certificates.rounding_errors import (
     evaluate_certificate,
     evaluate_edges,
@@ -40,10 +44,9 @@ from pgo_models.certificates.rounding_errors import (
     matrix_error,
     objective_rounding,
 )
-from pgo_models.geometry.rotations import Array, random_rotations
+from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 

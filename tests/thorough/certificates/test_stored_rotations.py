@@ -9,15 +9,20 @@ from exact_arithmetic import ExactGraph, exact, largest_share, nearest_rotations
 from graphs import DIMENSIONS, SEEDS, exact_graph, varied_graph
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import NoiseModel, PGOProblem, PoseGraph
-from pgo_models.certificates.certificate import certify_at
-from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
-from pgo_models.certificates.lower_bound import prove_bound
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    certificate_matrix,
+    certify_at,
+    chordal_start,
+    multipliers,
+    prove_bound,
+)
 from pgo_models.certificates.rounding_errors import matrix_error
 from pgo_models.geometry.rotations import orthogonality_error
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 AS_STORED = 63.0 * float(np.finfo(float).eps)  # farther from rotations than this they are projected

@@ -9,18 +9,24 @@ from graphs import DIMENSIONS, SEEDS, varied_graph
 from hypothesis import assume, given
 from robots import cut_in_one_piece
 
-from pgo_models import PGOProblem, PoseGraph, Poses
+from pgo_models import (
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    certify_at,
+    chordal_start,
+    multipliers,
+    prove_bound,
+    random_rotations,
+)
 from pgo_models.certificates import lower_bound
-from pgo_models.certificates.certificate import certify_at, judge
+from pgo_models.certificates.certificate import judge
 from pgo_models.certificates.definiteness import FIRST_MARGIN, prove_definite, shifted_certificate
-from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
-from pgo_models.certificates.lower_bound import prove_at, prove_bound
+from pgo_models.certificates.lower_bound import prove_at
 from pgo_models.certificates.rounding_errors import evaluate_certificate, matrix_errors
 from pgo_models.errors import ProofError
-from pgo_models.geometry.rotations import random_rotations
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from solvers import polish
 from solvers.robots import proof as proof_by_robots
 from solvers.robots.elimination import Cut
 
