@@ -39,7 +39,7 @@ columns of Z, one below the other, (N d, 1), and the matrix is blockdiag(S_1, ..
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from pgo_models.certificates.definiteness import (
     FIRST_MARGIN,
@@ -135,20 +135,44 @@ class AxisUnknowns(Unknowns):
         return False
 
     def starting_point(self, X: Array) -> Array:
-        """X' itself."""
+        """X', flat along axes that one position alone is measured along, which holds the map.
+
+        That is where the bound of such an axis is least, whatever gamma is: |p_k| = 1 is a
+        constraint that nothing there asks for.
+        """
+        graph = self.problem.graph
+        weights = np.zeros((graph.num_edges, graph.d))
+        weights[graph.i == graph.world] += self.problem.weights.tau[graph.i == graph.world, None]
+        weights[self.terms.edges] += self.terms.weights
+        X = X.copy()
+        for axis in np.flatnonzero(np.count_nonzero(weights, axis=0) == 1):
+            height = X[graph.j[np.argmax(weights[:, axis])], axis]
+            X[: graph.num_poses, axis] = height
+            X[graph.num_poses :, axis] = 0.0
+            X[self.rows, axis] = np.append(0.0, np.eye(graph.d)[axis])
         return X
 
     def prove_definite(self, Lambda: Array, eta: float, X: Array) -> DefiniteProof | None:
         """Proof that the matrix of every axis is definite without the rows left out."""
-        proofs = []
-        for axis in range(self.problem.d):
+        proofs = {}
+        # An axis that has been given something is the first to fail.
+        for axis in np.argsort(self.terms.gamma.sum(axis=0), kind="stable").tolist():
             matrix = self.stored_matrix(Lambda, eta, axis)
-            proof = None if matrix is None else prove_stored(matrix, turned=X)
+            proof = None if matrix is None else prove_stored(matrix, turned=self._moves(matrix, X))
             if proof is None:
                 return None
-            proofs.append(proof)
-        slack = np.concatenate([proof.slack for proof in proofs])
-        return DefiniteProof(_FactorsOfAxes([proof.factor for proof in proofs]), slack)
+            proofs[axis] = proof
+        by_axis = [proofs[axis] for axis in range(self.problem.d)]
+        slack = np.concatenate([proof.slack for proof in by_axis])
+        return DefiniteProof(_FactorsOfAxes([proof.factor for proof in by_axis]), slack)
+
+    def _moves(self, matrix: StoredMatrix, X: Array) -> Array:
+        """X' with the shifts along the axes that cost least: the softest moves that are known."""
+        shift = np.zeros(self.problem.side)
+        shift[: self.problem.num_poses] = 1.0
+        shift[self.rows] = 0.0
+        held = matrix.stored @ shift
+        return np.asarray(X - np.outer(shift, (held @ X) / (held @ shift)))
 
     def is_definite_in_doubles(self, Lambda: Array) -> bool:
         """Whether the matrix of every axis has a Cholesky factor."""
@@ -254,7 +278,9 @@ class _FactorsOfAxes:
         return np.concatenate(solved)[:, None]
 
 
-def balanced(unknowns: AxisUnknowns, Lambda: Array, X: Array) -> tuple[AxisTerms, Array] | None:
+def balanced(
+    unknowns: AxisUnknowns, Lambda: Array, X: Array
+) -> tuple[AxisTerms, Array, Array] | None:
     """The terms and multipliers with what strong axes have given to weak ones.
 
     An axis is strong if its matrix has a Cholesky factor; None where none is. X are poses with the
@@ -265,26 +291,29 @@ def balanced(unknowns: AxisUnknowns, Lambda: Array, X: Array) -> tuple[AxisTerms
     d = problem.d
     factors = [unknowns.factor_of_axis(Lambda, axis) for axis in range(d)]
     strong = [factor for factor in factors if factor is not None]
-    if len(strong) in (0, d):
-        return (unknowns.terms, Lambda) if strong else None
+    if not strong:
+        return None
     is_weak = np.array([factor is None for factor in factors])
-    P = X[n:].reshape(n, d, d)
-    turns = np.ones(n)
+    turns = np.ones((n, 1))
     turns[problem.graph.landmarks] = 0.0
     turns[problem.graph.world] = 0.0
-    lost = turns[:, None, None] * P[:, :, is_weak]
-    c = _GIVEN_SHARE * min(_most_given(factor, lost) for factor in strong)
-    gamma = -c * turns[:, None] * is_weak
+    weak = np.asarray(turns * is_weak)
+    if not is_weak.any():
+        return unknowns.terms, Lambda, weak
+    P = X[n:].reshape(n, d, d)
+    lost = turns[:, :, None] * P[:, :, is_weak]
+    gamma = -_GIVEN_SHARE * min(_most_given(factor, lost) for factor in strong) * weak
     changed = Lambda - (P * gamma[:, None, :]) @ np.swapaxes(P, 1, 2)
     Lambda = 0.5 * (changed + np.swapaxes(changed, 1, 2))
-    return replace(unknowns.terms, gamma=gamma), Lambda
+    return replace(unknowns.terms, gamma=gamma), Lambda, weak
 
 
 def _most_given(factor: CholeskyFactor, lost: Array) -> float:
     """Largest c for which S_k - c B is definite in doubles, with B = sum of v v^T.
 
     The vectors v are the columns of `lost`, (n, d, k), in the rows of every pose. 1 / c is the
-    largest eigenvalue of V^T S_k^-1 V, V the matrix of all v; the factor is that of S_k.
+    largest eigenvalue of V^T S_k^-1 V, V the matrix of all v; the factor is that of S_k. Zero where
+    that eigenvalue is not found.
     """
     n, d, k = lost.shape
     rotation_rows = rotation_columns(np.arange(n), n, d)
@@ -296,12 +325,15 @@ def _most_given(factor: CholeskyFactor, lost: Array) -> float:
         return np.asarray(np.einsum("ndk,nd->nk", lost, solved[rotation_rows]).ravel())
 
     operator = LinearOperator((n * k, n * k), matvec=apply, dtype=np.float64)
-    largest = eigsh(
-        operator,
-        k=1,
-        which="LA",
-        tol=_EIGENVALUE_TOLERANCE,
-        v0=np.ones(n * k),
-        return_eigenvectors=False,
-    )
+    try:
+        largest = eigsh(
+            operator,
+            k=1,
+            which="LA",
+            tol=_EIGENVALUE_TOLERANCE,
+            v0=np.ones(n * k),
+            return_eigenvectors=False,
+        )
+    except ArpackNoConvergence:
+        return 0.0
     return 1.0 / float(largest[0])

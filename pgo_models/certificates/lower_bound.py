@@ -95,6 +95,7 @@ from pgo_models.summaries import Summarised
 
 # Share of the wanted gap that eta may cost; the rest is for poses a little off the optimum.
 _ETA_SHARE = 0.5
+_SHIFTS_OF_AXES = 4  # the last one loses 500 times the gap
 # First margin of the form with eta alone, as a share of the diagonal.
 UNGROUNDED_MARGIN = 1e-11
 MOST_MOVES = 3  # of X', each of which solves with the factor of the proof once
@@ -262,9 +263,8 @@ def prove_by_axes(
 
     The problem is a tangent (`PGOProblem.tangent_at`), Lambda are its multipliers at the poses,
     which change with gamma (`pgo_models.certificates.axes`). None where no position is measured
-    axis by axis, or the proof fails. Along an axis that no position is measured along, as a height,
-    the relief of the map may be stretched at no cost: there a proof needs the smallest shift eta
-    that follows from gap and objective.
+    axis by axis, or the proof fails. Where a weak axis needs a shift it is the smallest that
+    succeeds: the first loses half of the gap, and each further one ten times as much.
     """
     terms = axis_terms(problem)
     if terms is None:
@@ -273,20 +273,26 @@ def prove_by_axes(
     in_balance = balanced(unknowns, _symmetric(problem, Lambda), X)
     if in_balance is None:
         return None
-    terms, Lambda = in_balance
-    bound = prove_with_axes(problem, Lambda, poses, terms)
-    if bound is None:
-        eta = smallest_shift(gap, objective, 8 * problem.num_poses)
-        bound = prove_with_axes(problem, Lambda, poses, terms, eta)
-    return None if bound is None else (bound, Lambda)
+    terms, Lambda, weak = in_balance
+    first = smallest_shift(gap, objective, problem.num_poses)
+    shifts = [0.0]
+    if weak.any():
+        shifts += [first * ETA_GROWTH**k for k in range(_SHIFTS_OF_AXES)]
+    for shift in shifts:
+        shifted = replace(terms, gamma=terms.gamma - shift * weak)
+        bound = prove_with_axes(problem, Lambda, poses, shifted)
+        if bound is not None:
+            return bound, Lambda
+    return None
 
 
 def prove_with_axes(
-    problem: PGOProblem, Lambda: Array, poses: Poses, axes: AxisTerms, eta: float = 0.0
+    problem: PGOProblem, Lambda: Array, poses: Poses, axes: AxisTerms
 ) -> LowerBound | None:
     """Bound grounded at the world pose with given terms by axis; None where it is not proved."""
     X, unknowns = _grounded_at_world(problem, poses, axes)
-    bound = _prove(problem, _symmetric(problem, Lambda), eta, _Ground(X, unknowns))
+    ground = _Ground(unknowns.starting_point(X), unknowns)
+    bound = _prove(problem, _symmetric(problem, Lambda), 0.0, ground)
     return None if bound is None else replace(bound, axes=axes)
 
 

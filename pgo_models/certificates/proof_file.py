@@ -293,7 +293,7 @@ def _proven_again(
     """Bound of the form of a certificate, from these poses and multipliers."""
     axes = certificate.bound.axes
     if axes is not None:
-        return prove_with_axes(tangent, Lambda, poses, axes, certificate.eta)
+        return prove_with_axes(tangent, Lambda, poses, axes)
     return prove_at(tangent, Lambda, poses, certificate.bound.is_complex, certificate.eta)
 
 

@@ -55,7 +55,7 @@ def walk_with_positions(weights: tuple[float, float, float], seed: int) -> pgo.P
     [
         ((4.0, 4.0, 0.04), 1e-9),
         ((4.0, 4.0, 4e-6), 1e-9),
-        ((4.0, 4.0, 0.0), 1e-6),  # along an axis that nothing measures a shift is needed
+        ((4.0, 4.0, 0.0), 1e-6),  # an axis that nothing measures costs half of the gap
         ((0.0, 4.0, 4.0), 1e-6),
     ],
 )
