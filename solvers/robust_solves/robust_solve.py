@@ -519,13 +519,17 @@ class _RobustSolve:
         request = replace(self.places.request, problem=_with_larger_errors(problem, noise))
         try:
             scaled = solve_robustly(settings, request)
+            if scaled.status is Status.INTERRUPTED:
+                raise KeyboardInterrupt
             rejection = scaled.robust
             if rejection is None or not (scaled.is_certified and keeps_most(rejection)):
                 return None
             solution = self.places.solution(rejection.kept, scaled.poses)
+            residuals = solution.edge_residuals
+        except KeyboardInterrupt:  # outside a run: runs end with a status instead
+            return replace(answer, status=Status.INTERRUPTED)
         except FAILURES:  # the answer stands
             return None
-        residuals = solution.edge_residuals
         is_even = float(np.median(residuals.cost)) >= _EVEN * float(residuals.cost.mean())
         if not is_even or residuals.overall <= LARGEST_SCALE:
             return None

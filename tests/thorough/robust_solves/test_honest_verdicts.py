@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from wrong_edges import joined_by, noisy_sphere, spoiled
 import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, Verdict
-from pgo_models.geometry.rotations import BoolArray
+from pgo_models.geometry.rotations import Array, BoolArray
 from solvers.cli import app as cli
 from solvers.robust.known import odometry
 from solvers.robust.rejection import Support
@@ -239,6 +240,34 @@ def test_noise_above_its_claim_on_all_edges_alike_rejects_none(claim: float) -> 
     # Of closures alone it is not that of all edges; of short cycles it is.
     assert robust.noise in (1.0, pytest.approx(claim, rel=0.1))
     assert robust.support is Support.DOUBTFUL or robust.kept.sum() > 0.95 * graph.num_edges
+
+
+def test_ctrl_c_while_larger_errors_are_tried_keeps_the_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    graph = noisy_sphere(60, 8, NoiseModel(0.1, 0.1), 0)
+    graph = replace(graph, kappa=4.0 * graph.kappa, tau=4.0 * graph.tau, information=None)
+    spoiled_graph, _ = spoiled(graph, 0.05, "random", 0)
+    edge_costs = pgo.PGOProblem.edge_costs
+    num_calls = 0
+    last_call = 0
+
+    def counted(*arguments: Any) -> Array:
+        nonlocal num_calls
+        num_calls += 1
+        if num_calls == last_call:
+            raise KeyboardInterrupt
+        return edge_costs(*arguments)
+
+    monkeypatch.setattr(pgo.PGOProblem, "edge_costs", counted)
+    assert solvers.solve(spoiled_graph, robust=solvers.GNC()).robust.noise > 3.0
+    total = num_calls
+    for back in (10, 0):
+        last_call = total - back
+        num_calls = 0
+        solution = solvers.solve(spoiled_graph, robust=solvers.GNC())
+        assert solution.status is solvers.Status.INTERRUPTED
+        assert solution.robust.noise == 1.0
 
 
 @KINDS
