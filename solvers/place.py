@@ -179,7 +179,7 @@ class Place(ABC):
             return ""
         sentences = list(best.failures)
         if best.is_out_of_time and self.traits.has_driver and best.proof.can_improve:
-            sentences.append("the search for a bound was broken off; a longer one may prove more")
+            sentences.append("out of time for a bound; a longer search may prove more")
         skipped: dict[str, list[str]] = {}
         for stage in self.table.stages:
             if not stage.was_taken:

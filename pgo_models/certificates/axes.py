@@ -30,7 +30,7 @@ have the same gradient and value at poses P^ as Lambda_i alone, and add sum_l (a
 p^_l^T to the block of pose i in S_k: an axis with a small a_k gains what others lose. An axis that
 is hardly measured has an S_k that is hardly definite, or not at all, while others have more than
 enough. So weak axes have a_k = -c and the strong ones 0, with a share of the largest c for which
-the matrices of strong axes are definite: they keep a sixteenth of themselves at least.
+the matrices of strong axes are definite: they keep about a sixteenth of themselves.
 
 **The proof** is that of `pgo_models.certificates.lower_bound` with V = I. The unknowns are the
 columns of Z, one below the other, (N d, 1), and the matrix is blockdiag(S_1, .., S_d).
@@ -39,7 +39,7 @@ columns of Z, one below the other, (N d, 1), and the matrix is blockdiag(S_1, ..
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
 from pgo_models.certificates.definiteness import (
     FIRST_MARGIN,
@@ -135,17 +135,24 @@ class AxisUnknowns(Unknowns):
         return False
 
     def starting_point(self, X: Array) -> Array:
-        """X', flat along axes that one position alone is measured along, which holds the map.
+        """X' itself."""
+        return X
 
-        That is where the bound of such an axis is least, whatever gamma is: |p_k| = 1 is a
-        constraint that nothing there asks for.
+    def flattened(self, X: Array) -> Array | None:
+        """X' that is flat along axes which one position alone holds; None without such axes.
+
+        Where nothing but the lengths |p_k| = 1 keeps the map from being flat along an axis, the
+        bound of this axis is attained there, as gamma has been lowered.
         """
         graph = self.problem.graph
         weights = np.zeros((graph.num_edges, graph.d))
         weights[graph.i == graph.world] += self.problem.weights.tau[graph.i == graph.world, None]
         weights[self.terms.edges] += self.terms.weights
+        unmeasured = np.flatnonzero(np.count_nonzero(weights, axis=0) == 1)
+        if not len(unmeasured):
+            return None
         X = X.copy()
-        for axis in np.flatnonzero(np.count_nonzero(weights, axis=0) == 1):
+        for axis in unmeasured:
             height = X[graph.j[np.argmax(weights[:, axis])], axis]
             X[: graph.num_poses, axis] = height
             X[graph.num_poses :, axis] = 0.0
@@ -261,7 +268,7 @@ class AxisUnknowns(Unknowns):
         product_error[n:] = UNIT_ROUNDOFF * np.abs(product[n:])
         lost = (1.0 / (1.0 - KEPT_SHARE) - 1.0) * float(np.sum(cost.tangent.loss[terms.edges]))
         total = exact_sum([*value.ravel(), *of_lengths.ravel(), -OUTWARD * lost])
-        error = float(np.sum(value_error) + np.sum(length_error))
+        error = float(np.sum(value_error) + np.sum(length_error)) + UNIT_ROUNDOFF * abs(total)
         return Evaluation(total, OUTWARD * error, product, OUTWARD * product_error)
 
 
@@ -281,10 +288,13 @@ class _FactorsOfAxes:
 def balanced(
     unknowns: AxisUnknowns, Lambda: Array, X: Array
 ) -> tuple[AxisTerms, Array, Array] | None:
-    """The terms and multipliers with what strong axes have given to weak ones.
+    """Terms and multipliers with what strong axes have given to weak ones, and which these are.
 
     An axis is strong if its matrix has a Cholesky factor; None where none is. X are poses with the
-    world pose at (0, I), where value and gradient stay what they are.
+    world pose at (0, I), where value and gradient stay what they are. Last come ones, (n, d), at
+    the weak axes of poses that turn, and zeros elsewhere. Along an axis that no position is
+    measured along, as a height, the relief of the map can be stretched at no cost, and the matrix
+    is singular. It is definite with gamma less eta there, which loses eta for every one.
     """
     problem = unknowns.problem
     n = problem.num_poses
@@ -334,6 +344,6 @@ def _most_given(factor: CholeskyFactor, lost: Array) -> float:
             v0=np.ones(n * k),
             return_eigenvectors=False,
         )
-    except ArpackNoConvergence:
+    except ArpackError:
         return 0.0
-    return 1.0 / float(largest[0])
+    return 1.0 / float(largest[0]) if largest[0] > 0.0 else 0.0

@@ -125,7 +125,8 @@ class Certificate(ReadOnly):
         F of these, the best value known.
     Lambda : (n, d, d) array
         Multipliers. With eta and these poses they are the proof, which `prove_bound` checks; its
-        `is_complex` is that of the bound. Those of `BoundSource.SOFTENED` belong to the smaller
+        `is_complex` is that of the bound. A bound with `axes` needs these, too: its proof file has
+        them. Those of `BoundSource.SOFTENED` belong to the smaller
         matrices.
     wanted_gap : float
         The gap that was asked for.
@@ -435,7 +436,7 @@ def _certificate_at(
         terms = closed_form_terms(problem.tangent_at(best), best)
         if terms is not None:
             certificate = with_terms(problem, certificate, terms, best)
-    return with_axes(problem, certificate, best)
+    return certificate if is_over(deadline) else with_axes(problem, certificate, best)
 
 
 def with_axes(problem: PGOProblem, certificate: Certificate, ground: Poses) -> Certificate:

@@ -272,7 +272,7 @@ def smallest_eta(
     while proof is None:
         if not eta < below:
             return None
-        if is_over(deadline):
+        if is_over(deadline) and below < math.inf:
             eta = max(eta, LATE_SHARE * below)
         with doing(next(shifts)):
             proof = attempt(eta)

@@ -263,8 +263,8 @@ def prove_by_axes(
 
     The problem is a tangent (`PGOProblem.tangent_at`), Lambda are its multipliers at the poses,
     which change with gamma (`pgo_models.certificates.axes`). None where no position is measured
-    axis by axis, or the proof fails. Where a weak axis needs a shift it is the smallest that
-    succeeds: the first loses half of the gap, and each further one ten times as much.
+    axis by axis, or the proof fails. Where a weak axis needs a shift of its gamma it is the
+    smallest that succeeds: the first loses half of the gap, and each further one ten times as much.
     """
     terms = axis_terms(problem)
     if terms is None:
@@ -274,26 +274,36 @@ def prove_by_axes(
     if in_balance is None:
         return None
     terms, Lambda, weak = in_balance
-    first = smallest_shift(gap, objective, problem.num_poses)
     shifts = [0.0]
-    if weak.any():
+    num_weak = int(weak.sum())  # what a shift of one loses
+    if num_weak:
+        first = smallest_shift(gap, objective, num_weak)
         shifts += [first * ETA_GROWTH**k for k in range(_SHIFTS_OF_AXES)]
     for shift in shifts:
         shifted = replace(terms, gamma=terms.gamma - shift * weak)
-        bound = prove_with_axes(problem, Lambda, poses, shifted)
+        bound = prove_from_axis_terms(problem, Lambda, poses, shifted)
         if bound is not None:
             return bound, Lambda
     return None
 
 
-def prove_with_axes(
+def prove_from_axis_terms(
     problem: PGOProblem, Lambda: Array, poses: Poses, axes: AxisTerms
 ) -> LowerBound | None:
-    """Bound grounded at the world pose with given terms by axis; None where it is not proved."""
+    """Bound grounded at the world pose with given terms by axis; None where it is not proved.
+
+    It is the better one of X' at the poses and of X' that is flat along axes which nothing measures
+    (`AxisUnknowns.flattened`): moves of X' do not reach the one from the other.
+    """
     X, unknowns = _grounded_at_world(problem, poses, axes)
-    ground = _Ground(unknowns.starting_point(X), unknowns)
-    bound = _prove(problem, _symmetric(problem, Lambda), 0.0, ground)
-    return None if bound is None else replace(bound, axes=axes)
+    Lambda = _symmetric(problem, Lambda)
+    bound = _prove(problem, Lambda, 0.0, _Ground(X, unknowns))
+    flat = unknowns.flattened(X)
+    if bound is None or flat is None:
+        return None if bound is None else replace(bound, axes=axes)
+    from_flat = _prove(problem, Lambda, 0.0, _Ground(flat, unknowns))
+    better = from_flat if from_flat is not None and from_flat.value > bound.value else bound
+    return replace(better, axes=axes)
 
 
 def _grounded_at_world(

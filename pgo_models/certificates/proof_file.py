@@ -11,7 +11,7 @@ from pgo_models.certificates.axes import AxisTerms
 from pgo_models.certificates.certificate import BoundSource, Certificate, Verdict
 from pgo_models.certificates.dual_variables import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
-from pgo_models.certificates.lower_bound import LowerBound, prove_at, prove_with_axes
+from pgo_models.certificates.lower_bound import LowerBound, prove_at, prove_from_axis_terms
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError
 from pgo_models.figures import scaled_below
@@ -293,7 +293,7 @@ def _proven_again(
     """Bound of the form of a certificate, from these poses and multipliers."""
     axes = certificate.bound.axes
     if axes is not None:
-        return prove_with_axes(tangent, Lambda, poses, axes)
+        return prove_from_axis_terms(tangent, Lambda, poses, axes)
     return prove_at(tangent, Lambda, poses, certificate.bound.is_complex, certificate.eta)
 
 

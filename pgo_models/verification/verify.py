@@ -85,7 +85,7 @@ of the world. Then q may have other terms in every column k: the squares of
 gradient; and with any numbers gamma_ik the terms gamma_ik (1 - |p_ik|^2), p_ik column k of P_i,
 which are zero for rotations, as their rows have length one. So H_k = H + diag(D_k) - diag(0,
 gamma_ik I) and column k of G, less gamma_ik p_ik in its rows of rotations, take the place of H and
-G, and the losses to the columns add up. (B) is as before.
+G, and the losses to the columns add up. (A) and (B) stay as they are.
 
 **Complex numbers.** In the plane a proof may ask less of H. Rotations are matrices (a, b; -b, a),
 and so are products, sums and transposes of such matrices. Thus all blocks of X, of X' V and of Z

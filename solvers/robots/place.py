@@ -288,7 +288,8 @@ class PlaceOfRobots(Place):
             certificate = certify_with(
                 here.problem, poses, Lambda, here.gap, attempt.decrement, BoundSource.GIVEN, bound
             )
-            certificate = with_axes(here.problem, certificate, poses)
+            if not attempt.is_out_of_time:
+                certificate = with_axes(here.problem, certificate, poses)
         if self.faults is not None and isinstance(attempt, AttemptWithFaults):
             # A robot may have fallen silent since SOC ended.
             attempt.check_heard(self.faults, self.ledger.rounds)

@@ -73,6 +73,24 @@ def test_positions_with_a_poor_height_or_none_are_certified(
     assert pgo.verify_proof(tmp_path / "graph.g2o", tmp_path / "proof.json").is_verified
 
 
+@pytest.mark.parametrize("seed", [3, 6])
+def test_gravity_beside_positions_without_height_leaves_no_gap(seed: int) -> None:
+    """It keeps the map from being stretched along the height, which then needs no shift."""
+    graph = walk_with_positions((4.0, 4.0, 0.0), seed)
+    num_edges = graph.num_edges
+    rng = np.random.default_rng(seed)
+    bodies = np.arange(40)
+    near = solvers.solve(graph).poses
+    R = near.R @ pgo.exp_map(0.02 * rng.standard_normal((40, 3)))
+    graph = graph.with_prior(bodies, pgo.Poses(R, near.t), kappa=1.0, tau=1.0)
+    assert graph.information is not None
+    information = graph.information.copy()
+    information[num_edges:] = 0.0
+    information[num_edges:, 3:, 3:] = R.mT @ np.diag([1.0, 1.0, 0.0]) @ R
+    solution = solvers.solve(replace(graph, information=information))
+    assert solution.gap <= 1e-9
+
+
 @given(seed=SEEDS)
 @settings(max_examples=examples(40))
 def test_no_bound_is_above_the_least_cost(seed: int) -> None:
