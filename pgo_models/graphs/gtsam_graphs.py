@@ -237,7 +237,10 @@ def _noise(gtsam: ModuleType, information: Array) -> Any:  # noqa: ANN401
         return gtsam.noiseModel.Gaussian.Information(information)
     eigenvalues, axes = np.linalg.eigh(information)
     root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * axes.T
-    return gtsam.noiseModel.Gaussian.SqrtInformation(np.linalg.qr(root)[1])
+    triangle = np.linalg.qr(root)[1]
+    # A diagonal triangle becomes a model of standard deviations, which must not be negative.
+    signs = np.where(np.diag(triangle) < 0.0, -1.0, 1.0)
+    return gtsam.noiseModel.Gaussian.SqrtInformation(signs[:, None] * triangle)
 
 
 def poses_in_gtsam(gtsam: ModuleType, poses: Poses) -> list[Any]:

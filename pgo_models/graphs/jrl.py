@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pgo_models.errors import FileFormatError, GraphWarning, printable
+from pgo_models.errors import FileFormatError, GraphWarning, door, printable
 from pgo_models.files import (
     LARGEST,
     Problem,
@@ -65,6 +65,7 @@ class Measurements:
     numbers: list[list[float]] = field(default_factory=list)
 
 
+@door
 def read_jrl(
     path: Path | str,
     weights: RotationWeight = RotationWeight.SE_SYNC,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -274,6 +275,22 @@ def test_weights_alone_are_written_as_matrices() -> None:
     factors, values = pgo.to_gtsam(graph, graph.truth)
     assert factors.size() == graph.num_edges
     assert values.size() == graph.num_poses
+
+
+@pytest.mark.parametrize("weights", [(1.0, 1.0, 0.0), (4.0, 0.0, 1.0), (0.0, 0.0, 2.0)])
+def test_positions_without_some_axes_go_to_gtsam(weights: tuple[float, float, float]) -> None:
+    graph = pgo.grid(np.random.default_rng(0))
+    truth = graph.truth
+    assert truth is not None
+    graph = graph.with_position_prior(np.array([0, 3, 5]), truth.t[[0, 3, 5]] + 0.5, tau=1.0)
+    information = np.zeros((graph.num_edges, 6, 6))
+    information[graph.is_prior, :3, :3] = np.diag(weights)
+    information[~graph.is_prior] = np.eye(6)
+    graph = replace(graph, information=information)
+    factors, values = pgo.to_gtsam(graph, truth)
+    of_priors = 3 * 0.25 * sum(weights)
+    without_priors, _ = pgo.to_gtsam(graph.without_edges(graph.is_prior), truth)
+    assert 2.0 * (factors.error(values) - without_priors.error(values)) == pytest.approx(of_priors)
 
 
 def pose3_example() -> tuple[Any, Any]:
