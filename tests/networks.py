@@ -25,7 +25,10 @@ BEFORE_THE_NUMBER = 13  # bytes of a hint and a seal
 
 @dataclass
 class Network:
-    """Robots, and what is on its way between them; those `asleep` neither send nor hear."""
+    """Robots, and what is on its way between them; those `asleep` neither send nor hear.
+
+    Computing takes no time, unless it `takes_time`.
+    """
 
     robots: dict[str, solvers.Robot]
     rng: np.random.Generator
@@ -34,6 +37,7 @@ class Network:
     delay: float = 0.02
     now: float = 0.0
     asleep: set[str] = field(default_factory=set)
+    takes_time: bool = False
     carried: int = 0  # bytes that have arrived
     # Whether a message, by sender, receiver and bytes, is lost, beside those lost at random.
     is_lost: Callable[[str, str, bytes], bool] = lambda sender, receiver, data: False
@@ -77,7 +81,7 @@ class Network:
         return len(revisions) == 1 and all(robot.is_settled for robot in awake)
 
     def _send(self, name: str, robot: solvers.Robot) -> None:
-        while robot.is_computing:  # computing takes no time here
+        while robot.is_computing and not self.takes_time:
             time.sleep(1e-5)
         for message in robot.outbox():
             copies = 1 + (self.rng.random() < self.repeated)

@@ -88,6 +88,7 @@ class DrivenTeam:
         self._known: dict[str, Term] = {}
         self._sent_at: dict[str, float] = {}  # when the last ask or outcome was sent to each
         self._paces: defaultdict[str, Pace] = defaultdict(Pace)
+        self._computing: set[str] = set()  # robots that say that they compute what they were asked
         self._waits_since: float | None = None  # for answers to the orders under way
         self._following: Following | None = None
         self._drive: Drive | None = None
@@ -188,6 +189,7 @@ class DrivenTeam:
         if sender in (*self._part, *asked) or sender not in self._present:
             self._learn_term(hello.term)  # another part has its own solves
         if self._drive is not None and self._drive.is_computed(sender, hello):
+            self._computing.add(sender)
             self._waits_since = self._session.now
             self._sent_at[sender] = self._session.now
 
@@ -359,7 +361,8 @@ class DrivenTeam:
         drive = self._drive
         if drive is not None and reply.term == drive.term and sender in drive.members:
             self._tried[sender] = (reply.revision, self._session.boot_of(sender))
-            if drive.waits_for(sender, reply):
+            # The time of the link alone tells when to send again, not that of a computation.
+            if drive.waits_for(sender, reply) and sender not in self._computing:
                 session = self._session
                 self._paces[sender].note_answer(reply.answers, session.now, session.retry)
             drive.take(sender, reply)
@@ -367,6 +370,7 @@ class DrivenTeam:
     def _after_step(self, drive: Drive) -> None:
         """Send what the solve asks for, or its outcome if it has ended."""
         self._waits_since = None
+        self._computing.clear()
         self._sent_at.clear()
         self._send_again(drive.waiting, Priority.URGENT)
         if drive.outcome is None:

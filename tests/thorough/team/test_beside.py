@@ -14,12 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from networks import KEY, give_edge, robots_of, world
+from networks import KEY, Network, give_edge, message_in, robots_of, world
 
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
 from solvers.soc.r_step import RotationStep, RStep, RSubproblem, prepare
+from solvers.team.messages import Ask
 
 SECONDS = 120.0
 CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"
@@ -109,6 +110,37 @@ def test_where_the_process_dies_the_next_solve_starts_another(number: int, how: 
     assert robot.is_certified
     assert robot.solution.sizes[1] == graph.num_edges + 1
     assert np.all([np.isfinite(covariance).all() for covariance in robot.covariances.values()])
+
+
+@pytest.mark.skipif(not CHILDREN.exists(), reason="/proc names the children of a process")
+def test_an_order_after_a_long_computation_is_sent_again_as_soon_as_others() -> None:
+    sent: dict[int, list[float]] = {}
+
+    def is_lost(by: str, to: str, data: bytes) -> bool:
+        message = message_in(data)
+        if not isinstance(message, Ask):
+            return False
+        times = sent.setdefault(message.call, [])
+        times.append(network.now)
+        if message.call == 2 and len(times) == 1:  # nothing is computed any more
+            network.takes_time = True
+            for pid in pids_that_compute():
+                os.kill(pid, signal.SIGSTOP)
+        return message.call == 3 and len(times) == 1
+
+    network = Network(robots_of(world(), 2), np.random.default_rng(0), is_lost=is_lost)
+    try:
+        while 2 not in sent:
+            network.wait(0.02)
+        network.wait(20.0)
+    finally:
+        for pid in pids_that_compute():
+            os.kill(pid, signal.SIGCONT)
+    network.takes_time = False
+    network.run(60.0)
+    assert network.is_settled
+    assert sent[3][0] >= 20.0
+    assert sent[3][1] - sent[3][0] <= 5.0
 
 
 @pytest.mark.skipif(not CHILDREN.exists(), reason="/proc names the children of a process")
