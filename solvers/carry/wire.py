@@ -106,6 +106,8 @@ def from_bytes(data: bytes, kind: type[K]) -> K:
 
 def inflated(data: bytes, most_bytes: int) -> bytes | None:
     """Bytes that were `deflated`; None for more than so many, and a WireError for others."""
+    if most_bytes <= 0:  # which zlib takes for no limit
+        return None
     unpacker = zlib.decompressobj(_NO_HEADER, _COMMON)
     try:
         plain = unpacker.decompress(data, most_bytes)

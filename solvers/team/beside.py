@@ -1,9 +1,9 @@
-"""Computations beside the calls of a robot, in another process.
+"""Computations beside the calls of a robot, in another process, and in a thread of this one.
 
 A robot answers at once, also while it computes. Compiled code may hold Python's lock for seconds,
-and with it all calls: so one other process computes for all robots of this one. What a computation
-tells waits in a queue until the robot is called again: so all that the robot knows is changed by
-the thread of its caller alone.
+and with it all calls: so one other process computes for all robots of this one. Long messages are
+read and written in a thread. What either tells waits in a queue until the robot is called again: so
+what the robot knows is changed by the thread of its caller, but for `Beside.num_read`.
 """
 
 from __future__ import annotations
@@ -39,13 +39,23 @@ _COMPUTING = threading.Lock()  # of the computation of the other process that do
 
 
 class Beside:
-    """The computations of a robot, and what is to be done with what they tell."""
+    """The computations of a robot, and what is to be done with what they tell.
+
+    Of what was begun in the thread, and not acted on, `num_in_thread` is the count, and
+    `bytes_in_thread` are the bytes. `num_read` are bytes of all that was read there, which the
+    thread counts, and `num_taken` those that were acted on.
+    """
 
     def __init__(self) -> None:
+        self.num_in_thread = 0
+        self.bytes_in_thread = 0
+        self.num_read = 0
+        self.num_taken = 0
         self._talks: list[Talk] = []
         self._to_do: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._thread: ThreadPoolExecutor | None = None
-        self._in_thread: list[Future[None]] = []
+        self._pid = os.getpid()  # of the process that has the thread
+        self._in_thread: list[tuple[Callable[[], None], Future[None]]] = []
 
     def __reduce__(self) -> tuple[type[Beside], tuple[()]]:
         """A copy has no computations: they belong to one robot."""
@@ -54,7 +64,8 @@ class Beside:
     @property
     def is_busy(self) -> bool:
         """Whether something is computed; what waits for other robots is not."""
-        is_thread_busy = not all(future.done() for future in self._in_thread)
+        self._go_on_in_fork()
+        is_thread_busy = not all(future.done() for _, future in self._in_thread)
         return is_thread_busy or any(talk.is_busy for talk in self._talks)
 
     def begin(
@@ -77,24 +88,53 @@ class Beside:
         return talk
 
     def begin_in_thread(
-        self, compute: Callable[[], T], end: Callable[[T | PGOError], None]
+        self, compute: Callable[[], T], end: Callable[[T | PGOError], None], num_bytes: int = 0
     ) -> None:
         """Compute in a thread of this process, and act on the result, or on an error.
 
-        It is for compression and for sums of bytes, which do not hold Python's lock.
+        It is for what mostly lets Python's lock go, as compression and sums of so many bytes do.
+        Where no thread can be started, it is computed at once.
         """
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(max_workers=1)
 
         def run() -> None:
             result = result_or_error(compute, "it cannot be computed")
-            self._to_do.put(lambda: end(result))
+            self._to_do.put(lambda: self._end_in_thread(partial(end, result), num_bytes))
 
-        self._in_thread = [future for future in self._in_thread if not future.done()]
-        self._in_thread.append(self._thread.submit(run))
+        self.num_in_thread += 1
+        self.bytes_in_thread += num_bytes
+        self._submit(run)
+
+    def _go_on_in_fork(self) -> None:
+        """In a fork, which has no thread, begin anew what the thread had to do."""
+        if self._pid == os.getpid():
+            return
+        self._pid = os.getpid()
+        self._thread = None
+        begun, self._in_thread = self._in_thread, []
+        for run, future in begun:
+            if not future.done():
+                self._submit(run)
+
+    def _submit(self, run: Callable[[], None]) -> None:
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(max_workers=1)
+        try:
+            future = self._thread.submit(run)
+        except RuntimeError:  # no more threads, or the interpreter ends
+            self._thread = None  # which may have noted it, and has no thread
+            run()
+            return
+        self._in_thread = [each for each in self._in_thread if not each[1].done()]
+        self._in_thread.append((run, future))
+
+    def _end_in_thread(self, end: Callable[[], None], num_bytes: int) -> None:
+        self.num_in_thread -= 1
+        self.bytes_in_thread -= num_bytes
+        end()
 
     def act(self) -> None:
         """Act on all that was told."""
+        self._go_on_in_fork()
         while not self._to_do.empty():
             self._to_do.get_nowait()()
 

@@ -123,12 +123,6 @@ class Session:
         self._reach: dict[str, tuple[str, ...]] = {}  # whom others hear, as they say
         self._greeted: dict[str, tuple[float, int]] = {}  # when, and how often without an answer
         self._out: list[Message] = []
-        # Long messages that are sealed beside the calls, and bytes of those that are read there, as
-        # they have arrived, and their contents: all that were read, and those taken.
-        self._num_sealing = 0
-        self._num_waiting = 0
-        self._num_read = 0
-        self._num_taken = 0
         self._speakers = Speakers(name, patience)
         self._strangers: dict[str, None] = {}  # sentences on messages of nobody in the team
         OTHER_PROCESS.start()
@@ -147,7 +141,7 @@ class Session:
     @property
     def is_settled(self) -> bool:
         """Whether nothing is to be solved or to be sent."""
-        return self.way.is_settled and not self._out and not self._num_sealing
+        return self.way.is_settled and not self._out and not self.beside.num_in_thread
 
     @property
     def problems(self) -> list[str]:
@@ -182,12 +176,11 @@ class Session:
             if not reading.is_long:
                 self._take_read(data, is_direct, reading)
                 return
-        if self._num_waiting + len(data) > MOST_BYTES:
+        if self.beside.bytes_in_thread + len(data) > MOST_BYTES:
             self._drop("", "")
             return
-        self._num_waiting += len(data)
         self.beside.begin_in_thread(
-            lambda: self._read_long(data), partial(self._take_long, data, is_direct)
+            lambda: self._read_long(data), partial(self._take_long, data, is_direct), len(data)
         )
 
     def _read(self, data: bytes, most_bytes: int) -> Reading:
@@ -198,16 +191,15 @@ class Session:
 
         Those that wait to be taken, and this one, have `MOST_BYTES` at most.
         """
-        reading = self._read(data, MOST_BYTES - (self._num_read - self._num_taken))
-        self._num_read += reading.num_bytes
+        reading = self._read(data, MOST_BYTES - (self.beside.num_read - self.beside.num_taken))
+        self.beside.num_read += reading.num_bytes
         return reading
 
     def _take_long(self, data: bytes, is_direct: bool, reading: Reading | PGOError) -> None:
-        self._num_waiting -= len(data)
         if isinstance(reading, PGOError):
             self._drop("", "")
             return
-        self._num_taken += reading.num_bytes
+        self.beside.num_taken += reading.num_bytes
         self._take_read(data, is_direct, reading)
 
     def _take_read(self, data: bytes, is_direct: bool, reading: Reading) -> None:
@@ -332,11 +324,9 @@ class Session:
         if len(writing.plain) <= _IN_A_CALL:
             self._post(to, priority, seal())
         else:
-            self._num_sealing += 1
             self.beside.begin_in_thread(seal, partial(self._post_long, to, priority))
 
     def _post_long(self, to: str, priority: Priority, data: bytes | PGOError) -> None:
-        self._num_sealing -= 1
         if not isinstance(data, PGOError):
             self._post(to, priority, data)
 

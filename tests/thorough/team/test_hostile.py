@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import os
+import pickle
+import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from budget import examples
-from networks import KEY, Network, message_in, robots_of
+from networks import KEY, Network, message_in, robots_of, world
 
 import pgo_models as pgo
 import solvers
@@ -151,6 +156,73 @@ def test_long_messages_are_read_and_written_beside_the_calls() -> None:
     np.testing.assert_array_equal(passed_on.data, data)
 
 
+def robot_that_writes() -> solvers.Robot:
+    """A robot that is settled but for a long message to another one, which it begins to write."""
+    robots = robots_of(world(n=10), 3)
+    robot = robots["r0"]
+    made = messages_to(robot)
+    now = 0.0
+    while not all(each.is_settled for each in robots.values()):
+        now += 0.1
+        for each in robots.values():
+            each.tick(now)
+            while each.is_computing:
+                time.sleep(1e-3)
+            for message in each.outbox():
+                robots[message.to].receive(message.data, now)
+    data = np.random.default_rng(0).integers(0, 256, 1 << 23, dtype=np.uint8)
+    robot.receive(made("r1", Relayed("r2", data)), now)
+    while robot.is_computing:
+        time.sleep(1e-3)
+    robot.receive(b"", now)
+    return robot
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda robot: pickle.loads(pickle.dumps(robot))])
+def test_a_copy_of_a_robot_that_writes_waits_for_nothing(
+    copied: Callable[[solvers.Robot], solvers.Robot],
+) -> None:
+    robot = robot_that_writes()
+    assert not robot.is_settled
+    other = copied(robot)
+    assert hand_on(other) == []
+    assert other.is_settled
+    assert any(isinstance(message, Relayed) for message in hand_on(robot))
+    assert robot.is_settled
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_fork_writes_what_its_robot_was_writing() -> None:
+    robot = robot_that_writes()
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(60)
+        is_sent = any(isinstance(message, Relayed) for message in hand_on(robot))
+        os._exit(not is_sent)
+    assert os.waitpid(pid, 0)[1] == 0
+
+
+def test_where_no_thread_can_be_started_a_long_message_is_written_in_the_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def cannot_start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    robot = solvers.Robot("r0", ["r0", "r1", "r2"], KEY)
+    made = messages_to(robot)
+    robot.receive(made("r2", HELLO), 0.0)
+    message = Relayed("r2", np.random.default_rng(0).integers(0, 256, 1 << 20, dtype=np.uint8))
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", cannot_start)
+        robot.receive(made("r1", message), 0.0)
+        robot.receive(b"", 0.0)  # which takes the one before
+        assert [type(each) for each in hand_on(robot)].count(Relayed) == 1
+    robot.receive(made("r1", message), 0.0)
+    for num_messages in (0, 1):
+        assert [type(each) for each in hand_on(robot)].count(Relayed) == num_messages
+
+
 def test_messages_that_wait_to_be_read_or_taken_are_bounded() -> None:
     robot = solvers.Robot("r0", ["r0", "r1", "r2"], KEY)
     made = messages_to(robot)
@@ -161,6 +233,20 @@ def test_messages_that_wait_to_be_read_or_taken_are_bounded() -> None:
         robot.receive(data, 0.0)
     hand_on(robot)
     assert robot.ledger.dropped_by == {"": 1, "r1": 2}
+
+
+def test_nothing_is_unpacked_where_all_bytes_wait_to_be_taken() -> None:
+    """A limit of 0 bytes is one: for zlib it is none."""
+    robot = solvers.Robot("r0", ["r0", "r1", "r2"], KEY)
+    made = messages_to(robot)
+    longest = 1 << 27
+    rest = len(packed(serialize(Relayed("r2", np.zeros(longest // 2, np.uint8))))) - longest // 2
+    data = np.zeros(longest - rest - 1, np.uint8)  # its length has one digit more
+    assert len(packed(serialize(Relayed("r2", data)))) == longest
+    robot.receive(made("r1", Relayed("r2", data)), 0.0)
+    robot.receive(made("r1", Relayed("r2", np.zeros(9 << 23, np.uint8))), 0.0)
+    hand_on(robot)
+    assert robot.ledger.dropped_by == {"r1": 1}
 
 
 def test_one_piece_is_read_and_one_is_packed_in_a_call() -> None:
