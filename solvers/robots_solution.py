@@ -55,6 +55,8 @@ class RobotsSolution(Summarised):
         have matrices, what failed, and what may find more.
     num_absent : int
         Number of poses of absent robots, which edges of others name.
+    num_apart : int
+        Number of poses that it is without: no edge joins them with most of those of their robots.
     robust : str
         Of a robust solve, what was left out, and what that is worth; else empty.
     is_held : bool
@@ -77,6 +79,7 @@ class RobotsSolution(Summarised):
     seconds: float
     note: str = ""
     num_absent: int = 0
+    num_apart: int = 0
     robust: str = ""
     is_held: bool = True
     num_rejected: int | None = None

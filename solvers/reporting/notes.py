@@ -72,6 +72,15 @@ def note_of_absence(num_absent: int) -> str:
     )
 
 
+def note_of_poses_apart(num_apart: int) -> str:
+    """Say how many poses a solution of robots is without; "" where it has all."""
+    if num_apart == 0:
+        return ""
+    return (
+        f"it is without {num_apart} poses, which no edge joins with most of those of their robots"
+    )
+
+
 def verdict_suffix(num_absent: int) -> str:
     """What a verdict adds where robots are absent; "" where none are."""
     return "; this is of the files here alone, without absent robots" if num_absent else ""

@@ -110,6 +110,7 @@ class OpenedFiles:
     has_indefinite: bool  # whether the share of any edge in chi2 can be negative
     num_absent: int  # number of poses of robots without a file, as `PoseGraph.absent`
     num_copies: int  # edges of two files that count once, as they differ by printing alone
+    num_apart: int  # poses that robots leave out, as no edge joins them with most of their own
     num_rejected: int = 0  # edges that robots have left out, as they do not agree with others
     # factor on the thresholds of GNC, below 1 where the closures within robots have clearly smaller
     # errors than their files claim
@@ -162,10 +163,12 @@ def open_files(
         claims = network.ask(read_file, [None] * len(files), Count.ROUND)
         joined = _joined(network, files, claims, trust_folder)
         components = _components_to_leave_out(*joined[:2]) if leaves_out else None
+        num_named = joined[1]
         if components is not None:
             claims = network.ask(leave_out, components, Count.PIGGYBACKED)
             joined = _joined(network, files, claims, trust_folder)
         borders, num_poses, num_absent, num_copies = joined
+        num_apart = num_named - num_poses
         has_indefinite = any(border.has_indefinite for border in borders)
         if weighting is Weighting.OWN:
             weighting = _own_weighting(borders)
@@ -186,6 +189,7 @@ def open_files(
                 has_indefinite,
                 num_absent,
                 num_copies,
+                num_apart,
                 num_rejected,
                 threshold_scale(scale),
             )

@@ -26,7 +26,7 @@ from solvers.carry.ray_engine import RayEngine
 from solvers.loop import RunMonitor
 from solvers.place import AUTO, FirstStage
 from solvers.plan import solve_at
-from solvers.reporting.notes import joined_notes, note_of_absence
+from solvers.reporting.notes import joined_notes, note_of_absence, note_of_poses_apart
 from solvers.request import Pipeline
 from solvers.result import Record, StageTable
 from solvers.robots.agent import OwnLines
@@ -193,6 +193,7 @@ class FilesOfRobots:
             F=F,
             note=_note(self.weighting, opened, answer.place.note(best)),
             num_absent=opened.num_absent,
+            num_apart=opened.num_apart,
             robust="" if kept is None else _text_of_rejected(opened, kept, answer.rejected_by),
             is_held=kept is None or not kept.doubts,
             num_rejected=None if kept is None else opened.num_rejected,
@@ -208,12 +209,13 @@ def _text_of_rejected(opened: OpenedFiles, kept: EdgesKept, rejected_by: str) ->
 
 
 def _note(weighting: Weighting, opened: OpenedFiles, note: str) -> str:
-    """Note of a solution: absent robots, copies, why the cost is F in place of chi2, and `note`."""
+    """Note of a solution: absent robots, poses left out, copies, why the cost is F, and `note`."""
     reason = ""
     if weighting is Weighting.OWN and opened.has_indefinite:
         reason = "the cost is F, as some information matrices are indefinite: chi2 can be negative"
     copies = copies_within_printing(opened.num_copies) if opened.num_copies else ""
-    return joined_notes(note_of_absence(opened.num_absent), copies, reason, note)
+    missing = (note_of_absence(opened.num_absent), note_of_poses_apart(opened.num_apart))
+    return joined_notes(*missing, copies, reason, note)
 
 
 def _check_first_stage(soc: FirstStage) -> None:

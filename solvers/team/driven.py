@@ -141,6 +141,13 @@ class DrivenTeam:
         known = self._member.known
         if known is not None and known.num_apart:
             problems.append(f"no edge joins {known.num_apart} poses of {self.name} with its others")
+        outcome = self._member.outcome
+        if outcome is not None and outcome.solution is not None:
+            num_of_others = outcome.solution.num_apart - (0 if known is None else known.num_apart)
+            if num_of_others:
+                problems.append(
+                    f"no edge joins {num_of_others} poses of other robots with most of theirs"
+                )
         return problems
 
     def greeting(self, to: str = "") -> Hello:

@@ -25,7 +25,7 @@ from solvers.carry.ledger import Ledger
 from solvers.growing import extend
 from solvers.loop import RunMonitor
 from solvers.pipeline import solution_for
-from solvers.reporting.notes import joined_notes
+from solvers.reporting.notes import joined_notes, note_of_poses_apart
 from solvers.request import Pipeline, SolveRequest
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
@@ -81,14 +81,21 @@ class TeamSettings:
         fitting = [name for name in files if name not in misfits]
         covered = [name for name in fitting if _has_poses_of(part, files[name])]
         is_own = np.isin(part.pose_ids, files[self.name].vertex_ids)
-        num_apart = len(np.setdiff1d(files[self.name].vertex_ids, part.pose_ids))
-        if num_apart:
-            problems.append(f"no edge joins {num_apart} poses of {self.name} with its others")
+        num_apart = {
+            name: len(np.setdiff1d(files[name].vertex_ids, part.pose_ids)) for name in covered
+        }
+        problems += [
+            f"no edge joins {count} poses of {name} with its others"
+            for name, count in num_apart.items()
+            if count
+        ]
         own = OwnAnswer.of(solution, is_own)
         sizes = _sizes_in(part, [files[name] for name in covered])
         found = RobotsSolution.of(solution, Ledger(len(covered)), sizes).without_histories
         of_files = dict.fromkeys(str(warning.message) for warning in caught)
-        found = replace(found, note=joined_notes(*of_files, found.note))
+        num_apart_of_all = sum(num_apart.values())
+        note = joined_notes(note_of_poses_apart(num_apart_of_all), *of_files, found.note)
+        found = replace(found, num_apart=num_apart_of_all, note=note)
         return SharedAnswer(found, pickle.dumps(solution), own, tuple(covered), tuple(problems))
 
     def _graph(self, files: Mapping[str, G2OLines]) -> tuple[PoseGraph, dict[str, PGOError]]:

@@ -229,18 +229,22 @@ def test_robots_come_and_go_and_messages_are_lost(seed: int) -> None:
 AHEAD = np.array([1.0, 0.0])
 
 
-def small_team(edges: Sequence[tuple[str, int, int]], **settings: object) -> Robots:
+def small_team(
+    edges: Sequence[tuple[str, int, int]],
+    sharing: solvers.Sharing = solvers.Sharing.INTERFACE,
+    **settings: object,
+) -> Robots:
     """Robots with edges of these two poses, the first of which each has."""
     names = sorted({name for name, _, _ in edges})
-    keeps = solvers.Sharing.INTERFACE
     robots = {
-        name: solvers.Robot(name, names, KEY, sharing=keeps, patience=5.0, **settings)
+        name: solvers.Robot(name, names, KEY, sharing=sharing, patience=5.0, **settings)
         for name in names
     }
     for name, i, j in edges:
         robots[name].add_pose(i, np.eye(2), i * AHEAD)
         if i != j:
-            robots[name].add_edge(i, j, np.eye(2), AHEAD, kappa=1.0, tau=1.0)
+            ahead = (1 + i / 100) * AHEAD  # no edge is a copy of another
+            robots[name].add_edge(i, j, np.eye(2), ahead, kappa=1.0, tau=1.0)
     return robots
 
 
@@ -252,16 +256,44 @@ def test_poses_that_no_edge_joins_with_a_robots_others_take_the_map_from_nobody(
     network = Network(robots, np.random.default_rng(0))
     network.run(20.0)
     assert network.is_settled
-    for name, poses, num_apart in (("a", [0, 1, 2], 2), ("b", [10, 11], 1)):
+    for name, poses, num_apart, rest in (("a", [0, 1, 2], 2, 1), ("b", [10, 11], 1, 2)):
         robot = robots[name]
         assert robot.is_certified
         assert sorted(robot.poses) == poses
-        assert robot.problems == [f"no edge joins {num_apart} poses of {name} with its others"]
+        assert robot.problems == [
+            f"no edge joins {num_apart} poses of {name} with its others",
+            f"no edge joins {rest} poses of other robots with most of theirs",
+        ]
     robots["b"].add_edge(77, 10, np.eye(2), AHEAD, kappa=1.0, tau=1.0)
     network.wait(1.0)
     network.run(20.0)
     assert sorted(robots["b"].poses) == [10, 11, 77]
-    assert robots["b"].problems == []
+    assert robots["b"].problems == ["no edge joins 2 poses of other robots with most of theirs"]
+
+
+@pytest.mark.parametrize("sharing", solvers.Sharing)
+def test_robots_whose_poses_are_all_joined_are_told_how_many_others_have_left_out(
+    sharing: solvers.Sharing,
+) -> None:
+    apart = [("a", 5, 6), ("a", 6, 7), ("b", 15, 16), ("b", 16, 17), ("b", 15, 5)]
+    longer = [("a", 2, 3), ("b", 11, 12), ("b", 12, 13), ("a", 7, 7), ("b", 17, 17)]
+    edges = [*PAIR, *longer, *apart, ("c", 20, 21), ("c", 21, 0)]
+    robots = small_team(edges, sharing)
+    network = Network(robots, np.random.default_rng(0))
+    network.run(20.0)
+    assert network.is_settled
+    robot = robots["c"]
+    assert robot.is_certified
+    assert robot.covered == ("a", "b", "c")
+    assert robot.absent == ()
+    assert {tuple(robot.problems)} <= {
+        ("no edge joins 6 poses of other robots with most of theirs",),
+        tuple(f"no edge joins 3 poses of {name} with its others" for name in "ab"),
+    }
+    for each in robots.values():
+        assert "it is without 6 poses, which no edge joins" in each.solution.note
+        assert each.solution.num_apart == 6
+        assert each.problems
 
 
 def test_a_robot_whose_poses_are_in_two_parts_goes_with_the_larger_one() -> None:
