@@ -124,7 +124,6 @@ class Beside:
             self._thread = None  # which may have noted it, and has no thread
             run()
             return
-        self._in_thread = [each for each in self._in_thread if not each[1].done()]
         self._in_thread.append((run, future))
 
     def _end_in_thread(self, end: Callable[[], None], num_bytes: int) -> None:
@@ -137,6 +136,7 @@ class Beside:
         self._go_on_in_fork()
         while not self._to_do.empty():
             self._to_do.get_nowait()()
+        self._in_thread = [each for each in self._in_thread if not each[1].done()]
 
 
 class Talk:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from pgo_models.errors import PGOError
+from solvers.carry.ledger import Ledger, Traffic
 from solvers.robots.setup import ApartError
 from solvers.robots_solution import RobotsSolution
 from solvers.team.beside import Beside
@@ -97,8 +101,26 @@ class Drive:
         """
         outcome = self.outcome
         if isinstance(outcome, RobotsSolution):
-            return Ended(self.term, revisions, absent, outcome, parts=parts)
+            found = replace(outcome, ledger=_in_few_exchanges(outcome.ledger))
+            return Ended(self.term, revisions, absent, found, parts=parts)
         if isinstance(outcome, ApartError):
-            found = tuple(tuple(self.members[k] for k in part) for part in outcome.parts)
-            return Ended(self.term, revisions, absent, None, parts=found)
+            apart = tuple(tuple(self.members[k] for k in part) for part in outcome.parts)
+            return Ended(self.term, revisions, absent, None, parts=apart)
         return Ended(self.term, revisions, absent, None, failure=f"failed: {outcome}")
+
+
+def _in_few_exchanges(ledger: Ledger) -> Ledger:
+    """The ledger with those exchanges as one that took place equally often.
+
+    All its sums stay. A message describes every exchange, and a long solve has many.
+    """
+    exchanged: dict[int, list[Traffic]] = {}
+    for traffic, times in ledger.counted:
+        exchanged.setdefault(times, []).append(traffic)
+    counted = []
+    for times, parts in exchanged.items():
+        sender = np.concatenate([each.sender for each in parts])
+        receiver = np.concatenate([each.receiver for each in parts])
+        num_bytes = np.concatenate([each.num_bytes for each in parts])
+        counted.append((Traffic(sender, receiver, num_bytes), times))
+    return replace(ledger, counted=tuple(counted))

@@ -156,20 +156,39 @@ def test_long_messages_are_read_and_written_beside_the_calls() -> None:
     np.testing.assert_array_equal(passed_on.data, data)
 
 
+def settle(robots: dict[str, solvers.Robot]) -> float:
+    """Let robots speak, from time 0 on, until all are settled; the time then."""
+    now = 0.0
+    while not all(robot.is_settled for robot in robots.values()):
+        now += 0.1
+        for robot in robots.values():
+            robot.tick(now)
+            while robot.is_computing:
+                time.sleep(1e-3)
+            for message in robot.outbox():
+                robots[message.to].receive(message.data, now)
+    return now
+
+
+def test_an_outcome_describes_exchanges_that_took_place_equally_often_as_one() -> None:
+    """Its description, of which others read 128 kB at most, would grow with the solve."""
+    robots = robots_of(world(n=10), 3, robust=solvers.GNC())
+    settle(robots)
+    for robot in robots.values():
+        assert robot.outcome is not None
+        assert robot.outcome.solution is not None
+        ledger = robot.outcome.solution.ledger
+        times = [each for _, each in ledger.counted]
+        assert len(set(times)) == len(times) > 1
+        assert ledger.messages >= 3 * ledger.rounds
+
+
 def robot_that_writes() -> solvers.Robot:
     """A robot that is settled but for a long message to another one, which it begins to write."""
     robots = robots_of(world(n=10), 3)
     robot = robots["r0"]
     made = messages_to(robot)
-    now = 0.0
-    while not all(each.is_settled for each in robots.values()):
-        now += 0.1
-        for each in robots.values():
-            each.tick(now)
-            while each.is_computing:
-                time.sleep(1e-3)
-            for message in each.outbox():
-                robots[message.to].receive(message.data, now)
+    now = settle(robots)
     data = np.random.default_rng(0).integers(0, 256, 1 << 23, dtype=np.uint8)
     robot.receive(made("r1", Relayed("r2", data)), now)
     while robot.is_computing:
