@@ -23,7 +23,7 @@ class Piece:
     """Lines of measurements of the robot `owner`, after those of the revision `before`.
 
     Where this has no digest, it is that of the run of the owner. `is_last` says that there are no
-    more.
+    more, or others than the receiver has said to have: those that it has after these do not stand.
     """
 
     owner: str

@@ -272,10 +272,14 @@ class SharedMap:
     def _give_back(self, owner: str, saved: Revision) -> None:
         """Give a robot that was restored from an older state its lines since then."""
         log = self.logs.get(owner)
-        if log is not None and log.begins_with(saved) and len(log.lines) > saved.num_lines:
-            piece = self._piece(owner, log, saved.num_lines, owner, may_pack=True)
-            if piece is not None:
-                self._session.send(owner, self._news(owner, (piece,)), Priority.NORMAL)
+        if log is None or len(log.lines) <= saved.num_lines:
+            return
+        if not log.begins_with(saved):  # they are of a run that it does not go on from
+            log.end_at(saved.num_lines, [])
+            return
+        piece = self._piece(owner, log, saved.num_lines, owner, may_pack=True)
+        if piece is not None:
+            self._session.send(owner, self._news(owner, (piece,)), Priority.NORMAL)
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Send what others lack, and solve where something is new."""
@@ -307,14 +311,16 @@ class SharedMap:
             if owner == to or known == log.revision or not log.lines:
                 self._lags.pop((to, owner), None)
                 continue
-            begins = known.num_lines if log.begins_with(known) else 0
+            is_known = log.begins_with(known)
+            begins = known.num_lines if is_known else 0
             if owner != self.name and not self._passes_on(to, owner, known, awake):
                 continue
-            if owner == self.name and self._takes_back and not log.begins_with(known):
+            may_come_back = not is_known and known.num_lines > len(log.lines)
+            if owner == self.name and self._takes_back and may_come_back:
                 continue
             piece = self._piece(to, log, begins, owner, may_pack)
             if piece is not None:
-                return piece
+                return piece if is_known else replace(piece, is_last=True)
         return None
 
     def _passes_on(self, to: str, owner: str, known: Revision, awake: tuple[str, ...]) -> bool:

@@ -258,6 +258,35 @@ def test_a_robot_that_has_measured_other_things_since_replaces_what_others_have_
         assert robot.outcome.revisions["r1"] == revision
 
 
+@pytest.mark.parametrize("measures_again", [True, False])
+def test_a_robot_that_begins_anew_from_an_older_save_and_measures_before_it_hears_is_heard(
+    measures_again: bool,
+) -> None:
+    def measure(robot: solvers.Robot, numbers: range) -> None:
+        for number in numbers:
+            ahead = np.array([float(number), 0.0])
+            robot.add_edge(first, last, np.eye(2), ahead, kappa=1e-6, tau=1e-6)
+
+    robots = shared(world(n=160), 2)
+    network = Network(robots, np.random.default_rng(0))
+    network.run(30.0)
+    first, last = min(robots["r1"].poses), max(robots["r1"].poses)
+    saved = robots["r1"].save()
+    measure(robots["r1"], range(10))
+    network.wait(5.0)
+    assert network.is_settled
+    robot = solvers.Robot.load(saved, KEY, patience=5.0, retry=0.3)
+    measure(robot, range(20, 25))
+    if not measures_again:
+        robot = solvers.Robot.load(robot.save(), KEY, patience=5.0, retry=0.3)
+    robots["r1"] = robot
+    revision = robot.revision
+    network.wait(20.0)
+    assert network.is_settled
+    for each in robots.values():
+        assert each.outcome.revisions["r1"] == revision
+
+
 # What is measured.
 
 
