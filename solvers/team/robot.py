@@ -323,10 +323,11 @@ class Robot:
 
     @property
     def problems(self) -> list[str]:
-        """Sentences on what is wrong with the team: names, keys, versions; none where nothing is.
+        """Sentences on what is wrong with the team, or was left out; none where nothing is.
 
         They are of messages that arrive: of two robots with one name, of a robot that is not in
-        the team, and of one with another key or version.
+        the team, and of one with another key or version. And they are of what the outcome is
+        without, as poses of any robot that no edge joins with most of its others.
         """
         return self._session.problems
 
