@@ -4,9 +4,11 @@ The key says that a robot of the team made a message, not when. So every run of 
 number, its boot, and a message names the boot of its sender and that of its receiver, as the sender
 has heard it. A message is of this mission if it names the boot of its receiver, which nobody could
 know before; one that does not is answered by a greeting, and believed in nothing. Messages of a run
-are numbered, and each number counts once. Where both know both boots, these and the names are in
-the seal alone; where there were two runs of a name, they are sent once in each patience, too, which
-tells the others of that name who is spoken to.
+are numbered, and each number counts once. A run is followed by another one, and comes back where it
+speaks on and that one is silent: a late message of an earlier run does not end one that lives.
+Where both know both boots, these and the names are in the seal alone; where there were two runs of
+a name, they are sent once in each patience, too, which tells the others of that name who is spoken
+to.
 """
 
 from __future__ import annotations
@@ -206,17 +208,22 @@ class Word(enum.Enum):
 
 @dataclass(eq=False)
 class _Run:
-    """A run of another robot: the highest number heard, and those within the window."""
+    """A run of another robot: the highest number heard, and those within the window.
+
+    It is the current one `since` it began or came back, and `heard` last.
+    """
 
     boot: bytes
     since: float
+    heard: float
     highest: int = -1
     numbers: set[int] = field(default_factory=set)
 
-    def takes(self, number: int) -> bool:
+    def takes(self, number: int, now: float) -> bool:
         """Whether a number has not come before; it has now."""
         if number in self.numbers or number <= self.highest - _WINDOW:
             return False
+        self.heard = now
         self.numbers.add(number)
         self.highest = max(number, self.highest)
         if len(self.numbers) > 2 * _WINDOW:
@@ -275,20 +282,28 @@ class Speakers:
         self.claimed_since = None
         run = self._runs.get(envelope.sender)
         former = self._former.setdefault(envelope.sender, {})
-        if envelope.boot in former:
-            is_new = former[envelope.boot].takes(envelope.number)
-            if is_new and run is not None and now - run.since > self._patience:
+        if run is not None and envelope.boot in former:
+            other = former[envelope.boot]
+            highest = other.highest
+            if not other.takes(envelope.number, now):
+                return Word.REPEATED
+            if now - run.heard > self._patience:  # it was a late message of an earlier run
+                former[run.boot] = run
+                self._runs[envelope.sender] = former.pop(envelope.boot)
+                other.since = now
+                return Word.NEW if envelope.number > highest else Word.LATE
+            if now - run.since > self._patience:
                 self.twins.add(envelope.sender)
             return Word.REPEATED
         if run is None or envelope.boot != run.boot:
             if run is not None:
                 former[run.boot] = run
-            run = self._runs[envelope.sender] = _Run(envelope.boot, now)
+            run = self._runs[envelope.sender] = _Run(envelope.boot, now, now)
             address = replace(envelope, number=0, content=b"")
             hint = hint_of(envelope.ends)
             self._ends[hint] = (*self.ends_at(hint), Ends(address, envelope.ends))
         highest = run.highest
-        if not run.takes(envelope.number):
+        if not run.takes(envelope.number, now):
             return Word.REPEATED
         return Word.NEW if envelope.number > highest else Word.LATE
 

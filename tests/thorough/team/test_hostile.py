@@ -304,6 +304,36 @@ def messages_to(robot: solvers.Robot) -> Callable[[str, object], bytes]:
     return made
 
 
+@pytest.mark.parametrize("sharing", solvers.Sharing)
+def test_a_late_message_of_an_earlier_run_does_not_end_the_run_that_lives(
+    sharing: solvers.Sharing,
+) -> None:
+    first, other, second = (
+        solvers.Robot(name, ["a", "b"], KEY, sharing=sharing, patience=10.0) for name in "aba"
+    )
+    other.tick(0.0)
+    for message in other.outbox():
+        first.receive(message.data, 0.0)
+    late = first.outbox()[0].data
+    robots = {"a": second, "b": other}
+    receivers = set()
+    for now in np.arange(0.0, 30.0, 0.1):
+        if now > 3.0 and late:
+            assert other.heard == ("a",)
+            other.receive(late, now)
+            late = b""
+        for robot in robots.values():
+            robot.tick(now)
+            for message in robot.outbox():
+                dropped = robots[message.to].ledger.dropped
+                robots[message.to].receive(message.data, now)
+                if now > 20.0:
+                    assert robots[message.to].ledger.dropped == dropped
+                    receivers.add(message.to)
+    assert receivers == {"a", "b"}
+    assert first.problems == second.problems == other.problems == []
+
+
 def as_r0(robot: solvers.Robot) -> Callable[[object], None]:
     """A function that has r0 send a message to r1, this robot, at time 0."""
     made = messages_to(robot)
