@@ -225,51 +225,58 @@ class AxisUnknowns(Unknowns):
         return StoredMatrix(stored, diagonal, self.rows, entries, problem.analysis, positions)
 
     def added(self, X: Array, low: Array) -> Evaluation:
-        """The terms by axis at X, half their gradient, and bounds on the errors of both.
+        """The terms by axis at X, half their gradient, and bounds on the errors of both."""
+        return self._of_positions(X, low).plus(self._of_lengths(X))
 
-        They are sum D_k (r_k - r*_k)^2 + sum gamma_ik (1 - |p_ik|^2), less what the tangents of
-        these edges may lose to rounding with the share of J_tt that D leaves.
+    def _of_positions(self, X: Array, low: Array) -> Evaluation:
+        """Sum of D_k (r_k - r*_k)^2, less what the tangents of these edges may lose.
+
+        That is what they lose to rounding with the share of J_tt that D leaves.
         """
-        problem = self.problem
-        n = problem.num_poses
-        d = problem.d
-        terms = self.terms
-        cost = problem.weights
+        graph = self.problem.graph
+        cost = self.problem.weights
         assert isinstance(cost, TangentCost)
-        ends = problem.graph.j[terms.edges]
-        t = X[ends]
-        low = low[ends]
-        offset = problem.graph.t_ij[terms.edges]
-        at_contact = cost.tangent.Z[terms.edges, 0]
-        residual = t - offset
+        edges = self.terms.edges
+        weights = self.terms.weights
+        ends = graph.j[edges]
+        residual = X[ends] - graph.t_ij[edges]
         residual_error = UNIT_ROUNDOFF * np.abs(residual)
-        for summand in (low, -at_contact):
+        for summand in (low[ends], -cost.tangent.Z[edges, 0]):
             residual = residual + summand
             residual_error = residual_error + UNIT_ROUNDOFF * np.abs(residual)
-        of_positions = terms.weights * residual
-        position_error = terms.weights * residual_error + UNIT_ROUNDOFF * np.abs(of_positions)
-        value = of_positions * residual
-        value_error = position_error * np.abs(residual) + np.abs(of_positions) * residual_error
-        value_error += position_error * residual_error + UNIT_ROUNDOFF * value
+        weighted = weights * residual
+        weighted_error = weights * residual_error + UNIT_ROUNDOFF * np.abs(weighted)
+        squares = weighted * residual
+        square_error = weighted_error * np.abs(residual) + np.abs(weighted) * residual_error
+        square_error += weighted_error * residual_error + UNIT_ROUNDOFF * squares
+        product = np.zeros_like(X)
+        sizes = np.zeros_like(X)
+        product_error = np.zeros_like(X)
+        np.add.at(product, ends, weighted)
+        np.add.at(sizes, ends, np.abs(weighted))
+        np.add.at(product_error, ends, weighted_error)
+        most_terms = int(np.bincount(ends).max())
+        product_error += rounding(most_terms) * sizes
+        times_lost = 1.0 / (1.0 - KEPT_SHARE) - 1.0
+        lost = OUTWARD * times_lost * float(np.sum(cost.tangent.loss[edges]))
+        value = exact_sum([*squares.ravel(), -lost])
+        value_error = float(np.sum(square_error)) + UNIT_ROUNDOFF * abs(value)
+        return Evaluation(value, OUTWARD * value_error, product, OUTWARD * product_error)
+
+    def _of_lengths(self, X: Array) -> Evaluation:
+        """Sum of gamma_ik (1 - |p_ik|^2)."""
+        n = self.problem.num_poses
+        d = self.problem.d
+        gamma = self.terms.gamma
         P = X[n:].reshape(n, d, d)
         lengths = np.einsum("nak,nak->nk", P, P)
-        of_lengths = terms.gamma * (1.0 - lengths)
-        length_error = np.abs(terms.gamma) * rounding(d + 3) * (1.0 + lengths)
+        errors = np.abs(gamma) * rounding(d + 3) * (1.0 + lengths)
+        value = exact_sum((gamma * (1.0 - lengths)).ravel())
+        value_error = float(np.sum(errors)) + UNIT_ROUNDOFF * abs(value)
         product = np.zeros_like(X)
-        product_error = np.zeros_like(X)
-        np.add.at(product, ends, of_positions)
-        np.add.at(product_error, ends, position_error)
-        most = int(np.bincount(ends).max())
-        sizes = np.zeros_like(X)
-        np.add.at(sizes, ends, np.abs(of_positions))
-        product_error += rounding(most) * sizes
-        of_P = -terms.gamma[:, None, :] * P
-        product[n:] = of_P.reshape(-1, d)
-        product_error[n:] = UNIT_ROUNDOFF * np.abs(product[n:])
-        lost = (1.0 / (1.0 - KEPT_SHARE) - 1.0) * float(np.sum(cost.tangent.loss[terms.edges]))
-        total = exact_sum([*value.ravel(), *of_lengths.ravel(), -OUTWARD * lost])
-        error = float(np.sum(value_error) + np.sum(length_error)) + UNIT_ROUNDOFF * abs(total)
-        return Evaluation(total, OUTWARD * error, product, OUTWARD * product_error)
+        product[n:] = (-gamma[:, None, :] * P).reshape(-1, d)
+        product_error = UNIT_ROUNDOFF * np.abs(product)
+        return Evaluation(value, OUTWARD * value_error, product, OUTWARD * product_error)
 
 
 class _FactorsOfAxes:
