@@ -47,11 +47,10 @@ from pgo_models.certificates.definiteness import (
     Factor,
     StoredMatrix,
     etas_of_rotations,
-    is_in_range,
     prove_stored,
-    shifted_certificate,
+    stored_certificate,
 )
-from pgo_models.certificates.rounding_errors import Evaluation, matrix_errors
+from pgo_models.certificates.rounding_errors import Evaluation
 from pgo_models.certificates.unknowns import Unknowns
 from pgo_models.geometry.arrays import ReadOnly
 from pgo_models.geometry.rotations import Array
@@ -105,7 +104,7 @@ def axis_terms(problem: PGOProblem) -> AxisTerms | None:
     along_axes = np.einsum("maa->ma", rows[:, :, :d])
     J_tt = along_axes.copy()
     along_axes[:] = 0.0
-    chosen = (graph.i == graph.world) & is_unturned & ~rows.any(axis=(1, 2))
+    chosen = graph.is_prior & is_unturned & ~rows.any(axis=(1, 2))
     error = _ROUNDINGS_OF_J * UNIT_ROUNDOFF * excess.size[:, :1] ** 2
     weights = KEPT_SHARE * (J_tt - error) / OUTWARD
     weights = np.where(chosen[:, None], np.maximum(weights, 0.0), 0.0)
@@ -138,26 +137,26 @@ class AxisUnknowns(Unknowns):
         """X' itself."""
         return X
 
-    def flattened(self, X: Array) -> Array | None:
-        """X' that is flat along axes which one position alone holds; None without such axes.
+    def other_starts(self, X: Array) -> list[Array]:
+        """X' that is flat along axes which one position alone holds, where there are such axes.
 
         Where nothing but the lengths |p_k| = 1 keeps the map from being flat along an axis, the
         bound of this axis is attained there, as gamma has been lowered.
         """
         graph = self.problem.graph
-        weights = np.zeros((graph.num_edges, graph.d))
-        weights[graph.i == graph.world] += self.problem.weights.tau[graph.i == graph.world, None]
+        tau_of_priors = np.where(graph.is_prior, self.problem.weights.tau, 0.0)
+        weights = np.repeat(tau_of_priors[:, None], graph.d, axis=1)
         weights[self.terms.edges] += self.terms.weights
         unmeasured = np.flatnonzero(np.count_nonzero(weights, axis=0) == 1)
         if not len(unmeasured):
-            return None
+            return []
         X = X.copy()
         for axis in unmeasured:
             height = X[graph.j[np.argmax(weights[:, axis])], axis]
             X[: graph.num_poses, axis] = height
             X[graph.num_poses :, axis] = 0.0
             X[self.rows, axis] = np.append(0.0, np.eye(graph.d)[axis])
-        return X
+        return [X]
 
     def prove_definite(self, Lambda: Array, eta: float, X: Array) -> DefiniteProof | None:
         """Proof that the matrix of every axis is definite without the rows left out."""
@@ -212,17 +211,9 @@ class AxisUnknowns(Unknowns):
         shifts = np.zeros(problem.side)
         np.add.at(shifts, ends, self.terms.weights[:, axis])
         shifts[:n] /= OUTWARD
-        added = np.repeat(etas_of_rotations(problem, eta), problem.d)
+        shifts[n:] = np.repeat(etas_of_rotations(problem, eta), problem.d)
         multipliers = Lambda + self.terms.gamma[:, axis, None, None] * np.eye(problem.d)
-        shifts[n:] = added
-        stored, diagonal = shifted_certificate(problem, multipliers, shifts)
-        diagonal[self.rows] = np.maximum(diagonal[self.rows], 1.0)
-        if not is_in_range(stored.data, diagonal):
-            return None
-        problem.leave_out(stored.data, self.rows, 2.0 * diagonal[self.rows])
-        entries = matrix_errors(problem, diagonal)
-        positions = problem.diagonal_positions
-        return StoredMatrix(stored, diagonal, self.rows, entries, problem.analysis, positions)
+        return stored_certificate(problem, multipliers, shifts, self.rows)
 
     def added(self, X: Array, low: Array) -> Evaluation:
         """The terms by axis at X, half their gradient, and bounds on the errors of both."""

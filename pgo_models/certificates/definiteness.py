@@ -121,6 +121,14 @@ def prove_definite(
     """
     shifts = np.zeros(problem.side)
     shifts[problem.num_poses :] = np.repeat(etas_of_rotations(problem, eta), problem.d)
+    matrix = stored_certificate(problem, Lambda, shifts, fixed)
+    return None if matrix is None else prove_stored(matrix, first_margin, turned)
+
+
+def stored_certificate(
+    problem: PGOProblem, Lambda: Array, shifts: Array, fixed: IntArray
+) -> StoredMatrix | None:
+    """S + diag(shifts) without the rows `fixed`; None where a number is out of range."""
     stored, diagonal = shifted_certificate(problem, Lambda, shifts)
     # A row that is left out may be empty, as that of a height which no prior measures.
     diagonal[fixed] = np.maximum(diagonal[fixed], 1.0)
@@ -129,8 +137,7 @@ def prove_definite(
     problem.leave_out(stored.data, fixed, 2.0 * diagonal[fixed])
     entries = matrix_errors(problem, diagonal)
     positions = problem.diagonal_positions
-    matrix = StoredMatrix(stored, diagonal, fixed, entries, problem.analysis, positions)
-    return prove_stored(matrix, first_margin, turned)
+    return StoredMatrix(stored, diagonal, fixed, entries, problem.analysis, positions)
 
 
 def etas_of_rotations(problem: PGOProblem, eta: float) -> Array:

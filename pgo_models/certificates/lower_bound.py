@@ -290,20 +290,10 @@ def prove_by_axes(
 def prove_from_axis_terms(
     problem: PGOProblem, Lambda: Array, poses: Poses, axes: AxisTerms
 ) -> LowerBound | None:
-    """Bound grounded at the world pose with given terms by axis; None where it is not proved.
-
-    It is the better one of X' at the poses and of X' that is flat along axes which nothing measures
-    (`AxisUnknowns.flattened`): moves of X' do not reach the one from the other.
-    """
+    """Bound grounded at the world pose with given terms by axis; None where it is not proved."""
     X, unknowns = _grounded_at_world(problem, poses, axes)
-    Lambda = _symmetric(problem, Lambda)
-    bound = _prove(problem, Lambda, 0.0, _Ground(X, unknowns))
-    flat = unknowns.flattened(X)
-    if bound is None or flat is None:
-        return None if bound is None else replace(bound, axes=axes)
-    from_flat = _prove(problem, Lambda, 0.0, _Ground(flat, unknowns))
-    better = from_flat if from_flat is not None and from_flat.value > bound.value else bound
-    return replace(better, axes=axes)
+    bound = _prove(problem, _symmetric(problem, Lambda), 0.0, _Ground(X, unknowns))
+    return None if bound is None else replace(bound, axes=axes)
 
 
 def _grounded_at_world(
@@ -533,7 +523,7 @@ def _prove(
         return None
     if ground is None:
         return _prove_with_eta(problem, Lambda, eta)
-    return _prove_grounded(problem, Lambda, eta, ground)
+    return _prove_grounded(Lambda, eta, ground)
 
 
 def _prove_with_eta(problem: PGOProblem, Lambda: Array, eta: float) -> LowerBound | None:
@@ -565,19 +555,31 @@ def bound_with_eta(
     return bound_from(terms, rounding + constant_error, eta, is_grounded=False)
 
 
-def _prove_grounded(
-    problem: PGOProblem, Lambda: Array, eta: float, ground: _Ground
-) -> LowerBound | None:
-    """Form grounded at a pose; None where S_r + eta blockdiag(0, I) is not shown to be definite."""
+def _prove_grounded(Lambda: Array, eta: float, ground: _Ground) -> LowerBound | None:
+    """Form grounded at a pose; None where S_r + eta blockdiag(0, I) is not shown to be definite.
+
+    It is the best one of all X' to begin at: the proof of definiteness is the same.
+    """
     unknowns = ground.unknowns
     proof = unknowns.prove_definite(Lambda, eta, ground.X)
     if proof is None:
         return None
+    starts = [ground.X, *unknowns.other_starts(ground.X)]
+    bounds = [_bound_from(start, Lambda, eta, ground, proof) for start in starts]
+    return max(bounds, key=lambda bound: bound.value)
+
+
+def _bound_from(
+    X: Array, Lambda: Array, eta: float, ground: _Ground, proof: DefiniteProof
+) -> LowerBound:
+    """Bound of a proof grounded at a pose, from X' on."""
+    unknowns = ground.unknowns
+    problem = unknowns.problem
 
     def move(point: _Point) -> tuple[_Point, float]:
         return _moved(unknowns, Lambda, proof, point)
 
-    point = move_until_settled(_first_point(unknowns, Lambda, ground.X), move)
+    point = move_until_settled(_first_point(unknowns, Lambda, X), move)
     evaluation = point.evaluation
     if evaluation is None:
         evaluation = _evaluate(unknowns, Lambda, point.X, point.low)

@@ -100,6 +100,10 @@ class Unknowns(ABC):
     def rows_of(self, unknowns: Array) -> Array:
         """Z, (N, d), of values of the unknowns."""
 
+    def other_starts(self, X: Array) -> list[Array]:
+        """Further X' for a proof to begin at, which moves from the given one do not reach."""
+        return []
+
     def added(self, X: Array, low: Array) -> Evaluation | None:
         """What is bounded beside tr(X^T S X) + tr(Lambda), if anything.
 
