@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pgo_models.errors import PGOError
 from solvers.carry.registry import VERSION, name_of_order, order_named, record
-from solvers.carry.serialization import deserialize, serialize
+from solvers.carry.serialization import deserialize
 
 MARK = b"PGO"
 _VERSION = VERSION.to_bytes(1, "big")
@@ -89,19 +89,6 @@ def deflated(data: bytes) -> bytes:
     """Bytes, compressed (RFC 1951) by what they have in common with every message, too."""
     packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, _NO_HEADER, zdict=_COMMON)
     return packer.compress(data) + packer.flush()
-
-
-def as_bytes(message: object) -> bytes:
-    """Bytes of a message, compressed."""
-    return deflated(packed(serialize(message)))
-
-
-def from_bytes(data: bytes, kind: type[K]) -> K:
-    """The message that the bytes are, one of the given kinds; else a WireError."""
-    plain = inflated(data, MOST_BYTES)
-    if plain is None:
-        raise WireError("a message that is too long")
-    return from_plain(plain, kind)
 
 
 def inflated(data: bytes, most_bytes: int) -> bytes | None:

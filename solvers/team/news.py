@@ -93,14 +93,14 @@ class News:
             if data[0] >= _END_OF_FLAGS:
                 raise ValueError("a byte of other flags")
             reader = _Reader(data)
-            read = cls._from_short if data[0] & _IS_SHORT else cls._from_long
-            return read(reader, data[0], sender, receiver)
+            if data[0] & _IS_SHORT:
+                return cls._from_short(reader, data[0], sender, receiver)
+            return cls._from_long(reader, data[0])
         except (IndexError, ValueError) as error:
             raise WireError(f"a message that cannot be read: {error}") from error
 
     @classmethod
-    def _from_long(cls, reader: _Reader, flags: int, sender: str, receiver: str) -> News:
-        del sender, receiver  # which it names where it tells of them
+    def _from_long(cls, reader: _Reader, flags: int) -> News:
         known = {reader.text().decode("utf-8"): reader.revision() for _ in reader.items()}
         names = list(known)
         hears, twins = reader.chosen(names), reader.chosen(names)

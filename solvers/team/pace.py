@@ -71,8 +71,8 @@ class _Sent(NamedTuple):
 
 
 @dataclass(eq=False)
-class Talk:
-    """What is known of the talk with a run of another robot, and how fast it is.
+class Correspondence:
+    """What is known of the messages to and from a run of another robot, and how fast they are.
 
     `heard` is the number of the last message that it told something with, by which it had
     `num_told` lines of its own, and `is_answered` whether that was answered. `num_checked` of its

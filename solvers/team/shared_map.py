@@ -22,7 +22,7 @@ from solvers.team.measurements import Measurements, Revision
 from solvers.team.member import Member
 from solvers.team.messages import Ended, Hello, Priority, Term
 from solvers.team.news import News, Piece
-from solvers.team.pace import MOST_IN_A_PIECE, Talk
+from solvers.team.pace import MOST_IN_A_PIECE, Correspondence
 from solvers.team.packed_lines import MOST_LINES, PackedLines, packed_lines, unpacked_lines
 from solvers.team.session import Session
 from solvers.team.shared_solve import SharedAnswer
@@ -75,7 +75,8 @@ class SharedMap:
         self._turn = ""  # the robot that lines were packed for last: others come first
         # What is on its way, by receiver and owner, and the last piece of all.
         self._flights: defaultdict[tuple[str, str], list[_Flight]] = defaultdict(list)
-        self._talks: defaultdict[tuple[str, bytes], Talk] = defaultdict(Talk)  # by robot and run
+        # By robot and run.
+        self._talks: defaultdict[tuple[str, bytes], Correspondence] = defaultdict(Correspondence)
         self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
         # When an answer is owed to robots whose pieces have come: they are collected, too.
         self._owed: dict[str, float] = {}
@@ -144,7 +145,7 @@ class SharedMap:
             return self._news(to, ())
         return News(self.revisions, tuple(self._has), (), self._takes_back, self._session.twins)
 
-    def _talk(self, to: str) -> Talk:
+    def _talk(self, to: str) -> Correspondence:
         return self._talks[to, self._session.boot_of(to)]
 
     def _news(self, to: str, pieces: tuple[Piece, ...]) -> News:

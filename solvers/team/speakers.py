@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 from solvers.carry.serialization import serialize
 from solvers.carry.wire import (
     MARK,
-    MOST_BYTES,
     WireError,
     deflated,
     from_plain,
@@ -60,14 +59,6 @@ class Envelope:
     heard: bytes
     number: int
     content: bytes
-
-    @property
-    def message(self) -> Any:  # noqa: ANN401 - a message of any kind
-        """The message; a WireError for bytes that are none."""
-        plain = self.plain(MOST_BYTES)
-        if plain is None:
-            raise WireError("a message that is too long")
-        return self.message_of(plain)
 
     def plain(self, most_bytes: int) -> bytes | None:
         """The content, not compressed; None for more than so many bytes."""

@@ -5,7 +5,7 @@ import importlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -27,10 +27,32 @@ from solvers import (
 )
 from solvers.carry.process import WorkerPool
 from solvers.carry.registry import VERSION, names_and_fields
-from solvers.carry.wire import Order, WireError, as_bytes, from_bytes, opened, sealed
+from solvers.carry.serialization import serialize
+from solvers.carry.wire import (
+    MOST_BYTES,
+    Order,
+    WireError,
+    deflated,
+    from_plain,
+    inflated,
+    opened,
+    packed,
+    sealed,
+)
 from solvers.studies.tightness import noisy_scene
 
 KEY = b"sixteen or more bytes"
+K = TypeVar("K")
+
+
+def as_bytes(message: object) -> bytes:
+    return deflated(packed(serialize(message)))
+
+
+def from_bytes(data: bytes, kind: type[K]) -> K:
+    plain = inflated(data, MOST_BYTES)
+    assert plain is not None
+    return from_plain(plain, kind)
 
 
 @dataclass
