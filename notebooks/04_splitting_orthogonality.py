@@ -190,12 +190,12 @@ for _ in range(20):
     by_hand.append(omega)
 
 # %% [markdown]
-# ## The library agrees, with four back ends
+# ## The library agrees, with three back ends
 #
 # A convex QP without constraints is a linear system: $(M + \tfrac\rho2 D) X = \tfrac\rho2 D V$,
-# with the same matrix at every iteration. One can factor it once (`FACTORIZED`), use gradients that
-# are accelerated as the paper does it (`FISTA`, Beck and Teboulle 2009) or by the constant momentum
-# that suits a strongly convex function (`NESTEROV`), or use an interior-point method (`CLARABEL`).
+# with the same matrix at every iteration. One can factor it once (`FACTORIZED`), use the accelerated
+# gradients of the paper (`FISTA`, Beck and Teboulle 2009), or use an interior-point method
+# (`CLARABEL`).
 
 # %%
 best = solvers.solve(problem)

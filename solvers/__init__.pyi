@@ -1,5 +1,4 @@
 from solvers.baselines.gauss_seidel import GaussSeidel as GaussSeidel
-from solvers.baselines.levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
 from solvers.carry.faults import Faults as Faults
 from solvers.carry.process import (
     InProcess as InProcess,
@@ -101,7 +100,7 @@ __all__ += ["SOC", "Coupling", "CvxpyStep", "PaperSOC", "RStep"]
 __all__ += ["BalancedPenalty", "FixedPenalty", "MultiplierPenalty"]
 __all__ += ["Newton", "Staircase", "gauss_newton", "polish"]
 __all__ += ["GNC", "IRLS", "PCM", "Known", "RobustLoss", "prove_outliers"]
-__all__ += ["GaussSeidel", "LevenbergMarquardt"]
+__all__ += ["GaussSeidel"]
 __all__ += ["Checkpoint", "Faults", "InProcess", "RayEngine"]
 __all__ += ["AlternatingBregman", "Bregman", "MethodOfMultipliers", "TwoLineBregman"]
 __all__ += ["ExtendedSOC", "OrthogonalSOC", "solve_orthogonal"]

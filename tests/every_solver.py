@@ -43,7 +43,6 @@ SOLVERS: dict[str, Make] = {
     ),
     "newton": lambda problem, **changes: solvers.Newton(**changes),
     "gauss_newton": lambda problem, **changes: replace(solvers.gauss_newton(), **changes),
-    "levenberg_marquardt": lambda problem, **changes: solvers.LevenbergMarquardt(**changes),
     "staircase": lambda problem, **changes: solvers.Staircase(**changes),
     "growing_start": lambda problem, **changes: GrowingStart(first_size=2, growth=0.1, **changes),
     "gnc": lambda problem, **changes: solvers.GNC(spread=None, **changes),

@@ -13,7 +13,7 @@ import typer
 FirstStage = enum.StrEnum("FirstStage", "JOINT SUBSTRUCTURED CONSENSUS PAPER NEWTON")
 Start = enum.StrEnum("Start", "CHORDAL TREE ODOMETRY FILE")
 # Back ends of the R-step.
-BackEndName = enum.StrEnum("BackEndName", "FACTORIZED FISTA NESTEROV CLARABEL")
+BackEndName = enum.StrEnum("BackEndName", "FACTORIZED FISTA CLARABEL")
 # How poses go to robots.
 Split = enum.StrEnum("Split", "GIVEN CONTIGUOUS METIS SINGLETONS")
 # Where robots run.

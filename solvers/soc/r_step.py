@@ -7,7 +7,7 @@ With M = A^T diag(w) A this is the solution of (M + D/2) X = D/2 V.
 
 import enum
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import quotient
 from pgo_models.summaries import Summarised
 from solvers.carry.registry import record
-from solvers.soc.accelerated_gradients import minimize_with_fista, minimize_with_nesterov
+from solvers.soc.fista import minimize_with_fista
 
 if TYPE_CHECKING:
     from pgo_models.convex.convex_solver import ConvexSolver
@@ -36,8 +36,7 @@ class RStep(enum.Enum):
     """Which back end solves the R-subproblem."""
 
     FACTORIZED = "one sparse Cholesky factorisation, then two triangular solves an iteration"
-    FISTA = "gradients with the growing momentum of Beck and Teboulle, the paper's choice"
-    NESTEROV = "gradients with the constant momentum of strongly convex functions, and restarts"
+    FISTA = "accelerated gradients of Beck and Teboulle, the paper's choice"
     CLARABEL = "the cvxpy quadratic program, solved by Clarabel"
 
 
@@ -104,7 +103,7 @@ def prepare(subproblem: RSubproblem, back_end: BackEnd) -> RotationStep:
         return _Factorized(factor, 0.5 * subproblem.rho[:, None])
     if back_end is RStep.CLARABEL:
         return CvxpyStep().prepare(subproblem)
-    return _Gradients(subproblem, back_end)
+    return _Gradients(subproblem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +179,7 @@ class _Factorized:
 
 
 class _Gradients:
-    """Accelerated gradients on the rotations alone.
+    """FISTA on the rotations alone.
 
     With P = M + D/2 in blocks, the best translations of rotations R are P_tt^-1 (b_t - P_tR R), by
     one factor of P_tt. What is left is a system in Y = D^(1/2) R,
@@ -189,7 +188,7 @@ class _Gradients:
     largest of them.
     """
 
-    def __init__(self, subproblem: RSubproblem, method: RStep) -> None:
+    def __init__(self, subproblem: RSubproblem) -> None:
         P = subproblem.matrix
         count = subproblem.num_translations
         self._subproblem = subproblem
@@ -201,14 +200,7 @@ class _Gradients:
         self._scale = scale[:, None]
         self._H_RR = (diags_array(scale) @ P[count:, count:] @ diags_array(scale)).tocsr()
         # The correction P_Rt P_tt^-1 P_tR only lowers the eigenvalues of H.
-        lipschitz = _largest_eigenvalue_bound(self._H_RR)
-        if method is RStep.FISTA:
-            self._minimize = partial(minimize_with_fista, self._apply, lipschitz=lipschitz)
-        else:
-            # H is half the identity and a positive semidefinite matrix.
-            self._minimize = partial(
-                minimize_with_nesterov, self._apply, lipschitz=lipschitz, strong_convexity=0.5
-            )
+        self._lipschitz = _largest_eigenvalue_bound(self._H_RR)
 
     def solve(self, V: Array) -> Array:
         count = self._subproblem.num_translations
@@ -216,7 +208,8 @@ class _Gradients:
         b_t = b[:count]
         reduced = self._scale * (b[count:] - self._P_tR.T @ self._solve_tt(b_t))
         start = V[count:] / self._scale
-        R = self._scale * self._minimize(b=reduced, start=start)
+        Y = minimize_with_fista(self._apply, reduced, start, self._lipschitz)
+        R = self._scale * Y
         return np.concatenate([self._solve_tt(b_t - self._P_tR @ R), R])
 
     def _apply(self, Y: Array) -> Array:

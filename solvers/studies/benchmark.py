@@ -26,7 +26,6 @@ class BenchmarkMethod(enum.Enum):
     STAIRCASE = "staircase", "SE-Sync (staircase)"
     GAUSS_SEIDEL = "gauss-seidel", "DGS"
     NEWTON = "newton", "Newton"
-    LEVENBERG_MARQUARDT = "levenberg-marquardt", "Levenberg-Marquardt"
     GTSAM = "gtsam", "GTSAM"
 
     label: str

@@ -16,7 +16,6 @@ from pgo_models.graphs.pose_graph import PoseGraph
 from pgo_models.problem.problem import PGOProblem
 from solvers.baselines.gauss_seidel import DGSStage, GaussSeidel, GaussSeidelState
 from solvers.baselines.gtsam import run_gtsam
-from solvers.baselines.levenberg_marquardt import LevenbergMarquardt
 from solvers.baselines.sweep_order import schedule
 from solvers.carry.ledger import Ledger
 from solvers.loop import Solver, run
@@ -309,8 +308,5 @@ _RUNS: dict[BenchmarkMethod, Callable[[PGOProblem, _Budget, Poses | None], Bench
     BenchmarkMethod.STAIRCASE: partial(_one_run, Staircase(), "staircase"),
     BenchmarkMethod.GAUSS_SEIDEL: _gauss_seidel,
     BenchmarkMethod.NEWTON: partial(_one_run, Newton(), "Newton"),
-    BenchmarkMethod.LEVENBERG_MARQUARDT: partial(
-        _one_run, LevenbergMarquardt(), "Levenberg-Marquardt"
-    ),
     BenchmarkMethod.GTSAM: _gtsam,
 }

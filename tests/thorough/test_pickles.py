@@ -210,7 +210,6 @@ SETTINGS += (
     "IRLS",
     "PCM",
     "GaussSeidel",
-    "LevenbergMarquardt",
     "Faults",
     "Robots",
     "InProcess",

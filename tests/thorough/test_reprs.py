@@ -26,7 +26,6 @@ METHODS: list[Any] = [
     solvers.Newton(),
     solvers.Staircase(),
     solvers.GaussSeidel(),
-    solvers.LevenbergMarquardt(),
     solvers.GNC(),
     solvers.IRLS(),
     solvers.ExtendedSOC(lambda unknown: pgo.ModelChange()),

@@ -31,7 +31,6 @@ from solvers import (
     Faults,
     FixedPenalty,
     InProcess,
-    LevenbergMarquardt,
     MultiplierPenalty,
     Newton,
     Solver,
@@ -147,8 +146,6 @@ def tight(make: Make, problem: PGOProblem) -> Solver[Any]:
     """
     solver = make(problem)
     tolerance = 1e-13 if isinstance(solver, Newton | Staircase | GNC) else 1e-8
-    if isinstance(solver, LevenbergMarquardt):
-        tolerance = 1e-15  # its damping, which ends with the run, slows it down
     return dataclasses.replace(solver, tolerance=tolerance, max_iterations=5000)
 
 

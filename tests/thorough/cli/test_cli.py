@@ -95,7 +95,6 @@ def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
         ("--method", "paper", "--robots", "3"),
         ("--method", "paper", "--split", "singletons"),
         ("--r-step", "fista"),
-        ("--r-step", "nesterov"),
         ("--r-step", "clarabel"),
         ("--start", "tree"),
         ("--start", "file"),

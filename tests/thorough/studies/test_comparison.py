@@ -10,7 +10,7 @@ from solvers import (
     BenchmarkMethod,
     BenchmarkSettings,
     ComparisonSettings,
-    LevenbergMarquardt,
+    GaussSeidel,
     Measurement,
     compare_methods,
 )
@@ -90,9 +90,9 @@ def test_ctrl_c_keeps_the_methods_that_are_done(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(LevenbergMarquardt, "init", interrupted)
+    monkeypatch.setattr(GaussSeidel, "init", interrupted)
     settings = ComparisonSettings(
-        (BenchmarkMethod.STAIRCASE, BenchmarkMethod.LEVENBERG_MARQUARDT, BenchmarkMethod.JOINT)
+        (BenchmarkMethod.STAIRCASE, BenchmarkMethod.GAUSS_SEIDEL, BenchmarkMethod.JOINT)
     )
     compared = compare_methods(pgo.grid(np.random.default_rng(1)), settings)
     assert not compared.is_complete
