@@ -39,12 +39,6 @@ from pgo_models.geometry.rotations import (
 from pgo_models.graphs.datasets import (
     load as load,
 )
-from pgo_models.graphs.edge_lists import (
-    from_networkx as from_networkx,
-    from_pandas as from_pandas,
-    to_networkx as to_networkx,
-    to_pandas as to_pandas,
-)
 from pgo_models.graphs.g2o import read_g2o as read_g2o, write_g2o as write_g2o
 from pgo_models.graphs.g2o_readings import Reading as Reading
 from pgo_models.graphs.grid_worlds import grid_world as grid_world
@@ -109,8 +103,7 @@ __all__ += ["without_indefinite_coupling"]
 __all__ += ["PartitionMethod", "partition"]
 __all__ += ["Reading", "load", "read_g2o", "write_g2o"]
 __all__ += ["read_kitti", "read_tum", "write_tum"]
-__all__ += ["from_gtsam", "from_networkx", "from_pandas"]
-__all__ += ["to_gtsam", "to_networkx", "to_pandas"]
+__all__ += ["from_gtsam", "to_gtsam"]
 __all__ += ["circle", "grid", "grid_world", "random_geometric", "sphere", "victoria_park"]
 __all__ += ["PGOProblem", "Weighting"]
 __all__ += ["chordal_start", "odometry_start", "spanning_tree_start"]

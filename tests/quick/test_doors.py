@@ -85,8 +85,6 @@ def scene() -> dict[str, Any]:
         "iterates": [solution.poses],
         "methods": [solvers.Newton()],
         "factors": None,
-        "network": pgo.to_networkx(graph),
-        "edges": pgo.to_pandas(graph)[0],
         "constrained": constrained,
         "on_circle": on_circle,
     }

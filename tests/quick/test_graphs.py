@@ -109,16 +109,6 @@ def test_a_partition_gives_every_pose_to_one_robot(seed, n, num_robots):
     np.testing.assert_array_equal(robots.separators(graph), ends)
 
 
-def test_tables_and_networks_keep_a_graph():
-    graph = pgo.grid(0)
-    for again in (
-        pgo.from_networkx(pgo.to_networkx(graph)),
-        pgo.from_pandas(*pgo.to_pandas(graph)),
-    ):
-        poses = graph.truth
-        assert pgo.chi2(again, poses) == pytest.approx(pgo.chi2(graph, poses), rel=1e-12)
-
-
 def test_trajectories_of_tum_keep_poses(tmp_path):
     poses = pgo.sphere(0).truth
     pgo.write_tum(poses, tmp_path / "poses.tum")
