@@ -42,9 +42,6 @@ class Newton:
     second_order : bool
         Whether the matrix is the Hessian; else it is Gauss-Newton, the second layer of the paper's
         method.
-    secants : bool
-        Whether moves with one factorisation learn from those before (L-BFGS). Robots do without, as
-        each learned one would cost them a reduction.
 
     References
     ----------
@@ -63,7 +60,6 @@ class Newton:
     tolerance: float = STATIONARY_DECREMENT
     max_iterations: int = 100
     second_order: bool = True
-    secants: bool = True
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["tolerance"], not_negative=["max_iterations"])
@@ -80,9 +76,7 @@ class Newton:
 
     def step(self, problem: PGOProblem, state: NewtonState) -> NewtonState:
         """One factorisation and the moves it serves."""
-        return NewtonState(
-            state.k + 1, polish_step(problem, state.polish, self.second_order, self.secants)
-        )
+        return NewtonState(state.k + 1, polish_step(problem, state.polish, self.second_order))
 
     def measure(self, problem: PGOProblem, state: NewtonState) -> Measurement:
         """F and the relative decrement."""
@@ -108,11 +102,11 @@ def newton_status(figures: NewtonFigures) -> Status | None:
 
 
 def gauss_newton() -> Newton:
-    """Return Newton with the Gauss-Newton matrix instead of the Hessian, and without secants.
+    """Return Newton with the Gauss-Newton matrix instead of the Hessian.
 
     Examples
     --------
     >>> gauss_newton().second_order
     False
     """
-    return Newton(second_order=False, secants=False)
+    return Newton(second_order=False)

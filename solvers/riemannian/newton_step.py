@@ -31,8 +31,6 @@ DAMPING_MAX = 1e6
 FIRST_SHIFT = 1e-3  # first shift of a run, as a share of F / (n d)
 SHIFT_DECAY = 0.25  # first shift of a step, as a share of the last one
 SHIFT_GROWTH = 4.0  # of the shift, while the matrix is not positive definite
-CHORD_STEPS = 3  # further moves with one factor as it is
-SECANT_STEPS = 8  # and with the secants of the moves before
 PROGRESS = 0.1  # share of the decrement that a move leaves, at most, before another is worth it
 
 
@@ -91,8 +89,8 @@ class NewtonAlgebra(Protocol[M, T]):
     """What a step needs of the poses it begins at."""
 
     @property
-    def has_secants(self) -> bool:
-        """Whether `model_at` learns from moves (L-BFGS), so that more of them take one factor."""
+    def further_moves(self) -> int:
+        """How many moves after the first take the same factor, at most (chord steps)."""
 
     def factorize(self, order: ModelOrder) -> M | None:
         """Return the model at the poses; None where its matrix is not positive definite."""
@@ -164,18 +162,16 @@ def stationary_tolerance(is_quadratic: bool, share: float = 1.0) -> float:
 def newton_step(algebra: NewtonAlgebra[M, T], rules: StepRules) -> NewtonStep[M]:
     """Factor once, then move as long as the same factor serves; F rises by its rounding at most.
 
-    Further moves take the same factor, with the secants of earlier moves (L-BFGS) or without (chord
-    steps). They end where a move does not cut the decrement to a tenth; with secants a smaller cut
-    is enough if, repeated in the remaining moves, it brings the decrement within tolerance. A
-    NotPositiveDefiniteError is raised where no damping or shift makes the matrix positive definite,
-    as with weights too far apart for doubles.
+    Further moves take the same factor (chord steps). They end where a move does not cut the
+    decrement to a tenth, unless this cut, repeated in the remaining moves, brings the decrement
+    within tolerance. A NotPositiveDefiniteError is raised where no damping or shift makes the
+    matrix positive definite, as with weights too far apart for doubles.
     """
     model = factorize_definite(algebra, rules)
     decrement = decrement_of(model)
     moved = False
     is_at_rounding = False
-    further_moves = SECANT_STEPS if algebra.has_secants else CHORD_STEPS
-    for moves_left in range(further_moves, -1, -1):
+    for moves_left in range(algebra.further_moves, -1, -1):
         if decrement <= rules.tolerance or is_at_rounding:
             break
         trial = backtrack(algebra, model)
@@ -196,7 +192,7 @@ def newton_step(algebra: NewtonAlgebra[M, T], rules: StepRules) -> NewtonStep[M]
             break
         if cut > PROGRESS:
             foreseen = decrement * cut ** (moves_left - 1)
-            if not algebra.has_secants or foreseen > rules.tolerance:
+            if foreseen > rules.tolerance:
                 break
     return NewtonStep(model, decrement, moved, is_at_rounding)
 

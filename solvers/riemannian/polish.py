@@ -1,9 +1,7 @@
 """Polish: from given poses to the stationary point nearby, by damped Riemannian Newton.
 
 The rules are those of `newton_step`; here is its algebra in one place, with sparse Cholesky. One
-factorisation serves several moves. After the first move the factored matrix is the initial matrix
-of L-BFGS (Nocedal & Wright 2006, algorithm 7.4), and L-BFGS learns from every move how the Hessian
-changes: sphere2500 needs one factorisation where moves with the factor alone need two.
+factorisation serves several moves.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +14,7 @@ from pgo_models.certificates.fit import fit_of
 from pgo_models.certificates.rounding_errors import rounding_level
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array, vee
+from pgo_models.geometry.rotations import Array
 from pgo_models.problem.cholesky import CholeskyFactor, SymbolicCholesky, analyze
 from pgo_models.problem.hessian import TangentLayout, ground_pose, riemannian_hessian, tangent_order
 from pgo_models.problem.matrices import inner
@@ -78,40 +76,29 @@ class CentralModel(PolishTrial):
     factor: CholeskyFactor  # of H
     rounding_level: float
     gradient: Array  # g, (side,)
-    step: Array  # -H^-1 g, or what L-BFGS makes of it, (side,)
+    step: Array  # -H^-1 g, (side,)
     square: float  # minus the slope of F along the step
-
-
-@dataclass(frozen=True, eq=False)
-class Secant:
-    """A move, and the change of g along it, for L-BFGS."""
-
-    move: Array  # (side,)
-    change: Array  # (side,)
-    curvature: float  # their inner product
-
-    @classmethod
-    def of(cls, move: Array, change: Array) -> "Secant":
-        """Pair of a move s and the change y of g along it, with s^T y, for L-BFGS."""
-        return cls(move, change, inner(move, change))
 
 
 class CentralAlgebra:
     """`newton_step.NewtonAlgebra` in one place, of one step: from poses, with sparse Cholesky.
 
     It analyses the pattern of the matrix if no earlier step has, and takes over the memory of an
-    earlier factor. With `has_secants` it learns from every move of the step.
+    earlier factor.
     """
 
-    def __init__(self, problem: PGOProblem, state: PolishState, has_secants: bool) -> None:
+    def __init__(self, problem: PGOProblem, state: PolishState) -> None:
         self.problem = problem
         self.state = state
         self.layout = TangentLayout(problem.num_poses, problem.d)
         self.analysis = state.analysis
         self.rounding_level = rounding_level(problem, state.poses)  # hardly moves with them
-        self.has_secants = has_secants
-        self._secants: list[Secant] = []  # of the moves so far
         self._short_move_factor: CholeskyFactor | None = None  # of translations
+
+    @property
+    def further_moves(self) -> int:
+        """Eight: a move costs two triangular solves, far less than a factorisation."""
+        return 8
 
     def factorize(self, order: ModelOrder) -> CentralModel | None:
         """Return the model at the poses of the state."""
@@ -141,8 +128,6 @@ class CentralAlgebra:
 
         The translations that are best for the turned rotations lie on the curved path that a
         straight move of both leaves: on parking-garage this saves two thirds of the factorisations.
-        Where they are best at every point of a step, its secants are those of the cost as a
-        function of the rotations, and one factorisation serves all moves of most runs.
         """
         problem = self.problem
         w, v = self.layout.split(model.step)
@@ -167,13 +152,9 @@ class CentralAlgebra:
         return factor
 
     def model_at(self, model: CentralModel, trial: PolishTrial) -> CentralModel:
-        """Return the model at the trial, its step by L-BFGS where the algebra learns from moves."""
+        """Return the model at the trial that takes the factor of another one."""
         gradient = self._gradient(trial.here)
-        if self.has_secants:
-            w = vee(np.swapaxes(model.poses.R, 1, 2) @ trial.poses.R)
-            move = self.layout.join(w, trial.poses.t - model.poses.t)
-            self._secants.append(Secant.of(move, gradient - model.gradient))
-        step = -_apply_inverse(model.factor, self._secants, gradient)
+        step = -model.factor.solve(gradient)
         return replace(
             model,
             here=trial.here,
@@ -249,15 +230,13 @@ def start_run(problem: PGOProblem, poses: Poses, share: float = 1.0) -> PolishSt
     return settled if settled.objective < given.objective else given
 
 
-def polish_step(
-    problem: PGOProblem, state: PolishState, second_order: bool = True, secants: bool = True
-) -> PolishState:
+def polish_step(problem: PGOProblem, state: PolishState, second_order: bool = True) -> PolishState:
     """Take one `newton_step` in one place.
 
     Where no damping makes the matrix definite, as with weights too far apart for doubles, the poses
     stay as they are.
     """
-    algebra = CentralAlgebra(problem, state, secants)
+    algebra = CentralAlgebra(problem, state)
     rules = StepRules(state.tolerance, second_order)
     try:
         result = newton_step(algebra, rules)
@@ -328,7 +307,7 @@ def polish(problem: PGOProblem, poses: Poses, max_steps: int = 100) -> Poses:
     References
     ----------
     P.-A. Absil, R. Mahony and R. Sepulchre, Optimization Algorithms on Matrix Manifolds, 2008,
-    chapter 6; J. Nocedal and S. Wright, Numerical Optimization, 2006, algorithm 7.4.
+    chapter 6.
 
     Examples
     --------
@@ -359,7 +338,7 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     definite.
     """
     state = start_polish(problem, poses)
-    algebra = CentralAlgebra(problem, state, has_secants=False)
+    algebra = CentralAlgebra(problem, state)
     try:
         model = factorize_definite(algebra, StepRules(state.tolerance))
     except NotPositiveDefiniteError:
@@ -368,21 +347,3 @@ def relative_decrement(problem: PGOProblem, poses: Poses) -> float:
     if model.order.is_newton:
         return decrement
     return max(decrement, 2.0 * STATIONARY_DECREMENT)
-
-
-def _apply_inverse(factor: CholeskyFactor, secants: list[Secant], gradient: Array) -> Array:
-    """Compute H^-1 g by the two loops of L-BFGS, from the factored matrix.
-
-    Secants of negative curvature are left out.
-    """
-    curved = [secant for secant in secants if secant.curvature > 0.0]
-    g = gradient.copy()
-    shares = []
-    for secant in reversed(curved):
-        share = inner(secant.move, g) / secant.curvature
-        g -= share * secant.change
-        shares.append(share)
-    step = factor.solve(g)
-    for secant, share in zip(curved, reversed(shares), strict=True):
-        step += (share - inner(secant.change, step) / secant.curvature) * secant.move
-    return step

@@ -115,9 +115,9 @@ class EliminatedAlgebra:
     is_straight: bool = False
 
     @property
-    def has_secants(self) -> bool:
-        """Whether moves are learned from: no, as each learned one would cost a reduction."""
-        return False
+    def further_moves(self) -> int:
+        """Three: a move takes two rounds, and a new factor goes along with one of them."""
+        return 3
 
     def factorize(self, order: ModelOrder) -> Model | None:
         """Return the model at the current poses."""
