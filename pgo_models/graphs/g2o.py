@@ -58,8 +58,7 @@ from pgo_models.graphs.written_digits import (
 
 MOST_SYMBOLS = len(LETTERS)  # robots whose poses can be named by GTSAM symbols
 COMPRESSED = ".gz"  # suffix of a file that is compressed by gzip
-# Entries of two rotations that may differ by normalisation of their quaternions.
-_SAME_ROTATION = 1e-9
+_WHOLE_GRAPH = "fullGraph.g2o"  # beside the files of robots, in the folders of distributed-mapper
 
 
 def read_g2o(
@@ -126,10 +125,9 @@ def read_g2o(
     name, the file of its robot is absent: `PoseGraph.absent` has these poses, and the name of the
     graph says so.
 
-    Some folders also contain the whole graph, such as `fullGraph.g2o` in those of
-    distributed-mapper. This file is not that of a robot: it is left out, and a `GraphWarning` names
-    it. It is recognised in a folder of three files or more, when its edges are all edges of the
-    other files, each once. It may number the poses in its own way.
+    A file `fullGraph.g2o` beside others is the whole graph, as in the folders of
+    distributed-mapper, which may number the poses in its own way. It is left out, and a
+    `GraphWarning` says so.
 
     Parameters
     ----------
@@ -190,7 +188,6 @@ def graph_of_robots(
     Those of several robots have to be of one graph, unless the folder is trusted. Poses of robots
     without a file are `PoseGraph.absent`.
     """
-    files = _files_of_robots(files)
     _check_ids_of_landmarks(files)
     _common_dimension(files)
     if not trust_folder:
@@ -322,7 +319,7 @@ def edge_places(path: Path | str) -> list[str]:
     files = [
         read_lines(file, skip_unknown=True, needs_matrices=False) for file in g2o_files(Path(path))
     ]
-    return edge_places_of(_files_of_robots(files))
+    return edge_places_of(files)
 
 
 def edge_places_of(files: list[G2OLines]) -> list[str]:
@@ -566,7 +563,8 @@ def name_of(path: Path) -> str:
 def g2o_files(path: Path) -> list[Path]:
     """The path itself if it is a file; the g2o files of a folder, in the order 0, 1, .., 9, 10.
 
-    A FileFormatError if the folder has none.
+    The file of the whole graph is left out, with a GraphWarning. A FileFormatError if the folder
+    has no files.
     """
     if not path.is_dir():
         return [path]
@@ -576,104 +574,20 @@ def g2o_files(path: Path) -> list[Path]:
         raise FileFormatError(
             path, None, "a folder without g2o files; give a file, or a folder with a file a robot"
         )
+    of_robots = [file for file in files if file.name != _WHOLE_GRAPH]
+    if 0 < len(of_robots) < len(files):
+        warnings.warn(
+            f"{printable(str(path / _WHOLE_GRAPH))}: left out, as it is the whole graph of the "
+            f"other {len(of_robots)} files by its name; remove it, or rename it if it is a robot's",
+            GraphWarning,
+            stacklevel=3,
+        )
+        files = of_robots
 
     def natural_order(file: Path) -> list[tuple[int, str]]:  # 9 before 10
         return [(len(part), part) for part in re.findall(r"\d+|\D+", file.name)]
 
     return sorted(files, key=natural_order)
-
-
-def _files_of_robots(files: list[G2OLines]) -> list[G2OLines]:
-    """Files of single robots. A GraphWarning names the file of the whole graph, if there is one."""
-    most_edges = max(len(file.edges) for file in files)
-    if len(files) < 3 or most_edges == 0:
-        return files
-    for candidate in files:
-        if len(candidate.edges) < most_edges:
-            continue
-        others = [file for file in files if file is not candidate]
-        if _is_whole_graph(candidate, others):
-            warnings.warn(
-                f"{candidate.path}: left out, it repeats the edges of the other "
-                f"{len(others)} files; remove it",
-                GraphWarning,
-                stacklevel=3,
-            )
-            return others
-    return files
-
-
-def _is_whole_graph(candidate: G2OLines, others: list[G2OLines]) -> bool:
-    """Whether a file is the whole graph: it has the edges of all other files, and is no robot's.
-
-    The edges alone are no proof. If every edge of the graph touches a pose of one robot, as in a
-    star with this robot in the middle, the file of this robot has all edges, too. The ids and the
-    VERTEX lines then tell the two cases apart.
-    """
-    if not _may_have_edges_of(candidate, others):
-        return False
-    edge_ids, edges = _joined_edges(others)
-    if not _are_same_measurements(candidate.d, candidate.edges, edges):
-        return False
-    # The files of robots use the same ids for the same poses. A file with other ids is no robot's.
-    id_pairs = np.unique(candidate.edge_ids, axis=0)
-    id_pairs_of_others = np.unique(edge_ids, axis=0)
-    if not np.array_equal(id_pairs, id_pairs_of_others):
-        return True
-    # An edge is in the files of the robots that own its two ends. If two of the other files have
-    # an edge, their robots own its ends, so that a third robot's file would not have it.
-    num_written = sum(len(file.edges) for file in others)
-    some_edge_is_in_two_files = num_written > len(edges)
-    if some_edge_is_in_two_files:
-        return True
-    # The file of a robot has VERTEX lines of poses that no other robot owns. The whole graph has
-    # those of the other files alone. Without VERTEX lines the file counts as a robot's.
-    others_ids = np.concatenate([file.vertex_ids for file in others])
-    repeats_others = np.isin(candidate.vertex_ids, others_ids)
-    return len(repeats_others) > 0 and bool(repeats_others.all())
-
-
-def _exact_columns(d: int, num_columns: int) -> IntArray:
-    """Columns whose numbers must be the same for two rows to be the same measurement.
-
-    A row is x y theta in 2D, x y z qx qy qz qw in 3D, and then the upper triangle of the
-    information matrix. The translation and the triangle are compared exactly. The rotation is not:
-    one file may have the quaternion q and the other its multiple or -q. It is compared as a matrix,
-    with the tolerance `_SAME_ROTATION`.
-    """
-    num_measured = 3 if d == 2 else 7
-    return np.asarray(np.r_[:d, num_measured:num_columns])
-
-
-def _may_have_edges_of(candidate: G2OLines, others: list[G2OLines]) -> bool:
-    """Whether a file has the first edge of every other file: a quick test before the full one."""
-    columns = _exact_columns(candidate.d, candidate.edges.shape[1])
-    for file in others:
-        if file.d != candidate.d:
-            return False
-        if len(file.edges):
-            first_edge = file.edges[0, columns]
-            is_equal = candidate.edges[:, columns] == first_edge
-            if not is_equal.all(axis=1).any():
-                return False
-    return True
-
-
-def _are_same_measurements(d: int, edges: Array, others: Array) -> bool:
-    """Whether two arrays of edges hold the same measurements, in any order."""
-    if len(edges) != len(others):
-        return False
-    columns = _exact_columns(d, edges.shape[1])
-    our_order = np.lexsort(edges[:, columns].T)
-    their_order = np.lexsort(others[:, columns].T)
-    ours = edges[our_order]
-    theirs = others[their_order]
-    if not np.array_equal(ours[:, columns], theirs[:, columns]):
-        return False
-    our_R, _ = poses_of(d, ours)
-    their_R, _ = poses_of(d, theirs)
-    largest_difference = np.abs(our_R - their_R).max()
-    return bool(largest_difference <= _SAME_ROTATION)
 
 
 def _rows_to_keep(files: list[G2OLines]) -> list[IntArray | slice]:

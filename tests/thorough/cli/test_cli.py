@@ -72,8 +72,8 @@ def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
     pgo.write_g2o(pgo.read_g2o(folder), folder / "fullGraph.g2o")
     done = subprocess.run([*PGO, "info", str(folder)], capture_output=True, text=True, check=True)
     left_out = (
-        f"{folder / 'fullGraph.g2o'}: left out, it repeats the edges of the other 4 files;"
-        " remove it"
+        f"{folder / 'fullGraph.g2o'}: left out, as it is the whole graph of the other 4 files by "
+        "its name; remove it, or rename it if it is a robot's"
     )
     assert done.stderr == f"pgo: warning: {left_out}\n"
     assert re.search(r"^ *robots +4 *$", done.stdout, re.M)

@@ -243,11 +243,11 @@ def test_what_one_file_measures_twice_within_printing_counts_twice(tmp_path: Pat
 def test_a_whole_graph_with_other_digits_is_a_question(digits: int, tmp_path: Path) -> None:
     shutil.copytree(ROBOTS, tmp_path / "in")
     graph = read_g2o(ROBOTS)
-    write_g2o(graph, tmp_path / "in" / "fullGraph.g2o")
-    rounded(tmp_path / "in" / "fullGraph.g2o", digits)
+    write_g2o(graph, tmp_path / "in" / "whole.g2o")
+    rounded(tmp_path / "in" / "whole.g2o", digits)
     with pytest.raises(
         FileFormatError,
-        match=rf"fullGraph\.g2o:161: the edge from \d+ to \d+ is nearly that at .*0\.g2o:41; "
+        match=rf"whole\.g2o:161: the edge from \d+ to \d+ is nearly that at .*0\.g2o:41; "
         rf"{graph.num_edges} edges of this file are nearly edges of others.*remove them, or the",
     ):
         read_g2o(tmp_path / "in")
