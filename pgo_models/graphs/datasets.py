@@ -7,8 +7,7 @@ import difflib
 import hashlib
 import os
 from collections.abc import Mapping
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from pgo_models.errors import DatasetError, FileFormatError, SettingError
@@ -22,20 +21,11 @@ from pgo_models.graphs.trajectories import read_tum
 
 DATA_VARIABLE = "PGO_DATA"
 _TIMEOUT = 30.0  # seconds without an answer
-
-
-@dataclass(frozen=True)
-class Registry:
-    """A public folder of g2o files with their checksums."""
-
-    base_url: str  # address of the folder: the file of a name is at `base_url/name.g2o`
-    # Name of a data set to `sha256:` and the digest of its file, or to `blob:` and its git blob id,
-    # which is the SHA-1 of "blob <size>", a zero byte, and the file.
-    checksums: Mapping[str, str]
-    cache: Path | None = None  # folder for downloads; the cache folder of the user unless given
-
-
-_SE_SYNC_CHECKSUMS: Mapping[str, str] = {
+# Folder of SE-Sync's g2o files: that of a name is at `SE_SYNC_URL/name.g2o`.
+SE_SYNC_URL = "https://raw.githubusercontent.com/david-m-rosen/SE-Sync/master/data"
+# Name of a data set to `sha256:` and the digest of its file, or to `blob:` and its git blob id,
+# which is the SHA-1 of "blob <size>", a zero byte, and the file.
+CHECKSUMS: Mapping[str, str] = {
     "CSAIL": "sha256:66d99ac857a9849d814d214a9ebd0d4876d5d40f0a37be9330c1ff6e6e9daaa6",
     "city10000": "sha256:df5988994339e990be198a36e7f640e31a5a1b26df3ed400363fafc49d5ca630",
     "cubicle": "sha256:f7781d485383cec86d47d7650970132c36d6f3a1f4e5d62a49b7f8245c0a6465",
@@ -50,15 +40,10 @@ _SE_SYNC_CHECKSUMS: Mapping[str, str] = {
     "tinyGrid3D": "sha256:c341eb0d09f7556b337be5a62b9354384885333a25fa718fd699fafb19620493",
     "torus3D": "sha256:1ef8831023b372188d33ca63ce0da079d51df89364df71f2bce1c5c7c69ed5ec",
 }
-SE_SYNC = Registry(
-    base_url="https://raw.githubusercontent.com/david-m-rosen/SE-Sync/master/data",
-    checksums=_SE_SYNC_CHECKSUMS,
-)
 
 
 def load(
     name_or_path: str | Path,
-    registry: Registry = SE_SYNC,
     *,
     download: bool = True,
     weights: RotationWeight = RotationWeight.SE_SYNC,
@@ -79,8 +64,6 @@ def load(
     name_or_path : str or Path
         Name of a data set (`known_datasets`), a g2o file, a folder with one for each robot, or a
         file of a JSON robot log, whose name ends in .jrl (`read_jrl`).
-    registry : Registry
-        Public data sets; those of SE-Sync unless given.
     download : bool
         Whether a data set that is not there is downloaded.
     weights : RotationWeight
@@ -109,7 +92,7 @@ def load(
     >>> load("sphere")
     PoseGraph('sphere', d=3, poses=50, edges=544, robots=1)
     """
-    path = locate(name_or_path, registry, download=download)
+    path = locate(name_or_path, download=download)
     reading = Reading.of(reading)
     if path.suffix != SUFFIX:
         graph = read_g2o(
@@ -137,9 +120,7 @@ def load(
     return replace(graph, truth=truth)
 
 
-def locate(
-    name_or_path: str | Path, registry: Registry = SE_SYNC, *, download: bool = True
-) -> Path:
+def locate(name_or_path: str | Path, *, download: bool = True) -> Path:
     """File or folder that `load` reads; parameters and errors as there."""
     path = Path(name_or_path)
     name = str(name_or_path)
@@ -150,11 +131,11 @@ def locate(
     # os.path, for which a name too long for the system is no file, and no error. A pipe or a device
     # is read like a file.
     if os.path.isdir(path):
-        if _holds_g2o(path) or name not in known_datasets(registry):
+        if _holds_g2o(path) or name not in known_datasets():
             return path
     elif os.path.exists(path):
         return path
-    if name == path.name and path.suffix == ".g2o" and path.stem in known_datasets(registry):
+    if name == path.name and path.suffix == ".g2o" and path.stem in known_datasets():
         name = path.stem  # the file that a data set is kept in
     is_file_name = name.endswith((".g2o", SUFFIX, COMPRESSED))
     if isinstance(name_or_path, Path) or is_file_name or name != Path(name).name:
@@ -164,9 +145,9 @@ def locate(
     in_folder = _in_folders(name)
     if in_folder is not None:
         return in_folder
-    if name not in registry.checksums:
-        raise _unknown(name, registry)
-    return _cached(name, registry, download)
+    if name not in CHECKSUMS:
+        raise _unknown(name)
+    return _cached(name, download)
 
 
 def places_of_edges(path: Path) -> list[str]:
@@ -183,9 +164,9 @@ def _in_folders(name: str) -> Path | None:
     return None
 
 
-def _unknown(name: str, registry: Registry) -> DatasetError:
+def _unknown(name: str) -> DatasetError:
     """Error of a name that is no data set, with those that are spelled alike."""
-    known = known_datasets(registry)
+    known = known_datasets()
     similar = difflib.get_close_matches(name, known, n=3)
     suggestion = f"did you mean {' or '.join(similar)}? " if similar else ""
     return DatasetError(
@@ -194,12 +175,12 @@ def _unknown(name: str, registry: Registry) -> DatasetError:
     )
 
 
-def known_datasets(registry: Registry = SE_SYNC) -> tuple[str, ...]:
+def known_datasets() -> tuple[str, ...]:
     """Return the names that `load` takes, in alphabetical order.
 
     They are those of the files in the data folders, and of those that can be downloaded.
     """
-    names = set(registry.checksums)
+    names = set(CHECKSUMS)
     for folder in _folders():
         files = [file for file in folder.glob("*.g2o") if file.is_file()]
         folders = [entry for entry in folder.iterdir() if entry.is_dir() and _holds_g2o(entry)]
@@ -229,15 +210,13 @@ def _holds_g2o(folder: Path) -> bool:
     return any(folder.glob("*.g2o"))
 
 
-def _cached(name: str, registry: Registry, download: bool) -> Path:
+def _cached(name: str, download: bool) -> Path:
     """File of a data set in the cache, downloaded if it is not there."""
     import pooch  # here, since it and requests take longer to import than all the rest
 
-    cache = registry.cache
-    if cache is None:
-        cache = Path(pooch.os_cache("pgo-splitting"))
+    cache = Path(pooch.os_cache("pgo-splitting"))
     path = cache / f"{name}.g2o"
-    checksum = registry.checksums[name]
+    checksum = CHECKSUMS[name]
     if path.is_file() and _fits(path, checksum):
         return path
     if not download:
@@ -250,7 +229,7 @@ def _cached(name: str, registry: Registry, download: bool) -> Path:
         raise DatasetError(
             f"cannot make the cache folder {cache}: {error.strerror}; {_by_hand(name)}"
         ) from error
-    url = f"{registry.base_url}/{name}.g2o"
+    url = f"{SE_SYNC_URL}/{name}.g2o"
     with replace_when_done(path) as temporary:
         _download(url, temporary, name)
         if not _fits(temporary, checksum):
@@ -261,29 +240,17 @@ def _cached(name: str, registry: Registry, download: bool) -> Path:
 
 
 def _download(url: str, path: Path, name: str) -> None:
-    """Download a file, with a progress bar on a terminal."""
+    """Download a file."""
     import requests
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
-    console = Console(stderr=True)
-    columns = (TextColumn("downloading {task.description}"), BarColumn(), DownloadColumn())
-    bar = Progress(*columns, console=console, transient=True)
-    # The bar is not entered where nobody sees it: rich before 14.3 prints an empty line even for a
-    # bar that is disabled.
-    shown_bar = bar if console.is_terminal else nullcontext()
     try:
         with (
-            shown_bar,
             requests.get(url, stream=True, timeout=_TIMEOUT) as response,
             path.open("wb") as file,
         ):
             response.raise_for_status()
-            size = int(response.headers.get("content-length", 0))
-            task = bar.add_task(name, total=size or None)
             for chunk in response.iter_content(2**16):
                 file.write(chunk)
-                bar.advance(task, len(chunk))
     except requests.RequestException as error:
         if error.response is not None:
             reason = f"status {error.response.status_code}"
@@ -305,7 +272,7 @@ def _by_hand(name: str) -> str:
 
 
 def _fits(path: Path, checksum: str) -> bool:
-    """Whether a file has a checksum of a `Registry`."""
+    """Whether a file has a checksum."""
     kind, _, expected = checksum.partition(":")
     data = path.read_bytes()
     if kind == "blob":

@@ -33,7 +33,7 @@ WRONG: dict[str, Any] = {
 }
 # Their work is whole studies, or a file of another process.
 STUDIES = {"reproduce_tables", "compare_methods", "solve_folder"}
-OTHERS = {"PGOError", "RayEngine", "Registry"}
+OTHERS = {"PGOError", "RayEngine"}
 
 
 def scene() -> dict[str, Any]:

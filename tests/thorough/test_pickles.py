@@ -30,7 +30,6 @@ import solvers
 from pgo_models import multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.convex.orthogonality_examples import procrustes
-from pgo_models.graphs.datasets import SE_SYNC
 from pgo_models.problem.cholesky import CholeskyBackend
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
 from pgo_models.problem.marginals import Marginals
@@ -131,7 +130,6 @@ MADE: dict[str, Make] = {
     "LowerBound": lambda: solved().certificate.bound,
     "EdgeResiduals": lambda: solved().edge_residuals,
     "NoiseModel": pgo.NoiseModel,
-    "Registry": lambda: SE_SYNC,
     "GraphQP": quadratic_program,
     "PoseVariables": lambda: quadratic_program().variables,
     "RotationQP": lambda: quadratic_program().qp,

@@ -3,7 +3,7 @@ import hashlib
 import http.server
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +13,8 @@ import pytest
 import pgo_models
 from pgo_models import PGOError, PoseGraph, circle, load, read_g2o, write_tum
 from pgo_models.errors import DatasetError, FileFormatError
-from pgo_models.graphs.datasets import DATA_VARIABLE, SE_SYNC, Registry, known_datasets
+from pgo_models.graphs import datasets
+from pgo_models.graphs.datasets import CHECKSUMS, DATA_VARIABLE, known_datasets
 
 DATA = Path(pgo_models.__file__).parent.parent / "data"
 GRAPH = b"EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
@@ -47,6 +48,29 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No data folder but the project's."""
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder that stands for the user's cache."""
+    folder = tmp_path / "cache" / "deeper"
+    monkeypatch.setattr("pooch.os_cache", lambda name: folder)
+    return folder
+
+
+@pytest.fixture
+def offered(
+    server: tuple[Path, str], cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], Path]:
+    """Offer a data set "far" with a checksum by the server, and return its file there."""
+    folder, url = server
+
+    def offer(checksum: str) -> Path:
+        monkeypatch.setattr(datasets, "SE_SYNC_URL", url)
+        monkeypatch.setattr(datasets, "CHECKSUMS", {"far": checksum})
+        return folder / "far.g2o"
+
+    return offer
 
 
 def sha256(data: bytes) -> str:
@@ -164,81 +188,83 @@ def test_unknown_names_list_the_known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_without_download_only_what_is_here_is_taken(
-    server: tuple[Path, str], tmp_path: Path
+    offered: Callable[[str], Path], cache: Path
 ) -> None:
-    folder, url = server
-    (folder / "far.g2o").write_bytes(GRAPH)
-    registry = Registry(url, {"far": sha256(GRAPH)}, tmp_path / "cache")
+    offered(sha256(GRAPH)).write_bytes(GRAPH)
     with pytest.raises(
         DatasetError,
         match=rf"far is not here; download it with: pgo info far, or .*{DATA_VARIABLE}",
     ):
-        load("far", registry, download=False)
-    assert not (tmp_path / "cache").exists()
-    load("far", registry)
-    assert load("far", registry, download=False).num_edges == 1
+        load("far", download=False)
+    assert not cache.exists()
+    load("far")
+    assert load("far", download=False).num_edges == 1
 
 
 @pytest.mark.parametrize("checksum", [sha256, blob])
 def test_downloads_are_checked_and_kept(
-    server: tuple[Path, str], tmp_path: Path, checksum: object, capfd: pytest.CaptureFixture[str]
+    offered: Callable[[str], Path],
+    cache: Path,
+    checksum: Callable[[bytes], str],
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    folder, url = server
-    assert callable(checksum)
-    (folder / "far.g2o").write_bytes(GRAPH)
-    registry = Registry(url, {"far": checksum(GRAPH)}, tmp_path / "cache" / "deeper")
-    assert load("far", registry).num_edges == 1
-    (folder / "far.g2o").unlink()
-    assert load("far", registry).name == "far"
+    far = offered(checksum(GRAPH))
+    far.write_bytes(GRAPH)
+    assert load("far").num_edges == 1
+    far.unlink()
+    assert load("far").name == "far"
     # A file in the cache that has changed is not used.
-    (tmp_path / "cache" / "deeper" / "far.g2o").write_bytes(GRAPH * 2)
+    (cache / "far.g2o").write_bytes(GRAPH * 2)
     with pytest.raises(DatasetError, match="status 404"):
-        load("far", registry)
-    (folder / "far.g2o").write_bytes(GRAPH)
-    assert load("far", registry).num_edges == 1
+        load("far")
+    far.write_bytes(GRAPH)
+    assert load("far").num_edges == 1
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("checksum", [sha256, blob])
 def test_a_corrupt_download_is_not_kept(
-    server: tuple[Path, str], tmp_path: Path, checksum: object
+    offered: Callable[[str], Path], cache: Path, checksum: Callable[[bytes], str]
 ) -> None:
-    folder, url = server
-    assert callable(checksum)
-    (folder / "far.g2o").write_bytes(GRAPH)
-    registry = Registry(url, {"far": checksum(GRAPH[:-1])}, tmp_path / "cache")
+    offered(checksum(GRAPH[:-1])).write_bytes(GRAPH)
     with pytest.raises(DatasetError, match="does not have the checksum"):
-        load("far", registry)
-    assert not list((tmp_path / "cache").iterdir())
+        load("far")
+    assert not list(cache.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("url", "reason"), [(None, "status 404"), ("http://127.0.0.1:9", "no connection")]
+)
 def test_offline_says_what_is_missing_and_how_to_get_it(
-    server: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    offered: Callable[[str], Path],
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    url: str | None,
+    reason: str,
 ) -> None:
-    _, url = server
-    missing = Registry(url, {"far": sha256(GRAPH)}, tmp_path / "cache")
+    offered(sha256(GRAPH))
     monkeypatch.setenv("no_proxy", "*")
-    closed = Registry("http://127.0.0.1:9", {"far": sha256(GRAPH)}, tmp_path / "cache")
-    for registry, reason in ((missing, "status 404"), (closed, "no connection")):
-        with pytest.raises(DatasetError) as caught:
-            load("far", registry)
-        message = str(caught.value)
-        assert reason in message
-        assert "far.g2o" in message
-        assert DATA_VARIABLE in message
-        assert "\n" not in message
-    assert not list((tmp_path / "cache").iterdir())
+    if url is not None:
+        monkeypatch.setattr(datasets, "SE_SYNC_URL", url)
+    with pytest.raises(DatasetError) as caught:
+        load("far")
+    message = str(caught.value)
+    assert reason in message
+    assert "far.g2o" in message
+    assert DATA_VARIABLE in message
+    assert "\n" not in message
+    assert not list(cache.iterdir())
 
 
-def test_a_cache_that_cannot_be_made_is_named(server: tuple[Path, str], tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    registry = Registry(server[1], {"far": sha256(GRAPH)}, tmp_path / "file" / "cache")
+def test_a_cache_that_cannot_be_made_is_named(offered: Callable[[str], Path], cache: Path) -> None:
+    offered(sha256(GRAPH))
+    cache.parent.write_text("")
     with pytest.raises(PGOError, match="cannot make the cache folder"):
-        load("far", registry)
+        load("far")
 
 
 def test_benchmarks_have_the_checksums_of_the_registry(benchmark_data: Path) -> None:
-    for name, checksum in SE_SYNC.checksums.items():
+    for name, checksum in CHECKSUMS.items():
         path = benchmark_data / f"{name}.g2o"
         if checksum.startswith("sha256"):
             assert sha256(path.read_bytes()) == checksum
