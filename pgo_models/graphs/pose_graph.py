@@ -106,7 +106,9 @@ class PoseGraph(ReadOnly):
         Information matrices as read: k = 3 in the plane (x, y, theta), k = 6 in space (x, y, z,
         then rotation).
     ids : IntArray, (n,), optional
-        Name of every pose in the file, unique; 0 .. n-1 unless given.
+        Name of every pose in the file, unique; 0 .. n-1 unless given. The world pose, which no
+        file names, has 2^63 - 1 (`WORLD_ID`) as its place in the row: `pose_ids[in_files]` are the
+        names that a file or GTSAM gave.
     robot : IntArray, (n,), optional
         Robot 0 .. num_robots - 1 that owns every pose; all 0 unless given.
     initial : Poses, optional
@@ -247,7 +249,7 @@ class PoseGraph(ReadOnly):
 
     @property
     def pose_ids(self) -> IntArray:
-        """Names of the poses, (n,)."""
+        """Names of the poses, (n,); `WORLD_ID`, which is no name, in place of the world pose's."""
         if self.ids is not None:
             return self.ids
         return np.arange(self.num_poses)
