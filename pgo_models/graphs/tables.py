@@ -134,22 +134,33 @@ def _noise(path: Path, line: int, others: dict[int, str], side: int) -> tuple[No
     are as many as its entries.
     """
     triangle = [(a, b) for a in range(side) for b in range(a, side)]
+    if not triangle:
+        return Noise.MISSING, {}
     numbered = _numbered(others)
-    if triangle and len(numbered) == len(triangle):
+    if len(numbered) == len(triangle):
         kind = next(iter(numbered.values()))
         return kind, dict(zip(triangle, numbered, strict=True))
-    named = _named(others, side) if triangle else {}
-    if len(named) > 1:
-        kinds = " and ".join(_TEXTS[kind] for kind in named)
-        raise FileFormatError(path, line, f"a table with {kinds}; leave one of them out")
-    for kind, places in named.items():
-        if not all((axis, axis) in places for axis in range(side)):
-            problem = f"the columns of {_TEXTS[kind]} lack an entry on the diagonal; add it"
-            raise FileFormatError(path, line, problem)
-        return kind, places
-    if triangle and len(others) == len(triangle):
+    named = _named(others, side)
+    if named:
+        return _one_kind(path, line, named, side)
+    if len(others) == len(triangle):
         return Noise.INFORMATION, dict(zip(triangle, others, strict=True))
     return Noise.MISSING, {}
+
+
+def _one_kind(path: Path, line: int, named: dict[Noise, Places], side: int) -> tuple[Noise, Places]:
+    """The one kind of noise that columns are named after, with the whole diagonal.
+
+    A FileFormatError where they have several kinds, or lack an entry on the diagonal.
+    """
+    (kind, places), *others = named.items()
+    if others:
+        kinds = " and ".join(_TEXTS[kind] for kind in named)
+        raise FileFormatError(path, line, f"a table with {kinds}; leave one of them out")
+    if not all((axis, axis) in places for axis in range(side)):
+        problem = f"the columns of {_TEXTS[kind]} lack an entry on the diagonal; add it"
+        raise FileFormatError(path, line, problem)
+    return kind, places
 
 
 def _named(others: dict[int, str], side: int) -> dict[Noise, Places]:
