@@ -121,8 +121,7 @@ pgo.plot_graph(kept_graph, surveyed.poses, covariances=blocks_of_survey)
 # as in SE-Sync: in the plane $\kappa = I_{\theta\theta}$,
 # $\tau = 2 / \operatorname{tr}(I_{tt}^{-1})$; in space
 # $\kappa = 3 / (2 \operatorname{tr}(I_{rr}^{-1}))$, $\tau = 3 / \operatorname{tr}(I_{tt}^{-1})$. In
-# the plane, this $\kappa$ is twice the weight of a rotation in a Gaussian model;
-# `weights=pgo.RotationWeight.GAUSSIAN` takes $\kappa = I_{\theta\theta} / 2$. We begin with $F$, whose
+# the plane, this $\kappa$ is twice the weight of a rotation in a Gaussian model. We begin with $F$, whose
 # certificate fits on a page. Unless it is asked for $F$, `solve` minimises $\chi^2$ of the complete
 # matrices ([notebook 18](18_the_files_own_cost.ipynb)).
 

@@ -49,7 +49,6 @@ from pgo_models.graphs.partitioning import (
 )
 from pgo_models.graphs.pose_graph import PoseGraph as PoseGraph
 from pgo_models.graphs.precisions import (
-    RotationWeight as RotationWeight,
     without_indefinite_coupling as without_indefinite_coupling,
 )
 from pgo_models.graphs.residuals import Chi2Convention as Chi2Convention, chi2 as chi2
@@ -94,7 +93,6 @@ __all__ += ["exp_map", "log_map", "project_to_rotations", "random_rotations"]
 __all__ += [
     "Chi2Convention",
     "PoseGraph",
-    "RotationWeight",
     "chi2",
     "chi2_thresholds",
     "edge_residuals",

@@ -16,7 +16,6 @@ from pgo_models.graphs.g2o import COMPRESSED, edge_places, name_of, read_g2o
 from pgo_models.graphs.g2o_readings import Reading
 from pgo_models.graphs.jrl import SUFFIX, jrl_edge_places, read_jrl
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.trajectories import read_tum
 
 DATA_VARIABLE = "PGO_DATA"
@@ -46,7 +45,6 @@ def load(
     name_or_path: str | Path,
     *,
     download: bool = True,
-    weights: RotationWeight = RotationWeight.SE_SYNC,
     reading: Reading = Reading.AS_WRITTEN,
     unit_weights: bool = False,
     skip_unknown: bool = False,
@@ -66,8 +64,6 @@ def load(
         file of a JSON robot log, whose name ends in .jrl (`read_jrl`).
     download : bool
         Whether a data set that is not there is downloaded.
-    weights : RotationWeight
-        As for `read_g2o`.
     reading : Reading
         As for `read_g2o`; a JSON robot log leaves no choice.
     unit_weights, skip_unknown, trust_folder : bool
@@ -97,7 +93,6 @@ def load(
     if path.suffix != SUFFIX:
         graph = read_g2o(
             path,
-            weights,
             reading=reading,
             unit_weights=unit_weights,
             skip_unknown=skip_unknown,
@@ -106,7 +101,7 @@ def load(
     elif reading is not Reading.AS_WRITTEN:
         raise SettingError(f"{path} says what it has, covariances; leave {reading.value} out")
     else:
-        graph = read_jrl(path, weights, skip_unknown=skip_unknown)
+        graph = read_jrl(path, skip_unknown=skip_unknown)
         graph = graph.unit_weights() if unit_weights else graph
     truth_path = path.absolute().parent / f"{name_of(path)}.truth.tum"
     if not os.path.isfile(truth_path):

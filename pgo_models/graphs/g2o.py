@@ -45,7 +45,6 @@ from pgo_models.graphs.missing_poses import with_missing_poses
 from pgo_models.graphs.origin import far_middle, shifted_exactly
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph, matrices_of_edges
 from pgo_models.graphs.precisions import (
-    RotationWeight,
     edge_precisions,
     without_negative_rounding,
 )
@@ -63,7 +62,6 @@ _WHOLE_GRAPH = "fullGraph.g2o"  # beside the files of robots, in the folders of 
 
 def read_g2o(
     path: Path | str,
-    weights: RotationWeight = RotationWeight.SE_SYNC,
     *,
     reading: Reading = Reading.AS_WRITTEN,
     unit_weights: bool = False,
@@ -133,9 +131,6 @@ def read_g2o(
     ----------
     path : Path or str
         File or folder. Translations are in the file's unit, taken as metres.
-    weights : RotationWeight
-        How the information I_theta of the heading, in the matrix of a 2D edge, becomes kappa: as
-        kappa = I_theta (SE_SYNC) or kappa = I_theta / 2 (GAUSSIAN). It has no effect on 3D edges.
     reading : Reading
         What the lines mean, if it is not what g2o's format says: for example that closures are
         reversed, or that matrices, of all tags, are square roots, as iSAM writes them.
@@ -172,14 +167,13 @@ def read_g2o(
         read_lines(file, skip_unknown, reading, needs_matrices=not unit_weights)
         for file in g2o_files(path)
     ]
-    graph = graph_of_robots(path, files, weights, path.is_dir(), trust_folder)
+    graph = graph_of_robots(path, files, path.is_dir(), trust_folder)
     return graph.unit_weights() if unit_weights else graph
 
 
 def graph_of_robots(
     path: Path,
     files: list[G2OLines],
-    weights: RotationWeight,
     is_folder: bool,
     trust_folder: bool = False,
 ) -> PoseGraph:
@@ -192,7 +186,7 @@ def graph_of_robots(
     _common_dimension(files)
     if not trust_folder:
         check_one_graph(files)
-    graph = graph_of_files(path, files, weights)
+    graph = graph_of_files(path, files)
     num_copies = sum(
         int(are_reprinted(edge_rows(file), rows).sum())
         for file, rows in zip(files, _as_first_printed(files), strict=True)
@@ -210,7 +204,6 @@ def graph_of_robots(
 def graph_of_files(
     path: Path,
     files: list[G2OLines],
-    weights: RotationWeight,
     letters: Sequence[int] = LETTER_CODES,
 ) -> PoseGraph:
     """Graph of the lines of a file for each robot, or of one file.
@@ -240,7 +233,7 @@ def graph_of_files(
             GraphWarning,
             stacklevel=3,
         )
-    kappa, tau = edge_precisions(information, weights)
+    kappa, tau = edge_precisions(information)
     R_ij, t_ij = poses_of(d, rows)
     is_prior = edge_ids[:, 0] == WORLD_ID
     origin = far_middle(t_ij[is_prior & (tau > 0)], t_ij[~is_prior])
@@ -399,8 +392,8 @@ def write_g2o(
 
     The numbers have all digits of the doubles. If the graph has no information matrices, they are
     made of its precisions: diag(tau, tau, kappa) in 2D and blockdiag(tau I_3, 2 kappa I_3) in 3D.
-    Read with `RotationWeight.SE_SYNC`, they give the same kappa and tau again. An existing file is
-    replaced when the new one is complete.
+    Read, they give the same kappa and tau again. An existing file is replaced when the new one is
+    complete.
 
     Parameters
     ----------

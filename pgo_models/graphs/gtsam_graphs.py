@@ -30,7 +30,6 @@ from pgo_models.graphs.jrl import (
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
 from pgo_models.graphs.precisions import (
     LEAST_SCALED,
-    RotationWeight,
     are_definite,
     proper_information,
 )
@@ -117,7 +116,6 @@ def from_gtsam(
     factors: Any,  # noqa: ANN401 - GTSAM has no types
     values: Any = None,  # noqa: ANN401
     *,
-    weights: RotationWeight = RotationWeight.SE_SYNC,
     skip_unknown: bool = False,
 ) -> PoseGraph:
     """Make a PoseGraph of a factor graph of GTSAM, to solve it or to certify GTSAM's answer.
@@ -136,8 +134,6 @@ def from_gtsam(
         Factors, whose noise models give the information matrices.
     values : gtsam.Values, optional
         Values of all keys, which become `PoseGraph.initial`.
-    weights : RotationWeight
-        As for `read_g2o`.
     skip_unknown : bool
         Whether other factors are left out, with a warning that names and counts them.
 
@@ -176,7 +172,7 @@ def from_gtsam(
     d = common_dimension(_SOURCE, [by_type], problems)
     lines = lines_of_measurements(_SOURCE, d, by_type, problems)
     check_lines(_SOURCE, problems + problems_of(lines), "factors")
-    graph = graph_of_files(_SOURCE, [lines], weights, _letters(lines.edge_ids, lines.landmarks))
+    graph = graph_of_files(_SOURCE, [lines], _letters(lines.edge_ids, lines.landmarks))
     graph = replace(graph, name="gtsam")
     if values is None:
         return graph

@@ -28,7 +28,6 @@ from pgo_models.graphs.g2o_source import ParsedLines
 from pgo_models.graphs.g2o_tags import Noise, Tag
 from pgo_models.graphs.origin import remainder_of
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray, PoseGraph
-from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.graphs.written_digits import digits_of
 
 SUFFIX = ".jrl"
@@ -66,12 +65,7 @@ class Measurements:
 
 
 @door
-def read_jrl(
-    path: Path | str,
-    weights: RotationWeight = RotationWeight.SE_SYNC,
-    *,
-    skip_unknown: bool = False,
-) -> PoseGraph:
+def read_jrl(path: Path | str, *, skip_unknown: bool = False) -> PoseGraph:
     """Read a JRL file: priors and relative measurements of one or several robots.
 
     Read are the measurements PriorFactorPose2 and 3, BetweenFactorPose2 and 3, PriorFactorPoint2
@@ -83,10 +77,9 @@ def read_jrl(
 
     Measurements have no lines: messages count them from 1, robot by robot in alphabetical order.
 
-    `information` is inverse to the covariances. `weights` are as for `read_g2o`; with
-    `skip_unknown` measurements of other types are skipped with a warning. A FileFormatError for a
-    file that is no JSON, as CBOR, or no JRL, and with the numbers of the first 20 measurements that
-    cannot be read or measure nothing.
+    `information` is inverse to the covariances. With `skip_unknown` measurements of other types are
+    skipped with a warning. A FileFormatError for a file that is no JSON, as CBOR, or no JRL, and
+    with the numbers of the first 20 measurements that cannot be read or measure nothing.
 
     References
     ----------
@@ -98,11 +91,11 @@ def read_jrl(
     files = _files_of_robots(path, log, skip_unknown)
     initial_files = _with_values(path, log, "initialization", files)
     letters = [ord(robot) for robot, _ in _logs(path, log) if len(robot) == 1]
-    graph = graph_of_files(path, initial_files, weights, letters)
+    graph = graph_of_files(path, initial_files, letters)
     if "groundtruth" not in log:
         return graph
     true_files = _with_values(path, log, "groundtruth", files)
-    truth = graph_of_files(path, true_files, weights, letters).initial
+    truth = graph_of_files(path, true_files, letters).initial
     return replace(graph, truth=truth)
 
 

@@ -3,7 +3,6 @@
 The formulas are those of the code of SE-Sync (Rosen et al. 2019).
 """
 
-import enum
 from dataclasses import replace
 from functools import lru_cache
 
@@ -38,38 +37,23 @@ _WAYS_OUT = (
 )
 
 
-class RotationWeight(enum.Enum):
-    """Which kappa stands for the information I_theta of a heading in the plane.
-
-    In space both choices have kappa = 3 / (2 tr(I_rr^-1)).
-
-    A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa
-    theta^2. For a Gaussian error it is I_theta theta^2 (neither F nor tau ||.||^2 has a factor
-    1/2), so that kappa = I_theta / 2, as it is in space. SE-Sync's kappa = I_theta gives rotations
-    twice the weight against translations; published optima of 2D graphs are with it.
-    """
-
-    SE_SYNC = "kappa = I_theta in the plane"
-    GAUSSIAN = "kappa = I_theta / 2 in the plane"
-
-
-def edge_precisions(
-    information: Array, weights: RotationWeight = RotationWeight.SE_SYNC
-) -> tuple[Array, Array]:
+def edge_precisions(information: Array) -> tuple[Array, Array]:
     """Precisions (kappa, tau), each (m,), of information matrices (m, k, k).
 
     In space, k = 6: tau = 3 / tr(I_tt^-1) and kappa = 3 / (2 tr(I_rr^-1)). In the plane, k = 3: tau
-    = 2 / tr(I_tt^-1), and kappa as `weights` says. The blocks themselves are inverted, not the
-    marginal information; blocks of zeros give 0. Of a singular block a direction without
-    information counts as if it had `UNMEASURED_SHARE` of the largest entry of its diagonal: F has
-    one precision for all directions. The units are those of the matrices, per radian^2 and per
-    metre^2.
+    = 2 / tr(I_tt^-1), and kappa = I_theta. The blocks themselves are inverted, not the marginal
+    information; blocks of zeros give 0. Of a singular block a direction without information counts
+    as if it had `UNMEASURED_SHARE` of the largest entry of its diagonal: F has one precision for
+    all directions. The units are those of the matrices, per radian^2 and per metre^2.
+
+    A rotation error theta costs kappa ||R - I||_F^2 = 4 kappa (1 - cos theta), about 2 kappa
+    theta^2, where a Gaussian error costs I_theta theta^2 (neither F nor tau ||.||^2 has a factor
+    1/2). So kappa = I_theta, by which optima of 2D graphs are published, gives rotations in the
+    plane twice that weight against translations; in space there is no such factor.
     """
     if information.shape[-1] == 3:
-        factor = 0.5 if weights is RotationWeight.GAUSSIAN else 1.0
-        kappa = factor * information[:, 2, 2]
         tau = 2.0 / trace_of_inverse(_without_null_directions(information[:, :2, :2]))
-        return kappa, tau
+        return information[:, 2, 2], tau
     kappa = 1.5 / trace_of_inverse(_without_null_directions(information[:, 3:, 3:]))
     tau = 3.0 / trace_of_inverse(_without_null_directions(information[:, :3, :3]))
     return kappa, tau

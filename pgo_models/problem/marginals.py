@@ -4,8 +4,8 @@ The gauge is fixed at one pose.
 
 A cost F without a factor 1/2, such as sum kappa ||..||_F^2 + tau ||..||^2 or chi2, is twice a
 negative log-likelihood. To second order (Laplace approximation) the moves have the covariance (Hess
-F / 2)^-1. Here tau is the information of a coordinate and 2 kappa that of an angle: 2 kappa is
-I_theta with `RotationWeight.GAUSSIAN`, and 2 I_theta with the kappa of SE-Sync in the plane.
+F / 2)^-1. Here tau is the information of a coordinate and 2 kappa that of an angle, which is
+2 I_theta with the kappa of SE-Sync in the plane.
 """
 
 from collections.abc import Callable, Iterator

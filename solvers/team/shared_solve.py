@@ -18,7 +18,6 @@ from pgo_models.errors import GraphError, GraphWarning, PGOError
 from pgo_models.graphs.g2o import graph_of_robots
 from pgo_models.graphs.g2o_parser import G2OLines, parse_lines
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph
-from pgo_models.graphs.precisions import RotationWeight
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.carry.ledger import Ledger
@@ -118,9 +117,8 @@ class TeamSettings:
         return graph, misfits
 
     def _graph_of(self, files: list[G2OLines]) -> PoseGraph:
-        weights = RotationWeight.SE_SYNC
         path = Path("team")
-        return graph_of_robots(path, files, weights, is_folder=True, trust_folder=self.trust_folder)
+        return graph_of_robots(path, files, is_folder=True, trust_folder=self.trust_folder)
 
     def _solution(self, graph: PoseGraph, before: Solution | None) -> Solution:
         """The solution from the map before, or where that is no part of it, from none."""

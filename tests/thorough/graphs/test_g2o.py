@@ -10,15 +10,13 @@ from pgo_models import (
     PGOProblem,
     PoseGraph,
     Poses,
-    RotationWeight,
     exp_map,
     grid_world,
-    load,
     random_geometric,
     read_g2o,
     write_g2o,
 )
-from pgo_models.errors import FileFormatError, GraphError, GraphWarning, SettingError
+from pgo_models.errors import FileFormatError, GraphError, GraphWarning
 from pgo_models.graphs.g2o import read_g2o_poses, symbol_ids, write_g2o_folder
 from pgo_models.graphs.precisions import edge_precisions
 
@@ -109,41 +107,21 @@ def test_without_information_the_precisions_come_back(
     assert_same_measurements(back, dataclasses.replace(graph, robot=back.robot))
 
 
-@pytest.mark.parametrize(
-    ("weights", "share"), [(RotationWeight.SE_SYNC, 2.0), (RotationWeight.GAUSSIAN, 1.0)]
-)
 @given(seed=SEEDS, d=DIMENSIONS)
-def test_gaussian_weights_give_the_chi_square_of_a_small_error(
-    weights: RotationWeight, share: float, seed: int, d: int
-) -> None:
+def test_precisions_give_the_chi_square_of_a_small_error(seed: int, d: int) -> None:
     # One edge of identities, its end pose off by a small turn and a step: I_theta theta^2 + I_t
-    # |t|^2, no 1/2.
+    # |t|^2, no 1/2; in the plane rotations have twice that weight.
     rng = np.random.default_rng(seed)
     I_t, I_theta = np.exp(rng.uniform(-5, 5, 2))
     information = np.diag([I_t] * d + [I_theta] * (d * (d - 1) // 2))[None]
-    kappa, tau = edge_precisions(information, weights)
+    kappa, tau = edge_precisions(information)
     one = np.array([0])
     graph = PoseGraph(2, one, one + 1, np.eye(d)[None], np.zeros((1, d)), kappa, tau)
     turn = 1e-4 * rng.standard_normal(d * (d - 1) // 2)
     step = rng.standard_normal(d)
     poses = Poses(np.stack([np.eye(d), exp_map(turn[None])[0]]), np.stack([np.zeros(d), step]))
-    chi_square = I_t * step @ step + (share if d == 2 else 1.0) * I_theta * turn @ turn
+    chi_square = I_t * step @ step + (2.0 if d == 2 else 1.0) * I_theta * turn @ turn
     np.testing.assert_allclose(PGOProblem(graph).objective(poses), chi_square, rtol=1e-6, atol=0)
-
-
-def test_a_file_is_read_with_the_weights_asked_for(tmp_path: Path) -> None:
-    path = tmp_path / "plane.g2o"
-    path.write_text("EDGE_SE2 0 1 1 0 0 4 0 0 4 0 6\n")
-    kappas = [float(load(path, weights=weights).kappa[0]) for weights in RotationWeight]
-    assert (
-        kappas
-        == [6.0, 3.0]
-        == [float(read_g2o(path, weights).kappa[0]) for weights in RotationWeight]
-    )
-    assert read_g2o(path).kappa[0] == load(path).kappa[0] == 6.0
-    assert read_g2o(path, "gaussian").kappa[0] == 3.0
-    with pytest.raises(SettingError, match=r"weights must be RotationWeight\.SE_SYNC or .*'gauss'"):
-        read_g2o(path, "gauss")
 
 
 @pytest.mark.parametrize("name", SIZES)

@@ -282,12 +282,6 @@ def test_every_fault_has_its_measurement_and_a_way_out(
     assert_says(caught.value, f"{path}{where}: ", words)
 
 
-def test_the_weights_of_rotations_are_a_choice(tmp_path: Path) -> None:
-    path = write(tmp_path, LOG)
-    with pytest.raises(SettingError, match="weights"):
-        read_jrl(path, "nonsense")
-
-
 def test_all_wrong_measurements_are_named_in_one_run(tmp_path: Path) -> None:
     log = copy.deepcopy(LOG)
     measurement(log, "a", 0).update(key="x")

@@ -17,7 +17,7 @@ from graphs import COSTS, varied_graph
 from proofs import PLANE, SPACE, edited, proof_of, written
 
 import solvers
-from pgo_models import PGOProblem, Poses, RotationWeight, Weighting, chordal_start
+from pgo_models import PGOProblem, Poses, Weighting, chordal_start
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.proof_file import proof_json, save_proof
 from pgo_models.errors import FileFormatError, SettingError
@@ -226,8 +226,9 @@ def test_files_compressed_by_gzip_are_read(tmp_path: Path, pgo_command: Call) ->
 
 
 def test_proofs_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
-    gaussian = read_g2o(written(tmp_path, varied_graph(0, 6, 2)), RotationWeight.GAUSSIAN)
-    problem = PGOProblem(gaussian, weighting=Weighting.ISOTROPIC)
+    graph = read_g2o(written(tmp_path, varied_graph(0, 6, 2)))
+    halved = replace(graph, kappa=graph.kappa / 2)
+    problem = PGOProblem(halved, weighting=Weighting.ISOTROPIC)
     with pytest.raises(SettingError, match="no g2o file has the weights"):
         proof_json(problem, certify(problem, solvers.solve(problem).poses))
     of_file = PGOProblem(read_g2o(tmp_path / "graph.g2o"), weighting=Weighting.INFORMATION)
