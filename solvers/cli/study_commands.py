@@ -90,9 +90,7 @@ def compare_command(
     out: TableOption = None,
     plot: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Write the gap against rounds, bytes and seconds: .png, .svg, .pdf or .html."
-        ),
+        typer.Option(help="Write the gap against rounds, bytes and seconds: .png, .svg or .pdf."),
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for every method.")] = math.inf,
     unit_weights: UnitWeightsOption = False,

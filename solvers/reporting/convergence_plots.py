@@ -16,20 +16,13 @@ from pgo_models.figures import rounded_up
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.published_results import PublishedRun
 from pgo_models.plots.interactive_plots import lay_out
-from pgo_models.plots.style import ALARM_COLOUR, COLOURS, column_figure, count_along_x, plotly
+from pgo_models.plots.style import ALARM_COLOUR, COLOURS, plotly
 from solvers.result import History
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from plotly.graph_objects import Figure as PlotlyFigure
+    from plotly.graph_objects import Figure
 
 Stages = Sequence[tuple[str, History]]
-_MAX_MARKERS = 12  # of a curve
-# Ratio of the paper's iterations to those of the run, up to which the paper's gap is a star. A star
-# farther to the right would squeeze the curves, so that a line is drawn instead.
-_MAX_STAR_RATIO = 3.0
-LINES = ("-", "--", ":", "-.")
 # Settings of an axis of plotly.
 LOGARITHMIC = {"type": "log", "exponentformat": "power", "gridcolor": "#eeeeee", "zeroline": False}
 
@@ -70,44 +63,14 @@ class Curve:
         return efforts[effort]
 
 
-def plot_convergence(
-    stages: Stages, lower_bound: float, published: PublishedRun | None = None
-) -> Figure:
-    """Figure of primal and dual residual, and of the gap (F - lower_bound) / F, over iterations.
-
-    Stages are for example `[(stage.name, stage.history) for stage in solution.stages]`; each of
-    them begins where the one before ends. The paper's gap and iterations, if given, are a star, or
-    a line with these figures if the star were far to the right. Raises a SettingError if no stage
-    has a record.
-    """
-    run = _with_records(stages)
-    begin = 0.0
-    with column_figure(height=1.3) as figure:
-        above, below = figure.subplots(2, 1, sharex=True)
-        for (name, history), colour, line in zip(run, cycle(COLOURS), cycle(LINES), strict=False):
-            curve = Curve(name, history, lower_bound)
-            k = begin + history.k
-            style = {"color": colour, "markevery": max(1, len(history) // _MAX_MARKERS)}
-            _semilogy(above, k, history.primal_residual, f"{name}, primal", "o-", style)
-            _semilogy(above, k, history.dual_residual, f"{name}, dual", "s--", style)
-            _semilogy(below, k, curve.gap, f"{name}, gap", f"^{line}", style)
-            begin = float(k[-1])
-        above.set_ylabel("relative residual")
-        below.set_ylabel("relative gap")
-        below.set_xlabel("iteration")
-        count_along_x(below)
-        if published is not None:
-            _mark(below, published, begin)
-        figure.legend(loc="outside lower center", ncols=2)
-    return figure
-
-
 def explore_convergence(
     stages: Stages, lower_bound: float, published: PublishedRun | None = None
-) -> PlotlyFigure:
-    """Plotly figure of the curves of `plot_convergence`: gap above, residuals below.
+) -> Figure:
+    """Plotly figure of the gap (F - lower_bound) / F over iterations, and of the residuals below it.
 
-    Figures are shown under the pointer.
+    Stages are for example `[(stage.name, stage.history) for stage in solution.stages]`; each of
+    them begins where the one before ends. A published gap is a line that names its iterations.
+    Values are shown under the pointer. Raises a SettingError if no stage has a record.
     """
     run = _with_records(stages)
     begin = 0.0
@@ -165,25 +128,3 @@ def _with_records(stages: Stages) -> list[tuple[str, History]]:
             "no stage has a record; give histories of runs that took at least their start"
         )
     return run
-
-
-def _semilogy(
-    axes: Axes, k: Array, values: Array, label: str, form: str, style: dict[str, object]
-) -> None:
-    """Draw the values that a logarithmic axis can show: zeros, nan and inf are left out."""
-    is_visible = np.isfinite(values) & (values > 0)
-    if is_visible.any():
-        axes.semilogy(k[is_visible], values[is_visible], form, label=label, **style)
-
-
-def _mark(axes: Axes, published: PublishedRun, last_iteration: float) -> None:
-    """Draw the paper's gap as a star, or as a line if its iterations are far to the right."""
-    if published.gap <= 0:
-        return
-    text = f"paper's SOC: {published.gap:.1e} after {published.iterations}"
-    if published.iterations <= _MAX_STAR_RATIO * max(last_iteration, 1.0):
-        axes.plot(
-            published.iterations, published.gap, "*", color=ALARM_COLOUR, markersize=8, label=text
-        )
-    else:
-        axes.axhline(published.gap, color=ALARM_COLOUR, linestyle=":", label=text)

@@ -15,13 +15,12 @@ from pgo_models.errors import SettingError, check_settings
 from pgo_models.figures import gap_above, rounded_down, rounded_up, sum_above
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.plots.pages import save_page
 from pgo_models.plots.style import check_installed, is_picture, save_figure
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
 from solvers.progress.bars import JobBar
-from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
+from solvers.reporting.comparison_plots import plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
 from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
@@ -114,13 +113,10 @@ class Comparison(Summarised):
         return tuple(notes)
 
     def save_plot(self, path: Path | str) -> None:
-        """Write the gap over rounds, bytes and seconds: .png, .svg, .pdf, or an .html page."""
+        """Write the gap over rounds, bytes and seconds: .png, .svg, .pdf."""
         path = Path(path)
         check_plot_format(path)
-        if path.suffix.lower() == ".html":
-            save_page(explore_efforts(self.curves, self.problem.graph.name), path)
-        else:
-            save_figure(plot_efforts(self.curves), path)
+        save_figure(plot_efforts(self.curves), path)
 
 
 def compare_methods(
@@ -176,9 +172,9 @@ def compare_methods(
 
 def check_plot_format(path: Path) -> None:
     """Raise the errors of `Comparison.save_plot` for the suffix of `path`."""
-    if path.suffix.lower() != ".html" and not is_picture(path):
+    if not is_picture(path):
         problem = f"cannot write {path}: no plot has suffix {path.suffix!r}"
-        raise SettingError(f"{problem}; use .html, .png, .svg or .pdf")
+        raise SettingError(f"{problem}; use .png, .svg or .pdf")
     check_installed(path)
 
 

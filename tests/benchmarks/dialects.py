@@ -34,7 +34,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models import PGOError
 from pgo_models.figures import rounded_up
-from solvers.studies.readings import compare_readings
+from solvers import compare_readings
 
 HEAD = (
     "| file | poses | points | edges | cost | gap | verdict | CPU s | assumed, or why refused |\n"

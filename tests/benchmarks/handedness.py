@@ -24,10 +24,9 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models import Poses
+from pgo_models import Poses, exp_map
 from pgo_models.certificates.certificate import with_terms
 from pgo_models.certificates.handedness import closed_form_terms
-from pgo_models.geometry.rotations import exp_map
 from pgo_models.graphs.precisions import edge_precisions
 from solvers import SweptScene
 from solvers.riemannian.shrunk_bound import bound_by_shrinking

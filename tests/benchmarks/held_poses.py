@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 import pgo_models as pgo
 import solvers
-from solvers import InProcess
-from solvers.loop import run
+from solvers import InProcess, run
 from solvers.result import Record
 from solvers.robots.consensus import ConsensusSOC
 from solvers.robots.place_without_driver import collect_copies

@@ -19,14 +19,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pgo_models import PGOProblem, PoseGraph, Poses
+from pgo_models import PGOProblem, PoseGraph, Poses, chordal_start, log_map
 from pgo_models.errors import NotPositiveDefiniteError
-from pgo_models.geometry.rotations import Array, hat, log_map
+from pgo_models.geometry.rotations import Array, hat
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.cholesky import SymbolicCholesky, analyze
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian, tangent_order
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import diagonal_positions, norm
 from pgo_models.summaries import Summarised
 from solvers import Measurement, Status

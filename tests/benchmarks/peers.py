@@ -29,11 +29,10 @@ from rich.table import Table
 
 import pgo_models as pgo
 import solvers
+from pgo_models import chordal_start
 from pgo_models.graphs.partitioning import Partition
-from pgo_models.problem.initialization import chordal_start
-from solvers import InProcess
+from solvers import InProcess, run
 from solvers.carry.ledger import Ledger
-from solvers.loop import run
 from solvers.result import Record
 from solvers.robots.consensus import ConsensusSOC
 from solvers.robots.driver import Driver

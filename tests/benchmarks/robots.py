@@ -36,11 +36,10 @@ import pgo_models as pgo
 import solvers
 from pgo_models.figures import rounded_up
 from pgo_models.graphs.separators import vertex_cover
-from solvers import Faults, InProcess, RayEngine
+from solvers import Faults, InProcess, RayEngine, run
 from solvers.carry.counted_pool import Count
 from solvers.carry.process import Engine
 from solvers.carry.ray_cluster import connect
-from solvers.loop import run
 from solvers.result import History, Record, Run
 from solvers.robots.consensus import AsynchronousSOC, AsynchronousState, RobotsOfDriver
 from solvers.robots.setup import open_driver

@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pgo_models import PGOProblem, Weighting
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.graphs.g2o import read_g2o
+from pgo_models import PGOProblem, Weighting, chordal_start, multipliers, read_g2o
 from pgo_models.problem.cholesky import analyze, factorize
 from pgo_models.problem.hessian import TangentLayout, riemannian_hessian
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.marginals import Marginals
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 MOST_FACTORISATIONS = 3.0
 

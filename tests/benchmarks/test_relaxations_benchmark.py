@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pgo_models import PGOProblem, Weighting
+from pgo_models import PGOProblem, Weighting, circle, grid, read_g2o, solve_relaxation, sphere
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.graphs.g2o import read_g2o
-from pgo_models.graphs.scenes import circle, grid, sphere
-from pgo_models.relaxations.solve_sdp import (
-    DEFAULT_RELAXATION_GAP,
-    RelaxationSolution,
-    solve_relaxation,
-)
-from solvers.pipeline import solve
+from pgo_models.relaxations.solve_sdp import DEFAULT_RELAXATION_GAP, RelaxationSolution
+from solvers import solve
 
 SCENES = {"grid": (grid, 3.0), "circle": (circle, 3.0), "sphere": (sphere, 10.0)}  # seconds
 

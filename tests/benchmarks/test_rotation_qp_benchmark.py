@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pgo_models import PGOProblem, Weighting
-from pgo_models.convex.graph_subproblem import graph_qp
-from pgo_models.graphs.g2o import read_g2o
-from pgo_models.problem.initialization import chordal_start
+from pgo_models import PGOProblem, Weighting, chordal_start, graph_qp, read_g2o
 from solvers import MultiplierPenalty, RStep
 from solvers.soc.penalty import first_penalties
 from solvers.soc.r_step import RSubproblem, prepare

@@ -27,8 +27,8 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel
-from pgo_models.geometry.rotations import BoolArray, exp_map, random_rotations
+from pgo_models import NoiseModel, exp_map, random_rotations
+from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.scenes import observe
 from solvers.robust.revision import truncated_cost
 

@@ -53,12 +53,12 @@ import numpy as np
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel
+from pgo_models import NoiseModel, exp_map, to_gtsam
 from pgo_models.errors import FAILURES
 from pgo_models.geometry.poses import absolute_rotation_error
-from pgo_models.geometry.rotations import BoolArray, exp_map
+from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.bridges import unchecked_bridges
-from pgo_models.graphs.gtsam_graphs import poses_in_gtsam, to_gtsam
+from pgo_models.graphs.gtsam_graphs import poses_in_gtsam
 from pgo_models.graphs.pose_graph import isotropic_information
 from solvers.baselines.gtsam import poses_of_values
 from solvers.robust.known import odometry

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import solvers
-from pgo_models import PoseGraph, Reading
+from pgo_models import PoseGraph, Reading, exp_map, read_g2o, write_g2o
 from pgo_models.errors import FileFormatError, GraphWarning
-from pgo_models.geometry.rotations import exp_map, quaternions_from_rotations
-from pgo_models.graphs.g2o import pose_names, read_g2o, write_g2o
+from pgo_models.geometry.rotations import quaternions_from_rotations
+from pgo_models.graphs.g2o import pose_names
 
 pytest.importorskip("flint")
 CASES = Path(__file__).parents[1] / "cases"

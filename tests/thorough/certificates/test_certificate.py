@@ -22,20 +22,34 @@ from graphs import (
 )
 from hypothesis import assume, given, settings, strategies as st
 
-from pgo_models import Certificate, NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
-from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, certify_at, judge
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import (
+    Certificate,
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Verdict,
+    Weighting,
+    certify_at,
+    chordal_start,
+    circle,
+    exp_map,
+    grid,
+    multipliers,
+    prove_bound,
+    random_geometric,
+    random_rotations,
+)
+from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, judge
 from pgo_models.certificates.fit import FITS_WITHOUT_EDGES, Fit, fits_to_rounding
-from pgo_models.certificates.lower_bound import best_bound, prove_bound
+from pgo_models.certificates.lower_bound import best_bound
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import exp_map, random_rotations
-from pgo_models.graphs.scenes import MILD_NOISE, circle, grid, observe, random_geometric
+from pgo_models.graphs.scenes import MILD_NOISE, observe
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.stationarity import STATIONARY_DECREMENT
-from solvers.riemannian.polish import polish, relative_decrement
-from solvers.solves.given_poses import certify
+from solvers import certify, polish
+from solvers.riemannian.polish import relative_decrement
 
 NOISES = st.sampled_from([MILD_NOISE, LOUD_NOISE, NoiseModel(0.5, 0.8), NoiseModel(0.1, 2.0)])
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)

@@ -34,24 +34,24 @@ from proofs import PLANE
 from roads import Shape, road
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, Weighting
-from pgo_models.certificates.certificate import certify_at
-from pgo_models.certificates.definiteness import DefiniteProof
-from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
-from pgo_models.certificates.lower_bound import (
-    best_bound,
-    pose_rows,
-    prove_at,
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    Weighting,
+    certify_at,
+    chordal_start,
+    multipliers,
     prove_bound,
+    read_g2o,
 )
+from pgo_models.certificates.definiteness import DefiniteProof
+from pgo_models.certificates.dual_variables import scalar_multipliers
+from pgo_models.certificates.lower_bound import best_bound, pose_rows, prove_at
 from pgo_models.certificates.unknowns import ComplexUnknowns
 from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.g2o import read_g2o
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
-from solvers.solves.given_poses import certify
+from solvers import certify, polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 LOUD = st.sampled_from(

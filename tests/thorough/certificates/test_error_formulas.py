@@ -11,7 +11,7 @@ from graphs import exact_graph, varied_graph
 from robots import cut_in_one_piece, interface_of
 from scipy.sparse import csc_array
 
-from pgo_models import PGOProblem
+from pgo_models import PGOProblem, random_rotations
 from pgo_models.certificates import lower_bound
 from pgo_models.certificates.definiteness import shifted_certificate
 from pgo_models.certificates.lower_bound import bound_from, quadratic_loss, squared_distances
@@ -24,7 +24,7 @@ from pgo_models.certificates.rounding_errors import (
     objective_rounding,
     rounding_level,
 )
-from pgo_models.geometry.rotations import Array, orthogonality_error, random_rotations
+from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.problem.cholesky import CholeskyBackend, analyze
 from pgo_models.problem.floating_point import (
     UNIT_ROUNDOFF as u,

@@ -21,17 +21,25 @@ from hypothesis import example, given, settings, strategies as st
 from roads import Shape, road
 
 import solvers
-from pgo_models import Certificate, NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
-from pgo_models.certificates.certificate import certify_at
+from pgo_models import (
+    Certificate,
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Verdict,
+    Weighting,
+    certify_at,
+    chordal_start,
+    multipliers,
+    prove_bound,
+    read_g2o,
+)
 from pgo_models.certificates.definiteness import prove_definite
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import LowerBound, best_bound, pose_rows, prove_bound
-from pgo_models.graphs.g2o import read_g2o
+from pgo_models.certificates.lower_bound import LowerBound, best_bound, pose_rows
 from pgo_models.graphs.pose_graph import middle_pose
 from pgo_models.problem.cholesky import CholeskyBackend
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
-from solvers.solves.given_poses import certify
+from solvers import certify, polish
 
 BACKENDS = pytest.mark.parametrize("backend", CholeskyBackend)
 DATA = Path(__file__).parents[3] / "data"

@@ -16,8 +16,7 @@ from hypothesis import given, settings, strategies as st
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PGOProblem, PoseGraph, Poses, Verdict
-from pgo_models.geometry.rotations import exp_map
+from pgo_models import PGOProblem, PoseGraph, Poses, Verdict, exp_map
 
 
 def off_by(graph: PoseGraph, size: float, seed: int) -> Poses:

@@ -17,14 +17,21 @@ from hypothesis import given, settings, strategies as st
 from roads import road
 
 import solvers
-from pgo_models import Certificate, NoiseModel, PGOProblem, PoseGraph, Poses, Verdict, Weighting
+from pgo_models import (
+    Certificate,
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Verdict,
+    Weighting,
+    chordal_start,
+)
 from pgo_models.certificates.certificate import BoundSource, certify_with
 from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.lower_bound import NO_BOUND
 from pgo_models.certificates.rounding_errors import objective_rounding, rounding_level
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
-from solvers.solves.given_poses import certify
+from solvers import certify, polish
 
 SPREADS = st.sampled_from([0.0, 1.0, 3.0, 10.0, 30.0])
 

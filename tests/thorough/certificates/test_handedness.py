@@ -10,9 +10,19 @@ from graphs import COSTS, LOUD_NOISE, SEEDS, informed, random_poses, varied_grap
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models import PGOProblem, PoseGraph, Poses, Weighting
-from pgo_models.certificates.certificate import certify_at
-from pgo_models.certificates.dual_variables import certificate_matrix, multipliers
+from pgo_models import (
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Weighting,
+    certificate_matrix,
+    certify_at,
+    chordal_start,
+    exp_map,
+    log_map,
+    multipliers,
+    random_rotations,
+)
 from pgo_models.certificates.handedness import (
     HandednessTerms,
     closed_form_terms,
@@ -21,16 +31,9 @@ from pgo_models.certificates.handedness import (
 )
 from pgo_models.certificates.lower_bound import best_bound, best_bound_with_terms
 from pgo_models.certificates.rounding_errors import evaluate_certificate, matrix_errors
-from pgo_models.geometry.rotations import (
-    Array,
-    exp_map,
-    log_map,
-    orthogonality_error,
-    random_rotations,
-)
+from pgo_models.geometry.rotations import Array, orthogonality_error
 from pgo_models.problem.floating_point import UNIT_ROUNDOFF, gamma
-from pgo_models.problem.initialization import chordal_start
-from solvers.riemannian.polish import polish
+from solvers import polish
 
 SIZES = st.integers(2, 7)
 SCALES = st.sampled_from([1e-6, 1.0, 1e5])

@@ -6,8 +6,8 @@ from graphs import DIMENSIONS, SEEDS, random_poses, varied_problem
 from hypothesis import assume, given, strategies as st
 from scipy.linalg import block_diag
 
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import prove_bound, smallest_shift
+from pgo_models import multipliers, prove_bound
+from pgo_models.certificates.lower_bound import smallest_shift
 from pgo_models.certificates.spectrum import negative_curvature
 
 

@@ -22,13 +22,18 @@ from pgo_models import (
     PoseGraph,
     Poses,
     Weighting,
+    certify_at,
+    chi2,
+    chordal_start,
     exp_map,
+    multipliers,
     project_to_rotations,
+    prove_bound,
+    read_g2o,
 )
-from pgo_models.certificates.certificate import BoundSource, certify_at
+from pgo_models.certificates.certificate import BoundSource
 from pgo_models.certificates.definiteness import shifted_certificate
-from pgo_models.certificates.dual_variables import multipliers
-from pgo_models.certificates.lower_bound import best_bound, prove_bound
+from pgo_models.certificates.lower_bound import best_bound
 from pgo_models.certificates.rounding_errors import (
     evaluate_edges,
     matrix_errors,
@@ -37,15 +42,11 @@ from pgo_models.certificates.rounding_errors import (
 from pgo_models.certificates.shrunk_information import shrink_information
 from pgo_models.errors import GraphError, NotPositiveDefiniteError, SettingError
 from pgo_models.geometry.rotations import Array
-from pgo_models.graphs.g2o import read_g2o
 from pgo_models.graphs.precisions import are_definite, proper_information
-from pgo_models.graphs.residuals import chi2
 from pgo_models.problem.costs import ExcessCost, TangentCost
-from pgo_models.problem.initialization import chordal_start
 from pgo_models.problem.matrices import rotation_columns
-from solvers.riemannian.polish import polish
+from solvers import certify, polish
 from solvers.riemannian.shrunk_bound import bound_by_shrinking
-from solvers.solves.given_poses import certify
 
 COUPLED = st.booleans()
 

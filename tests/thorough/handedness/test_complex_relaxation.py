@@ -21,14 +21,12 @@ from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import project_to_tangent, retract
 from pgo_models.problem.initialization import spanning_tree
-from solvers import Status
+from solvers import Status, certify, iterate, run
 from solvers.handedness.complex_relaxation import (
     ComplexCost,
     ComplexRelaxation,
     certificates_of_relaxation,
 )
-from solvers.loop import iterate, run
-from solvers.solves.given_poses import certify
 
 LOUD = NoiseModel(0.3, 1.0)
 

@@ -9,11 +9,11 @@ from budget import examples
 from graphs import LOUD_NOISE, SEEDS, restarts, varied_problem
 from hypothesis import given, settings, strategies as st
 
-from pgo_models import NoiseModel, PGOProblem, RelaxationForm
+from pgo_models import NoiseModel, PGOProblem, RelaxationForm, random_rotations, solve_relaxation
 from pgo_models.certificates.dual_variables import factorize_certificate
 from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, random_rotations
+from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import project_to_tangent, retract
 from pgo_models.problem.matrices import inner
 from pgo_models.relaxations.rotation_hull import (
@@ -24,11 +24,8 @@ from pgo_models.relaxations.rotation_hull import (
     matrices_at,
     terms_of,
 )
-from pgo_models.relaxations.solve_sdp import solve_relaxation
-from solvers import Pipeline, Status, SweptScene
+from solvers import Pipeline, Status, SweptScene, iterate, run, solve
 from solvers.handedness.hull_lagrangian import AugmentedLagrangian, HullLagrangian
-from solvers.loop import iterate, run
-from solvers.pipeline import solve
 from solvers.studies.tightness import noisy_scene
 
 SIZES = st.integers(2, 8)

@@ -10,21 +10,25 @@ from graphs import LOUD_NOISE, SEEDS, informed, restarts, varied_graph
 from hypothesis import given, settings, strategies as st
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, RelaxationForm, Weighting
-from pgo_models.certificates.certificate import certify_at, with_terms
-from pgo_models.certificates.dual_variables import multipliers
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    RelaxationForm,
+    Weighting,
+    certify_at,
+    chordal_start,
+    multipliers,
+    solve_relaxation,
+    victoria_park,
+)
+from pgo_models.certificates.certificate import with_terms
 from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.errors import NotPositiveDefiniteError
-from pgo_models.graphs.scenes import victoria_park
-from pgo_models.problem.initialization import chordal_start
-from pgo_models.relaxations.solve_sdp import solve_relaxation
-from solvers import Pipeline, Status, SweptScene
+from solvers import Pipeline, Status, SweptScene, iterate, polish, run, solve
 from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
 from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
 from solvers.handedness.search import HandednessSearch, terms_can_help
-from solvers.loop import RunMonitor, iterate, run
-from solvers.pipeline import solve
-from solvers.riemannian.polish import polish
+from solvers.loop import RunMonitor
 from solvers.studies.tightness import noisy_lattice, noisy_scene
 
 SIZES = st.integers(3, 8)

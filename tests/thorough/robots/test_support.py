@@ -12,9 +12,9 @@ import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, PoseGraph, read_g2o
 from pgo_models.graphs.g2o import write_g2o_folder
+from solvers import Solution
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.known import odometry
-from solvers.solution import Solution
 
 Robust = solvers.GNC | solvers.PCM
 

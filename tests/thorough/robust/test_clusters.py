@@ -11,11 +11,11 @@ from wrong_edges import noisy_sphere, ring_road, spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models import NoiseModel
-from pgo_models.geometry.rotations import BoolArray, exp_map
+from pgo_models import NoiseModel, exp_map
+from pgo_models.geometry.rotations import BoolArray
 from pgo_models.graphs.edge_groups import EdgeGroups
 from pgo_models.graphs.pose_graph import IntArray
-from solvers.riemannian.polish import polish
+from solvers import polish
 from solvers.robust.chains import Chains
 from solvers.robust.cluster_search import ClusterSearch
 from solvers.robust.clusters import ClosurePairs

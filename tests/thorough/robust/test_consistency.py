@@ -7,9 +7,9 @@ import pytest
 from graphs import informed
 
 import pgo_models as pgo
-from pgo_models import NoiseModel, PoseGraph, Poses
+from pgo_models import NoiseModel, PoseGraph, Poses, exp_map, random_rotations
 from pgo_models.errors import SettingError
-from pgo_models.geometry.rotations import Array, exp_map, random_rotations
+from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.precisions import edge_precisions, proper_information
 from solvers.robust.consistency import pairwise_consistent
 from solvers.robust.known import odometry

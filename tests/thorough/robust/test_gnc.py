@@ -10,8 +10,8 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
+from pgo_models import chi2_thresholds
 from pgo_models.errors import SettingError
-from pgo_models.problem.thresholds import chi2_thresholds
 from solvers import Status
 from solvers.robust.gnc import GNCSchedule, advanced, ending
 from solvers.robust.known import odometry

@@ -9,13 +9,16 @@ import pytest
 from graphs import COSTS_OF_POSES
 from hypothesis import given, strategies as st
 
-from pgo_models import PGOProblem, PoseGraph, Weighting
+from pgo_models import (
+    PGOProblem,
+    PoseGraph,
+    Weighting,
+    chi2_thresholds,
+    partition,
+    random_geometric,
+)
 from pgo_models.errors import SettingError
-from pgo_models.graphs.partitioning import partition
-from pgo_models.graphs.scenes import random_geometric
-from pgo_models.problem.thresholds import chi2_thresholds
-from solvers import IRLS, SOC, MultiplierPenalty, Status
-from solvers.loop import run
+from solvers import IRLS, SOC, MultiplierPenalty, Status, run
 from solvers.riemannian.polish import relative_decrement
 from solvers.robust.irls import huber
 

@@ -10,10 +10,9 @@ import pytest
 from wrong_edges import spoiled
 
 import pgo_models as pgo
-from pgo_models import NoiseModel
-from pgo_models.geometry.rotations import exp_map
+from pgo_models import NoiseModel, exp_map
 from pgo_models.problem.hessian import TangentLayout
-from solvers.riemannian.polish import polish
+from solvers import polish
 from solvers.robust.chains import measured_covariances
 from solvers.robust.clusters import ClosurePairs
 from solvers.robust.distances import linearised_errors

@@ -10,7 +10,7 @@ import pytest
 
 import pgo_models as pgo
 import solvers
-from pgo_models.graphs.scenes import NoiseModel
+from pgo_models import NoiseModel
 from solvers.robust.known import odometry
 from solvers.robust.rejection import Rejection
 

@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 
 import pgo_models as pgo
 from pgo_models import NoiseModel
-from solvers.riemannian.polish import polish
+from solvers import polish
 from solvers.robust.chains import Chains
 from solvers.robust_solves.chain_sums import ChainSums
 from solvers.robust_solves.closure_costs import precisions_below

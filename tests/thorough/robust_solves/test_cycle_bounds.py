@@ -10,7 +10,7 @@ from graphs import DIMENSIONS, SEEDS, chain_with_closures
 from hypothesis import given, strategies as st
 
 import pgo_models as pgo
-from solvers.riemannian.polish import polish
+from solvers import polish
 from solvers.robust.chains import Chains
 from solvers.robust_solves.chain_sums import ChainSums
 from solvers.robust_solves.cycle_bounds import CycleBounds

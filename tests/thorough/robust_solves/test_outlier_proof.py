@@ -14,7 +14,7 @@ import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel
 from pgo_models.errors import SettingError
-from solvers.riemannian.polish import polish
+from solvers import polish
 from solvers.robust.revision import truncated_cost
 from solvers.robust_solves.closure_costs import isotropic_below, precisions_below
 

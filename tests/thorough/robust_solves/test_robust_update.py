@@ -10,8 +10,8 @@ from wrong_edges import spoiled
 
 import pgo_models as pgo
 import solvers
-from pgo_models import PoseGraph
-from pgo_models.geometry.rotations import Array, BoolArray, exp_map
+from pgo_models import PoseGraph, exp_map
+from pgo_models.geometry.rotations import Array, BoolArray
 
 
 def beginning(graph: PoseGraph, is_wrong: BoolArray, n: int) -> tuple[PoseGraph, BoolArray]:

@@ -14,7 +14,7 @@ from solvers import (
     Measurement,
     compare_methods,
 )
-from solvers.reporting.comparison_plots import explore_efforts, plot_efforts
+from solvers.reporting.comparison_plots import plot_efforts
 from solvers.reporting.convergence_plots import Curve
 from solvers.result import History, Record
 from solvers.studies.comparison import check_plot_format
@@ -100,15 +100,15 @@ def test_ctrl_c_keeps_the_methods_that_are_done(monkeypatch):
     assert "interrupted: the methods left out were not run" in compared.table().notes
 
 
-def test_plots_are_written_as_pictures_and_pages(compared, tmp_path):
-    for suffix, begin in ((".png", b"\x89PNG"), (".svg", b"<?xml"), (".html", b"<html")):
+def test_plots_are_written_as_pictures(compared, tmp_path):
+    for suffix, begin in ((".png", b"\x89PNG"), (".svg", b"<?xml")):
         compared.save_plot(tmp_path / f"plot{suffix}")
         assert begin in (tmp_path / f"plot{suffix}").read_bytes()[:100]
 
 
 @pytest.mark.parametrize("name", ["plot", "plot.gif", "plot.md"])
 def test_another_suffix_is_refused(name, compared, tmp_path):
-    with pytest.raises(SettingError, match=r"use .html, .png, .svg or .pdf"):
+    with pytest.raises(SettingError, match=r"use .png, .svg or .pdf"):
         check_plot_format(tmp_path / name)
     with pytest.raises(SettingError):
         compared.save_plot(tmp_path / name)
@@ -122,21 +122,12 @@ def test_a_panel_holds_the_methods_whose_effort_is_counted():
     labels = [axes.get_xlabel() for axes in figure.axes]
     assert labels == ["communication rounds", "communication (bytes)", "time in steps (s)"]
     assert [len(axes.lines) for axes in figure.axes] == [2, 1, 3]
-    page = explore_efforts([central, robots, rounds_only])
-    assert len(page.data) == 6
-    assert sorted(trace.name for trace in page.data if trace.showlegend) == [
-        "central",
-        "robots",
-        "rounds only",
-    ]
     assert [axes.get_xlabel() for axes in plot_efforts([central]).axes] == labels[2:]
 
 
 def test_there_must_be_something_to_draw():
     with pytest.raises(SettingError, match="no method has a gap above zero"):
-        plot_efforts([])
-    with pytest.raises(SettingError, match="no method has a gap above zero"):
-        explore_efforts([curve("start only", length=1)])
+        plot_efforts([curve("start only", length=1)])
 
 
 def test_records_are_plain_json(compared, tmp_path):

@@ -19,7 +19,8 @@ from networks import KEY, Network, give_edge, message_in, robots_of, world
 import pgo_models as pgo
 import solvers
 from pgo_models.errors import SettingError
-from solvers.soc.r_step import RotationStep, RStep, RSubproblem, prepare
+from solvers import RStep
+from solvers.soc.r_step import RotationStep, RSubproblem, prepare
 from solvers.team.messages import Ask
 
 SECONDS = 120.0

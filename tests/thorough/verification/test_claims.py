@@ -28,14 +28,13 @@ from graphs import COSTS, COSTS_OF_POSES, informed
 from proofs import PLANE, assert_verified, edited, proof_of, written
 
 import solvers
-from pgo_models import PGOProblem, Verdict, Weighting
+from pgo_models import PGOProblem, Verdict, Weighting, load, verify_proof
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FileFormatError, GraphWarning, SettingError
-from pgo_models.graphs.datasets import load
 from pgo_models.verification.measurements import read_graph
 from pgo_models.verification.proof import read_proof
 from pgo_models.verification.robot_logs import read_robot_log
-from pgo_models.verification.verify import PRECISIONS, verify_proof
+from pgo_models.verification.verify import PRECISIONS
 
 CASES = Path(__file__).parent / "cases"
 SEEDS_OF_ALL = 45  # of every kind of graph, 500 in all

@@ -13,10 +13,8 @@ from flint import arb, arb_mat, ctx, fmpq
 from graphs import DIMENSIONS, SEEDS, informed, random_poses
 from hypothesis import given, reject, settings, strategies as st
 
-from pgo_models import PGOError, PGOProblem, Poses, Weighting
-from pgo_models.graphs.g2o import read_g2o, write_g2o
+from pgo_models import PGOError, PGOProblem, Poses, Weighting, chi2, read_g2o, write_g2o
 from pgo_models.graphs.precisions import edge_precisions
-from pgo_models.graphs.residuals import chi2
 from pgo_models.verification.balls import first_bad_pivot, is_semidefinite
 from pgo_models.verification.costs import (
     QuadraticForm,

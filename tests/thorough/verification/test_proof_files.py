@@ -17,14 +17,21 @@ from graphs import COSTS, varied_graph
 from proofs import PLANE, SPACE, edited, proof_of, written
 
 import solvers
-from pgo_models import PGOProblem, Poses, Weighting, chordal_start
+from pgo_models import (
+    PGOProblem,
+    Poses,
+    Weighting,
+    chordal_start,
+    read_g2o,
+    save_proof,
+    verify_proof,
+    write_g2o,
+)
 from pgo_models.certificates.certificate import BoundSource
-from pgo_models.certificates.proof_file import proof_json, save_proof
+from pgo_models.certificates.proof_file import proof_json
 from pgo_models.errors import FileFormatError, SettingError
 from pgo_models.graphs.datasets import locate
-from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.verification.verify import verify_proof
-from solvers.solves.given_poses import certify
+from solvers import certify
 
 Call = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[3]

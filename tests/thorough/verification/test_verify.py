@@ -28,22 +28,31 @@ from hypothesis import assume, given, settings, strategies as st
 from proofs import PLANE, SPACE, assert_verified, edited, proof_of, written
 
 import solvers
-from pgo_models import NoiseModel, PGOProblem, PoseGraph, Poses, Weighting
-from pgo_models.certificates.certificate import BoundSource, certify_at
-from pgo_models.certificates.dual_variables import multipliers, scalar_multipliers
+from pgo_models import (
+    NoiseModel,
+    PGOProblem,
+    PoseGraph,
+    Poses,
+    Weighting,
+    certify_at,
+    chi2,
+    exp_map,
+    load,
+    multipliers,
+    random_rotations,
+    read_g2o,
+    save_proof,
+    verify_proof,
+    victoria_park,
+    write_g2o,
+)
+from pgo_models.certificates.certificate import BoundSource
+from pgo_models.certificates.dual_variables import scalar_multipliers
 from pgo_models.certificates.handedness import HandednessTerms
 from pgo_models.certificates.lower_bound import LowerBound, prove_at
-from pgo_models.certificates.proof_file import save_proof
 from pgo_models.errors import FileFormatError
-from pgo_models.geometry.rotations import exp_map, random_rotations
-from pgo_models.graphs.datasets import load, locate
-from pgo_models.graphs.g2o import read_g2o, write_g2o
-from pgo_models.graphs.residuals import chi2
-from pgo_models.graphs.scenes import victoria_park
-from pgo_models.verification.verify import verify_proof
-from solvers import SweptScene
-from solvers.riemannian.polish import polish
-from solvers.solves.given_poses import certify
+from pgo_models.graphs.datasets import locate
+from solvers import SweptScene, certify, polish
 from solvers.studies.tightness import noisy_scene
 
 WEIGHTINGS = st.sampled_from(COSTS)

@@ -11,14 +11,12 @@ import pytest
 from graphs import varied_graph
 from proofs import written
 
-from pgo_models import PGOProblem, PoseGraph, Weighting
-from pgo_models.certificates.proof_file import save_proof
-from pgo_models.geometry.rotations import exp_map, tangent_dimension
-from pgo_models.graphs.g2o import read_g2o
+from pgo_models import PGOProblem, PoseGraph, Weighting, exp_map, read_g2o, save_proof, verify_proof
+from pgo_models.geometry.rotations import tangent_dimension
 from pgo_models.verification.balls import ctx
 from pgo_models.verification.measurements import WORLD, Graph, read_graph
 from pgo_models.verification.proof import Proof, read_proof
-from pgo_models.verification.verify import prove, verify_proof, with_world_at_zero
+from pgo_models.verification.verify import prove, with_world_at_zero
 from solvers import solve
 
 UTM = np.array([691234.5, 5572094.1, 312.7])
