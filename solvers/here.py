@@ -176,14 +176,6 @@ class Here(Place):
         self.table.add(replace(Stage.of(finished), name=f"growing start{self.where}"))
         return Attempt(finished.poses, status=finished.status)
 
-    def start_again(self) -> Poses | None:
-        """The optimum of F where the cost is another; None where SOC can run on the cost itself."""
-        problem = self.problem
-        if problem.is_quadratic:
-            return None
-        isotropic = PGOProblem(problem.graph, problem.backend, Weighting.ISOTROPIC)
-        return polish(isotropic, chordal_start(isotropic))
-
     def try_other_starts(self, best: Attempt, newton: Newton) -> Attempt:
         """Return the better of the answer and an attempt from the best of some other starts."""
         for name, kind in KINDS_OF_STARTS:

@@ -65,8 +65,6 @@ class Step(enum.Enum):
 
     AGAIN = "complete solve"
     GROWING = "growing start"
-    LAST_STEPS = "last steps of Newton"
-    SECOND = "second attempt"
     STARTS = "other starts"
     STAIRCASE = "Staircase"
     SMALLER_MATRICES = "smaller matrices"
@@ -245,10 +243,6 @@ class Place(ABC):
     @abstractmethod
     def start_grown(self, growing: GrowingStart) -> Attempt:
         """Start at poses that prefixes of the graph lead to."""
-
-    @abstractmethod
-    def start_again(self) -> Poses | None:
-        """Return where a second attempt starts without SOC; None where it runs SOC once more."""
 
     @abstractmethod
     def try_other_starts(self, best: Attempt, newton: Newton) -> Attempt:

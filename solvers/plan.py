@@ -12,11 +12,11 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
 3. Newton, down to rounding level.
 4. The certificate of the poses. Steps 1 to 4 are an attempt.
 5. Another attempt, from a start that grows: prefixes of the graph, each solved from the one before.
-   On graphs with landmarks Newton of the first attempt has few steps, as this attempt may follow.
-   If this attempt does not close the gap, the first one takes the rest of its steps.
-6. A second attempt: by a finer SOC, or by Newton from the optimum of F where the cost is a chi2
-   that SOC cannot run on. Then Newton from other starts: the estimate of the file, a spanning tree
-   and, on small graphs, random poses. The table of stages says which of them is the best.
+   On graphs with landmarks Newton of the first attempt has few steps, as this attempt may follow,
+   and after it one from the chordal relaxation.
+6. Newton from other starts: the estimate of the file, a spanning tree, the chordal relaxation or,
+   where the cost is another, the optimum of F, and on small graphs random poses. The table of
+   stages says which of them is the best.
 7. A relaxation of the cost: poses that its solution rounds to, and its bound. In the plane it has
    rotations as complex numbers, and is never worse than the semidefinite one, which the staircase
    solves. For chi2, bounds by smaller information matrices, whose cost is below chi2.
@@ -26,17 +26,15 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
    says that no terms raise the bound.
 
 Steps 5 to 8 are taken while the answer is open, where the settings ask for them and nothing stands
-against them (`improved`). A Newton that was cut short goes on in any case. They can only improve
-the answer. What fails in them, as linear algebra does (`pgo_models.errors.FAILURES`), leaves the
-answer before it, with a sentence. A step that is asked for and cannot be taken has a line in the
-table of stages, which says why.
+against them (`improved`). They can only improve the answer. What fails in them, as linear algebra
+does (`pgo_models.errors.FAILURES`), leaves the answer before it, with a sentence. A step that is
+asked for and cannot be taken has a line in the table of stages, which says why.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 from pgo_models.certificates.certificate import BoundSource
 from pgo_models.errors import FAILURES, NotPositiveDefiniteError
@@ -48,15 +46,13 @@ from solvers.request import Pipeline
 from solvers.result import Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.soc.paper import PaperSOC
-from solvers.soc.soc import SOC, WARM_START
+from solvers.soc.soc import WARM_START
 
 # Poses in space up to which Newton alone is faster than SOC and Newton in one process.
 SMALL = 1000
 # Newton steps of a first attempt on graphs with landmarks. On all graphs tried, those that ended at
 # the global minimum took at most as many, and the others 17 to 100.
 LANDMARK_STEPS = 16
-# Residuals at which SOC of a second attempt ends; `WARM_START`, the first one, ends at 5e-3.
-SECOND_TRY_TOLERANCE = 1e-6
 HULL_PASSES = 3  # with CLOSER the last one has a hundredth of the first tolerance
 CLOSER = 0.1  # factor on the tolerance of the next pass over the relaxation with hulls
 Improvement = Callable[[Place, Pipeline, Attempt], Attempt]
@@ -64,7 +60,7 @@ Improvement = Callable[[Place, Pipeline, Attempt], Attempt]
 
 def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     """Solve at a place, from a start or the place's own: all steps in their order."""
-    newton = _first_newton(place.traits, settings)
+    newton = _first_newton(place.traits, settings, start)
     try:
         first = attempt(place, settings.first_stage, newton, start)  # steps 1 to 4
     except KeyboardInterrupt:
@@ -78,12 +74,7 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
     if not place.traits.has_driver:
         return first
     best = improved(Step.GROWING, from_growing_start, place, settings, first)  # step 5
-    growth_has_ended_it = first.is_open and not best.is_open  # certified, or out of time
-    if _was_cut_short(place, settings, first) and not growth_has_ended_it:
-        go_on = partial(with_last_steps, first)
-        best = unless_it_fails(Step.LAST_STEPS, go_on, place, settings, best)
-    best = improved(Step.SECOND, from_second_start, place, settings, best)  # step 6
-    best = improved(Step.STARTS, from_other_starts, place, settings, best)
+    best = improved(Step.STARTS, from_other_starts, place, settings, best)  # step 6
     best = by_relaxation(place, settings, best)  # step 7
     return by_handedness(place, settings, best)  # step 8
 
@@ -155,15 +146,7 @@ def improved(
 
 
 def obstacle(step: Step, place: Place, settings: Pipeline, best: Attempt) -> str:
-    """Why a step cannot be taken, in a few words; "" where it can.
-
-    An attempt that reached a limit would reach it again from another start. Few Newton steps are no
-    such limit: the first attempt has the rest of them after the growing start.
-    """
-    if step in (Step.GROWING, Step.SECOND) and not best.status.is_success:
-        has_few_steps = step is Step.GROWING and _was_cut_short(place, settings, best)
-        if not has_few_steps:
-            return f"the attempt before it ended with {best.status.name}"
+    """Why a step cannot be taken, in a few words; "" where it can."""
     reason = place.lacks(step) or _misfit(step, place, settings)
     if not reason and step is Step.TERMS and not place.terms_can_help(best):
         return "turns of the poses lower the tangent of chi2, with any terms"
@@ -216,33 +199,9 @@ def from_growing_start(place: Place, settings: Pipeline, best: Attempt) -> Attem
     return place.better(best, grown)
 
 
-def with_last_steps(first: Attempt, place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Newton of the first attempt to its end, so that no answer is worse for having cut it short.
-
-    It goes on from the poses of the first attempt, whose place in the answer it takes.
-    """
-    place.table.begin_attempt()
-    finished = newton_and_certificate(place, settings.newton, first)
-    return finished if best is first else place.better(best, finished)
-
-
-def from_second_start(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """Step 6: the better of the answer and an attempt by a finer SOC, or from another start."""
-    start = place.start_again()
-    soc = finer(settings.first_stage) if start is None else None
-    return place.better(best, attempt(place, soc, settings.newton, start))
-
-
 def from_other_starts(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
-    """The better of the answer and an attempt from the best of some other starts."""
+    """Step 6: the better of the answer and an attempt from the best of some other starts."""
     return place.try_other_starts(best, settings.newton)
-
-
-def finer(soc: FirstStage) -> SOC | PaperSOC:
-    """SOC of a second attempt: a finer tolerance, and as many iterations as that may take."""
-    known = soc if isinstance(soc, SOC | PaperSOC) else SOC()
-    tolerance = min(known.tolerance, SECOND_TRY_TOLERANCE)
-    return replace(known, tolerance=tolerance, max_iterations=SOC.max_iterations)
 
 
 def by_relaxation(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
@@ -331,15 +290,10 @@ def _with_closer_hulls(settings: Pipeline) -> Pipeline:
     return replace(settings, handedness=replace(settings.handedness, hulls=closer))
 
 
-def _first_newton(traits: Traits, settings: Pipeline) -> Newton:
-    """Newton of the first attempt, with few steps where a growing start may follow soon."""
+def _first_newton(traits: Traits, settings: Pipeline, start: Poses | None) -> Newton:
+    """Newton of the first attempt, with few steps from a start that other attempts make up for."""
     newton = settings.newton
-    if not traits.has_landmarks or settings.growing is None:
+    others_follow = settings.growing is not None and settings.other_starts
+    if not (start is None and traits.has_landmarks and others_follow):
         return newton
     return replace(newton, max_iterations=min(newton.max_iterations, LANDMARK_STEPS))
-
-
-def _was_cut_short(place: Place, settings: Pipeline, first: Attempt) -> bool:
-    """Whether Newton of the first attempt was given few steps, and took them all."""
-    has_more = _first_newton(place.traits, settings) != settings.newton
-    return has_more and first.status is Status.MAX_ITERATIONS

@@ -62,8 +62,8 @@ class Pipeline:
     growing : GrowingStart or None
         The growing start of step 5, which is found in one place, also for robots that share a
         graph. None leaves the step out.
-    second_try : bool
-        Whether step 6 is taken, the second attempt.
+    other_starts : bool
+        Whether step 6 is taken, Newton from other starts.
     staircase : Staircase or None
         The staircase of step 7; None leaves the step out.
     handedness : HandednessSearch or None
@@ -85,7 +85,7 @@ class Pipeline:
     newton: Newton = field(default_factory=Newton)
     gap: float = DEFAULT_GAP
     growing: GrowingStart | None = field(default_factory=GrowingStart)
-    second_try: bool = True
+    other_starts: bool = True
     staircase: Staircase | None = field(default_factory=Staircase)
     handedness: HandednessSearch | None = field(default_factory=HandednessSearch)
 
@@ -106,7 +106,7 @@ class Pipeline:
             soc=None,
             newton=newton,
             growing=None,
-            second_try=False,
+            other_starts=False,
             staircase=None,
             handedness=None,
         )
@@ -121,8 +121,7 @@ class Pipeline:
         has_relaxation = self.staircase is not None
         return {
             Step.GROWING: self.growing is not None,
-            Step.SECOND: self.second_try,
-            Step.STARTS: self.second_try,
+            Step.STARTS: self.other_starts,
             Step.STAIRCASE: has_relaxation,
             Step.SMALLER_MATRICES: has_relaxation,
             Step.COMPLEX: has_relaxation and search is not None,
@@ -220,7 +219,7 @@ class SolveRequest:
             pipeline.newton,
             pipeline.gap,
             pipeline.growing,
-            pipeline.second_try,
+            pipeline.other_starts,
             robots.faults,
             robots.has_driver,
         )

@@ -60,7 +60,6 @@ COMMANDS = {
         groups={
             "What is read, and the cost that is minimised": (
                 "cost",
-                "unit_weights",
                 "estimate_noise",
                 "rotations",
                 "drop_coupling",
@@ -77,7 +76,6 @@ COMMANDS = {
             "How it is solved": (
                 "method",
                 "start",
-                "r_step",
                 "gap",
                 "max_iterations",
                 "tolerance",

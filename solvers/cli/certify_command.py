@@ -26,13 +26,11 @@ from solvers.cli.options import (
     DropEdgeOption,
     GapOption,
     GraphArgument,
-    InformationOption,
     LargestComponentOption,
     ProofOption,
     RotationsOption,
     SkipUnknownOption,
     TrustFolderOption,
-    UnitWeightsOption,
 )
 from solvers.cli.shell import (
     DONE,
@@ -68,9 +66,7 @@ def certify_command(
     proof: ProofOption = None,
     gap: GapOption = DEFAULT_GAP,
     cost: CostOption = None,
-    unit_weights: UnitWeightsOption = False,
     rotations: RotationsOption = False,
-    information: InformationOption = False,
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
@@ -88,8 +84,6 @@ def certify_command(
     source = GraphOptions(
         graph,
         cost,
-        unit_weights,
-        information,
         drop_coupling,
         skip_unknown,
         drop_edge,

@@ -11,11 +11,10 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start, odometry_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
 from solvers.carry.process import DEFAULT_MEMORY, Engine, InProcess
-from solvers.cli.options import BackEndName, FirstStage, Robust, Runner, Start, TakenForRight
+from solvers.cli.options import FirstStage, Robust, Runner, Start, TakenForRight
 from solvers.request import Pipeline
 from solvers.riemannian.newton import gauss_newton
 from solvers.soc.paper import PaperSOC
-from solvers.soc.r_step import RStep
 from solvers.soc.settings import Coupling
 from solvers.soc.soc import SOC, WARM_START
 
@@ -41,7 +40,6 @@ FOR_OWN_FILES = {
     "address",
     "driver_memory",
     "cost",
-    "information",
     "gap",
     "max_iterations",
     "tolerance",
@@ -55,7 +53,6 @@ FOR_OWN_FILES = {
 def chosen_pipeline(
     method: FirstStage,
     robots: Partition | None,
-    r_step: BackEndName | None,
     gap: float,
     max_iterations: int | None,
     tolerance: float | None,
@@ -69,21 +66,14 @@ def chosen_pipeline(
     SettingError when the options do not go together.
     """
     if method is FirstStage.NEWTON:
-        _check_without_soc(r_step, max_iterations, tolerance)
+        _check_without_soc(max_iterations, tolerance)
         return Pipeline(soc=None, gap=gap)
-    if method is FirstStage.SUBSTRUCTURED and r_step not in (None, BackEndName.FACTORIZED):
-        raise SettingError(
-            f"--method substructured factors, got --r-step {r_step.value}; "
-            "use joint, consensus or paper"
-        )
-    options_of_soc = (r_step, max_iterations, tolerance)
-    if not is_asked_for and all(option is None for option in options_of_soc):
+    if not is_asked_for and max_iterations is None and tolerance is None:
         return Pipeline(gap=gap)
     soc = _default_soc(method, has_driver)
     soc = replace(
         soc,
         robots=robots if method in (FirstStage.CONSENSUS, FirstStage.PAPER) else None,
-        r_step=RStep.FACTORIZED if r_step is None else RStep[r_step.name],
         tolerance=soc.tolerance if tolerance is None else tolerance,
         max_iterations=soc.max_iterations if max_iterations is None else max_iterations,
     )
@@ -96,7 +86,7 @@ def chosen_pipeline(
 
 def pipeline_of_robots(method: FirstStage) -> Pipeline:
     """Pipeline of robots with files of their own, with one of the methods `ON_ROBOTS`."""
-    return chosen_pipeline(method, None, None, DEFAULT_GAP, None, None)
+    return chosen_pipeline(method, None, DEFAULT_GAP, None, None)
 
 
 def chosen_memory(method: FirstStage, driver_memory: float | None) -> float:
@@ -110,15 +100,9 @@ def chosen_memory(method: FirstStage, driver_memory: float | None) -> float:
     return 1e9 * driver_memory
 
 
-def _check_without_soc(
-    r_step: BackEndName | None, max_iterations: int | None, tolerance: float | None
-) -> None:
+def _check_without_soc(max_iterations: int | None, tolerance: float | None) -> None:
     """Raise a SettingError for an option of SOC, where the solve has none."""
-    options_of_soc = {
-        "--r-step": r_step,
-        "--max-iterations": max_iterations,
-        "--tolerance": tolerance,
-    }
+    options_of_soc = {"--max-iterations": max_iterations, "--tolerance": tolerance}
     for name, value in options_of_soc.items():
         if value is not None:
             raise SettingError(

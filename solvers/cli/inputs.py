@@ -42,8 +42,6 @@ class GraphOptions:
 
     graph: str
     cost: Cost | None = None
-    unit_weights: bool = False
-    information: bool = False
     drop_coupling: bool = False
     skip_unknown: bool = False
     drop_edge: Dropped = None
@@ -54,10 +52,9 @@ class GraphOptions:
 
     def __post_init__(self) -> None:
         asked = self._asked
-        if self.estimate_noise and self.chosen_cost is Cost.UNIT:
-            (option,) = list(asked)[:1]
+        if self.estimate_noise and self.cost is Cost.UNIT:
             raise SettingError(
-                f"--estimate-noise and {option} ask for different weights; leave out one"
+                "--estimate-noise and --cost ask for different weights; leave out one"
             )
         if len(set(asked.values())) > 1:
             first, second = list(asked)[:2]
@@ -69,8 +66,6 @@ class GraphOptions:
         asked = {
             "--rotations": "rotations" if self.rotations else "",
             "--cost": self.cost.value if self.cost is not None else "",
-            "--information": Cost.CHI2.value if self.information else "",
-            "--unit-weights": Cost.UNIT.value if self.unit_weights else "",
             "--drop-coupling": Cost.CHI2.value if self.drop_coupling else "",
         }
         return {option: cost for option, cost in asked.items() if cost}

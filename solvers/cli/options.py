@@ -12,8 +12,6 @@ import typer
 # The first stage of a solve.
 FirstStage = enum.StrEnum("FirstStage", "JOINT SUBSTRUCTURED CONSENSUS PAPER NEWTON")
 Start = enum.StrEnum("Start", "CHORDAL TREE ODOMETRY FILE")
-# Back ends of the R-step.
-BackEndName = enum.StrEnum("BackEndName", "FACTORIZED FISTA CLARABEL")
 # How poses go to robots.
 Split = enum.StrEnum("Split", "GIVEN CONTIGUOUS METIS SINGLETONS")
 # Where robots run.
@@ -82,9 +80,6 @@ CostOption = Annotated[
         help="chi2: of the file's information matrices, the default where it has them; isotropic: "
         "F, two precisions an edge, as in SE-Sync; unit: F with the weights of the paper."
     ),
-]
-InformationOption = Annotated[
-    bool, typer.Option("--information", help="The same as --cost chi2.", hidden=True)
 ]
 DropCouplingOption = Annotated[
     bool,

@@ -47,7 +47,6 @@ from solvers.cli.inputs import (
 )
 from solvers.cli.options import (
     AllComponentsOption,
-    BackEndName,
     Cost,
     CostOption,
     DropCouplingOption,
@@ -56,7 +55,6 @@ from solvers.cli.options import (
     FirstStage,
     GapOption,
     GraphArgument,
-    InformationOption,
     LargestComponentOption,
     ProofOption,
     Robust,
@@ -68,7 +66,6 @@ from solvers.cli.options import (
     Start,
     TakenForRight,
     TrustFolderOption,
-    UnitWeightsOption,
 )
 from solvers.cli.shell import (
     DONE,
@@ -157,10 +154,6 @@ def solve_command(
         Start | None,
         typer.Option(help="Start: chordal relaxation (tree for the paper's method) unless given."),
     ] = None,
-    r_step: Annotated[
-        BackEndName | None,
-        typer.Option("--r-step", help="Back end of SOC's R-subproblem; factorized unless given."),
-    ] = None,
     gap: GapOption = DEFAULT_GAP,
     max_iterations: Annotated[
         int | None,
@@ -175,9 +168,7 @@ def solve_command(
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the iterations.")] = math.inf,
     cost: CostOption = None,
-    unit_weights: UnitWeightsOption = False,
     rotations: RotationsOption = False,
-    information: InformationOption = False,
     drop_coupling: DropCouplingOption = False,
     skip_unknown: SkipUnknownOption = False,
     trust_folder: TrustFolderOption = False,
@@ -255,8 +246,6 @@ def solve_command(
     source = GraphOptions(
         graph,
         cost,
-        unit_weights,
-        information,
         drop_coupling,
         skip_unknown,
         drop_edge,
@@ -268,7 +257,6 @@ def solve_command(
     stages = StageOptions(
         method,
         start,
-        r_step,
         gap,
         max_iterations,
         tolerance,
@@ -307,7 +295,6 @@ class StageOptions:
 
     method: FirstStage | None
     start: Start | None
-    r_step: BackEndName | None
     gap: float
     max_iterations: int | None
     tolerance: float | None
@@ -344,7 +331,6 @@ class StageOptions:
         return choices.chosen_pipeline(
             method,
             robots,
-            self.r_step,
             self.gap,
             self.max_iterations,
             self.tolerance,
@@ -448,16 +434,7 @@ class RobotOptions:
         partition = None
         if self.is_given or method in (FirstStage.SUBSTRUCTURED, FirstStage.CONSENSUS):
             partition = chosen_partition(graph, self.robots, self.split)
-        # Robots of SOC factor; the other back ends of CONSENSUS have all robots in one place.
-        has_back_end = method is FirstStage.PAPER or stages.r_step in (None, BackEndName.FACTORIZED)
-        if partition is not None and engine is not None and has_back_end:
-            return ChosenPlace(method, partition, engine)
-        if stages.r_step is not None and self.is_about_network:
-            raise SettingError(
-                f"robots of an engine factor, got --r-step {stages.r_step.value}; "
-                "leave out --engine, --resume and --driver-memory"
-            )
-        return ChosenPlace(method, partition, None)
+        return ChosenPlace(method, partition, engine if partition is not None else None)
 
 
 @dataclass(frozen=True)

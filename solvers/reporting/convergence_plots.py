@@ -66,7 +66,7 @@ class Curve:
 def explore_convergence(
     stages: Stages, lower_bound: float, published: PublishedRun | None = None
 ) -> Figure:
-    """Plotly figure of the gap (F - lower_bound) / F over iterations, and of the residuals below it.
+    """Plotly figure of the gap (F - lower_bound) / F over iterations, and of residuals below.
 
     Stages are for example `[(stage.name, stage.history) for stage in solution.stages]`; each of
     them begins where the one before ends. A published gap is a line that names its iterations.

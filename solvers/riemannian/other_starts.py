@@ -1,6 +1,7 @@
 """Other starts of Newton, for a cost with several minima: cheap beside a relaxation.
 
-They are the estimate of the file, poses along a spanning tree and, on small graphs, random ones.
+They are the estimate of the file, poses along a spanning tree, those of the chordal relaxation or,
+where the cost is not F, the optimum of F, and on small graphs random poses.
 Half of the random starts have random rotations. The other half are the best poses so far, with all
 poses from a random one on turned by the same rotation.
 """
@@ -13,8 +14,9 @@ import numpy as np
 
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array, project_to_rotations
-from pgo_models.problem.initialization import spanning_tree_start
+from pgo_models.problem.initialization import chordal_start, spanning_tree_start
 from pgo_models.problem.problem import PGOProblem
+from pgo_models.problem.weighting import Weighting
 from solvers.riemannian.polish import polish
 
 MOST_RANDOM_POSES = 100  # of a graph that is started at random
@@ -39,6 +41,11 @@ def starts_of_graph(problem: PGOProblem, best: Poses) -> Iterator[tuple[str, Pos
     if graph.initial is not None:
         yield "file", graph.near_zero(graph.initial)
     yield "tree", spanning_tree_start(graph)
+    if problem.is_quadratic:
+        yield "chordal", chordal_start(problem)
+    else:
+        isotropic = PGOProblem(graph, problem.backend, Weighting.ISOTROPIC)
+        yield "optimum of F", polish(isotropic, chordal_start(isotropic))
 
 
 def random_starts(problem: PGOProblem, best: Poses) -> Iterator[tuple[str, Poses]]:

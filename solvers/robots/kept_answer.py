@@ -105,10 +105,6 @@ class AnswerAtRobots:
         driver.network.ask(return_to_answer, nothing, Count.PIGGYBACKED)
         driver.current = kept.cover
 
-    def start_again(self) -> Poses | None:
-        """A second attempt runs SOC once more."""
-        return None
-
     def salvage(self, reason: Status) -> Attempt:
         """The poses that the robots keep; a PGOError where a matrix had no factor before any."""
         if self.kept is None:

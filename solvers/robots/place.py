@@ -140,9 +140,7 @@ class PlaceOfRobots(Place):
         """Why a step cannot be taken: most need one process with the graph of all robots."""
         if self.here is not None:
             return ""
-        if step is Step.SECOND and self.begins_at is not None:
-            return "there is no other start"
-        return "" if step in (Step.SECOND, Step.STAIRCASE) else "no process has the graph"
+        return "" if step is Step.STAIRCASE else "no process has the graph"
 
     @property
     def way_out(self) -> str:
@@ -315,10 +313,6 @@ class PlaceOfRobots(Place):
         return self.holder.salvage(reason)
 
     # Steps after the first attempt
-
-    def start_again(self) -> Poses | None:
-        """The optimum of F, found in one place, where the cost is another; else SOC runs again."""
-        return self.holder.start_again()
 
     def climb(self, best: Attempt, staircase: Staircase) -> Attempt:
         """Have the robots climb the staircase from the best poses, and round its solution."""

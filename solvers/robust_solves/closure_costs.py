@@ -35,7 +35,7 @@ from solvers.robust_solves.coarse_chains import CoarseChains
 # Relative gap of the first certificate: of most wrong closures the cost is many times s.
 _WIDE_GAP = 0.5
 # Poses are not improved: what counts is the bound.
-_FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, second_try=False)
+_FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, other_starts=False)
 # A wide gap can be proven far from a stationary point.
 _COARSE_STAIRCASE = Staircase(tolerance=1e-2, gap=_WIDE_GAP)
 _MOST_STEPS = 100  # of the coarse staircase; after them the best bound so far stands

@@ -65,11 +65,11 @@ _FAR_TOO_SMALL = 1.0 / 30.0  # times what is expected: then square roots are at 
 _MOST_MISFIT_OF_BLOCKS = 2.0  # where blocks are exchanged, which changes the cost either way
 _CLOSE = math.log(1e3)  # difference of evidence up to which a reading is named beside the best
 _TURN = 2.0 * math.pi  # no program writes larger angles in radians
-# There is nothing to gain from a second attempt or a better bound under a wrong reading.
+# There is nothing to gain from other starts or a better bound under a wrong reading.
 _PLAIN = Pipeline(
     newton=Newton(max_iterations=30),
     growing=None,
-    second_try=False,
+    other_starts=False,
     staircase=None,
     handedness=None,
 )

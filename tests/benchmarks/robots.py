@@ -140,7 +140,7 @@ def ray_job(name: str, robots: str, coupling: str) -> dict[str, object]:
     soc = solvers.SOC(
         robots=shared, coupling=solvers.Coupling[coupling], tolerance=1e-14, max_iterations=40
     )
-    pipeline = solvers.Pipeline(soc=soc, second_try=False, staircase=None)
+    pipeline = solvers.Pipeline(soc=soc, other_starts=False, staircase=None)
 
     def least(engine: Engine) -> dict[str, float]:
         found = []

@@ -65,7 +65,7 @@ def test_a_solve_writes_every_format_and_each_holds_the_same_poses(
 def test_a_robust_solve_of_chi2_by_robots_writes_its_files(planar, pgo_command, tmp_path):
     outs = repeated("-o", tmp_path, [*TRAJECTORIES, "x.json"])
     code, _, err = pgo_command(
-        "solve", planar, "--information", "--robots", "2", "--robust", "gnc", *outs
+        "solve", planar, "--cost", "chi2", "--robots", "2", "--robust", "gnc", *outs
     )
     assert (code, err) == (0, "")
     assert all((tmp_path / name).exists() for name in (*TRAJECTORIES, "x.json"))

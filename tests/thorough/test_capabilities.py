@@ -280,7 +280,7 @@ def grows(place: Place) -> bool:
     i, j = np.concatenate([np.stack([along, along + 1], axis=1), far]).T
     R_ij = pgo.random_rotations(25, 2, rng)
     graph = PoseGraph(14, i, j, R_ij, rng.standard_normal((25, 2)), np.ones(25), np.ones(25))
-    pipeline = solvers.Pipeline(growing=GrowingStart(first_size=6), second_try=False)
+    pipeline = solvers.Pipeline(growing=GrowingStart(first_size=6), other_starts=False)
     answer = place.solve(graph, pipeline, Weighting.ISOTROPIC)
     refuse_what_the_note_names(answer, "growing start")
     return any(stage.name.startswith("growing start") for stage in answer.stages)

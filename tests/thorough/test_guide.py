@@ -101,7 +101,6 @@ CHOICES = {
     "--split": cli_options.Split,
     "--engine": cli_options.Runner,
     "--start": cli_options.Start,
-    "--r-step": cli_options.BackEndName,
     "--robust": cli_options.Robust,
 }
 CHOICES_OF_COMMANDS = {("robot", "--method"): MethodOfTeam}

@@ -73,10 +73,10 @@ def test_without_an_estimate_pose_0_is_the_identity():
     np.testing.assert_allclose(solution.poses.t[0], 0, rtol=0, atol=1e-12)
 
 
-def test_a_bad_start_is_rescued_by_the_second_try():
+def test_a_bad_start_is_rescued_by_other_starts():
     problem, wound = wound_ring(20, 2)
     stuck = solvers.solve(
-        problem, solvers.Pipeline(soc=None, second_try=False, staircase=None), wound
+        problem, solvers.Pipeline(soc=None, other_starts=False, staircase=None), wound
     )
     rescued = solvers.solve(problem, solvers.Pipeline(soc=None, staircase=None), wound)
     assert not stuck.is_certified
@@ -88,7 +88,7 @@ def test_a_bad_start_is_rescued_by_the_second_try():
 @pytest.mark.parametrize("d", [2, 3])
 def test_a_bad_start_is_rescued_by_the_relaxation(d):
     problem, wound = wound_ring(20, d)
-    solution = solvers.solve(problem, solvers.Pipeline(soc=None, second_try=False), wound)
+    solution = solvers.solve(problem, solvers.Pipeline(soc=None, other_starts=False), wound)
     relaxation = ["ComplexRelaxation"] if d == 2 else ["Staircase", "Newton"]
     taken = [stage.name for stage in solution.stages if stage.was_taken]
     assert taken == ["given start", "Newton", *relaxation]
@@ -123,7 +123,7 @@ def test_a_staircase_that_is_cut_short_gives_a_valid_bound():
     cut = solvers.Pipeline(
         soc=None,
         growing=None,
-        second_try=False,
+        other_starts=False,
         staircase=solvers.Staircase(max_iterations=8),
     )
     solution = solvers.solve(problem, cut, wound)

@@ -117,7 +117,7 @@ SOLVES: dict[str, Callable[[Robots], solvers.Solution]] = {
     "PaperSOC": lambda robots: solve(varied_graph(1, 40, 3), Pipeline(PaperSOC()), robots=robots),
     "staircase": lambda robots: solve(
         wound()[0],
-        Pipeline(soc=None, second_try=False, handedness=None),
+        Pipeline(soc=None, other_starts=False, handedness=None),
         wound()[1],
         robots=robots,
     ),

@@ -26,13 +26,9 @@ def test_consensus_goes_without_a_driver_and_says_so(pgo_command):
     code, out, err = pgo_command("solve", "robots", "--driver-memory", "0.000001")
     assert (code, out) == (1, "")
     assert "raise driver_memory (--driver-memory), or set it to 0" in err
-    for options in (
-        ("--method", "joint"),
-        ("--method", "consensus", "--r-step", "fista"),
-    ):
-        code, out, err = pgo_command("solve", "robots", "--driver-memory", "4", *options)
-        assert (code, out) == (1, "")
-        assert "--driver-memory" in err
+    code, out, err = pgo_command("solve", "robots", "--driver-memory", "4", "--method", "joint")
+    assert (code, out) == (1, "")
+    assert "--driver-memory" in err
     # substructured is by a driver
     assert pgo_command("solve", "robots", "--driver-memory", "0")[0] == 1
 
@@ -94,8 +90,6 @@ def test_the_whole_graph_beside_the_robots_is_one_line_on_stderr(tmp_path):
         ("--robots", "3", "--engine", "process", "--split", "contiguous", "--start", "chordal"),
         ("--method", "paper", "--robots", "3"),
         ("--method", "paper", "--split", "singletons"),
-        ("--r-step", "fista"),
-        ("--r-step", "clarabel"),
         ("--start", "tree"),
         ("--start", "file"),
         ("--max-iterations", "3"),
@@ -324,7 +318,6 @@ def test_bad_files_end_with_1_and_one_line_without_a_traceback(
         ("solve", "sphere", "--method", "joint", "--engine", "process"),
         ("solve", "sphere", "--method", "joint", "--split", "contiguous"),
         ("solve", "sphere", "--method", "joint", "--resume", "run.ckpt"),
-        ("solve", "sphere", "--method", "substructured", "--r-step", "fista"),
         ("solve", "sphere", "--robots", "2", "--engine", "process", "--address", "localhost:6379"),
         ("solve", "sphere", "--robots", "2", "--address", "localhost"),
         ("solve", "sphere", "--robots", "2", "--split", "given"),
@@ -337,7 +330,6 @@ def test_bad_files_end_with_1_and_one_line_without_a_traceback(
         ("certify", "sphere", "--gap", "nan"),
         ("solve", "sphere", "--method", "newton", "--tolerance", "1e-3"),
         ("solve", "sphere", "--method", "newton", "--max-iterations", "3"),
-        ("solve", "sphere", "--method", "newton", "--r-step", "factorized"),
         ("solve", ""),
         ("solve", "sphere", "--out", ""),
         ("solve", "sphere", "--out", "/dev/null"),
@@ -385,14 +377,6 @@ def test_a_start_the_graph_does_not_offer_is_refused(pgo_command, tmp_path):
     assert "no odometry from pose 0 to 1" in pgo_command("solve", path, "--start", "odometry")[2]
     assert "no VERTEX line" in pgo_command("solve", path, "--start", "file")[2]
     assert "no VERTEX line" in pgo_command("certify", path)[2]
-
-
-def test_robots_of_an_engine_factor(pgo_command):
-    code, _, error = pgo_command(
-        "solve", "robots", "--method", "consensus", "--r-step", "clarabel", "--engine", "process"
-    )
-    assert code == 1
-    assert "--r-step clarabel" in error
 
 
 def test_an_anchor_stays_where_the_file_has_it_and_times_are_written(pgo_command, tmp_path):

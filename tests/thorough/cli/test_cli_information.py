@@ -53,34 +53,33 @@ def test_both_costs_are_in_the_file_and_the_hint_is_a_line(
 
 
 def test_anyones_poses_are_judged_by_chi2(pgo_command: Call, file: Path, tmp_path: Path) -> None:
-    code, _, _ = pgo_command("solve", file, "--information", "-o", tmp_path / "best.g2o")
+    code, _, _ = pgo_command("solve", file, "--cost", "chi2", "-o", tmp_path / "best.g2o")
     assert code == 0
     code, out, err = pgo_command(
-        "certify", file, "--information", "-e", tmp_path / "best.g2o", "-o", tmp_path / "c.json"
+        "certify", file, "--cost", "chi2", "-e", tmp_path / "best.g2o", "-o", tmp_path / "c.json"
     )
     assert (code, err) == (0, "")
     assert "CERTIFIED" in out
     record = json.loads((tmp_path / "c.json").read_text())
     assert record["weighting"] == "INFORMATION"
-    code, out, _ = pgo_command("certify", file, "--information")
+    code, out, _ = pgo_command("certify", file, "--cost", "chi2")
     assert code == 3
     assert "best known chi2" in out
 
 
 def test_information_that_is_not_there_is_asked_for_in_vain(pgo_command: Call, file: Path) -> None:
-    code, _, err = pgo_command("solve", "circle", "--information")
+    code, _, err = pgo_command("solve", "circle", "--cost", "chi2")
     assert (code, err) == (0, "")
-    for options in (["--information", "--unit-weights"], ["--cost", "unit", "--drop-coupling"]):
-        code, _, err = pgo_command("solve", file, *options)
-        assert (code, err.count("\n")) == (1, 1)
-        assert "ask for different costs; leave out one" in err
+    code, _, err = pgo_command("solve", file, "--cost", "unit", "--drop-coupling")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "ask for different costs; leave out one" in err
 
 
 def test_the_advice_of_a_report_is_about_the_same_cost(
     pgo_command: Call, file: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("plotly")
-    code, _, err = pgo_command("solve", file, "--information", "--report", tmp_path / "r.html")
+    code, _, err = pgo_command("solve", file, "--cost", "chi2", "--report", tmp_path / "r.html")
     assert (code, err) == (0, "")
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert f"pgo certify {file} --estimate solved.g2o" in page
@@ -105,7 +104,7 @@ def test_indefinite_matrices_are_refused_with_their_line(
 ) -> None:
     count = len(read_g2o(indefinite).i)
     for command in ("solve", "certify"):
-        code, out, err = pgo_command(command, indefinite, "--information")
+        code, out, err = pgo_command(command, indefinite, "--cost", "chi2")
         assert (code, out, err.count("\n")) == (1, "", 1)
         assert (
             f"information matrices of 2 of {count} edges are indefinite (first {indefinite}:5,"
@@ -121,7 +120,7 @@ def test_coupling_that_is_left_out_is_said_wherever_chi2_is(
     pgo_command: Call, indefinite: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("plotly")
-    options = ("--information", "--drop-coupling")
+    options = ("--cost", "chi2", "--drop-coupling")
     record, page, solved = (tmp_path / name for name in ("s.json", "r.html", "solved.g2o"))
     outputs = ("--out", record, "--report", page, "--out", solved)
     code, out, err = pgo_command("solve", indefinite, *options, *outputs)

@@ -115,7 +115,7 @@ def test_a_file_with_only_rotations_needs_no_option(
 
 
 def test_chi2_of_a_file_with_only_rotations(pgo_command: Call, file: Path) -> None:
-    code, out, err = pgo_command("solve", file, "--information")
+    code, out, err = pgo_command("solve", file, "--cost", "chi2")
     assert (code, err) == (0, "")
     assert facts(out)["verdict"].startswith("CERTIFIED: rotations globally optimal")
     assert float(facts(out)["chi2(R)"]) > 0.0
@@ -151,7 +151,7 @@ def test_every_method_ends_at_the_same_cost(pgo_command: Call, method: str) -> N
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--information"], "--rotations and --information ask for different costs"),
+        (["--cost=chi2"], "--rotations and --cost ask for different costs"),
         (["--report", "report.html"], "report.html needs positions"),
         (["--out", "picture.svg"], "picture.svg needs positions"),
     ],

@@ -19,10 +19,10 @@ FOR_READERS = [
     ("info", "robots", "--split", "given"),
     ("solve", "sphere"),
     ("solve", "sphere", "--robots", "5", "--verbose"),
-    ("solve", "robots", "--method", "consensus", "--information"),
+    ("solve", "robots", "--method", "consensus", "--cost", "chi2"),
     ("solve", "circle", "--method", "paper", "--max-iterations", "3"),
     ("certify", "sphere"),
-    ("certify", "circle", "--information"),
+    ("certify", "circle", "--cost", "chi2"),
     ("compare", "grid", "--robots", "2"),
     ("tables", "--only", "grid", "--seeds", "1"),
     ("generate", "random", "--out", "r.g2o"),
@@ -72,13 +72,13 @@ def test_what_is_printed_stays_within_80_columns(arguments: tuple[str, ...], col
     assert_narrow(out)
 
 
-@pytest.mark.parametrize("options", [(), ("--information",), ("--robots", "4")], ids=" ".join)
+@pytest.mark.parametrize("options", [(), ("--cost", "chi2"), ("--robots", "4")], ids=" ".join)
 @pytest.mark.parametrize("name", GRAPHS)
 def test_and_so_does_that_of_public_graphs(
     name: str, options: tuple[str, ...], columns: Call, benchmark_data: Path
 ) -> None:
     path = benchmark_data / f"{name}.g2o"
-    if name == "cubicle" and "--information" in options:
+    if name == "cubicle" and "chi2" in options:
         options += ("--drop-coupling",)  # with indefinite matrices it has no chi2
         beginning = read_g2o(path).subgraph(np.arange(600))  # says as much of its open gap as all
         path = Path("cubicle.g2o")

@@ -210,7 +210,8 @@ def test_a_command_is_broken_into_lines_that_a_shell_reads_as_one(columns, monke
         "pgo",
         "solve",
         "a folder/it's here.g2o",
-        "--information",
+        "--cost",
+        "chi2",
         "--drop-edge",
         "here.g2o:22475",
     ]

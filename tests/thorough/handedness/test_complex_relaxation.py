@@ -162,7 +162,7 @@ def test_of_chi2_the_tangent_is_relaxed(seed: int, n: int, coupled: bool) -> Non
 def test_what_it_rounds_to_may_be_better_poses() -> None:
     """Newton from the chordal start, prefixes and SOC ends at 116, and 61.6 is possible."""
     problem = PGOProblem(planar_lattice(19, 4, np.deg2rad(60)))
-    one_start = replace(solvers.Pipeline(), second_try=False)
+    one_start = replace(solvers.Pipeline(), other_starts=False)
     without = solvers.solve(problem, replace(one_start, handedness=None), progress=False)
     solution = solvers.solve(problem, one_start, progress=False)
     assert solution.objective < 0.6 * without.objective

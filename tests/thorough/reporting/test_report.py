@@ -167,7 +167,7 @@ def test_without_its_package_one_line_names_the_extra_before_anything_is_solved(
 
 @pytest.mark.parametrize("unit_weights", [False, True])
 def test_the_command_line_writes_one_whose_commands_can_be_typed(unit_weights, tmp_path, capsys):
-    options = ["--unit-weights"] if unit_weights else []
+    options = ["--cost", "unit"] if unit_weights else []
     with pytest.raises(SystemExit) as end:
         cli.main(["solve", "grid", *options, "--report", str(tmp_path / "out.html")])
     assert end.value.code == 0

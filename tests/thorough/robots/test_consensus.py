@@ -69,7 +69,7 @@ def test_the_solution_is_certified_with_the_central_gap(
     problem = varied_problem(seed, n, d)
     parts = partitioner(problem.graph, seed)
     # The coupling follows from the robots of SOC; one robot is JOINT's.
-    pipeline = Pipeline(soc=SOC(robots=parts, tolerance=2e-3), second_try=False, staircase=None)
+    pipeline = Pipeline(soc=SOC(robots=parts, tolerance=2e-3), other_starts=False, staircase=None)
     solution = solve(problem, pipeline, robots=parts)
     central = solve(problem, pipeline)
     rounding = 1e-12 * central.objective + central.certificate.rounding_level

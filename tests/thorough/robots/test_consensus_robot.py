@@ -122,7 +122,7 @@ def solved_graph(
     soc = replace(
         soc if soc is not None else SOC(tolerance=1e-4), coupling=Coupling.CONSENSUS, robots=parts
     )
-    pipeline = Pipeline(soc=soc, second_try=False, staircase=None)
+    pipeline = Pipeline(soc=soc, other_starts=False, staircase=None)
     return solve(graph, pipeline, robots=Robots(parts, engine=engine)), engine
 
 

@@ -76,7 +76,7 @@ def test_it_solves_the_relaxation_as_one_place_does(
 def test_robots_climb_out_of_a_wound_ring(d: int, partitioner: Partitioner) -> None:
     problem, wound = wound_ring(20, d)
     robots = partitioner(problem.graph, 3)
-    short = solvers.Pipeline(soc=None, second_try=False, handedness=None)
+    short = solvers.Pipeline(soc=None, other_starts=False, handedness=None)
     stuck = solvers.solve(problem, replace(short, staircase=None), wound, robots=robots)
     rescued, central = (solvers.solve(problem, short, wound, robots=who) for who in (robots, None))
     assert stuck.objective > 100 * rescued.objective

@@ -435,7 +435,7 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
         solution.certificate.objective, rel=1e-9
     )
     unfinished = solvers.Pipeline(
-        soc=None, newton=solvers.Newton(max_iterations=0), second_try=False, staircase=None
+        soc=None, newton=solvers.Newton(max_iterations=0), other_starts=False, staircase=None
     )
     without = solve_folder(tmp_path / "in", unfinished).certificate
     assert without.lower_bound == 0.0  # none was found, so it is no relaxation's
@@ -444,17 +444,9 @@ def test_the_staircase_is_run_by_the_robots(d: int, tmp_path: Path) -> None:
 
 def test_the_staircase_follows_where_newton_has_had_no_step() -> None:
     unfinished = solvers.Pipeline(
-        soc=None, newton=solvers.Newton(max_iterations=0), second_try=False
+        soc=None, newton=solvers.Newton(max_iterations=0), other_starts=False
     )
     solution = solve_folder(ROBOTS, unfinished)
     without = solve_folder(ROBOTS, replace(unfinished, staircase=None))
     assert not without.certificate.is_certified
     assert solution.certificate.gap < without.certificate.gap
-
-
-def test_a_second_try_keeps_the_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    first = solvers.Pipeline(newton=solvers.Newton(max_iterations=0), staircase=None, gap=1e-15)
-    alone = solve_folder(ROBOTS, replace(first, second_try=False))
-    both = solve_folder(ROBOTS, replace(first, newton=solvers.Newton()))
-    assert both.certificate.objective <= alone.certificate.objective
-    assert both.certificate.lower_bound >= alone.certificate.lower_bound

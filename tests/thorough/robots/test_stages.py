@@ -141,7 +141,7 @@ def test_a_bound_holds_where_nothing_is_certified(
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_a_second_try_and_the_staircase_follow_where_the_gap_stays_wide(d: int) -> None:
+def test_other_starts_and_the_staircase_follow_where_the_gap_stays_wide(d: int) -> None:
     # The cycle closes with half a turn too much: the chordal start is at a local minimum or the
     # relaxation is loose.
     problem = PGOProblem(varied_graph(11, 14, d, NoiseModel(translation_std=1.0, rotation_std=1.5)))
@@ -171,7 +171,7 @@ def test_a_number_of_robots_stands_for_the_default_partition() -> None:
 @pytest.mark.parametrize("robots", [None, 3])
 def test_the_staircase_is_watched_wherever_it_runs(robots: int | None) -> None:
     (problem, wound), seen = wound_ring(20, 2), list[str]()
-    short = Pipeline(soc=None, second_try=False, handedness=None)
+    short = Pipeline(soc=None, other_starts=False, handedness=None)
     solve(
         problem,
         short,
@@ -263,7 +263,7 @@ def test_every_stage_reports_f_of_its_poses(stage: str, d: int, threads: int) ->
             Pipeline(soc=None, newton=stay),
             *(Pipeline(soc=soc, newton=newton) for newton in (stay, Newton())),
         ):
-            short = replace(pipeline, second_try=False, staircase=None, handedness=None)
+            short = replace(pipeline, other_starts=False, staircase=None, handedness=None)
             robots = Robots(parts, InProcess(threads), faults=faults if pipeline.soc else None)
             solution = solve(problem, short, start, robots=robots)
             rounding = 1e-12 * solution.objective

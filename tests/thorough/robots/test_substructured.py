@@ -19,7 +19,7 @@ from solvers.soc.penalty import PenaltyRule
 CONVERGED = 1e-8  # only rounding is left
 COUPLINGS = st.sampled_from([Coupling.JOINT, Coupling.CONSENSUS])
 SOC_ALONE = Pipeline(
-    newton=Newton(max_iterations=0), second_try=False, staircase=None, handedness=None
+    newton=Newton(max_iterations=0), other_starts=False, staircase=None, handedness=None
 )
 
 

@@ -253,7 +253,7 @@ def test_what_does_not_go_together_is_refused(clean):
         solvers.solve(clean, robust=solvers.SOC())
 
 
-@pytest.mark.parametrize("options", [["--information"], []])
+@pytest.mark.parametrize("options", [["--cost", "chi2"], []])
 def test_the_command_writes_what_it_rejected_and_a_graph_without_it(
     clean, tmp_path, capsys, options
 ):

@@ -274,7 +274,7 @@ def test_pgo_solve_certify_and_verify(tmp_path: Path, pgo_command: Call) -> None
     assert code == 0
     assert "VERIFIED" in out
     assert pgo_command("verify", "grid", proof, "--quiet")[:2] == (0, "")
-    assert pgo_command("certify", "grid", "--information", "--proof", proof)[0] in (0, 3)
+    assert pgo_command("certify", "grid", "--cost", "chi2", "--proof", proof)[0] in (0, 3)
     code, out, _ = pgo_command("verify", "grid", proof, "--json")
     record = json.loads(out)
     assert (code, record["cost"], record["verified"]) == (0, "chi2", True)
