@@ -9,7 +9,6 @@ error) diag is positive definite (Rump 2006, *Verification of positive definiten
 Chaykin & Keil 2007, VSDP). The word shift is for eta, which is added to the rows of rotations.
 """
 
-import itertools
 import math
 import time
 from collections.abc import Callable
@@ -19,7 +18,6 @@ from typing import Protocol, TypeVar
 import numpy as np
 from scipy.sparse import csc_array
 
-from pgo_models.activity import Activity, doing
 from pgo_models.certificates.dual_variables import certificate_matrix
 from pgo_models.certificates.rounding_errors import matrix_errors
 from pgo_models.errors import NotPositiveDefiniteError
@@ -271,18 +269,13 @@ def smallest_eta(
     After the `deadline`, by `time.perf_counter`, one proof is tried at most, with half the limit
     `below` where nothing is proved yet, and nothing is bisected.
     """
-    most = ETA_BISECTIONS + 1
-    if 0.0 < eta < below < math.inf:
-        most += math.floor(math.log(below / eta, ETA_GROWTH))
-    shifts = (Activity(f"shift {k} of at most {most}") for k in itertools.count(1))
     proof = None
     while proof is None:
         if not eta < below:
             return None
         if is_over(deadline) and below < math.inf:
             eta = max(eta, LATE_SHARE * below)
-        with doing(next(shifts)):
-            proof = attempt(eta)
+        proof = attempt(eta)
         if proof is None:
             if not eta > 0.0:
                 return None
@@ -292,8 +285,7 @@ def smallest_eta(
         if too_small is None or is_over(deadline):
             break
         middle = math.sqrt(too_small * eta)
-        with doing(next(shifts)):
-            better = attempt(middle)
+        better = attempt(middle)
         if better is None:
             too_small = middle
         else:

@@ -12,7 +12,6 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +19,6 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
-from pgo_models.activity import Activity, doing
 from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.pose_graph import IntArray
@@ -112,7 +110,6 @@ class SymbolicCholesky(ABC):
         self._indices = pattern.indices
         self._shape = pattern.shape
         self._most_counts = most_counts
-        self._factorisation = Activity("factorisation", pattern.shape[0])
 
     @abstractmethod
     def factorize(
@@ -397,8 +394,7 @@ class _SuperLU(SymbolicCholesky):
     def _lu(self, matrix: csc_array) -> SuperLU:
         permuted = matrix[self.order][:, self.order].tocsc()
         options = {"SymmetricMode": True}
-        with doing(self._factorisation):
-            return splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
+        return splu(permuted, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
 
 
 class _CholmodFactor(CholeskyFactor):
@@ -490,8 +486,7 @@ class _Cholmod(SymbolicCholesky):
         return L, np.array(order).ravel().real.astype(np.int64)
 
     def _analyze(self) -> _Capsule:
-        analysis = replace(self._factorisation, name="analysis")
-        with supernodal() as cholmod, doing(analysis):
+        with supernodal() as cholmod:
             if self._order is None:
                 return cholmod.symbolic(self._matrix)
             cvxopt, _ = import_cvxopt()
@@ -565,7 +560,7 @@ class _Cholmod(SymbolicCholesky):
         """
         cvxopt, cholmod = import_cvxopt()
         self._matrix.V = cvxopt.matrix(lower)
-        with supernodal(), doing(self._factorisation):
+        with supernodal():
             cholmod.numeric(self._matrix, capsule)
         # A ValueError here would mean L D L^T, which indefinite matrices have, too.
         return np.array(cholmod.diag(capsule)).ravel().real

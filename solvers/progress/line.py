@@ -1,16 +1,14 @@
-"""The printed table of a run, and the line on what is being done, in terminals and notebooks."""
+"""The printed table of a run, and the line on a stage, in terminals and notebooks."""
 
 import html
 import math
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
-from pgo_models.activity import Activity, watched_by
 from pgo_models.figures import rounded_up
 from solvers.result import Measurement, Record, Status
 
@@ -40,13 +38,13 @@ def _is_in_notebook() -> bool:
 
 
 class StageLine:
-    """A line on one stage of a solve: its iterations, if it has any, and what is done just now.
+    """A line on one stage of a solve, with its iterations if it has any.
 
     It appears on stderr, or in the notebook, where the solve has taken `Pace.first_after` seconds
     and the stage is no matter of a moment, or before work that may take seconds. It is removed at
-    the end of the stage. It is drawn when an activity begins: the library that factors lets no
-    other thread draw meanwhile. `began` is the time at which the solve did, and `side` that of a
-    matrix which the stage factors.
+    the end of the stage. It is drawn before a large matrix is factored: the library that factors
+    lets no other thread draw meanwhile. `began` is the time at which the solve did, and `side` that
+    of a matrix which the stage factors.
     """
 
     def __init__(
@@ -65,41 +63,20 @@ class StageLine:
         self._began = pace.clock()
         self._drawn = -math.inf
         self._bar: Any = None  # a _NotebookBar, or a JobBar
-        self._watching = watched_by(self)
-        self._k = 0
-        self._figures = ""
-        self._activities: list[Activity] = []  # one within the other
-        self._num_begun: Counter[str] = Counter()
 
     def __enter__(self) -> "StageLine":
-        self._watching.__enter__()
-        self._draw(self._pace.first_after if self._is_large else 0.0)
+        self._draw(0, "", self._pace.first_after if self._is_large else 0.0)
         return self
 
     def __exit__(self, *error: Any) -> None:  # noqa: ANN401 - as of any context
-        self._watching.__exit__(*error)
         if self._bar is not None:
             self._bar.stop()
 
     def show(self, k: int, figures: str) -> None:
         """Show how many iterations are done, and figures of the last one."""
-        self._k = k
-        self._figures = figures
-        self._draw(0.0)
+        self._draw(k, figures, 0.0)
 
-    def begin(self, activity: Activity) -> None:
-        """Show what begins (`pgo_models.activity.Watcher`)."""
-        self._activities.append(activity)
-        self._num_begun[activity.name] += 1
-        is_large = activity.side >= self._pace.large_side
-        self._draw(self._pace.first_after if is_large else self._pace.between)
-
-    def end(self, activity: Activity) -> None:
-        """Show the activity no longer."""
-        self._activities.pop()
-        self._draw(0.0)
-
-    def _draw(self, expected: float) -> None:
+    def _draw(self, k: int, figures: str, expected: float) -> None:
         """Draw the line, if it is time for it or what follows may take so many seconds."""
         pace = self._pace
         now = pace.clock()
@@ -113,17 +90,7 @@ class StageLine:
         at_once = max(now - self._drawn, expected) >= pace.between
         if at_once:
             self._drawn = now
-        self._bar.show(self._k, self._text(), at_once)
-
-    def _text(self) -> str:
-        """What is done, and the figures of the last iteration."""
-        activities = [self._text_of(activity) for activity in self._activities]
-        return "  ".join([", ".join(activities), self._figures]).strip()
-
-    def _text_of(self, activity: Activity) -> str:
-        """An activity, and which one it is of its name."""
-        count = self._num_begun[activity.name]
-        return f"{activity.name} {count}" if count > 1 else activity.name
+        self._bar.show(k, figures, at_once)
 
     def _new_bar(self, elapsed: float) -> Any:  # noqa: ANN401 - one of two classes
         if _is_in_notebook():

@@ -18,7 +18,6 @@ ORDER = {
         "annotations",
         "errors",
         "lazy_names",
-        "activity",
         "figures",
         "verification",
         "html_tables",

@@ -1,5 +1,4 @@
 import sys
-from contextlib import suppress
 from dataclasses import replace
 from types import ModuleType
 
@@ -7,7 +6,6 @@ import pytest
 
 import solvers
 from pgo_models import PGOProblem, Weighting, load
-from pgo_models.activity import Activity, doing
 from solvers import Measurement, Newton, Status
 from solvers.progress.line import Pace, StageLine, Table, is_shown
 from solvers.result import Record
@@ -151,37 +149,6 @@ def test_no_bar_is_shown_by_default_outside_notebooks(capsys: pytest.CaptureFixt
     assert capsys.readouterr() == ("", "")
 
 
-OF_M = Activity("factorisation", 4 * 1000)
-
-
-def test_activities_of_one_name_are_counted(monkeypatch) -> None:
-    notebook = Notebook(monkeypatch)
-    with StageLine("certificate", None, -5.0, pace=replace(EVERY_TIME, clock=Clock())):
-        for activity in (OF_M, replace(OF_M, name="analysis"), OF_M):
-            with doing(activity):
-                pass
-    shown_texts = [text for text in notebook.outputs[0] if text.removeprefix("certificate").strip()]
-    assert [text.split()[1:-2] for text in shown_texts if len(text.split()) > 3] == [
-        ["factorisation"],
-        ["analysis"],
-        ["factorisation", "2"],
-    ]
-
-
-def test_activities_within_others_are_shown_together_and_none_after_an_error(monkeypatch) -> None:
-    notebook = Notebook(monkeypatch)
-    pace = replace(EVERY_TIME, clock=Clock())
-    with StageLine("certificate", None, -5.0, pace=pace) as line:
-        with suppress(ValueError), doing(Activity("shift 1 of at most 9")), doing(OF_M):
-            raise ValueError
-        line.show(0, "F 1")
-    first, second, _, _, last, removed = notebook.outputs[0][-6:]
-    assert "shift 1 of at most 9 0 s" in first
-    assert "shift 1 of at most 9, factorisation 0 s" in second
-    assert "certificate F 1 0 s" in last
-    assert removed == ""
-
-
 @pytest.mark.parametrize(
     ("of_solve", "of_stage", "is_shown"),
     [(0.9, 0.5, False), (1.1, 0.05, False), (1.1, 0.15, True), (5.0, 0.15, True)],
@@ -201,19 +168,6 @@ def test_a_line_waits_for_a_second_of_the_solve_and_a_moment_of_the_stage(
 
 def test_a_large_matrix_is_shown_before_a_second_has_passed(monkeypatch) -> None:
     notebook = Notebook(monkeypatch)
-    with line_of("SOC", 0.0), doing(OF_M):
-        assert notebook.outputs == []
-    with line_of("SOC", 0.0), doing(replace(OF_M, side=Pace.large_side)):
-        assert "factorisation" in notebook.outputs[0][-1]
-
-
-def test_nobody_is_told_of_activities_after_a_line(monkeypatch) -> None:
-    notebook = Notebook(monkeypatch)
-    with line_of("SOC", 10.0):
-        pass
-    with doing(OF_M):
-        pass
-    assert all("factorisation" not in text for output in notebook.outputs for text in output)
-    with line_of("SOC", 10.0), doing(OF_M):
-        pass
-    assert any("factorisation" in text for output in notebook.outputs for text in output)
+    for side in (4 * 1000, Pace.large_side):
+        with StageLine("certificate", None, 0.0, side, replace(EVERY_TIME, clock=Clock())):
+            assert bool(notebook.outputs) == (side == Pace.large_side)
