@@ -104,9 +104,3 @@ def test_every_rule_for_rho_leads_to_the_minimum(rule):
     best = solvers.solve(problem).objective
     found = solvers.run(solvers.SOC(penalty=rule, max_iterations=2000), problem)
     assert found.objective == pytest.approx(best, rel=1e-4)
-
-
-@pytest.mark.parametrize("changes", [{"penalty": -1.0}, {"alpha": 2.5}, {"tolerance": 0.0}])
-def test_settings_that_cannot_be_are_refused(changes):
-    with pytest.raises(pgo.PGOError):
-        solvers.SOC(**changes)

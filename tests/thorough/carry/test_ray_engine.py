@@ -285,12 +285,6 @@ def test_without_ray_the_extra_is_named(monkeypatch, capsys):
     )
 
 
-@pytest.mark.parametrize("wrong", [{"num_cpus": 0}, {"actors": 0}, {"patience": 0.0}])
-def test_settings_are_checked(wrong):
-    with pytest.raises(SettingError, match=f"{next(iter(wrong))} must be positive, got 0"):
-        RayEngine(**wrong)
-
-
 def test_cpus_of_a_cluster_are_its_own():
     with pytest.raises(SettingError, match="the cluster at host:1 has its own"):
         RayEngine(address="host:1", num_cpus=2)

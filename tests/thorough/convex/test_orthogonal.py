@@ -200,22 +200,6 @@ def test_unfinished_starts_are_told_apart() -> None:
     assert "MAX_ITERATIONS" in repr(solution)
 
 
-@pytest.mark.parametrize(
-    ("settings_given", "message"),
-    [
-        ({"penalty": 0.0}, "penalty must be positive"),
-        ({"penalty": math.nan}, "penalty must be positive"),
-        ({"alpha": 2.0}, r"alpha must be in \(0, 2\)"),
-        ({"safeguard": 1.0}, "safeguard must be above 1"),
-        ({"tolerance": 0.0}, "tolerance must be positive"),
-        ({"max_iterations": -1}, "max_iterations must not be negative"),
-    ],
-)
-def test_settings_are_checked(settings_given, message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        OrthogonalSOC(**settings_given)
-
-
 def test_starts_are_checked() -> None:
     with pytest.raises(SettingError, match="starts must be at least 1"):
         solve_orthogonal(example(), rng_of(0), starts=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 
 import cvxpy as cp
@@ -17,7 +16,6 @@ from hypothesis import assume, example, given, settings, strategies as st
 import solvers
 from pgo_models import NoiseModel, PGOProblem, Weighting
 from pgo_models.certificates.certificate import BoundSource
-from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import project_to_tangent, retract
 from pgo_models.problem.initialization import spanning_tree
@@ -199,12 +197,3 @@ def test_limits_are_reported() -> None:
     problem = PGOProblem(planar_lattice(4, 4, 0.5))
     assert run(ComplexRelaxation(max_iterations=2), problem).status is Status.MAX_ITERATIONS
     assert run(ComplexRelaxation(), problem, time_limit=1e-9).status is Status.TIME_LIMIT
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"columns": 0}, {"tolerance": 0.0}, {"max_iterations": -1}],
-)
-def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(SettingError):
-        partial(ComplexRelaxation, **wrong)()

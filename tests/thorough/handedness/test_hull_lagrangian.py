@@ -1,6 +1,5 @@
 """The augmented Lagrangian of the relaxation with hulls: its derivatives, and what it proves."""
 
-from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -12,7 +11,6 @@ from hypothesis import given, settings, strategies as st
 from pgo_models import NoiseModel, PGOProblem, RelaxationForm, random_rotations, solve_relaxation
 from pgo_models.certificates.dual_variables import factorize_certificate
 from pgo_models.certificates.handedness import distinct_pairs
-from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.geometry.stiefel import project_to_tangent, retract
 from pgo_models.problem.matrices import inner
@@ -152,9 +150,3 @@ def test_states_are_left_alone_and_a_run_goes_on_from_one() -> None:
     resumed = method.init(problem, states[1])
     assert resumed.k == 0
     np.testing.assert_array_equal(resumed.Pi, states[1].Pi)
-
-
-def test_settings_are_checked() -> None:
-    for wrong in ({"tolerance": 0.0}, {"gap": -1.0}, {"rank": 3}, {"rank": 15}):
-        with pytest.raises(SettingError):
-            partial(HullLagrangian, **wrong)()

@@ -1,11 +1,10 @@
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pgo_models.certificates.certificate import relative_gap
-from pgo_models.errors import MissingExtraError, SettingError
+from pgo_models.errors import SettingError
 from pgo_models.graphs.published_results import PublishedRun
 from solvers import Measurement
 from solvers.reporting.convergence_plots import Curve, explore_convergence
@@ -52,9 +51,3 @@ def test_stages_follow_each_other_and_what_has_no_logarithm_is_left_out():
 def test_a_run_without_records_is_refused():
     with pytest.raises(SettingError, match="no stage has a record"):
         explore_convergence([("start", History())], 1.0)
-
-
-def test_without_plotly_one_line_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "plotly", None)
-    with pytest.raises(MissingExtraError, match=r"pgo-splitting\[plot\]"):
-        explore_convergence([("SOC", history(4))], 9.0)

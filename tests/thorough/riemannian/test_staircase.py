@@ -20,7 +20,6 @@ from hypothesis import example, given, settings, strategies as st
 
 from pgo_models import PGOProblem, Verdict, certify_at, prove_bound, solve_relaxation
 from pgo_models.certificates.certificate import DEFAULT_GAP, BoundSource, certify_with
-from pgo_models.errors import SettingError
 from pgo_models.relaxations.solve_sdp import TOLERANCE
 from solvers import Newton, Staircase, Status, SweptScene, gauss_newton, polish, run
 from solvers.riemannian.staircase import StaircaseState
@@ -143,14 +142,3 @@ def test_graphs_without_noise_end_at_zero(seed: int, n: int, d: int) -> None:
         result = run(Staircase(), problem, start)
         assert result.status.is_success
         assert result.objective <= 1e-15
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"gap": 0.0}, "gap must be positive, got 0.0"),
-    ],
-)
-def test_settings_are_checked(changes: dict[str, float], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        Staircase(**changes)

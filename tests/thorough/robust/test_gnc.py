@@ -155,15 +155,6 @@ def test_thresholds_follow_information_matrices_that_claim_too_little():
     assert scale < 1.0 < np.median(honest.thresholds / chi2_thresholds(pgo.PGOProblem(graph), 0.99))
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"quantile": 1.0}, {"growth": 1.0}, {"spread": 0.0}, {"scale": -1.0}, {"inner_steps": 0}],
-)
-def test_settings_out_of_range_are_refused(wrong):
-    with pytest.raises(SettingError):
-        solvers.GNC(**wrong)
-
-
 def test_known_inliers_of_another_size_are_refused():
     graph = clean()
     with pytest.raises(

@@ -1,12 +1,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import pytest
 from budget import examples
 from graphs import SEEDS
 from hypothesis import given, settings, strategies as st
 
-from pgo_models.errors import SettingError
 from pgo_models.geometry.rotations import Array
 from pgo_models.problem.matrices import inner, norm
 from solvers.soc.anderson import Anderson, AndersonShare, AndersonSums
@@ -125,16 +123,3 @@ def test_a_linear_map_is_solved_in_as_many_steps_as_unknowns(
         image = fixed + T @ (s - fixed)
         s = parties.extrapolate(rule, image - s, image)
     np.testing.assert_allclose(s, fixed, rtol=0, atol=1e-4 * np.linalg.norm(fixed))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"memory": 0}, "memory must be at least 1, got 0"),
-        ({"restart_ratio": 1.0}, r"restart_ratio must be above 1, got 1\.0"),
-        ({"restart_ratio": np.nan}, "restart_ratio must be above 1"),
-    ],
-)
-def test_settings_are_checked(settings: dict[str, float], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        Anderson(**settings)

@@ -248,33 +248,6 @@ def test_couplings_follow_from_the_robots() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"alpha": 0.0}, r"alpha must be in \(0, 2\), got 0\.0"),
-        ({"alpha": 2.0}, r"alpha must be in \(0, 2\)"),
-        ({"alpha": np.nan}, r"alpha must be in \(0, 2\)"),
-        ({"local_passes": 0}, "local_passes must be at least 1, got 0"),
-        ({"bytes_per_number": 4}, "bytes_per_number must be 1, 2 or 8, got 4"),
-        ({"translation_penalty": 0.0}, "translation_penalty must be positive"),
-        ({"tolerance": 0.0}, "tolerance must be positive"),
-        ({"tolerance": np.nan}, "tolerance must be positive"),
-        ({"max_iterations": -1}, "max_iterations must not be negative"),
-        (
-            {
-                "coupling": Coupling.JOINT,
-                "robots": Partition(np.array([0, 1]), PartitionMethod.CONTIGUOUS),
-            },
-            "JOINT has one robot",
-        ),
-    ],
-)
-def test_settings_are_checked(changes: dict[str, object], message: str) -> None:
-    for kind in (SettingError, ValueError):
-        with pytest.raises(kind, match=message):
-            SOC(**changes)
-
-
 def test_robots_of_another_graph_are_refused() -> None:
     problem = varied_problem(0, 8, 3)
     for robots in (partition(varied_graph(0, 9, 3), 3), partition(varied_graph(0, 7, 3), 3)):

@@ -5,7 +5,7 @@ import pytest
 from graphs import OPTIMUM, REFERENCE, optimum_tolerance
 
 import pgo_models as pgo
-from pgo_models.errors import NotPositiveDefiniteError, SettingError
+from pgo_models.errors import NotPositiveDefiniteError
 from pgo_models.graphs.published_results import published_rows
 from solvers import BenchmarkMethod, GaussSeidel, reproduce_tables
 from solvers.studies.paper_tables import (
@@ -183,19 +183,6 @@ def test_scenes_are_drawn_from_their_seeds():
         made = graph_of_row(one_row(name), 0, False)
         assert made.name == name
         np.testing.assert_allclose(made.t_ij, pgo.load(name).t_ij, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"only": ("torus",)}, "no row 'torus'; they have circle"),
-        ({"num_seeds": 0}, "num_seeds must be at least 1"),
-        ({"num_robots": 0}, "num_robots must be at least 1"),
-    ],
-)
-def test_wrong_settings_are_refused(wrong, message):
-    with pytest.raises(SettingError, match=message):
-        ReproductionSettings(**wrong)
 
 
 def assert_row_shows_what_it_should(name: str) -> None:
