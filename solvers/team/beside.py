@@ -34,7 +34,6 @@ _CANNOT_BEGIN = (
     "settings of a robot are to be in a module, as the process that computes does not run the main "
     "script"
 )
-_GIVEN_UP = pickle.dumps(None)  # what tells a computation that it is given up
 _COMPUTING = threading.Lock()  # of the computation of the other process that does not wait
 
 
@@ -149,7 +148,7 @@ class Talk:
         to_do: queue.SimpleQueue[Callable[[], None]],
     ) -> None:
         self.is_over = False
-        self.send: Callable[[bytes], None] = lambda _: None
+        self.send: Callable[[object], None] = lambda _: None
         self._take = take
         self._end = end
         self._to_do = to_do
@@ -162,9 +161,12 @@ class Talk:
         return not self.is_over and self._num_told > self._num_waits
 
     def tell(self, message: object) -> None:
-        """Tell the computation what it waits for; None ends it."""
+        """Tell the computation what it waits for; None ends it.
+
+        It is pickled in a thread, a moment later: nobody may change it.
+        """
         self._num_told += 1
-        self.send(pickle.dumps(message))
+        self.send(message)
 
     def give_up(self) -> None:
         """End the computation where it waits next; nothing that it tells is acted on any more."""
@@ -207,7 +209,7 @@ class OtherProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._reader: threading.Thread | None = None
         self._talks: MutableMapping[int, Talk] = weakref.WeakValueDictionary()
-        self._to_write: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
+        self._to_write: queue.SimpleQueue[tuple[int, object] | None] = queue.SimpleQueue()
         self._numbers = itertools.count()
 
     def start(self) -> None:
@@ -227,7 +229,7 @@ class OtherProcess:
         )
         self._process = process
         talks: MutableMapping[int, Talk] = weakref.WeakValueDictionary()
-        to_write: queue.SimpleQueue[tuple[int, bytes] | None] = queue.SimpleQueue()
+        to_write: queue.SimpleQueue[tuple[int, object] | None] = queue.SimpleQueue()
         self._talks = talks
         self._to_write = to_write
         threading.Thread(target=_write, args=(process, to_write), daemon=True).start()
@@ -249,16 +251,16 @@ class OtherProcess:
             number = next(self._numbers)
             to_write = self._to_write
             self._talks[number] = talk
-            talk.send = lambda data: to_write.put((number, data))
+            talk.send = lambda message: to_write.put((number, message))
             talk.send(job)
             # A computation that has ended takes no notice.
-            weakref.finalize(talk, to_write.put, (number, _GIVEN_UP)).atexit = False
+            weakref.finalize(talk, to_write.put, (number, None)).atexit = False
 
     def _read(
         self,
         process: subprocess.Popen[bytes],
         talks: MutableMapping[int, Talk],
-        to_write: queue.SimpleQueue[tuple[int, bytes] | None],
+        to_write: queue.SimpleQueue[tuple[int, object] | None],
     ) -> None:
         """Hand on what a process tells, until it ends; that ends its computations."""
         assert process.stdout is not None
@@ -301,13 +303,13 @@ def _hand_on(talk: Talk | None, kind: Kind, data: bytes) -> None:
 
 
 def _write(
-    process: subprocess.Popen[bytes], to_write: queue.SimpleQueue[tuple[int, bytes] | None]
+    process: subprocess.Popen[bytes], to_write: queue.SimpleQueue[tuple[int, object] | None]
 ) -> None:
     """Write to a process what it is told, in a thread: it reads nothing while it is busy."""
     assert process.stdin is not None
     with suppress(OSError), process.stdin:
-        for message in iter(to_write.get, None):
-            pickle.dump(message, process.stdin)
+        for number, message in iter(to_write.get, None):
+            pickle.dump((number, pickle.dumps(message)), process.stdin)
             process.stdin.flush()
 
 
@@ -362,7 +364,7 @@ class Line:
             self._send(self._number, Kind.ENDS, data)
 
     def _result(self) -> bytes:
-        compute, failure = pickle.loads(self.told.get())
+        compute, failure = pickle.loads(pickle.loads(self.told.get()))
         return pickle.dumps(result_or_error(lambda: compute(self), failure))
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +24,7 @@ from solvers.team.news import News, Piece
 from solvers.team.pace import MOST_IN_A_PIECE, Correspondence
 from solvers.team.packed_lines import MOST_LINES, PackedLines, packed_lines, unpacked_lines
 from solvers.team.session import Session
-from solvers.team.shared_solve import SharedAnswer
+from solvers.team.shared_solve import SharedAnswer, SolverBeside
 
 _MOST_FLIGHTS = 4  # pieces on their way to a robot that has not answered the first of them
 _MOST_PACKED = 8  # pieces that are kept for others
@@ -81,9 +80,10 @@ class SharedMap:
         # When an answer is owed to robots whose pieces have come: they are collected, too.
         self._owed: dict[str, float] = {}
         self._keep_theirs: set[str] = set()
-        self._tried: Mapping[str, Revision] = {}
+        self._solver = SolverBeside(member.settings, session.beside)
         self._changed_at: float | None = None
-        self._is_solving = False
+        self._began_at = 0.0
+        self._took = 0.0  # seconds of the last solve
         self._problems: tuple[str, ...] = ()
 
     @property
@@ -130,12 +130,12 @@ class SharedMap:
         A robot that is out of reach may come back for it, and is waited for.
         """
         outcome = self._member.outcome
-        if outcome is None or outcome.absent or self._is_solving or self._owed:
+        if outcome is None or outcome.absent or self._solver.is_solving or self._owed:
             return False
         revisions = self.revisions
         oldest = self._session.now - _FORGOTTEN * self._session.patience
         waited_for = [said for said in self._said.values() if said.when >= oldest]
-        return revisions == self._tried and all(said.has == revisions for said in waited_for)
+        return revisions == self._solver.tried and all(said.has == revisions for said in waited_for)
 
     # Lines
 
@@ -302,7 +302,8 @@ class SharedMap:
                 priority = Priority.HELLO if piece is None else Priority.NORMAL
                 pieces = () if piece is None else (piece,)
                 self._session.send(name, self._news(name, pieces), priority)
-        self._solve_if_due()
+        if self._solver.tell(self.logs, self._end):
+            self._solve_if_due()
 
     def _piece_for(self, to: str, awake: tuple[str, ...], may_pack: bool) -> Piece | None:
         """Lines that a robot lacks: this robot's, or those of another that it does not hear."""
@@ -400,38 +401,29 @@ class SharedMap:
         """Solve where lines are new, once those that others have announced are there.
 
         A robot waits for these for as long as it waits for a robot, at first, and later for as long
-        as a message takes to be sent again.
+        as a message takes to be sent again, or as the last solve took.
         """
         revisions = self.revisions
-        if self._is_solving or self.name not in revisions or revisions == self._tried:
+        solver = self._solver
+        if solver.is_solving or self.name not in revisions or revisions == solver.tried:
             return
         if self._changed_at is None:
             self._changed_at = self._session.now
         is_first = self.last is None
-        pause = self._session.patience if is_first else self._session.pause(1)
+        pause = self._session.patience if is_first else max(self._session.pause(1), self._took)
         is_waited_for = self._session.now - self._changed_at >= pause
         announced = [has.get(name, Revision()) for name, has in self._has.items()]
         is_here = all(each in (Revision(), *revisions.values()) for each in announced)
         if is_first and not self._session.is_complete(revisions):
             return
         if is_here or is_waited_for:
-            self._begin(revisions)
+            self._changed_at = None
+            self._began_at = self._session.now
+            solver.solve(revisions)
 
-    def _begin(self, revisions: Mapping[str, Revision]) -> None:
-        """Solve in the process beside the robot."""
-        self._tried = revisions
-        self._changed_at = None
-        self._is_solving = True
-        lines = {name: "".join(self.logs[name].lines) for name in revisions}
-        solve = partial(self._member.settings.solved, lines, self._member.solution)
-        self._session.beside.begin(
-            solve,
-            lambda answer: self._end(revisions, answer),
-            "the measurements cannot be computed with",
-        )
-
-    def _end(self, revisions: Mapping[str, Revision], answer: SharedAnswer | PGOError) -> None:
-        self._is_solving = False
+    def _end(self, answer: SharedAnswer | PGOError) -> None:
+        revisions = self._solver.tried
+        self._took = self._session.now - self._began_at
         self.term = Term(self.term.number + 1, self.name)
         if isinstance(answer, PGOError):
             self._problems = ()

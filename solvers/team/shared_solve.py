@@ -1,16 +1,20 @@
 """The solve of a robot that has the measurements of its team: of the connected part that it is in.
 
 It is that of one place, with all options of `solve`. The next one begins at the map before
-(`extend`). It runs in a process of its own (`solvers.team.beside`).
+(`extend`). It runs in a process of its own (`solvers.team.beside`), which has the lines and the
+last map, so that a solve begins without handing these over.
 """
 
 from __future__ import annotations
 
+import os
 import pickle
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,17 +34,20 @@ from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
 from solvers.robust.gnc import GNC
 from solvers.solution import Solution
-from solvers.team.beside import Line
-from solvers.team.measurements import Measurements
+from solvers.team.beside import Beside, Line, Talk, result_or_error
+from solvers.team.measurements import Measurements, Revision
 from solvers.team.sharing import OwnAnswer
+
+_FAILURE = "the measurements cannot be computed with"
+_MOST_TOLD = 1 << 14  # lines that the other process is told in a call
 
 
 @dataclass(frozen=True, eq=False)
 class SharedAnswer:
     """What a robot has found: the solution of its part, its own poses, and whose part it is.
 
-    `found` is what is told of the solution, which itself is a pickle: the next solve begins there,
-    in the other process. `problems` are sentences on what was left out.
+    `found` is what is told of the solution, which itself is a pickle: it is read where somebody
+    asks for it. `problems` are sentences on what was left out.
     """
 
     found: RobotsSolution
@@ -60,7 +67,25 @@ class TeamSettings:
     robust: GNC | PCM | None
     trust_folder: bool
 
-    def solved(self, lines: Mapping[str, str], before: bytes | None, _: Line) -> SharedAnswer:
+    def solve_each(self, line: Line) -> None:
+        """Solve each time that robots are told, of their lines that were told before.
+
+        Messages are `NewLines`, or names of robots, which the answer is for.
+        """
+        lines: dict[str, list[str]] = {}
+        before: bytes | None = None
+        while True:
+            message: NewLines | tuple[str, ...] = line.wait()
+            if isinstance(message, NewLines):
+                lines.setdefault(message.owner, [])[message.num_before :] = message.lines
+                continue
+            lines_of_these = {name: lines[name] for name in message}
+            answer = result_or_error(partial(self.solved, lines_of_these, before), _FAILURE)
+            if isinstance(answer, SharedAnswer):
+                before = answer.solution
+            line.tell(answer)
+
+    def solved(self, lines: Mapping[str, list[str]], before: bytes | None) -> SharedAnswer:
         """The solution of the part that the robot is in, of the lines that each robot has measured.
 
         What cannot be read, or does not fit to the robot's own, is left out. A PGOError where it
@@ -134,9 +159,88 @@ class TeamSettings:
         )
 
 
-def _files_of(lines: Mapping[str, str]) -> tuple[dict[str, G2OLines], list[str]]:
+class NewLines(NamedTuple):
+    """Lines that come after the first ones of a robot, in place of those that were there."""
+
+    owner: str
+    num_before: int
+    lines: list[str]
+
+
+class SolverBeside:
+    """What solves beside a robot: the computation in the other process that has its lines.
+
+    `tried` are the revisions that the last solve began with.
+    """
+
+    def __init__(self, settings: TeamSettings, beside: Beside) -> None:
+        self.is_solving = False
+        self.tried: Mapping[str, Revision] = {}
+        self._settings = settings
+        self._beside = beside
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Be without a computation, which a copy, a fork and a process that has ended have not."""
+        self._pid = os.getpid()
+        self._talk: Talk | None = None
+        self._has: dict[str, Revision] = {}  # what it was told, by robot
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy has no computations: what this one is solving, it solves again."""
+        tried = {} if self.is_solving else self.tried
+        without = {"is_solving": False, "tried": tried, "_talk": None, "_has": {}}
+        return {**self.__dict__, **without}
+
+    def tell(
+        self, logs: Mapping[str, Measurements], end: Callable[[SharedAnswer | PGOError], None]
+    ) -> bool:
+        """Tell it lines that are new, so many in a call; whether it has all.
+
+        What is solved with them ends with `end`.
+        """
+        if self._pid != os.getpid():
+            self.__dict__.update(self.__getstate__())
+            self._begin_anew()
+        if self._talk is not None and self._talk.is_over:
+            self._begin_anew()
+        num_left = _MOST_TOLD
+        for name, log in logs.items():
+            known = self._has.get(name, Revision())
+            if known == log.revision:
+                continue
+            if num_left == 0:
+                return False
+            begins = known.num_lines if log.begins_with(known) else 0
+            lines = log.lines[begins : begins + num_left]
+            num_left -= len(lines)
+            self._begun(end).tell(NewLines(name, begins, lines))
+            self._has[name] = log.revision_at(begins + len(lines))
+        return all(self._has.get(name, Revision()) == log.revision for name, log in logs.items())
+
+    def _begun(self, end: Callable[[SharedAnswer | PGOError], None]) -> Talk:
+        """The computation, which is begun where there is none."""
+        if self._talk is None:
+
+            def hear(answer: SharedAnswer | PGOError) -> None:
+                if self.is_solving:
+                    self.is_solving = False
+                    end(answer)
+
+            self._talk = self._beside.begin(self._settings.solve_each, hear, _FAILURE, hear)
+        return self._talk
+
+    def solve(self, revisions: Mapping[str, Revision]) -> None:
+        """Solve for robots whose lines it has all."""
+        assert self._talk is not None
+        self.tried = revisions
+        self.is_solving = True
+        self._talk.tell(tuple(revisions))
+
+
+def _files_of(lines: Mapping[str, list[str]]) -> tuple[dict[str, G2OLines], list[str]]:
     """The lines of each robot, read, and sentences on those that cannot be."""
-    measured = {name: Measurements(its.splitlines(keepends=True)) for name, its in lines.items()}
+    measured = {name: Measurements(its) for name, its in lines.items()}
     dimensions = [its.told_dimension for its in measured.values()]
     d = next((each for each in dimensions if each is not None), None)
     if d is None:

@@ -183,6 +183,46 @@ def test_an_outcome_describes_exchanges_that_took_place_equally_often_as_one() -
         assert ledger.messages >= 3 * ledger.rounds
 
 
+def robot_that_solves() -> solvers.Robot:
+    """A robot that has the measurements of its team, and has begun to solve."""
+    (robot,) = robots_of(world(n=10), 1, sharing=solvers.Sharing.MEASUREMENTS).values()
+    now = 0.0
+    while not robot.is_computing:
+        robot.tick(now)
+        now += 1.0
+    return robot
+
+
+def solve_alone(robot: solvers.Robot) -> None:
+    deadline = time.monotonic() + 60
+    while not robot.is_settled and time.monotonic() < deadline:
+        robot.tick(1e3)
+        time.sleep(1e-3)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda robot: pickle.loads(pickle.dumps(robot))])
+def test_a_copy_of_a_robot_that_solves_solves_too(
+    copied: Callable[[solvers.Robot], solvers.Robot],
+) -> None:
+    robot = robot_that_solves()
+    other = copied(robot)
+    for each in (robot, other):
+        solve_alone(each)
+        assert each.is_certified
+
+
+def test_lines_are_told_again_where_the_process_that_has_them_ends() -> None:
+    robot = robot_that_solves()
+    solve_alone(robot)
+    before = len(robot.poses)
+    OTHER_PROCESS.close()
+    robot.add_pose(1000)
+    robot.add_edge(0, 1000, np.eye(2), np.ones(2), kappa=1.0, tau=1.0)
+    solve_alone(robot)
+    assert robot.is_certified
+    assert len(robot.poses) == before + 1
+
+
 def robot_that_writes() -> solvers.Robot:
     """A robot that is settled but for a long message to another one, which it begins to write."""
     robots = robots_of(world(n=10), 3)
