@@ -1,4 +1,4 @@
-"""The relaxation with the convex hull of SO(3) at every edge, as cvxpy models: primal and dual.
+"""The relaxation with the convex hull of SO(3) at every edge: its dual as a cvxpy model.
 
     primal   min tr(Q Z)                  Z_ii = I, Z PSD, A(Z_ij) PSD at every edge (i, j)
     dual     max sum tr Lambda_i - sum tr Pi_e     Pi_e PSD,
@@ -21,9 +21,7 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.relaxations.primal_dual import (
     DualRelaxation,
-    PrimalRelaxation,
     dual_relaxation,
-    primal_relaxation,
 )
 from pgo_models.relaxations.rotation_hull import (
     PRODUCTS,
@@ -31,31 +29,6 @@ from pgo_models.relaxations.rotation_hull import (
     less_diagonal_blocks,
     terms_of,
 )
-
-
-@dataclass(frozen=True, eq=False)
-class PrimalHullRelaxation(PrimalRelaxation):
-    """The primal with a hull constraint at every edge.
-
-    Parameters
-    ----------
-    edges : (k, 2) array of int
-        The poses of every constrained pair.
-    hull : tuple of constraints
-        A(Z_ij) is PSD; the dual value of each is Pi_e / scale.
-    """
-
-    edges: IntArray
-    hull: tuple[cp.Constraint, ...]
-
-    def Lambda(self) -> Array:
-        """Multipliers, (n, d, d), of the cost less the terms, as solved."""
-        return less_diagonal_blocks(super().Lambda(), self.terms())
-
-    def terms(self) -> HandednessTerms:
-        """The handedness terms of the multipliers Pi, as solved."""
-        dual_values = np.stack([constraint.dual_value for constraint in self.hull])
-        return terms_of(self.edges, self.scale * dual_values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,23 +54,6 @@ class DualHullRelaxation(DualRelaxation):
         """The handedness terms of the multipliers Pi, as solved."""
         values = np.stack([variable.value for variable in self.multipliers])
         return terms_of(self.edges, self.scale * values)
-
-
-def primal_hull_relaxation(problem: PGOProblem) -> PrimalHullRelaxation:
-    """Pose the primal; a SettingError in the plane, or where Q would be too large."""
-    plain = primal_relaxation(problem)
-    edges = edges_of(problem)
-    linear_map = PRODUCTS.reshape(9, 16).T
-    hull = []
-    for i, j in edges.tolist():
-        block = plain.Z[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
-        products = linear_map @ cp.reshape(block, (9,), order="C")
-        matrix = cp.reshape(products, (4, 4), order="C") + np.eye(4)
-        hull.append(matrix >> 0)
-    model = cp.Problem(plain.model.objective, [*plain.orthogonality, *hull])
-    return PrimalHullRelaxation(
-        problem, model, plain.Z, plain.orthogonality, plain.scale, edges, tuple(hull)
-    )
 
 
 def dual_hull_relaxation(problem: PGOProblem) -> DualHullRelaxation:

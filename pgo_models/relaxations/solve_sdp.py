@@ -14,12 +14,7 @@ from pgo_models.errors import PGOError, SettingError
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
 from pgo_models.problem.problem import PGOProblem
-from pgo_models.relaxations.hull_models import (
-    DualHullRelaxation,
-    PrimalHullRelaxation,
-    dual_hull_relaxation,
-    primal_hull_relaxation,
-)
+from pgo_models.relaxations.hull_models import DualHullRelaxation, dual_hull_relaxation
 from pgo_models.relaxations.primal_dual import (
     DualRelaxation,
     PrimalRelaxation,
@@ -36,7 +31,7 @@ TOLERANCE = 1e-10
 # sphere, with side 600, takes 1.1 s. Beyond, Clarabel decomposes the sparse dual over cliques.
 LARGEST_DENSE_CONE = 1000
 
-# The relaxations with hulls are subclasses of these.
+# The relaxation with hulls is a subclass of the dual.
 Relaxation = PrimalRelaxation | DualRelaxation
 
 
@@ -45,7 +40,6 @@ class RelaxationForm(enum.Enum):
 
     PRIMAL = "min tr(Q Z), Z_ii = I, Z PSD: one dense cone, translations marginalised out"
     DUAL = "max tr(Lambda), M - blockdiag(0, Lambda) PSD: one sparse linear matrix inequality"
-    HULL = "PRIMAL, and Z_ij in the convex hull of SO(3) at every edge"
     HULL_DUAL = "DUAL, with a multiplier of the convex hull of SO(3) at every edge"
 
 
@@ -197,7 +191,7 @@ def solve_relaxation(
     poses, rank = relaxation.rounded()
     terms = None
     source = BoundSource.RELAXATION
-    if isinstance(relaxation, PrimalHullRelaxation | DualHullRelaxation):
+    if isinstance(relaxation, DualHullRelaxation):
         terms = relaxation.terms()
         source = BoundSource.HULLS
     certificate = certify_with(
@@ -238,7 +232,6 @@ def _form_and_solver(
 _POSE: dict[RelaxationForm, Callable[[PGOProblem], Relaxation]] = {
     RelaxationForm.PRIMAL: primal_relaxation,
     RelaxationForm.DUAL: dual_relaxation,
-    RelaxationForm.HULL: primal_hull_relaxation,
     RelaxationForm.HULL_DUAL: dual_hull_relaxation,
 }
 

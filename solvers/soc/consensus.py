@@ -46,7 +46,6 @@ from solvers.soc.copies import (
 )
 from solvers.soc.penalty import MultiplierPenalty, PenaltyOrder
 from solvers.soc.recursion_block import Agreement, Rotations
-from solvers.soc.rounding import WHOLE, ShortNumbers
 from solvers.soc.safeguard import Due, SharedSteps, with_due_penalty
 from solvers.soc.separator_stiffness import TRANSLATION_PENALTY, adapted_penalty, fell_most
 from solvers.soc.settings import SOCSettings
@@ -162,10 +161,7 @@ class Consensus:
         if not math.isfinite(merit):
             return state.broken()
         gamma, anderson = state.sums.coefficients(self.soc.acceleration, state.ahead)
-        sent_gamma: Array | ShortNumbers | None = gamma
-        if gamma is not None and self.soc.bytes_per_number < WHOLE:
-            sent_gamma = ShortNumbers.of(gamma)
-        agreement = Agreement(sent_gamma, state.is_best(merit))
+        agreement = Agreement(gamma, state.is_best(merit))
         orders = [(agreement, rows) for rows in state.rows]
         # (b) projection and (c) Bregman update, and (a) of the next iteration
         answers = robots.ask(ConsensusRobot.step, orders, Count.ALL_REDUCE)
@@ -271,7 +267,7 @@ def _with_solution(
 ) -> ConsensusState:
     """State with the result of step (a), whose rows are delivered to the neighbours."""
     rows = robots.exchange([answer.rows for answer in answers])
-    sums = np.sum([answer.part.sums for answer in answers], axis=0)
+    sums = np.sum([answer.sums for answer in answers], axis=0)
     return replace(state, ahead=sums, rows=rows)
 
 

@@ -41,7 +41,7 @@ from solvers.soc.recursion_block import (
     nearest_rotations,
     stationary_B,
 )
-from solvers.soc.rounding import WHOLE, PartOfSums, RowChange
+from solvers.soc.rounding import WHOLE, RowChange
 from solvers.soc.separator_stiffness import GROUND, stiffness_of_separators, travel
 
 _OVER_RELAXATION = 1.8  # of an asynchronous run
@@ -259,8 +259,7 @@ class ConsensusRobot:
         shared = self.layout.shared
         step[shared] = image[shared] - before.s[shared]
         block, sums = before.after_map(x, step, image)
-        part = PartOfSums.of(sums, block.settings.bytes_per_number)
-        return self._with(ahead=(X, block)), copies.SolveReply(part, sent)
+        return self._with(ahead=(X, block)), copies.SolveReply(sums, sent)
 
     def _as_sent(
         self, X: Array, known: Array, bytes_per_number: int

@@ -15,7 +15,7 @@ from pgo_models.problem.matrices import columns_of
 from solvers.carry.messages import Messages
 from solvers.carry.registry import record
 from solvers.soc.r_step import BackEnd, RStep, RSubproblem
-from solvers.soc.rounding import PartOfSums, RowChange
+from solvers.soc.rounding import RowChange
 from solvers.soc.subgraph import PartProblem, Subgraph
 
 Rows = Messages[Array]  # to or from every neighbour
@@ -94,7 +94,7 @@ class RescaleCopies:
 class SolveReply:
     """Answer to an order to solve step (a)."""
 
-    part: PartOfSums  # of this robot, for the acceleration
+    sums: Array  # (1,) or (2 + q,): of this robot, for the acceleration
     rows: RowMessages  # of s for every neighbour, before the extrapolation that all do together
 
 

@@ -25,7 +25,7 @@ from pgo_models.problem.matrices import inner
 from pgo_models.problem.stationarity import quotient
 from solvers.carry.registry import record
 from solvers.soc.anderson import AndersonShare, over_relax
-from solvers.soc.rounding import WHOLE, ShortNumbers
+from solvers.soc.rounding import WHOLE
 
 
 @record("Rotations")
@@ -57,14 +57,8 @@ class StepSettings:
 class Agreement:
     """What all parties learn from the sums of step (a)."""
 
-    coefficients: Array | ShortNumbers | None  # (q,): of the acceleration; None restarts it
+    gamma: Array | None  # (q,): coefficients of the acceleration; None restarts it
     is_best: bool  # whether the s before this step has the smallest merit
-
-    @property
-    def gamma(self) -> Array | None:
-        """Coefficients gamma of the acceleration, (q,), as all parties have them."""
-        given = self.coefficients
-        return given.numbers if isinstance(given, ShortNumbers) else given
 
 
 @record("RecursionBlock")

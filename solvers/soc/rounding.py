@@ -1,4 +1,4 @@
-"""Messages of CONSENSUS in few bytes: steps of rows as small integers, and sums in few digits.
+"""Messages of CONSENSUS in few bytes: steps of rows as small integers.
 
 A robot's neighbours have its rows of s. The robot sends them the step of the fixed-point map from
 there, in whole multiples of a unit: the largest step divided by 127 (one byte a number) or 32767
@@ -67,60 +67,3 @@ def _of_rows(units: Array, rows: Array) -> Array:
     d = rows.shape[1]
     q = len(rows) // (d + 1)
     return np.repeat(units, [q, d * q])[:, None]
-
-
-@record("ShortNumbers")
-@dataclass(frozen=True, eq=False)
-class ShortNumbers:
-    """Numbers in two bytes each, m 2^e with a mantissa m of one byte: two digits.
-
-    Coefficients of the acceleration need no more, as long as all parties have the same. Sizes
-    beyond 2^-128 and 2^127 are cut off.
-    """
-
-    mantissas: NDArray[np.int8]
-    exponents: NDArray[np.int8]
-
-    @classmethod
-    def of(cls, numbers: Array) -> ShortNumbers:
-        """Round numbers, (q,)."""
-        fractions, exponents = np.frexp(numbers)  # 1/2 <= |fraction| < 1
-        mantissas = np.clip(np.rint(128.0 * fractions), -127, 127)
-        return cls(mantissas.astype(np.int8), np.clip(exponents, -128, 127).astype(np.int8))
-
-    @property
-    def numbers(self) -> Array:
-        """The numbers as they were rounded, (q,)."""
-        return np.ldexp(self.mantissas / 128.0, self.exponents)
-
-
-@record("PartOfSums")
-@dataclass(frozen=True, eq=False)
-class PartOfSums:
-    """One party's part of the sums of the acceleration; those after the first are in float32.
-
-    They are sent as multiples of the first, ||f||^2, since weights, and with them all sums, may be
-    of any size.
-    """
-
-    first: float
-    ratios: NDArray[np.float32] | Array
-
-    @classmethod
-    def of(cls, sums: Array, num_bytes: int) -> PartOfSums:
-        """Part of sums, (1 + k,), whose ratios are in full if rows are (`WHOLE`)."""
-        first = float(sums[0])
-        if not np.isfinite(first):  # only this is read then
-            return cls(first, np.zeros(len(sums) - 1))
-        with np.errstate(over="ignore"):
-            ratios = sums[1:] / (first if first > 0 else 1.0)
-        if num_bytes == WHOLE:
-            return cls(first, ratios)
-        largest = np.finfo(np.float32).max
-        return cls(first, np.clip(ratios, -largest, largest).astype(np.float32))
-
-    @property
-    def sums(self) -> Array:
-        """The sums, (1 + k,), as everybody has them."""
-        factor = self.first if np.isfinite(self.first) and self.first > 0 else 1.0
-        return np.append(self.first, factor * self.ratios.astype(float))

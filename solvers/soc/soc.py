@@ -59,9 +59,8 @@ class SOC(SOCSettings):
     bytes_per_number : 1, 2 or 8
         Of CONSENSUS alone: of the rows that robots send each other. With 2, the default, a robot
         sends the change of its rows. Each number of the change is a whole multiple of 1/32767 of
-        the largest one, and with 1 byte of 1/127 of it. So are forces at the start. Sums of the
-        acceleration have four bytes, its coefficients two (`solvers.soc.rounding`). 8 is full
-        precision, which robots that do not wait for each other always have.
+        the largest one, and with 1 byte of 1/127 of it (`solvers.soc.rounding`). So are forces at
+        the start. 8 is full precision, which robots that do not wait for each other always have.
     translation_penalty : float or None
         Of CONSENSUS alone: penalty of the translations of separators, the poses that several robots
         hold, as a multiple of their diagonal in M, the matrix of the cost F = tr(X^T M X). The

@@ -107,7 +107,6 @@ def print_hulls() -> None:
     print("|---|---|---|---|---|---|---|---|")
     forms = (
         pgo.RelaxationForm.DUAL,
-        pgo.RelaxationForm.HULL,
         pgo.RelaxationForm.HULL_DUAL,
     )
     for scene, degrees, seed in LOOSE:
