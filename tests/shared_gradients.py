@@ -5,6 +5,14 @@ import math
 import numpy as np
 
 from pgo_models import PGOProblem, Poses
+from pgo_models.problem.stationarity import gradient_squares, relative_length, rotation_squares
+
+
+def relative_gradient(problem: PGOProblem, poses: Poses) -> float:
+    """Relative length of the Riemannian gradient, of the sums that robots send."""
+    gradient_square = float(gradient_squares(problem, poses).sum())
+    rotation_square = float(rotation_squares(problem).sum())
+    return relative_length(gradient_square, problem.objective(poses), rotation_square)
 
 
 def dense_relative_gradient(problem: PGOProblem, poses: Poses) -> float:

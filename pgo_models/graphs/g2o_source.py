@@ -6,7 +6,6 @@ one call. Only when that call fails are the lines looked at one by one, to name 
 
 import re
 import warnings
-from bisect import bisect_left
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +30,6 @@ from pgo_models.graphs.origin import remainder_of
 from pgo_models.graphs.pose_graph import WORLD_ID, IntArray
 from pgo_models.graphs.tables import COMMENT_SIGNS
 
-_LONG_RUN = 16  # lines of one tag in a row, from which on they need not be sorted by tag
 _SHOWN = 40  # characters of a wrong word that a message shows
 _COMMENT = re.compile(r"(#|//|%).*")
 # Fortran writes 1.5e-3 as 1.5D-03.
@@ -78,35 +76,15 @@ class Source:
         self.offsets: dict[tuple[int, str], list[tuple[int, list[str]]]] = {}
 
     def take(self, first_line: int, lines: list[str]) -> None:
-        """Parse lines, of which the first has the number `first_line` in the file."""
+        """Sort lines by their tags, and parse the lines of each tag by one call.
+
+        The first line has the number `first_line` in the file.
+        """
         numbers = np.arange(first_line, first_line + len(lines))
         if "" in lines:
             is_blank = np.array([not line for line in lines])
             numbers = numbers[~is_blank]
             lines = [line for line in lines if line]
-        num_taken = self._take_runs(numbers, lines)
-        self._take_groups(numbers[num_taken:], lines[num_taken:])
-
-    def _take_runs(self, numbers: IntArray, lines: list[str]) -> int:
-        """Parse long runs of lines of one tag; return how many lines these are."""
-        start = 0
-        while start < len(lines):
-            first_word = lines[start].split(None, 1)[:1]
-            tag = "".join(first_word)  # empty on a blank line
-            # Bisection takes for granted that all lines of a tag follow each other. Where other
-            # lines stand between them, parsing fails, and the lines are sorted by their tags.
-            end = bisect_left(lines, True, start, key=lambda line: not line.startswith(tag))
-            is_simple = tag in TAGS and not TAGS[tag].num_other_ids
-            if not is_simple or end - start < _LONG_RUN:
-                break
-            is_sound = self._parse(tag, tag, numbers[start:end], lines[start:end])
-            if not is_sound:
-                break
-            start = end
-        return start
-
-    def _take_groups(self, numbers: IntArray, lines: list[str]) -> None:
-        """Sort lines by their tags, and parse the lines of each tag."""
         places: dict[str, list[int]] = {}
         for place, line in enumerate(lines):
             if words := line.split(None, 1):

@@ -60,24 +60,6 @@ def relative_length(gradient_square: float, objective: float, rotation_square: f
     return math.inf
 
 
-def relative_gradient(problem: PGOProblem, poses: Poses) -> float:
-    """Relative length of the Riemannian gradient of F at poses.
-
-    It has no unit, and is zero at a stationary point.
-
-    Examples
-    --------
-    >>> from pgo_models.graphs.scenes import grid
-    >>> problem = PGOProblem(grid(np.random.default_rng(0)))
-    >>> relative_gradient(problem, problem.graph.truth) < 1.0
-    True
-    """
-    gradient_square = float(gradient_squares(problem, poses).sum())
-    rotation_square = float(rotation_squares(problem).sum())
-    objective = problem.objective(poses)
-    return relative_length(gradient_square, objective, rotation_square)
-
-
 def quotient(numerator: Array, denominator: Array) -> Array:
     """Quotients, entry by entry; zero where the denominator is zero."""
     quotient = np.zeros_like(numerator)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from graphs import DIMENSIONS, SEEDS, exact_graph, random_poses, varied_graph, varied_problem
 from hypothesis import given, strategies as st
-from shared_gradients import dense_relative_gradient
+from shared_gradients import dense_relative_gradient, relative_gradient
 
 from pgo_models import PGOProblem, Poses, chordal_start
-from pgo_models.problem.stationarity import gradient_squares, relative_gradient, relative_length
+from pgo_models.problem.stationarity import gradient_squares, relative_length
 from solvers import polish
 
 

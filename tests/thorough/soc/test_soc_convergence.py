@@ -16,6 +16,7 @@ from graphs import (
     varied_problem,
 )
 from hypothesis import assume, example, given, settings, strategies as st
+from shared_gradients import relative_gradient
 
 from pgo_models import (
     NoiseModel,
@@ -30,7 +31,6 @@ from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.scenes import MILD_NOISE
 from pgo_models.problem.stationarity import (
     gradient_squares,
-    relative_gradient,
     rotation_squares,
 )
 from solvers import (
