@@ -22,10 +22,6 @@ from pgo_models.problem.matrices import assemble, rotation_columns
 from pgo_models.problem.ordering import row_order
 from pgo_models.problem.problem import PGOProblem
 
-# Up to this number of poses the symbolic analysis of M, which others need as well, is used for the
-# chordal relaxation. Its factor is larger than that of the rotations alone.
-_SHARED = 10_000
-
 
 def odometry_start(graph: PoseGraph) -> Poses:
     """Compose the measurements i -> i + 1 from pose 0 at (I, 0) on; of repeated ones the first.
@@ -155,15 +151,10 @@ def _chordal_rotations(problem: PGOProblem) -> Array:
     """Rotations, (n, d, d), of the chordal relaxation with R_0 = I, projected."""
     n = problem.num_poses
     matrix, b = relaxed_rotations(problem, 0)
-    if n <= _SHARED:
-        factor = factorize_damped(problem.analysis, matrix)
-        Y = factor.solve(b)[n:]
-    else:
-        of_rotations = matrix[n:, n:].tocsc()
-        order = row_order(problem.pose_order, problem.d)
-        analysis = analyze(of_rotations, problem.backend, order)
-        factor = factorize_damped(analysis, of_rotations)
-        Y = factor.solve(b[n:])
+    of_rotations = matrix[n:, n:].tocsc()
+    order = row_order(problem.pose_order, problem.d)
+    analysis = analyze(of_rotations, problem.backend, order)
+    Y = factorize_damped(analysis, of_rotations).solve(b[n:])
     return project_to_rotations(unstack_transposes(Y))
 
 
