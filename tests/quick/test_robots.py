@@ -112,8 +112,3 @@ def test_a_robust_solve_by_robots_rejects_what_one_place_does():
     shared = solvers.solve(wrong, robots=pgo.partition(wrong, 2), robust=solvers.GNC())
     np.testing.assert_array_equal(shared.robust.kept, alone.robust.kept)
     assert not shared.robust.kept[-2:].any()
-
-
-def test_a_partition_of_another_graph_is_refused():
-    with pytest.raises(pgo.PGOError):
-        solvers.solve(pgo.load("grid"), robots=pgo.partition(pgo.load("sphere"), 3))

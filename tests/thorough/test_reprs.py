@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cvxpy as cp
 import numpy as np
@@ -15,6 +16,7 @@ from public_results import RESULTS
 import pgo_models as pgo
 import solvers
 from pgo_models.certificates.handedness import HandednessTerms
+from pgo_models.html_tables import facts_table, rows_table
 from pgo_models.problem.marginals import Marginals
 
 LINES = 10
@@ -95,6 +97,13 @@ def test_a_notebook_shows_a_table(made) -> None:
             text = shown._repr_html_()
             assert text.count("<table>") >= 1, type(shown)
             assert len(text) < 10_000, type(shown)
+
+
+def test_tables_are_well_formed_and_escaped() -> None:
+    nasty = "<b>&\"'</td>"
+    for table in (facts_table([(nasty, "1")]), rows_table([nasty, "F"], [["b", nasty]])):
+        texts = ["".join(cell.itertext()) for cell in ElementTree.fromstring(table).iter()]
+        assert nasty in texts
 
 
 def test_every_result_is_shown_here(made) -> None:

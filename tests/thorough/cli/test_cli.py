@@ -191,15 +191,6 @@ def test_a_gap_that_rounding_hides_is_not_certified_and_ends_with_3(pgo_command)
     assert pgo_command("solve", "grid", "--cost", "isotropic", "--gap", printed[1])[0] == 0
 
 
-def test_not_converged_ends_with_2_and_writes_the_result(pgo_command, tmp_path):
-    code, out, _ = pgo_command(
-        "solve", "grid", "--time-limit", "1e-9", "--out", tmp_path / "so_far.json"
-    )
-    assert code == 2
-    assert "TIME_LIMIT" in out
-    assert (tmp_path / "so_far.json").exists()
-
-
 def test_not_certified_ends_with_3(pgo_command, tmp_path):
     pgo_command(
         "generate",
@@ -257,22 +248,6 @@ def test_a_generated_folder_holds_one_file_a_robot(pgo_command, tmp_path):
     assert (graph.num_robots, graph.num_poses, graph.d) == (3, 45, 2)
     assert graph.truth is not None
     assert pgo_command("solve", tmp_path / "world", "--method", "consensus")[0] == 0
-
-
-def test_info_describes_graphs_and_the_installation(pgo_command):
-    code, out, _ = pgo_command("info", "robots")
-    assert code == 0
-    assert re.search(r"poses +160", out)
-    assert re.search(r"robots +4", out)
-    for part in (
-        "I_tt            condition 1 in the median, at most 1",
-        "I_tr            not zero in 0 of",
-    ):
-        assert part in out
-    code, out, _ = pgo_command("info")
-    assert code == 0
-    assert re.search(r"cholesky +(CHOLMOD|SuperLU)", out)
-    assert "circle" in out
 
 
 BAD_FILES = {

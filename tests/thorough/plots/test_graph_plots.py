@@ -152,15 +152,6 @@ def test_figures_are_a_column_wide_and_readable_there(tmp_path):
         assert not small
 
 
-@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
-def test_a_solution_saves_its_picture(suffix, tmp_path):
-    path = tmp_path / f"picture{suffix}"
-    solvers.solve(pgo.circle(np.random.default_rng(0))).save(path)
-    head = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[suffix]
-    assert path.read_bytes().startswith(head)
-    assert [file.name for file in tmp_path.iterdir()] == [path.name]
-
-
 def test_poses_of_another_graph_are_refused():
     from matplotlib.figure import Figure
 

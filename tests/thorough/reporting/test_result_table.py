@@ -77,13 +77,6 @@ def test_a_wide_table_is_printed_in_blocks_within_80_columns(capsys, monkeypatch
     assert f"grid   SOC     {'  '.join(rows[0][2:-1])}  why why" in capsys.readouterr().out
 
 
-def test_every_format_is_written_whole(tmp_path):
-    for suffix, text in ((".md", TABLE.markdown()), (".csv", TABLE.csv()), (".json", TABLE.json())):
-        TABLE.save(tmp_path / f"table{suffix}")
-        assert (tmp_path / f"table{suffix}").read_text(encoding="utf-8") == text
-    assert len(list(tmp_path.iterdir())) == 3
-
-
 def test_a_place_that_cannot_be_written_is_said(tmp_path):
     with pytest.raises(PGOError, match="cannot write"):
         TABLE.save(tmp_path / "no" / "table.md")

@@ -1,5 +1,4 @@
 import importlib.util
-import json
 
 import numpy as np
 import pytest
@@ -100,12 +99,6 @@ def test_ctrl_c_keeps_the_methods_that_are_done(monkeypatch):
     assert "interrupted: the methods left out were not run" in compared.table().notes
 
 
-def test_plots_are_written_as_pictures(compared, tmp_path):
-    for suffix, begin in ((".png", b"\x89PNG"), (".svg", b"<?xml")):
-        compared.save_plot(tmp_path / f"plot{suffix}")
-        assert begin in (tmp_path / f"plot{suffix}").read_bytes()[:100]
-
-
 @pytest.mark.parametrize("name", ["plot", "plot.gif", "plot.md"])
 def test_another_suffix_is_refused(name, compared, tmp_path):
     with pytest.raises(SettingError, match=r"use .png, .svg or .pdf"):
@@ -128,9 +121,3 @@ def test_a_panel_holds_the_methods_whose_effort_is_counted():
 def test_there_must_be_something_to_draw():
     with pytest.raises(SettingError, match="no method has a gap above zero"):
         plot_efforts([curve("start only", length=1)])
-
-
-def test_records_are_plain_json(compared, tmp_path):
-    compared.table().save(tmp_path / "table.json")
-    content = json.loads((tmp_path / "table.json").read_text())
-    assert [row["method"] for row in content["rows"]] == [method.value for method in CHOSEN]
