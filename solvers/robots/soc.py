@@ -41,14 +41,10 @@ from solvers.robots.elimination import Reduced, RightHandSide
 from solvers.robots.interface import InterfaceFactor
 from solvers.robots.part import Interior, ReducedTranslations, Session
 from solvers.robots.poses import reduce_translations
-from solvers.soc.copies import Norms, subsampled
 from solvers.soc.penalty import PenaltyOrder
 from solvers.soc.recursion_block import Agreement, RecursionBlock
 from solvers.soc.safeguard import Due, SharedSteps, with_due_penalty
 from solvers.soc.soc import SOC
-
-# Poses that are enough to estimate the penalty's quantile, where robots have files of their own.
-ENOUGH_NORMS = 2**12
 
 
 @record("SubstructuredState")
@@ -154,20 +150,14 @@ class SubstructuredSOC:
 
         If the poses are stationary, B is the multiplier that belongs to them.
         """
-        # Where robots have files of their own, every k-th pose stands for all in the quantile.
-        step = None
-        if not driver.has_whole and driver.num_poses >= ENOUGH_NORMS:
-            step = driver.num_poses // ENOUGH_NORMS
         Lambda = driver.current.multipliers
-        answers = [*driver.ask(report_norms, step, Count.PIGGYBACKED)]
-        answers.append(subsampled(Norms(multiplier_norms(Lambda), driver.scale), step))
-        norms = np.concatenate([answer.norms for answer in answers])
-        scales = np.concatenate([answer.scale for answer in answers])
+        of_robots = driver.ask(report_norms, None, Count.PIGGYBACKED)
+        of_cover = np.stack([multiplier_norms(Lambda), driver.scale])
+        norms, scales = np.concatenate([*of_robots, of_cover], axis=1)
         order = self.soc.penalty_order(norms / scales, is_stationary)
         block = order.block(driver.current.R, Lambda, driver.diagonal[driver.rotation_rows])
         reduced = driver.ask(penalize, order)
-        # ||omega||_rho^2 = d sum_i rho_i, of which the sampled poses are a fraction 1 / step.
-        squared_size = driver.d * (step or 1) * float(order.rho(norms, scales).sum())
+        squared_size = driver.d * float(order.rho(norms, scales).sum())  # ||omega||_rho^2
         return SubstructuredState(
             block=block,
             right=[answer.right for answer in reduced],
@@ -281,14 +271,13 @@ class RecursionSession(Session):
 
 
 @order("soc.report_norms")
-def report_norms(robot: Interior, step: int | None) -> tuple[Interior, Norms]:
-    """||Lambda_i||_2 and m_i of the interior poses, of every step-th one."""
+def report_norms(robot: Interior, _: None) -> tuple[Interior, Array]:
+    """||Lambda_i||_2 and m_i of the interior poses, (2, k)."""
     Lambda = robot.multipliers()[robot.part.interior]
     problem = robot.part.problem
     positions = problem.diagonal_positions[robot.interior_rows]
     diagonal = problem.M.data[positions].reshape(-1, problem.d)
-    norms = Norms(multiplier_norms(Lambda), np.asarray(diagonal.mean(axis=1)))
-    return robot, subsampled(norms, step)
+    return robot, np.stack([multiplier_norms(Lambda), diagonal.mean(axis=1)])
 
 
 @order("soc.penalize")

@@ -22,24 +22,6 @@ Rows = Messages[Array]  # to or from every neighbour
 RowMessages = Messages[Array | RowChange]  # of rows, or of their change since the last message
 
 
-@record("Norms")
-@dataclass(frozen=True, eq=False)
-class Norms:
-    """||Lambda_i||_2 and m_i of a party's poses, in no order."""
-
-    norms: Array
-    scale: Array
-
-
-def subsampled(norms: Norms, step: int | None) -> Norms:
-    """Every k-th of the poses in the order of their ratios, with k = `step`; all without a step."""
-    if step is None:
-        return norms
-    in_order = np.argsort(norms.norms / norms.scale)
-    chosen = in_order[step // 2 :: step]
-    return Norms(norms.norms[chosen], norms.scale[chosen])
-
-
 @record("NeighbourMessage")
 @dataclass(frozen=True, eq=False)
 class NeighbourMessage:
