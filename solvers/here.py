@@ -264,7 +264,7 @@ class Here(Place):
         problem = self.problem
         ground = problem.at_best_translations(best.known_poses)
         terms, stage = search.run(problem, ground, self.monitor, Pi)
-        self.table.add(stage)
+        self.table.add(replace(stage, name=f"{stage.name}{self.where}"))
         judged = judge(problem, best.known_poses, best.proof)
         return after_search(best, with_terms(problem, judged, terms, ground), stage)
 

@@ -9,18 +9,16 @@ derivative for P_e is
 A step goes along it as far as the smallest eigenvalue would need to become positive if it were
 linear (Polyak 1969), and back to P >= 0.
 
-How far a step goes, and when to stop, is decided here; where the P and the eigenvectors are is
-`AscentPoint`. There are two: `solvers.handedness.certificate_spectrum` in one place, and
-`solvers.robots.handedness` by a driver and its robots, each of which has the P of its edges.
+How far a step goes, and when to stop, is decided here; the P and the eigenvectors are those of
+`solvers.handedness.certificate_spectrum`.
 """
 
 from dataclasses import dataclass, replace
-from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
 from pgo_models.errors import check_settings
-from pgo_models.geometry.rotations import Array
+from solvers.handedness.certificate_spectrum import HandedPoint
 from solvers.result import Measurement, Status
 
 POSITIVE = 1e-9  # of the mean diagonal of M: an eigenvalue above that is no rounding
@@ -30,38 +28,12 @@ _SOFTNESS = 0.1  # temperature of the soft minimum, as a share of the smallest e
 _WINDOW = 10  # last steps, whose rise tells whether those that are left can reach zero
 
 
-class AscentPoint(Protocol):
-    """Matrices P of pairs of poses, with the lowest eigenvalues of what they leave."""
-
-    @property
-    def values(self) -> Array:
-        """The lowest eigenvalues of S_r less the terms, ascending, (q,)."""
-
-    @property
-    def objective(self) -> float:
-        """The cost of the poses."""
-
-    @property
-    def scale(self) -> float:
-        """Mean diagonal of M over the rotations."""
-
-    def ascended(self, weights: Array, rise: float) -> Self:
-        """Return the point after a step along the derivative, (q,) weights of the eigenvectors.
-
-        The weighted mean of the eigenvalues would gain `rise` if it were linear in the step. The
-        point is projected to P >= 0.
-        """
-
-
-T = TypeVar("T", bound=AscentPoint)
-
-
 @dataclass(frozen=True, eq=False)
-class AscentState(Generic[T]):
+class AscentState:
     """State k: the matrices with the lowest eigenvalues, and the best one of each step so far."""
 
     k: int
-    point: T
+    point: HandedPoint
     best: tuple[float, ...]  # best smallest eigenvalue up to every step so far
 
     @property
@@ -95,11 +67,11 @@ class HandednessAscent:
     def __post_init__(self) -> None:
         check_settings(self, not_negative=["max_iterations"], at_least_one=["num_eigenvalues"])
 
-    def init(self, first: T, start: None) -> AscentState[T]:
+    def init(self, first: HandedPoint, start: None) -> AscentState:
         """State 0, at the first point."""
         return AscentState(0, first, (float(first.values[0]),))
 
-    def step(self, first: T, state: AscentState[T]) -> AscentState[T]:
+    def step(self, first: HandedPoint, state: AscentState) -> AscentState:
         """One step along the derivative of the soft minimum."""
         best = state.best[-1]
         # The first one may be zero.
@@ -114,12 +86,12 @@ class HandednessAscent:
         now = max(best, float(point.values[0]))
         return replace(state, k=state.k + 1, point=point, best=(*state.best, now))
 
-    def measure(self, first: T, state: AscentState[T]) -> Measurement:
+    def measure(self, first: HandedPoint, state: AscentState) -> Measurement:
         """The cost of the poses, and what the smallest eigenvalue lacks to be positive."""
         lacking = max(0.0, POSITIVE - state.smallest / first.scale)
         return Measurement(first.objective, 0.0, lacking, infeasibility=lacking)
 
-    def converged(self, state: AscentState[T], measurement: Measurement) -> Status | None:
+    def converged(self, state: AscentState, measurement: Measurement) -> Status | None:
         """CONVERGED with a positive eigenvalue, STALLED where it rises too slowly to become one.
 
         Steps gain less and less, so that the rise of the last ones, times those that are left, is
@@ -132,19 +104,3 @@ class HandednessAscent:
         rise = (state.best[-1] - state.best[-1 - _WINDOW]) / _WINDOW
         steps_left = self.max_iterations - state.k
         return None if state.best[-1] + steps_left * rise > 0.0 else Status.STALLED
-
-
-def derivative_of_minimum(moves: Array, weights: Array) -> Array:
-    """Derivative for the P of every pair, (k, 3, 3), of eigenvalues with weights, (q,).
-
-    Their eigenvectors do `moves` to the pairs, (k, 3, q).
-    """
-    D = moves * np.sqrt(weights)
-    squares = np.sum(D * D, axis=(1, 2))
-    return np.asarray(0.25 * (D @ np.swapaxes(D, 1, 2) - 0.5 * squares[:, None, None] * np.eye(3)))
-
-
-def nearest_semidefinite(P: Array) -> Array:
-    """P with its negative eigenvalues raised to zero, (k, 3, 3)."""
-    values, axes = np.linalg.eigh(P)
-    return np.asarray((axes * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))

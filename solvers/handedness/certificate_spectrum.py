@@ -26,7 +26,6 @@ from pgo_models.problem import matrices
 from pgo_models.problem.cholesky import CholeskyFactor
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.stationarity import rotation_scale
-from solvers.handedness.ascent import derivative_of_minimum, nearest_semidefinite
 
 MOST_DENSE = 130  # poses up to which dense eigenvalues are faster
 _ACCURACY = 1e-3  # of sparse eigenvalues, relative to their distance from the shift
@@ -230,7 +229,7 @@ def shifts_below(expected: float, scale: float) -> Iterator[float]:
 
 @dataclass(frozen=True, eq=False)
 class HandedPoint:
-    """`ascent.AscentPoint` in one place: the P of all pairs, (k, 3, 3), and the spectrum there.
+    """A point of the ascent: the P of all pairs, (k, 3, 3), and the spectrum there.
 
     `count` lowest eigenvalues count, if there are so many; the smallest is about `expected`.
     """
@@ -274,3 +273,19 @@ class HandedPoint:
         length = rise / matrices.inner(derivative, derivative)
         P = nearest_semidefinite(self.P + length * derivative)
         return replace(self, P=P, expected=float(self.values[0]))
+
+
+def derivative_of_minimum(moves: Array, weights: Array) -> Array:
+    """Derivative for the P of every pair, (k, 3, 3), of eigenvalues with weights, (q,).
+
+    Their eigenvectors do `moves` to the pairs, (k, 3, q).
+    """
+    D = moves * np.sqrt(weights)
+    squares = np.sum(D * D, axis=(1, 2))
+    return np.asarray(0.25 * (D @ np.swapaxes(D, 1, 2) - 0.5 * squares[:, None, None] * np.eye(3)))
+
+
+def nearest_semidefinite(P: Array) -> Array:
+    """P with its negative eigenvalues raised to zero, (k, 3, 3)."""
+    values, axes = np.linalg.eigh(P)
+    return np.asarray((axes * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))

@@ -72,7 +72,7 @@ class HandednessSearch:
         matrix = HandedMatrix(tangent, multipliers(problem, poses), poses, i, j)
         P = None if Pi is None else matrices_at(matrix.T, Pi)
         first = HandedPoint.first(matrix, P, self.ascent.num_eigenvalues)
-        ascent: Outcome[AscentState[HandedPoint]] = monitor.run(self.ascent, first)
+        ascent: Outcome[AscentState] = monitor.run(self.ascent, first)
         return HandednessTerms.at(poses, i, j, ascent.state.point.P), stage_of_search(ascent)
 
 

@@ -18,7 +18,6 @@ has what the driver does, and below that the orders that robots obey.
 | `soc`, `consensus`, `paper` | SOC with a driver, robot by robot, and as published |
 | `newton`, `climb` | Newton, and the climb of the staircase |
 | `proof` | the lower bound |
-| `handedness` | terms that tell rotations from reflections |
 | `reweigh`, `revision` | weights of a robust solve; edges that come back |
 | `place`, `kept_answer` | the place of a solve, and the answer that robots keep |
 | `place_without_driver` | the place of a solve by CONSENSUS alone |

@@ -9,7 +9,7 @@ leave the robot in snapshots and when the result is collected; edges between the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -80,17 +80,6 @@ class ReducedTranslations:
     schur: Array | None
 
 
-@record("RobotAscent")
-@dataclass(frozen=True, eq=False)
-class RobotAscent:
-    """Where a robot is in an ascent of handedness terms, with the k pairs that its edges join."""
-
-    P: Array  # (k, 3, 3)
-    best: Array  # (k, 3, 3): the P that had the largest smallest eigenvalue
-    derivative: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    X: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (side, q): inverse iteration's
-
-
 @record("Session")
 @dataclass(frozen=True, eq=False)
 class Session:
@@ -117,7 +106,6 @@ class InteriorState:
     reweighing: Reweigh | None = None  # how these weights came about
     has_sent_laplacian: bool = False  # whether the driver has the matrix of the translations
     terms: HandednessTerms | None = None  # of its edges, for proofs with them
-    ascent: RobotAscent | None = None  # the search for such terms
 
 
 S = TypeVar("S", bound=Session)

@@ -15,20 +15,17 @@ from functools import partial
 from typing import Any
 
 from pgo_models.certificates.certificate import BoundSource, certify_with, with_axes
-from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.geometry.poses import Poses
 from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.initialization import chordal_start, spanning_tree_start
-from solvers.carry.counted_pool import Count
 from solvers.carry.faults import Faults
 from solvers.carry.ledger import Ledger
-from solvers.handedness.ascent import AscentState
 from solvers.handedness.complex_relaxation import ComplexRelaxation
 from solvers.handedness.hull_lagrangian import HullLagrangian
-from solvers.handedness.search import HandednessSearch, stage_of_search
+from solvers.handedness.search import HandednessSearch
 from solvers.here import Here
-from solvers.place import AnySOC, Attempt, OwnStart, Place, Step, Traits, after_search
+from solvers.place import AnySOC, Attempt, OwnStart, Place, Step, Traits
 from solvers.result import History, Outcome, Stage, Status
 from solvers.riemannian.newton import Newton
 from solvers.riemannian.prefixes import GrowingStart
@@ -37,18 +34,11 @@ from solvers.robots.checkpoint import Journal
 from solvers.robots.climb import SubstructuredStaircase, round_lifted
 from solvers.robots.consensus import AsynchronousSOC, ConsensusSOC
 from solvers.robots.driver import Driver, collect
-from solvers.robots.handedness import (
-    RobotsPoint,
-    begin_without_terms,
-    hand_out_terms,
-    return_to_best,
-)
 from solvers.robots.kept_answer import AnswerAtRobots
 from solvers.robots.newton import SubstructuredNewton
 from solvers.robots.own_file import READ_HERE
 from solvers.robots.paper import PaperByRobots
-from solvers.robots.poses import reduce_translations
-from solvers.robots.proof import best_bound_distributed, best_bound_with_terms
+from solvers.robots.proof import best_bound_distributed
 from solvers.robots.revision import go_to_poses_found
 from solvers.robots.reweigh import SharedGNC, inliers_of
 from solvers.robots.soc import SubstructuredSOC
@@ -367,35 +357,8 @@ class PlaceOfRobots(Place):
     def bound_by_terms(
         self, best: Attempt, search: HandednessSearch, Pi: Array | None = None
     ) -> Attempt:
-        """Return the same poses, with the bound of terms that the robots have of their edges."""
-        driver = self.driver
-        here = self.known_here
-        poses = best.known_poses
-        driver.choose_cost(final=True)
-        driver.set_poses(poses)
-        driver.set_translations(driver.ask(reduce_translations, None, Count.PIGGYBACKED))
-        driver.describe(Count.PIGGYBACKED)
-        if Pi is None:
-            begin_without_terms(driver)
-        else:
-            hand_out_terms(driver, distinct_pairs(here.problem.graph), poses, Pi)
-        first = RobotsPoint.first(driver, search.ascent.num_eigenvalues)
-        outcome: Outcome[AscentState[RobotsPoint]] = self.monitor.run(search.ascent, first)
-        stage = stage_of_search(outcome)
-        self.table.add(stage)
-        bound = best_bound_with_terms(driver, here.gap, return_to_best(driver))
-        certificate = best.proof
-        if bound.value > certificate.bound.value:
-            certificate = certify_with(
-                here.problem,
-                poses,
-                collect(driver)[1],
-                here.gap,
-                certificate.stationarity,
-                BoundSource.GIVEN,
-                bound,
-            )
-        return after_search(best, certificate, stage)
+        """Search for handedness terms in one place."""
+        return self.known_here.bound_by_terms(best, search, Pi)
 
     def run_gnc(self, gnc: GNC, start: Poses | None) -> Inliers:
         """Run graduated non-convexity by the robots, which have the thresholds of their edges."""

@@ -101,36 +101,20 @@ def _best_form(driver: Driver, gap: float, most_lost: float | None, deadline: fl
     if driver.d == 3:
         described = driver.ask(take_closed_form, None, Count.PIGGYBACKED)
         if any(answer.num_pairs for answer in described):
-            with_terms = _bound_with_terms(driver, diagonal_less_terms(driver, described))
+            less_terms = driver.gather_diagonal([answer.diagonal for answer in described])
+            with_terms = _bound_with_terms(driver, less_terms)
             if with_terms is not None:
                 return with_terms
     if not has_scale:
         return central.NO_BOUND
-    return _search_forms(driver, gap, most_lost=most_lost, deadline=deadline)
-
-
-def best_bound_with_terms(driver: Driver, gap: float, less_terms: Array) -> LowerBound:
-    """Return the best bound of the cost less the robots' handedness terms."""
-    grounded = _bound_with_terms(driver, less_terms)
-    if grounded is not None:
-        return grounded
-    if not (less_terms > 0.0).all():
-        return central.NO_BOUND
-    bound = _search_forms(driver, gap, less_terms)
-    return replace(bound, terms=_collect_terms(driver)) if bound.value > 0.0 else bound
-
-
-def diagonal_less_terms(driver: Driver, described: Sequence[TermsAnswer]) -> Array:
-    """Diagonal of M less the robots' handedness terms, on the cover, ((d+1) g,)."""
-    return driver.gather_diagonal([answer.diagonal for answer in described])
+    return _search_forms(driver, gap, most_lost, deadline)
 
 
 def _search_forms(
     driver: Driver,
     gap: float,
-    less_terms: Array | None = None,
-    most_lost: float | None = None,
-    deadline: float = math.inf,
+    most_lost: float | None,
+    deadline: float,
 ) -> LowerBound:
     """Return the better of both forms of the bound, each with the smallest eta found."""
     count = driver.num_poses * driver.d
@@ -138,8 +122,8 @@ def _search_forms(
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     return central.search_forms(
         [
-            partial(prove_with_eta, driver, less_terms=less_terms),
-            partial(prove_grounded, driver, less_terms=less_terms),
+            partial(prove_with_eta, driver),
+            partial(prove_grounded, driver),
         ],
         smallest,
         driver.current.objective if most_lost is None else most_lost,
@@ -148,15 +132,12 @@ def _search_forms(
     )
 
 
-def prove_with_eta(
-    driver: Driver, eta: float, less_terms: Array | None = None
-) -> LowerBound | None:
+def prove_with_eta(driver: Driver, eta: float) -> LowerBound | None:
     """Bound F by tr(Lambda) - eta n d: one round.
 
-    None unless S + eta blockdiag(0, I) without a translation is positive definite. `less_terms` is
-    as in `eliminate_S`.
+    None unless S + eta blockdiag(0, I) without a translation is positive definite.
     """
-    proof = eliminate_S(driver, None, eta, central.UNGROUNDED_MARGIN, less_terms=less_terms)
+    proof = eliminate_S(driver, None, eta, central.UNGROUNDED_MARGIN)
     if proof is None:
         return None
     return central.bound_with_eta(proof.traces, eta, driver.num_poses * driver.d)
@@ -539,11 +520,19 @@ def _evaluated(robot: Interior) -> tuple[Interior, ProofStep]:
 
 @order("handedness.take_closed_form")
 def take_closed_form(robot: Interior, _: None) -> tuple[Interior, TermsAnswer]:
-    """Take the terms of the robot's edges that are known in closed form."""
-    terms = None
-    if robot.problem.d == 3:
-        terms = closed_form_terms(robot.tangent_problem, robot.poses)
-    return take_terms(robot, terms)
+    """Take the terms of the robot's edges that are known in closed form.
+
+    The answer is their number, and the diagonal of M less them on the boundary.
+    """
+    problem = robot.tangent_problem
+    terms = closed_form_terms(problem, robot.poses) if problem.d == 3 else None
+    num_pairs = 0
+    if terms is not None:
+        problem = terms.taken_off(problem)
+        num_pairs = terms.num_pairs
+    diagonal = problem.M.data[problem.diagonal_positions]
+    answer = TermsAnswer(num_pairs, diagonal[robot.boundary_rows])
+    return robot.with_state(replace(robot.state, terms=terms)), answer
 
 
 @order("handedness.report_terms")
@@ -554,18 +543,6 @@ def report_terms(robot: Interior, _: None) -> tuple[Interior, HandednessTerms | 
         return robot, None
     numbers = robot.part.poses
     return robot, replace(terms, i=numbers[terms.i], j=numbers[terms.j])
-
-
-def take_terms(robot: Interior, terms: HandednessTerms | None) -> tuple[Interior, TermsAnswer]:
-    """The robot with terms; their number, and the diagonal of M less them on the boundary."""
-    problem = robot.tangent_problem
-    num_pairs = 0
-    if terms is not None:
-        problem = terms.taken_off(problem)
-        num_pairs = terms.num_pairs
-    diagonal = problem.M.data[problem.diagonal_positions]
-    answer = TermsAnswer(num_pairs, diagonal[robot.boundary_rows])
-    return robot.with_state(replace(robot.state, terms=terms)), answer
 
 
 # The algebra of these orders.

@@ -40,12 +40,10 @@ from solvers import (
     run,
 )
 from solvers.carry.process import Engine
-from solvers.handedness.ascent import HandednessAscent
 from solvers.loop import Method
 from solvers.robots.climb import SubstructuredStaircase
 from solvers.robots.consensus import AsynchronousSOC, ConsensusSOC
 from solvers.robots.driver import Driver
-from solvers.robots.handedness import RobotsPoint, begin_without_terms
 from solvers.robots.newton import SubstructuredNewton
 from solvers.robots.reweigh import SharedGNC
 from solvers.robots.setup import open_driver
@@ -258,12 +256,6 @@ RESTLESS = MultiplierPenalty(stall_window=2, stall_ratio=1e-6, max_refreshes=2)
 Begin = Callable[[Driver], tuple[Method[Any, Any, Any], Any]]
 
 
-def ascent(driver: Driver) -> tuple[Method[Any, Any, Any], Any]:
-    begin_without_terms(driver)
-    method = HandednessAscent(num_eigenvalues=3)
-    return method, RobotsPoint.first(driver, method.num_eigenvalues)
-
-
 METHODS_OF_ROBOTS: dict[str, Begin] = {
     "substructured": lambda driver: (SubstructuredSOC(), driver),
     "substructured_restless": lambda driver: (SubstructuredSOC(SOC(penalty=RESTLESS)), driver),
@@ -281,7 +273,6 @@ METHODS_OF_ROBOTS: dict[str, Begin] = {
     "newton": lambda driver: (SubstructuredNewton(), driver),
     "staircase": lambda driver: (SubstructuredStaircase(), driver),
     "gnc": lambda driver: (SharedGNC(GNC(spread=None), 1e-9, 1e-13), driver),
-    "ascent": ascent,
 }
 BY_ROBOTS = pytest.mark.parametrize("begin", METHODS_OF_ROBOTS.values(), ids=METHODS_OF_ROBOTS)
 

@@ -25,8 +25,8 @@ from pgo_models.certificates.certificate import with_terms
 from pgo_models.certificates.handedness import distinct_pairs
 from pgo_models.errors import NotPositiveDefiniteError
 from solvers import Pipeline, Status, SweptScene, iterate, polish, run, solve
-from solvers.handedness.ascent import HandednessAscent, nearest_semidefinite
-from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint
+from solvers.handedness.ascent import HandednessAscent
+from solvers.handedness.certificate_spectrum import HandedMatrix, HandedPoint, nearest_semidefinite
 from solvers.handedness.search import HandednessSearch, terms_can_help
 from solvers.loop import RunMonitor
 from solvers.studies.tightness import noisy_lattice, noisy_scene

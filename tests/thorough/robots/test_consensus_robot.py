@@ -22,7 +22,7 @@ from pgo_models import NoiseModel, PoseGraph, exp_map, grid, partition
 from pgo_models.geometry.rotations import Array, tangent_dimension
 from solvers import SOC, Coupling, Pipeline, Robots, Solution, solve
 from solvers.carry.ledger import DRIVER
-from solvers.robots import handedness, newton, poses as pose_orders
+from solvers.robots import newton, poses as pose_orders
 from solvers.robots.consensus import begin_copies
 from solvers.robots.interface import Separators
 from solvers.robots.proof import fits_part, move_proof, prove_interior
@@ -43,9 +43,6 @@ ROUNDS = (  # orders that are, or end, a round
     ),
     *(
         move_proof,
-        handedness.follow_vectors,
-        handedness.find_derivative,
-        handedness.ascend,
         pose_orders.adopt,
         begin_copies,
         Copies.penalize,
