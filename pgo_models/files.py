@@ -7,7 +7,6 @@ import os
 import re
 import secrets
 import stat
-import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -262,9 +261,6 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
     too many numbers or are not all numbers; also when there is no row.
     """
     lines = read_text(path).removesuffix("\n").split("\n")
-    table = _sound_table(lines, columns)
-    if table is not None:
-        return table, list(range(1, len(lines) + 1))
     rows = []
     row_lines = []
     problems: list[Problem] = []
@@ -287,21 +283,6 @@ def read_table(path: Path | str, columns: int) -> tuple[NDArray[np.float64], lis
     if not rows:
         raise FileFormatError(path, None, f"no rows; give lines of {columns} numbers")
     return np.array(rows), row_lines
-
-
-def _sound_table(lines: list[str], columns: int) -> NDArray[np.float64] | None:
-    """Numbers of lines by one call; None unless every line is a row of them and nothing else."""
-    if max(map(len, lines)) > LONGEST:
-        return None
-    try:
-        # NumPy warns where all lines are blank.
-        with warnings.catch_warnings(action="error"):
-            table = np.loadtxt(lines, comments=None, ndmin=2)
-    except (ValueError, UserWarning):
-        return None
-    if table.shape != (len(lines), columns) or not (np.abs(table) <= LARGEST).all():
-        return None
-    return table
 
 
 @contextmanager

@@ -987,13 +987,11 @@ class PoseGraph(ReadOnly):
         measured = Poses.of_points(positions)
         return self.with_prior(poses, measured, kappa=0.0, tau=tau)
 
-    def with_landmark(
-        self, seen_from: IntArray, positions: Array, tau: Weights, name: int | None = None
-    ) -> PoseGraph:
+    def with_landmark(self, seen_from: IntArray, positions: Array, tau: Weights) -> PoseGraph:
         """Return the graph with one more landmark; the ground truth is left out.
 
-        The estimate, if there is one, has the landmark where the first pose sees it. Errors are
-        those of `with_edges`.
+        Its id is the first above all others. The estimate, if there is one, has the landmark where
+        the first pose sees it. Errors are those of `with_edges`.
 
         Parameters
         ----------
@@ -1003,8 +1001,6 @@ class PoseGraph(ReadOnly):
             Measured positions of the landmark in the frames of these poses, metres.
         tau : Array, (k,), or float
             Precisions of the positions, per metre^2.
-        name : int, optional
-            Id of the landmark; the first above all other ids unless given.
         """
         seen_from = self._checked_poses(seen_from)
         points = Poses.of_points(positions)
@@ -1014,9 +1010,7 @@ class PoseGraph(ReadOnly):
                 "give one each"
             )
         first = seen_from[0]
-        if name is None:
-            ids = self.pose_ids[self.in_files]
-            name = int(ids.max()) + 1
+        name = int(self.pose_ids[self.in_files].max()) + 1
         initial = self.initial
         if initial is not None:
             initial = self.with_world_of(initial)

@@ -95,8 +95,8 @@ def test_edits_keep_what_they_do_not_touch():
     np.testing.assert_allclose(
         seen.initial.t[-1], graph.initial.t[0] + graph.initial.R[0] @ np.ones(3), rtol=0, atol=1e-14
     )
-    named = seen.with_landmark(np.array([0]), np.ones((1, 3)), 1.0, name=5)
-    assert named.pose_ids[-1] == 5
+    named = seen.with_landmark(np.array([0]), np.ones((1, 3)), 1.0)
+    assert named.pose_ids[-1] == 128
     np.testing.assert_array_equal(named.bodies, np.arange(27))
     np.testing.assert_array_equal(named.times, graph.times)
     back = named.without_edges(named.is_prior).without_edges(
