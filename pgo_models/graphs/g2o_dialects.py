@@ -4,7 +4,6 @@ Three things are open: the order of the matrix on lines in the plane, the frame 
 not at its pose, and an id that stands for a pose and a landmark.
 """
 
-import enum
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -25,47 +24,23 @@ NO_OFFSET = -(2**63)
 # Places of the numbers of a line in TORO's order: x y theta, then the triangle, ff fs ss rr fr sr.
 _TORO = [0, 1, 2, 3, 4, 7, 5, 8, 6]
 # An eigenvalue below this, of a matrix with ones on its diagonal, is negative beyond rounding.
-_NEGATIVE = -1e-10
-_NO_CHANCE = 8  # lines in g2o's order that are hardly all definite in TORO's, too
+NEGATIVE = -1e-10
 
 
-class MatrixOrder(enum.Enum):
-    """Order of the matrices on EDGE2 lines, and on those of EDGE_SE2."""
+def fitting_orders(lines: Sequence[Array], least: float) -> tuple[bool, bool]:
+    """Whether all matrices on lines in the plane, (n, 9), fit TORO's order, and whether by rows.
 
-    TORO = "ff fs ss rr fr sr"
-    ROWS = "xx xy xt yy yt tt, as iSAM writes them"
-    EITHER = "all matrices are positive definite in both orders"
-
-
-def order_of_edge2(lines: Sequence[Array]) -> MatrixOrder:
-    """Order in which all matrices of EDGE2 lines, arrays (n, 9), are positive definite.
-
-    TORO's page defines this tag, so that TORO is returned, too, where neither order fits.
+    In TORO's order, ff fs ss rr fr sr, they are to be positive definite. By rows, xx xy xt yy yt
+    tt, as g2o and iSAM write them, their eigenvalues beside ones on the diagonals are to be above
+    `least`. A few matrices may fit both by chance.
     """
     numbers = np.concatenate(lines)
-    is_toro = _all_are_definite(from_toro_order(numbers))
-    is_by_rows = _all_are_definite(numbers)
-    if is_toro and is_by_rows:
-        return MatrixOrder.EITHER
-    return MatrixOrder.ROWS if is_by_rows else MatrixOrder.TORO
-
-
-def order_of_edge_se2(lines: Sequence[Array]) -> MatrixOrder:
-    """Order of the matrices on EDGE_SE2 lines, arrays (n, 9): by rows, as g2o has them, or TORO's.
-
-    It is TORO's where some matrix has a negative eigenvalue by rows, beyond rounding, and all are
-    positive definite in TORO's order. A few matrices may be definite in both by chance.
-    """
-    numbers = np.concatenate(lines)
-    # The second entry on the diagonal, which is the coupling of x and theta by rows.
-    may_be_toro = bool((numbers[:, 5] > 0.0).all())
-    if not may_be_toro or not _all_are_definite(from_toro_order(numbers)):
-        return MatrixOrder.ROWS
-    matrices = _matrices(numbers)
-    is_by_rows = _have_minors(matrices) and bool(are_definite(matrices, _NEGATIVE).all())
-    if not is_by_rows:
-        return MatrixOrder.TORO
-    return MatrixOrder.EITHER if len(numbers) >= _NO_CHANCE else MatrixOrder.ROWS
+    by_rows = _matrices(numbers)
+    of_toro = _matrices(from_toro_order(numbers))
+    may_be_toro = bool((np.einsum("mkk->mk", of_toro) > 0.0).all()) and _have_minors(of_toro)
+    is_toro = may_be_toro and bool(are_definite(of_toro, SINGULAR).all())
+    is_by_rows = _have_minors(by_rows) and bool(are_definite(by_rows, least).all())
+    return is_toro, is_by_rows
 
 
 def from_toro_order(numbers: Array) -> Array:
@@ -78,14 +53,6 @@ def _matrices(rows: Array) -> Array:
     return np.asarray(rows[:, 3 + triangle_places(3)])
 
 
-def _all_are_definite(rows: Array) -> bool:
-    """Whether the whole matrices on EDGE rows in the plane, (n, 9), are positive definite."""
-    matrices = _matrices(rows)
-    diagonals = np.einsum("mkk->mk", matrices)
-    may_be_definite = bool((diagonals > 0.0).all()) and _have_minors(matrices)
-    return may_be_definite and bool(are_definite(matrices, SINGULAR).all())
-
-
 def _have_minors(matrices: Array) -> bool:
     """Whether no entry is larger than those on the diagonal allow: |a_ij|^2 <= a_ii a_jj.
 
@@ -93,7 +60,7 @@ def _have_minors(matrices: Array) -> bool:
     """
     root = np.sqrt(np.maximum(np.einsum("mkk->mk", matrices), 0.0))
     most = root[:, :, None] * root[:, None, :]
-    return bool((np.abs(matrices) <= (1.0 - _NEGATIVE) * most).all())
+    return bool((np.abs(matrices) <= (1.0 - NEGATIVE) * most).all())
 
 
 def in_frames_of_poses(kind: Tag, rows: Array, offsets: Sequence[Poses]) -> tuple[Array, Array]:

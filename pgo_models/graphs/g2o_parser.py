@@ -26,14 +26,13 @@ from pgo_models.files import (
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.foreign_files import as_g2o
 from pgo_models.graphs.g2o_dialects import (
+    NEGATIVE,
     NO_OFFSET,
-    MatrixOrder,
+    fitting_orders,
     from_toro_order,
     in_frames_of_poses,
     landmark_shift,
     offsets_named,
-    order_of_edge2,
-    order_of_edge_se2,
 )
 from pgo_models.graphs.g2o_readings import ROTATION_FIRST, Reading, edges_as, noise_as, numbers_as
 from pgo_models.graphs.g2o_rows import information_of
@@ -54,6 +53,7 @@ from pgo_models.graphs.weight_errors import MOST, SINGULAR
 from pgo_models.graphs.written_digits import ALL_DIGITS, WrittenDigits, digits_of
 
 _NAMED_TAGS = 10  # unknown tags that a warning names
+_NO_CHANCE = 8  # lines in g2o's order that are hardly all definite in TORO's, too
 _SQUARE_ROOTS = (
     "iSAM's own files have square roots of information (pgo info --reading square-roots --out)"
 )
@@ -322,14 +322,15 @@ class _Assembly:
         parts = self._source.parsed["EDGE2"]
         if not parts:
             return
-        order = order_of_edge2([part.numbers for part in parts])
-        if order is MatrixOrder.ROWS:
+        # TORO's page defines this tag, so that its order is taken where neither fits.
+        is_toro, is_by_rows = fitting_orders([part.numbers for part in parts], SINGULAR)
+        if is_by_rows and not is_toro:
             self.notes.append(
                 "EDGE2 matrices are read in iSAM's order, xx xy xt yy yt tt: all are positive "
                 f"definite in it, and not in TORO's; {_TAKEN_AS_INFORMATION}"
             )
             return
-        if order is MatrixOrder.EITHER:
+        if is_by_rows:
             self.notes.append(
                 "EDGE2 matrices are read in TORO's order, ff fs ss rr fr sr; they are all positive "
                 "definite in iSAM's, xx xy xt yy yt tt, too"
@@ -346,14 +347,14 @@ class _Assembly:
         if self._reading is Reading.TORO_ORDER:
             self._reorder("EDGE_SE2")
             return
-        order = order_of_edge_se2([part.numbers for part in parts])
-        if order is MatrixOrder.TORO:
+        is_toro, is_by_rows = fitting_orders([part.numbers for part in parts], NEGATIVE)
+        if is_toro and not is_by_rows:
             self.notes.append(
                 "EDGE_SE2 matrices are read in TORO's order, ff fs ss rr fr sr: all are positive "
                 "definite in it, and not in g2o's, xx xy xt yy yt tt"
             )
             self._reorder("EDGE_SE2")
-        elif order is MatrixOrder.EITHER:
+        elif is_toro and sum(len(part.lines) for part in parts) >= _NO_CHANCE:
             self.notes.append(
                 "EDGE_SE2 matrices are read in g2o's order, xx xy xt yy yt tt; they are all "
                 "positive definite in TORO's, ff fs ss rr fr sr, too (--reading toro-order)"
