@@ -16,8 +16,8 @@ from solvers.convex.solve_orthogonal import solve_orthogonal as solve_orthogonal
 from solvers.growing import extend as extend
 from solvers.loop import Solver as Solver, iterate as iterate, run as run
 from solvers.pipeline import solve as solve
+from solvers.report.report import write_report as write_report
 from solvers.reporting.film import film as film
-from solvers.reporting.report import write_report as write_report
 from solvers.request import Pipeline as Pipeline
 from solvers.result import (
     Measurement as Measurement,

@@ -270,31 +270,6 @@ class Solution:
             )
         save_proof(self.problem, self.certificate, path)
 
-    def report(self, path: Path | str) -> None:
-        """Write one HTML page that opens offline: verdict, what to try next, pictures and tables.
-
-        Parameters
-        ----------
-        path : Path or str
-            A name that ends in `.html`.
-
-        Raises
-        ------
-        MissingExtraError
-            Without plotly or Jinja2.
-        SettingError
-            For another suffix.
-        PGOError
-            When the file cannot be written.
-
-        See Also
-        --------
-        solvers.write_report : The same, with more to set.
-        """
-        from solvers.reporting.report import write_report
-
-        write_report(self, path)
-
     def plot(self) -> "Figure":
         """Draw the graph as it came and as it was solved, side by side; this needs matplotlib.
 

@@ -499,7 +499,7 @@ class Outputs:
     def check_pages(self) -> None:
         """Raise an error where report, film or covariances have a name of another format."""
         if self.report is not None:
-            from solvers.reporting.report import check_report
+            from solvers.report.report import check_report
 
             check_report(self.report)
         if self.film is not None:
@@ -669,7 +669,7 @@ def _save_and_show(
     if outputs.report is not None:
 
         def save_report(path: Path) -> None:
-            from solvers.reporting.report import write_report
+            from solvers.report.report import write_report
 
             has_covariances = outputs.covariances is not None
             reported = with_covariances(solution) if has_covariances else solution

@@ -49,6 +49,7 @@ ORDER = {
         "reporting",
         "solution",
         "robots_solution",
+        "report",
         "request",
         "plan",
         "robust_solves",
@@ -235,7 +236,7 @@ assert ours == ["pgo_models.lazy_names"], ours
 solvers.solve, solvers.SOC, solvers.Solution
 pgo_models.PGOProblem, pgo_models.read_g2o, solvers.certify
 late = ("rich", "scipy.spatial", "scipy.special", "cvxpy", "solvers.robots.driver")
-late += ("solvers.reporting.report", "solvers.studies.benchmark")
+late += ("solvers.report.report", "solvers.studies.benchmark")
 found = [name for name in late if name in sys.modules]
 assert not found, found
 solvers.solve(pgo_models.load("grid"))

@@ -31,7 +31,7 @@ UNUSED_BY_SOLVE = EXTRAS | {
     "solvers.convex",
     "solvers.robots.driver",
     "solvers.solves.folder_solve",
-    "solvers.reporting.report",
+    "solvers.report.report",
     "solvers.robust_solves",
     "solvers.robust.gnc",
     "solvers.soc.consensus",

@@ -40,6 +40,7 @@ from solvers import (
     certify,
     run,
     solve,
+    write_report,
 )
 from solvers.convex.extended_soc import ExtendedStep, with_priors
 from solvers.result import Run
@@ -287,7 +288,7 @@ def test_the_bound_of_what_is_no_prior_is_below_all_poses_and_the_note_says_why(
     assert solution.note in str(solution)
     solution.save(tmp_path / "x.json")
     assert json.loads((tmp_path / "x.json").read_text())["objective"] == solution.objective
-    solution.report(tmp_path / "x.html")
+    write_report(solution, tmp_path / "x.html")
     page = (tmp_path / "x.html").read_text()
     assert "ExtendedSOC" in page
     assert solution.note in page

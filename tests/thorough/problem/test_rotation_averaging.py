@@ -378,7 +378,7 @@ def test_what_has_no_rotations_is_refused() -> None:
 
 def test_rotations_have_no_picture(tmp_path: Path) -> None:
     solution = solved(averaging(varied_graph(4, 9, 3)))
-    for draw in (solution.plot, lambda: solution.report(tmp_path / "report.html")):
+    for draw in (solution.plot, lambda: solvers.write_report(solution, tmp_path / "report.html")):
         with pytest.raises(SettingError, match="needs positions"):
             draw()
     assert not list(tmp_path.iterdir())

@@ -15,9 +15,9 @@ from pages import Page, own_part
 import pgo_models as pgo
 import solvers
 from pgo_models import NoiseModel, Weighting
+from solvers.report.fit_plots import explore_fit
+from solvers.report.report import report_page
 from solvers.reporting.edge_fit import EdgeFit, fit_sentence, judge_edges
-from solvers.reporting.fit_plots import explore_fit
-from solvers.reporting.report import report_page
 
 Call = Callable[..., tuple[int, str, str]]
 NOISE = NoiseModel(0.05, 0.05)

@@ -17,9 +17,9 @@ from pgo_models.errors import SettingError
 from pgo_models.figures import rounded_up
 from solvers.carry.ledger import Ledger, Traffic
 from solvers.cli import app as cli
+from solvers.report.report import report_page
+from solvers.report.report_text import advice, headline, meaning
 from solvers.reporting.edge_fit import EdgeFit, fit_sentence, judge_edges
-from solvers.reporting.report import report_page
-from solvers.reporting.report_text import advice, headline, meaning
 
 pytest.importorskip("plotly")
 
@@ -143,12 +143,12 @@ def test_ten_thousand_poses_take_less_than_five_megabytes_beside_the_library(sol
 
 
 def test_a_report_is_written_whole_under_a_pages_name_only(solution, tmp_path):
-    solution.report(tmp_path / "out.html")
+    solvers.write_report(solution, tmp_path / "out.html")
     assert [file.name for file in tmp_path.iterdir()] == ["out.html"]
     with pytest.raises(SettingError, match=r"ends in \.html"):
-        solution.report(tmp_path / "out.pdf")
+        solvers.write_report(solution, tmp_path / "out.pdf")
     with pytest.raises(pgo.PGOError, match="cannot write"):
-        solution.report(tmp_path / "no" / "out.html")
+        solvers.write_report(solution, tmp_path / "no" / "out.html")
 
 
 @pytest.mark.parametrize("package", ["plotly", "jinja2"])

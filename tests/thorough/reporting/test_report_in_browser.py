@@ -34,7 +34,7 @@ def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(
         solved = solvers.solve(pgo.random_geometric(40, np.random.default_rng(0), d=2))
     else:
         solved = request.getfixturevalue(which)
-    solved.report(tmp_path / "out.html")
+    solvers.write_report(solved, tmp_path / "out.html")
     browser.open(tmp_path / "out.html")
     browser.wait_for("document.querySelectorAll('.plot .main-svg').length > 0")
     place = "graph2d" if which == "plane" else "graph3d"
@@ -71,7 +71,7 @@ def test_a_browser_shows_it_without_a_complaint_and_sorts_the_table(
 def test_it_fits_a_phone_and_follows_the_colours_of_the_system(
     width, scheme, browser, solution, tmp_path
 ):
-    solution.report(tmp_path / "out.html")
+    solvers.write_report(solution, tmp_path / "out.html")
     with browser.showing(width, scheme):
         browser.open(tmp_path / "out.html")
         browser.wait_for("document.querySelectorAll('.plot .main-svg').length > 0")
@@ -99,7 +99,7 @@ def test_it_fits_a_phone_and_follows_the_colours_of_the_system(
 
 
 def test_the_page_is_painted_before_the_library_is_parsed(browser, solution, tmp_path):
-    solution.report(tmp_path / "out.html")
+    solvers.write_report(solution, tmp_path / "out.html")
     browser.open(tmp_path / "out.html")
     browser.wait_for(
         "performance.getEntriesByName('library').length"
@@ -115,7 +115,7 @@ def test_the_page_is_painted_before_the_library_is_parsed(browser, solution, tmp
 def test_a_large_graph_is_thinned_and_its_page_can_be_opened(browser, solution, tmp_path):
     graph = pgo.grid_world(1, 44_521, np.random.default_rng(0), d=2)
     bounded = replace(solution, problem=pgo.PGOProblem(graph), all_poses=graph.truth)
-    bounded.report(tmp_path / "out.html")
+    solvers.write_report(bounded, tmp_path / "out.html")
     assert (tmp_path / "out.html").stat().st_size < 15e6
     text = Page(own_part((tmp_path / "out.html").read_text(encoding="utf-8"))).text
     assert "paths through one of 3 poses, one of 3 other edges" in text

@@ -6,22 +6,15 @@ The command line prints some of them, too.
 import math
 import shlex
 from decimal import Decimal
-from typing import Protocol
 
 from pgo_models.certificates.certificate import Certificate, Verdict
 from pgo_models.figures import in_percent, rounded_up
-from pgo_models.geometry.poses import Poses
-from pgo_models.geometry.rotations import Array
 from pgo_models.graphs.datasets import known_datasets
 from pgo_models.graphs.g2o_folder import FILES_HERE
-from pgo_models.graphs.partitioning import Partition
 from pgo_models.graphs.pose_graph import PoseGraph
-from pgo_models.problem.problem import PGOProblem
-from pgo_models.problem.thresholds import EdgeResiduals
 from pgo_models.problem.weighting import Weighting
-from solvers.carry.ledger import Ledger
 from solvers.reporting.edge_fit import Advice, EdgeFit
-from solvers.result import Stage, Status
+from solvers.result import Status
 from solvers.robust.rejection import Rejection, Support
 
 _NEARLY_CLOSED = 1e-4  # relative gap below which the poses count as good as optimal
@@ -44,61 +37,6 @@ _OPTIMAL = (
     "measurements."
 )
 _NEARLY_OPTIMAL = "The gap is nearly closed: the poses are as good as optimal for most purposes."
-
-
-class Solved(Protocol):
-    """What a report reads of a `solvers.Solution`, which has this and more."""
-
-    @property
-    def problem(self) -> PGOProblem:
-        """What was solved."""
-
-    @property
-    def all_poses(self) -> Poses:
-        """Poses of the solution, (n)."""
-
-    @property
-    def certificate(self) -> Certificate:
-        """Cost, lower bound, gap and verdict."""
-
-    @property
-    def status(self) -> Status:
-        """How the last stage ended."""
-
-    @property
-    def stages(self) -> tuple[Stage, ...]:
-        """What every stage did."""
-
-    @property
-    def ledger(self) -> Ledger:
-        """What crossed the network."""
-
-    @property
-    def robots(self) -> Partition | None:
-        """Which robot owned which pose, of a solve by robots."""
-
-    @property
-    def covariances(self) -> Array | None:
-        """Marginals of all poses, (n, p, p), for ellipses."""
-
-    @property
-    def robust(self) -> Rejection | None:
-        """Which edges a robust solve kept."""
-
-    @property
-    def edge_residuals(self) -> EdgeResiduals:
-        """How well every edge fits the poses, in the cost that was solved."""
-
-    @property
-    def fit_text(self) -> str:
-        """How the edges fit in that cost; "" where the verdict or a robust solve says so."""
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether edges fit worse than their weights allow."""
-
-    def before(self) -> tuple[Poses, str]:
-        """Poses before the solve, and what they are."""
 
 
 def headline(certificate: Certificate) -> str:
@@ -255,7 +193,7 @@ def _advice_on_status(status: Status, solve: str) -> Advice:
     if status is Status.NOT_FACTORED:
         return Advice(
             "The weights are too far apart for a run in doubles: set all of them to 1.",
-            f"{solve} --unit-weights",
+            f"{solve} --cost unit",
         )
     return Advice(f"The run did not finish ({status.value}): let it finish.", solve)
 

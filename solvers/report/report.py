@@ -27,12 +27,13 @@ from pgo_models.plots.pages import PAGE_CONFIG
 from pgo_models.plots.style import plotly
 from pgo_models.problem.thresholds import EdgeResiduals
 from solvers.carry.ledger import Ledger
+from solvers.report.fit_plots import explore_fit
+from solvers.report.report_text import advice, advice_in_doubt, headline, meaning
 from solvers.reporting.convergence_plots import explore_convergence
 from solvers.reporting.edge_fit import Advice, EdgeFit, judge_edges
-from solvers.reporting.fit_plots import explore_fit
-from solvers.reporting.report_text import Solved, advice, advice_in_doubt, headline, meaning
 from solvers.reporting.versions import installed_versions
 from solvers.soc.soc import SOC
+from solvers.solution import Solution
 
 # Rows of the tables of edges and of robots: the page of a large graph stays short.
 _WORST_EDGES = 100
@@ -41,7 +42,7 @@ _PAGE_SUFFIXES = (".html", ".htm")
 
 
 def write_report(
-    solution: Solved, path: Path | str, *, source: str | None = None, fit: EdgeFit | None = None
+    solution: Solution, path: Path | str, *, source: str | None = None, fit: EdgeFit | None = None
 ) -> None:
     """Write the report of a solution as one HTML page, whole or not at all.
 
@@ -92,7 +93,9 @@ def check_report(path: Path) -> None:
     extra_module("jinja2", "plot")
 
 
-def report_page(solution: Solved, *, source: str | None = None, fit: EdgeFit | None = None) -> str:
+def report_page(
+    solution: Solution, *, source: str | None = None, fit: EdgeFit | None = None
+) -> str:
     """HTML of the report: `report.html` filled in.
 
     Parameters and errors are those of `write_report`.
@@ -149,7 +152,7 @@ def report_page(solution: Solved, *, source: str | None = None, fit: EdgeFit | N
 
 
 def _plots(
-    solution: Solved, graph: PoseGraph, fit: EdgeFit, stage_names: Sequence[str]
+    solution: Solution, graph: PoseGraph, fit: EdgeFit, stage_names: Sequence[str]
 ) -> dict[str, Any]:
     """Plotly figures of the page, by the name of their element."""
     before, _ = solution.before()
@@ -170,7 +173,7 @@ def _plots(
     return plots
 
 
-def _trajectory_error(solution: Solved, graph: PoseGraph) -> float | None:
+def _trajectory_error(solution: Solution, graph: PoseGraph) -> float | None:
     """Absolute trajectory error; None if the truth is not known."""
     if graph.truth is None:
         return None
@@ -178,7 +181,7 @@ def _trajectory_error(solution: Solved, graph: PoseGraph) -> float | None:
     return absolute_trajectory_error(solution.all_poses[graph.bodies], truth[graph.bodies])
 
 
-def _advice(solution: Solved, graph: PoseGraph, fit: EdgeFit, source: str | None) -> list[Advice]:
+def _advice(solution: Solution, graph: PoseGraph, fit: EdgeFit, source: str | None) -> list[Advice]:
     if any(stage.name == "ExtendedSOC" for stage in solution.stages):
         return []  # commands would solve the graph without the user's own terms
     robust = solution.robust
@@ -212,7 +215,7 @@ class _Table:
     alarms: Collection[int] = ()
 
 
-def _partition(solution: Solved) -> Partition:
+def _partition(solution: Solution) -> Partition:
     """Robots that solved the problem, or else those that the graph names."""
     if solution.robots is not None:
         return solution.robots
@@ -222,7 +225,7 @@ def _partition(solution: Solved) -> Partition:
     return Partition(solution.problem.graph.robots, PartitionMethod.GIVEN)
 
 
-def _robots(solution: Solved, robots: Partition) -> _Table:
+def _robots(solution: Solution, robots: Partition) -> _Table:
     """Table of the robots: poses, edges, communication, and share of the cost."""
     graph = solution.problem.graph
     num_robots = robots.num_robots
@@ -252,7 +255,7 @@ def _robots(solution: Solved, robots: Partition) -> _Table:
     return _Table("robots", sentences, [*columns, f"share of {cost}"], rows)
 
 
-def _share_of_robots(solution: Solved, robots: Partition) -> Array:
+def _share_of_robots(solution: Solution, robots: Partition) -> Array:
     """Share of every robot in the cost, (num_robots,); an edge counts half at either end."""
     graph = solution.problem.graph
     half = 0.5 * solution.edge_residuals.share
@@ -293,7 +296,7 @@ def _communication(ledger: Ledger) -> list[str]:
     return sentences
 
 
-def _worst_edges(solution: Solved, robots: Partition, fit: EdgeFit) -> _Table:
+def _worst_edges(solution: Solution, robots: Partition, fit: EdgeFit) -> _Table:
     """Table of the edges that cost most, with their errors and weights."""
     graph = solution.problem.graph
     names = pose_names(graph)
@@ -359,7 +362,7 @@ def _median_errors(graph: PoseGraph, residuals: EdgeResiduals) -> str:
     return " and ".join(medians)
 
 
-def _stages(solution: Solved, names: Sequence[str]) -> _Table:
+def _stages(solution: Solution, names: Sequence[str]) -> _Table:
     """Table of the stages and how they ended."""
     rows = []
     for name, stage in zip(names, solution.stages, strict=True):
@@ -375,7 +378,7 @@ def _stages(solution: Solved, names: Sequence[str]) -> _Table:
     return _Table("stages", [], heads, rows)
 
 
-def _settings(solution: Solved, names: Sequence[str]) -> list[tuple[str, list[tuple[str, str]]]]:
+def _settings(solution: Solution, names: Sequence[str]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Settings of the solve and of every method: a title, then names and values.
 
     A method with the settings of an earlier stage is left out.
@@ -394,7 +397,7 @@ def _settings(solution: Solved, names: Sequence[str]) -> list[tuple[str, list[tu
     return parts
 
 
-def _stage_names(solution: Solved) -> list[str]:
+def _stage_names(solution: Solution) -> list[str]:
     """Names of the stages, with the number of a later attempt; repeated names are numbered."""
     count: Counter[str] = Counter()
     names = []
