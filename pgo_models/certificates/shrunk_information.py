@@ -16,7 +16,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from pgo_models.errors import GraphError
 from pgo_models.geometry.rotations import Array, BoolArray
 from pgo_models.graphs.pose_graph import IntArray, PoseGraph, edge_counts, least_tree
 from pgo_models.graphs.precisions import (
@@ -31,7 +30,6 @@ from pgo_models.problem.weighting import least_rotation_part
 
 _SHOWN = 2.0**-45  # smallest eigenvalue of a matrix with ones on its diagonal that is not rounding
 _SHARE_ROUNDING = 2.0**-20  # taken off the share that the coupling leaves, as it is rounded
-_HALVINGS = 60  # of a share that rounding makes too large; the matrix is then about zero
 # of the trace: above the rounding of a block, so that I' is below I all the same
 _MARGIN = 2.0**-40
 
@@ -42,10 +40,9 @@ def shrink_information(graph: PoseGraph, cap: float) -> PoseGraph:
     The condition of their I_tt is at most `cap`, and their W is convex.
 
     Coupling blocks are removed first. With C = I_tt^-1/2 I_tr I_rr^-1/2 the rest keeps the share
-    1 - ||C||, since I >= (1 - ||C||) blockdiag(I_tt, I_rr). Rounding may ask for a smaller share.
-    An edge whose coupled matrix is only semidefinite has a share of zero. Such an edge costs zero
-    or more, and is removed; so is a singular block. A GraphError is raised if rounding hides the
-    inequality for every share, or if no edge is left.
+    1 - ||C||, since I >= (1 - ||C||) blockdiag(I_tt, I_rr). An edge whose coupled matrix is only
+    semidefinite, or whose inequality rounding hides, costs zero or more, and is removed; so is a
+    singular block. A GraphError is raised if no edge is left.
     """
     whole = without_singular_blocks(proper_information(graph), graph.d)
     return _without_empty_edges(graph, _smaller_information(whole, graph.d, cap))
@@ -133,19 +130,13 @@ def _smaller_information(information: Array, d: int, cap: float) -> Array:
 
     coupled_share = uncoupled_share(information, d) - _SHARE_ROUNDING
     share = np.where(is_coupled, np.maximum(coupled_share, 0.0), 1.0)
-    is_below = ~is_coupled | is_empty
-    for _ in range(_HALVINGS):
-        shares = share[:, None, None]
-        smaller = np.zeros_like(information)
-        smaller[:, :d, :d] = _clipped(shares * I_tt, largest_of_tt)
-        smaller[:, d:, d:] = _clipped(shares * I_rr, largest_of_rr)
-        is_below = is_below | are_definite(information - smaller, _SHOWN)
-        if is_below.all():
-            smaller[is_empty] = 0.0
-            return smaller
-        # Rounding hides that the others are below; half of them is tried.
-        share = np.where(is_below, share, 0.5 * share)
-    raise GraphError("rounding hides that smaller information matrices are below the graph's own")
+    shares = share[:, None, None]
+    smaller = np.zeros_like(information)
+    smaller[:, :d, :d] = _clipped(shares * I_tt, largest_of_tt)
+    smaller[:, d:, d:] = _clipped(shares * I_rr, largest_of_rr)
+    is_below = ~is_coupled | are_definite(information - smaller, _SHOWN)
+    smaller[is_empty | ~is_below] = 0.0
+    return smaller
 
 
 def without_singular_blocks(information: Array, d: int) -> Array:
