@@ -158,18 +158,24 @@ class Solution:
         """How the edges fit in the cost solved; "" where the verdict or a robust solve says so."""
         if self.robust is not None or self.certificate.fit.is_exact:
             return ""
-        return fit_row(self.edge_residuals)
+        return fit_row(self.edge_residuals, self._has_ended)
 
     @property
     def is_doubtful(self) -> bool:
         """Whether edges fit worse than their weights allow, one by one or together.
 
+        A solve that a limit has broken off says it of no edges, unless its answer is certified.
         Of a robust solve, whether nothing supports the edges kept, or something speaks against
         them. The certificate does not ask: it is on the cost of the measurements as they are.
         """
         if self.robust is not None:
             return self.robust.support is not Support.CHECKED
-        return self.edge_residuals.is_doubtful
+        return self._has_ended and self.edge_residuals.is_doubtful
+
+    @property
+    def _has_ended(self) -> bool:
+        """Whether the solve reached its end: before, poses that cost more say nothing of edges."""
+        return self.status.is_success or self.is_certified
 
     def before(self) -> tuple[Poses, str]:
         """Return poses before the solve and their name: the graph's own, or a spanning tree's."""

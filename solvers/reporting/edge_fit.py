@@ -171,15 +171,18 @@ def _count_of_misfits(residuals: EdgeResiduals) -> str:
     return f"{subject} worse than its information matrix allows"
 
 
-def fit_row(residuals: EdgeResiduals) -> str:
+def fit_row(residuals: EdgeResiduals, has_ended: bool) -> str:
     """Return how the cost compares with what the information matrices lead one to expect.
 
     It stands under the verdict: a certificate says that no other poses are better, and not that the
-    measurements agree. Empty where there is no redundancy, and thus nothing to compare.
+    measurements agree. Empty where there is no redundancy, and thus nothing to compare. Of a solve
+    that has not ended it is the ratio alone, as better poses fit better.
     """
     if residuals.overall == 0.0:
         return ""
     ratio = f"{residuals.overall:.3g} times what is expected"
+    if not has_ended:
+        return f"{ratio}, at poses that the solve has not finished"
     reasons = []
     if residuals.is_overall_misfit:
         reasons.append(f"chance allows {residuals.overall_allowed:.3g}")

@@ -71,3 +71,14 @@ def test_doctor_proposes_a_robust_solve_where_no_reading_fits(with_wrong_edge, p
     code, out, _ = pgo_command("doctor", with_wrong_edge)
     assert code == 0
     assert f"pgo solve {with_wrong_edge} --robust gnc" in " ".join(out.replace("\\", "").split())
+
+
+def test_poses_that_a_limit_has_left_unfinished_are_no_reason_to_doubt_edges() -> None:
+    graph = pgo.grid_world(1, 200, 0, d=2)
+    odometry = pgo.odometry_start(graph)
+    solution = solvers.solve(graph, start=odometry, time_limit=1e-9)
+    assert solution.status is solvers.Status.TIME_LIMIT
+    assert solution.edge_residuals.is_doubtful
+    assert not solution.is_doubtful
+    assert "DOUBTFUL" not in str(solution) + repr(solution)
+    assert rows_of(str(solution))["fit"].endswith("at poses that the solve has not finished")
