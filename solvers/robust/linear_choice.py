@@ -12,7 +12,8 @@ with g half the gradient of the edges that stay. At stationary poses of these an
 g = -sum over the kept of A_e^T C_e^-1 r_e. With c^2 the threshold of the truncated cost, the set of
 the least F(S) + sum of c^2 over the others is looked for by tabu search (Glover, "Tabu search, part
 I", ORSA Journal on Computing 1989): in every step the best change of one closure is made, even if
-it raises the cost, and that closure stays as it is for some steps.
+it raises the cost, and that closure stays as it is for some steps, whose number varies (Taillard,
+"Robust taboo search for the quadratic assignment problem", Parallel Computing 1991).
 """
 
 from __future__ import annotations
@@ -107,7 +108,8 @@ class LinearChoice:
                 break
             e = int(np.where(is_allowed, changes, np.inf).argmin())
             current.change(e)
-            free_at[e] = step + 1 + max(1, min(_TENURE, k // 4))
+            # One step more now and then, so that no cycle of changes comes round again and again.
+            free_at[e] = step + 1 + max(1, min(_TENURE, k // 4)) + (step % 3 == 0)
         return np.flatnonzero(best)
 
     def choose(self, chosen: IntArray) -> SweptChoice:
