@@ -109,6 +109,7 @@ class Beside:
             return
         self._pid = os.getpid()
         self._thread = None
+        self._talks = []  # those of the process that was forked
         begun, self._in_thread = self._in_thread, []
         for run, future in begun:
             if not future.done():

@@ -82,7 +82,6 @@ class SharedMap:
         self._keep_theirs: set[str] = set()
         self._solver = SolverBeside(member.settings, session.beside)
         self._changed_at: float | None = None
-        self._began_at = 0.0
         self._took = 0.0  # seconds of the last solve
         self._problems: tuple[str, ...] = ()
 
@@ -302,7 +301,8 @@ class SharedMap:
                 priority = Priority.HELLO if piece is None else Priority.NORMAL
                 pieces = () if piece is None else (piece,)
                 self._session.send(name, self._news(name, pieces), priority)
-        if self._solver.tell(self.logs, self._end):
+        is_new = self._solver.has_not_tried(self.revisions)
+        if is_new and self._solver.tell(self.logs, self._end):
             self._solve_if_due()
 
     def _piece_for(self, to: str, awake: tuple[str, ...], may_pack: bool) -> Piece | None:
@@ -405,7 +405,7 @@ class SharedMap:
         """
         revisions = self.revisions
         solver = self._solver
-        if solver.is_solving or self.name not in revisions or revisions == solver.tried:
+        if solver.is_solving or self.name not in revisions:
             return
         if self._changed_at is None:
             self._changed_at = self._session.now
@@ -418,12 +418,10 @@ class SharedMap:
             return
         if is_here or is_waited_for:
             self._changed_at = None
-            self._began_at = self._session.now
             solver.solve(revisions)
 
     def _end(self, answer: SharedAnswer | PGOError) -> None:
         revisions = self._solver.tried
-        self._took = self._session.now - self._began_at
         self.term = Term(self.term.number + 1, self.name)
         if isinstance(answer, PGOError):
             self._problems = ()
@@ -436,6 +434,7 @@ class SharedMap:
         self._member.outcome = self.last
         self._member.known = answer.own
         self._member.solution = answer.solution
+        self._took = answer.found.seconds
 
 
 def _lines_of(piece: Piece, log: Measurements) -> list[str]:

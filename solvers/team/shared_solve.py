@@ -70,12 +70,15 @@ class TeamSettings:
     def solve_each(self, line: Line) -> None:
         """Solve each time that robots are told, of their lines that were told before.
 
-        Messages are `NewLines`, or names of robots, which the answer is for.
+        Messages are `BeginsAt`, `NewLines`, or names of robots, which the answer is for.
         """
         lines: dict[str, list[str]] = {}
         before: bytes | None = None
         while True:
-            message: NewLines | tuple[str, ...] = line.wait()
+            message: BeginsAt | NewLines | tuple[str, ...] = line.wait()
+            if isinstance(message, BeginsAt):
+                before = message.solution
+                continue
             if isinstance(message, NewLines):
                 lines.setdefault(message.owner, [])[message.num_before :] = message.lines
                 continue
@@ -159,6 +162,12 @@ class TeamSettings:
         )
 
 
+class BeginsAt(NamedTuple):
+    """The solution that the next solve begins at, as bytes; None where there is none yet."""
+
+    solution: bytes | None
+
+
 class NewLines(NamedTuple):
     """Lines that come after the first ones of a robot, in place of those that were there."""
 
@@ -178,6 +187,7 @@ class SolverBeside:
         self.tried: Mapping[str, Revision] = {}
         self._settings = settings
         self._beside = beside
+        self._last: bytes | None = None  # the last solution, which another process begins at
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -192,6 +202,13 @@ class SolverBeside:
         without = {"is_solving": False, "tried": tried, "_talk": None, "_has": {}}
         return {**self.__dict__, **without}
 
+    def has_not_tried(self, revisions: Mapping[str, Revision]) -> bool:
+        """Whether no solve has begun with these; a fork begins that of its parent anew."""
+        if self._pid != os.getpid():
+            self.__dict__.update(self.__getstate__())
+            self._begin_anew()
+        return revisions != self.tried
+
     def tell(
         self, logs: Mapping[str, Measurements], end: Callable[[SharedAnswer | PGOError], None]
     ) -> bool:
@@ -199,11 +216,6 @@ class SolverBeside:
 
         What is solved with them ends with `end`.
         """
-        if self._pid != os.getpid():
-            self.__dict__.update(self.__getstate__())
-            self._begin_anew()
-        if self._talk is not None and self._talk.is_over:
-            self._begin_anew()
         num_left = _MOST_TOLD
         for name, log in logs.items():
             known = self._has.get(name, Revision())
@@ -222,12 +234,23 @@ class SolverBeside:
         """The computation, which is begun where there is none."""
         if self._talk is None:
 
-            def hear(answer: SharedAnswer | PGOError) -> None:
-                if self.is_solving:
-                    self.is_solving = False
-                    end(answer)
+            def take(answer: SharedAnswer | PGOError) -> None:
+                if self._talk is not talk or not self.is_solving:
+                    return
+                self.is_solving = False
+                if isinstance(answer, SharedAnswer):
+                    self._last = answer.solution
+                end(answer)
 
-            self._talk = self._beside.begin(self._settings.solve_each, hear, _FAILURE, hear)
+            def lose(error: PGOError) -> None:
+                """The process has ended; what it had is told to the next one."""
+                take(error)
+                if self._talk is talk:
+                    self._begin_anew()
+
+            talk = self._beside.begin(self._settings.solve_each, lose, _FAILURE, take)
+            self._talk = talk
+            talk.tell(BeginsAt(self._last))
         return self._talk
 
     def solve(self, revisions: Mapping[str, Revision]) -> None:

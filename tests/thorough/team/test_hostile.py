@@ -223,6 +223,37 @@ def test_lines_are_told_again_where_the_process_that_has_them_ends() -> None:
     assert len(robot.poses) == before + 1
 
 
+@pytest.mark.parametrize("is_solving", [True, False])
+def test_a_process_that_ends_is_told_once_what_it_had(is_solving: bool) -> None:
+    """Its end is heard before or after the robot is told that it has ended."""
+    robot = robot_that_solves()
+    if not is_solving:
+        solve_alone(robot)
+    OTHER_PROCESS.close()
+    robot.add_pose(1000)
+    robot.add_edge(0, 1000, np.eye(2), np.ones(2), kappa=1.0, tau=1.0)
+    deadline = time.monotonic() + 60
+    while 1000 not in robot.poses and time.monotonic() < deadline:
+        robot.tick(1e3)
+        time.sleep(1e-3)
+    assert robot.is_certified
+    assert 1000 in robot.poses
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_fork_solves_what_its_robot_was_solving() -> None:
+    robot = robot_that_solves()
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(60)
+        solve_alone(robot)
+        os._exit(not (robot.is_certified and not robot.is_computing))
+    assert os.waitpid(pid, 0)[1] == 0
+    solve_alone(robot)
+    assert robot.is_certified
+
+
 def robot_that_writes() -> solvers.Robot:
     """A robot that is settled but for a long message to another one, which it begins to write."""
     robots = robots_of(world(n=10), 3)
