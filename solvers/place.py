@@ -66,6 +66,7 @@ class Step(enum.Enum):
     AGAIN = "complete solve"
     GROWING = "growing start"
     STARTS = "other starts"
+    LAST_STEPS = "last steps of Newton"
     STAIRCASE = "Staircase"
     SMALLER_MATRICES = "smaller matrices"
     COMPLEX = "ComplexRelaxation"

@@ -12,11 +12,12 @@ of the steps, and what happens when one of them is interrupted, out of time, or 
 3. Newton, down to rounding level.
 4. The certificate of the poses. Steps 1 to 4 are an attempt.
 5. Another attempt, from a start that grows: prefixes of the graph, each solved from the one before.
-   On graphs with landmarks Newton of the first attempt has few steps, as this attempt may follow,
-   and after it one from the chordal relaxation.
+   On graphs with landmarks Newton of the first attempt has few steps from the place's own start, as
+   this attempt may follow, and after it one from the chordal relaxation.
 6. Newton from other starts: the estimate of the file, a spanning tree, the chordal relaxation or,
    where the cost is another, the optimum of F, and on small graphs random poses. The table of
-   stages says which of them is the best.
+   stages says which of them is the best. If it is the first attempt's, whose Newton had few steps,
+   Newton goes on from there.
 7. A relaxation of the cost: poses that its solution rounds to, and its bound. In the plane it has
    rotations as complex numbers, and is never worse than the semidefinite one, which the staircase
    solves. For chi2, bounds by smaller information matrices, whose cost is below chi2.
@@ -75,6 +76,8 @@ def solve_at(place: Place, settings: Pipeline, start: Poses | None) -> Attempt:
         return first
     best = improved(Step.GROWING, from_growing_start, place, settings, first)  # step 5
     best = improved(Step.STARTS, from_other_starts, place, settings, best)  # step 6
+    if newton != settings.newton and best.status is Status.MAX_ITERATIONS:
+        best = unless_it_fails(Step.LAST_STEPS, with_last_steps, place, settings, best)
     best = by_relaxation(place, settings, best)  # step 7
     return by_handedness(place, settings, best)  # step 8
 
@@ -202,6 +205,11 @@ def from_growing_start(place: Place, settings: Pipeline, best: Attempt) -> Attem
 def from_other_starts(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
     """Step 6: the better of the answer and an attempt from the best of some other starts."""
     return place.try_other_starts(best, settings.newton)
+
+
+def with_last_steps(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
+    """Newton from the best poses to its end, where that of the first attempt was cut short."""
+    return place.better(best, attempt(place, None, settings.newton, best.known_poses))
 
 
 def by_relaxation(place: Place, settings: Pipeline, best: Attempt) -> Attempt:
