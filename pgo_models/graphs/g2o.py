@@ -194,11 +194,28 @@ def graph_of_robots(
     if num_copies:
         message = f"{printable(str(path))}: {copies_within_printing(num_copies)}"
         warnings.warn(message, GraphWarning, stacklevel=3)
+    for file in [] if trust_folder else _without_own_poses(files):
+        message = (
+            f"{printable(str(file.path))}: all its poses are in files before it; a file of the "
+            f"whole graph is left out if it is named {_WHOLE_GRAPH}"
+        )
+        warnings.warn(message, GraphWarning, stacklevel=3)
     absent = absent_ids(files) if is_folder else np.zeros(0, dtype=np.int64)
     if not len(absent):
         return graph
     name = f"{graph.name}, {FILES_HERE}"
     return replace(graph, absent=np.searchsorted(graph.pose_ids, absent), name=name)
+
+
+def _without_own_poses(files: list[G2OLines]) -> list[G2OLines]:
+    """Files with VERTEX lines, all of which are of poses that files before them have."""
+    without = []
+    seen = np.zeros(0, dtype=np.int64)
+    for file in files:
+        if len(file.vertex_ids) and np.isin(file.vertex_ids, seen).all():
+            without.append(file)
+        seen = np.union1d(seen, file.vertex_ids)
+    return without
 
 
 def graph_of_files(

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -230,6 +231,25 @@ def test_the_whole_graph_beside_the_robots_is_said_and_left_out(
     np.testing.assert_array_equal(found.pose_ids, expected.pose_ids)
     np.testing.assert_array_equal(found.robots, expected.robots)
     assert_same_measurements(found, expected)
+
+
+@pytest.mark.parametrize(("name", "without_own"), [("all", "robot0"), ("whole", "whole")])
+def test_the_whole_graph_under_another_name_is_warned_of(
+    tmp_path: Path, name: str, without_own: str
+) -> None:
+    robots = np.arange(12) // 4
+    graph = dataclasses.replace(random_graph(3, 12, 2), robot=robots)
+    folder = tmp_path / "folder"
+    write_g2o_folder(graph, folder)
+    for k in range(3):
+        (folder / f"{k}.g2o").rename(folder / f"robot{k}.g2o")
+    expected = read_g2o(folder)
+    write_g2o(graph, folder / f"{name}.g2o")
+    message = rf"{without_own}\.g2o: all its poses are in files before it; .* fullGraph\.g2o"
+    with pytest.warns(GraphWarning) as caught:
+        found = read_g2o(folder)
+    assert any(re.search(message, str(warning.message)) for warning in caught)
+    assert found.num_edges == expected.num_edges  # each counts once
 
 
 def test_robots_that_all_measure_the_same_step_keep_their_edges(tmp_path: Path) -> None:
