@@ -158,7 +158,7 @@ class Solution:
         """How the edges fit in the cost solved; "" where the verdict or a robust solve says so."""
         if self.robust is not None or self.certificate.fit.is_exact:
             return ""
-        return fit_row(self.edge_residuals, self._has_ended)
+        return fit_row(self.edge_residuals, self.has_ended)
 
     @property
     def is_doubtful(self) -> bool:
@@ -170,10 +170,10 @@ class Solution:
         """
         if self.robust is not None:
             return self.robust.support is not Support.CHECKED
-        return self._has_ended and self.edge_residuals.is_doubtful
+        return self.has_ended and self.edge_residuals.is_doubtful
 
     @property
-    def _has_ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether the solve reached its end: before, poses that cost more say nothing of edges."""
         return self.status.is_success or self.is_certified
 

@@ -205,7 +205,8 @@ def _problems_of_missing_matrices(source: Source) -> list[Problem]:
             num_lines = sum(len(part.lines) for part in parts)
             problem = (
                 f"no information matrix on {num_lines} {tag} lines, the first of them here; choose "
-                "the weights: --cost unit or --unit-weights (unit_weights=True) takes those of the "
+                "the weights: --cost unit of solve and certify, --unit-weights of other commands "
+                "and unit_weights=True take those of the "
                 "paper, and --estimate-noise finds them from the measurements"
             )
             problems.append((int(parts[0].lines[0]), problem))

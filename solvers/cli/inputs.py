@@ -54,7 +54,7 @@ class GraphOptions:
         asked = self._asked
         if self.estimate_noise and self.cost is Cost.UNIT:
             raise SettingError(
-                "--estimate-noise and --cost ask for different weights; leave out one"
+                "--estimate-noise and --cost unit ask for different weights; leave out one"
             )
         if len(set(asked.values())) > 1:
             first, second = list(asked)[:2]

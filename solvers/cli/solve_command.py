@@ -679,6 +679,8 @@ def _save_and_show(
 
     def show() -> None:
         typer.echo(wrapped(_text_with_error(solution), _INDENT))
+        if not solution.has_ended:  # its status says what to do
+            return
         is_robust = stages.robust is not None
         if not is_robust:
             meant = reading_that_is_meant(judged(), source)

@@ -141,7 +141,7 @@ def advice(
                 for piece in suggestions
                 if "--robust gnc" not in piece.command.removeprefix(solve)
             ]
-    if not is_robust:
+    if not is_robust and (status.is_success or certificate.is_certified):
         suggestions += fit.advice_on_edges(solve)
     if certificate.is_certified and not fit.advice(solve, is_robust):
         text = f"{fit.sentence()} If the map still looks wrong, suspect the weights."

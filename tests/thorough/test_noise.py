@@ -113,7 +113,7 @@ def test_the_command_solves_with_the_noise_and_says_it(tmp_path: Path, pgo_comma
     assert overall == pytest.approx(1.0, abs=2e-3)
     code, _, err = pgo_command("solve", bare, "--estimate-noise", "--cost", "unit")
     assert code == 1
-    assert "--estimate-noise and --cost ask for different weights; leave out one" in err
+    assert "--estimate-noise and --cost unit ask for different weights; leave out one" in err
 
 
 def test_noise_of_a_problem_is_that_of_its_graph() -> None:
