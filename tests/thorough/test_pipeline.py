@@ -381,3 +381,15 @@ def test_weights_too_far_apart_for_doubles_end_in_a_solution(robots, d, seed):
     assert solution.objective == problem.objective(solution.poses)
     assert solution.objective <= 1e18  # of poses, not of what overflowed
     assert solution.lower_bound <= solution.objective
+
+
+@pytest.mark.parametrize("seed", [141, 181])
+def test_newton_of_a_graph_with_landmarks_goes_on_to_its_end(seed: int) -> None:
+    """The first attempt's has few steps, and no other attempt follows where they close the gap."""
+    rng = np.random.default_rng(seed)
+    num_poses = int(rng.integers(20, 55))
+    spread = float(rng.choice([0.5, 1.5, 4.0]))
+    noise = pgo.NoiseModel(spread, float(rng.choice([0.3, 0.8, 2.0])))
+    graph = pgo.victoria_park(rng, num_poses=num_poses, noise=noise)
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+    assert solvers.solve(problem).status is solvers.Status.CONVERGED
