@@ -99,17 +99,14 @@ class Pipeline:
         soc = self.soc
         return isinstance(soc, SOC) and soc.effective_coupling is Coupling.CONSENSUS
 
+    @property
+    def of_first_attempt(self) -> Pipeline:
+        """The pipeline whose first attempt is the last: without steps 5 to 8."""
+        return replace(self, growing=None, other_starts=False, staircase=None, handedness=None)
+
     def with_newton_alone(self, newton: Newton) -> Pipeline:
         """The pipeline of a start, Newton and its certificate alone, to the same gap."""
-        return replace(
-            self,
-            soc=None,
-            newton=newton,
-            growing=None,
-            other_starts=False,
-            staircase=None,
-            handedness=None,
-        )
+        return replace(self.of_first_attempt, soc=None, newton=newton)
 
     def asks_for(self, step: Step) -> bool:
         """Whether there are settings for a step that may improve the answer.

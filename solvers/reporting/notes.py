@@ -72,6 +72,16 @@ def note_of_absence(num_absent: int) -> str:
     )
 
 
+def note_of_first_attempt(is_open: bool) -> str:
+    """Say that a robot has not searched for more, as it soon will; "" where the bound is tight."""
+    if not is_open:
+        return ""
+    return (
+        "it is of a first attempt alone, as measurements of others are still on their way: once "
+        "they have come, the robot searches for better poses and a better bound"
+    )
+
+
 def note_of_poses_apart(num_apart: int) -> str:
     """Say how many poses a solution of robots is without; "" where it has all."""
     if num_apart == 0:

@@ -134,7 +134,8 @@ class SharedMap:
         revisions = self.revisions
         oldest = self._session.now - _FORGOTTEN * self._session.patience
         waited_for = [said for said in self._said.values() if said.when >= oldest]
-        return revisions == self._solver.tried and all(said.has == revisions for said in waited_for)
+        is_tried = not self._solver.has_not_tried(revisions)
+        return is_tried and all(said.has == revisions for said in waited_for)
 
     # Lines
 
@@ -401,7 +402,8 @@ class SharedMap:
         """Solve where lines are new, once those that others have announced are there.
 
         A robot waits for these for as long as it waits for a robot, at first, and later for as long
-        as a message takes to be sent again, or as the last solve took.
+        as a message takes to be sent again, or as the last solve took. While lines are missing it
+        makes a first attempt alone: a search for more would be for a map that is soon replaced.
         """
         revisions = self.revisions
         solver = self._solver
@@ -418,7 +420,7 @@ class SharedMap:
             return
         if is_here or is_waited_for:
             self._changed_at = None
-            solver.solve(revisions)
+            solver.solve(revisions, in_full=is_here)
 
     def _end(self, answer: SharedAnswer | PGOError) -> None:
         revisions = self._solver.tried

@@ -28,7 +28,7 @@ from solvers.carry.ledger import Ledger
 from solvers.growing import extend
 from solvers.loop import RunMonitor
 from solvers.pipeline import solution_for
-from solvers.reporting.notes import joined_notes, note_of_poses_apart
+from solvers.reporting.notes import joined_notes, note_of_first_attempt, note_of_poses_apart
 from solvers.request import Pipeline, SolveRequest
 from solvers.robots_solution import RobotsSolution
 from solvers.robust.consistency import PCM
@@ -70,29 +70,32 @@ class TeamSettings:
     def solve_each(self, line: Line) -> None:
         """Solve each time that robots are told, of their lines that were told before.
 
-        Messages are `BeginsAt`, `NewLines`, or names of robots, which the answer is for.
+        Messages are `BeginsAt`, `NewLines`, or `SolveNow`, which has an answer.
         """
         lines: dict[str, list[str]] = {}
         before: bytes | None = None
         while True:
-            message: BeginsAt | NewLines | tuple[str, ...] = line.wait()
+            message: BeginsAt | NewLines | SolveNow = line.wait()
             if isinstance(message, BeginsAt):
                 before = message.solution
                 continue
             if isinstance(message, NewLines):
                 lines.setdefault(message.owner, [])[message.num_before :] = message.lines
                 continue
-            lines_of_these = {name: lines[name] for name in message}
-            answer = result_or_error(partial(self.solved, lines_of_these, before), _FAILURE)
+            of_these = {name: lines[name] for name in message.names}
+            solve = partial(self.solved, of_these, before, message.in_full)
+            answer = result_or_error(solve, _FAILURE)
             if isinstance(answer, SharedAnswer):
                 before = answer.solution
             line.tell(answer)
 
-    def solved(self, lines: Mapping[str, list[str]], before: bytes | None) -> SharedAnswer:
+    def solved(
+        self, lines: Mapping[str, list[str]], before: bytes | None, in_full: bool
+    ) -> SharedAnswer:
         """The solution of the part that the robot is in, of the lines that each robot has measured.
 
         What cannot be read, or does not fit to the robot's own, is left out. A PGOError where it
-        cannot solve its own.
+        cannot solve its own. Unless it is solved in full, the first attempt is the last.
         """
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", GraphWarning)
@@ -104,7 +107,8 @@ class TeamSettings:
             graph, misfits = self._graph(files)
         problems += [f"what {name} has measured does not fit: {misfits[name]}" for name in misfits]
         part = _part_of(graph, files[self.name])
-        solution = self._solution(part, None if before is None else pickle.loads(before))
+        pipeline = self.pipeline if in_full else self.pipeline.of_first_attempt
+        solution = self._solution(part, pipeline, None if before is None else pickle.loads(before))
         fitting = [name for name in files if name not in misfits]
         covered = [name for name in fitting if _has_poses_of(part, files[name])]
         is_own = np.isin(part.pose_ids, files[self.name].vertex_ids)
@@ -121,7 +125,9 @@ class TeamSettings:
         found = RobotsSolution.of(solution, Ledger(len(covered)), sizes).without_histories
         of_files = dict.fromkeys(str(warning.message) for warning in caught)
         num_apart_of_all = sum(num_apart.values())
-        note = joined_notes(note_of_poses_apart(num_apart_of_all), *of_files, found.note)
+        is_open = not (in_full or solution.is_certified)
+        notes = [note_of_poses_apart(num_apart_of_all), note_of_first_attempt(is_open)]
+        note = joined_notes(*notes, *of_files, found.note)
         found = replace(found, num_apart=num_apart_of_all, note=note)
         return SharedAnswer(found, pickle.dumps(solution), own, tuple(covered), tuple(problems))
 
@@ -148,18 +154,16 @@ class TeamSettings:
         path = Path("team")
         return graph_of_robots(path, files, is_folder=True, trust_folder=self.trust_folder)
 
-    def _solution(self, graph: PoseGraph, before: Solution | None) -> Solution:
+    def _solution(self, graph: PoseGraph, pipeline: Pipeline, before: Solution | None) -> Solution:
         """The solution from the map before, or where that is no part of it, from none."""
         if before is not None:
             try:
-                return extend(before, graph, self.pipeline, robust=self.robust)
+                return extend(before, graph, pipeline, robust=self.robust)
             except GraphError:
                 pass
         problem = PGOProblem(graph, weighting=self.weighting)
         monitor = RunMonitor(progress=False)
-        return solution_for(
-            SolveRequest(problem, self.pipeline, robust=self.robust, monitor=monitor)
-        )
+        return solution_for(SolveRequest(problem, pipeline, robust=self.robust, monitor=monitor))
 
 
 class BeginsAt(NamedTuple):
@@ -176,15 +180,24 @@ class NewLines(NamedTuple):
     lines: list[str]
 
 
+class SolveNow(NamedTuple):
+    """Solve for robots, with the lines that they have: in full, or by a first attempt alone."""
+
+    names: tuple[str, ...]
+    in_full: bool
+
+
 class SolverBeside:
     """What solves beside a robot: the computation in the other process that has its lines.
 
-    `tried` are the revisions that the last solve began with.
+    `tried` are the revisions that the last solve began with. It may have been a first attempt
+    alone, whose bound is not tight: these are solved again, in full, where nothing new has come.
     """
 
     def __init__(self, settings: TeamSettings, beside: Beside) -> None:
         self.is_solving = False
         self.tried: Mapping[str, Revision] = {}
+        self._may_find_more = False
         self._settings = settings
         self._beside = beside
         self._last: bytes | None = None  # the last solution, which another process begins at
@@ -203,11 +216,14 @@ class SolverBeside:
         return {**self.__dict__, **without}
 
     def has_not_tried(self, revisions: Mapping[str, Revision]) -> bool:
-        """Whether no solve has begun with these; a fork begins that of its parent anew."""
+        """Whether no solve in full has begun with these, and none was certified.
+
+        A fork begins the solve of its parent anew.
+        """
         if self._pid != os.getpid():
             self.__dict__.update(self.__getstate__())
             self._begin_anew()
-        return revisions != self.tried
+        return revisions != self.tried or self._may_find_more
 
     def tell(
         self, logs: Mapping[str, Measurements], end: Callable[[SharedAnswer | PGOError], None]
@@ -240,6 +256,7 @@ class SolverBeside:
                 self.is_solving = False
                 if isinstance(answer, SharedAnswer):
                     self._last = answer.solution
+                    self._may_find_more &= not answer.found.is_certified
                 end(answer)
 
             def lose(error: PGOError) -> None:
@@ -253,12 +270,17 @@ class SolverBeside:
             talk.tell(BeginsAt(self._last))
         return self._talk
 
-    def solve(self, revisions: Mapping[str, Revision]) -> None:
-        """Solve for robots whose lines it has all."""
+    def solve(self, revisions: Mapping[str, Revision], in_full: bool) -> None:
+        """Solve for robots whose lines it has all.
+
+        Which edges are wrong is not decided by halves: a robust solve is always in full.
+        """
         assert self._talk is not None
+        in_full = in_full or self._settings.robust is not None or revisions == self.tried
         self.tried = revisions
         self.is_solving = True
-        self._talk.tell(tuple(revisions))
+        self._may_find_more = not in_full
+        self._talk.tell(SolveNow(tuple(revisions), in_full))
 
 
 def _files_of(lines: Mapping[str, list[str]]) -> tuple[dict[str, G2OLines], list[str]]:

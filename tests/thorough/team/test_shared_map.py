@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -383,3 +384,30 @@ def test_robots_that_share_differently_say_so() -> None:
     network.wait(10.0)
     assert "r1 shares its interface alone" in robots["r0"].problems[0]
     assert "r0 shares its measurements" in robots["r1"].problems[0]
+
+
+def test_while_lines_are_on_their_way_a_robot_makes_a_first_attempt_and_then_searches() -> None:
+    noise = pgo.NoiseModel(translation_std=0.3, rotation_std=0.5)
+    graph = replace(pgo.grid_world(1, 30, 4, noise=noise), information=None)
+    robots = shared(graph, 2, owners=np.arange(30) // 29)
+    own = pgo.PGOProblem(graph.without_edges(graph.i == 29), weighting=pgo.Weighting.ISOTROPIC)
+    first = solvers.solve(own, solvers.Pipeline().of_first_attempt)
+    best = solvers.solve(own)
+    assert best.objective < 0.99 * first.objective
+
+    def carries_lines(sender: str, receiver: str, data: bytes) -> bool:
+        message = message_in(data, sender, receiver)
+        return sender == "r1" and isinstance(message, News) and bool(message.pieces)
+
+    network = Network(robots, np.random.default_rng(0), is_lost=carries_lines)
+    ends: list[tuple[float, bool]] = []
+    while network.now < 20.0:
+        network.wait(0.1)
+        solution = robots["r0"].solution
+        if solution is not None:
+            end = (solution.certificate.objective, "of a first attempt alone" in solution.note)
+            ends += [end] if end not in ends else []
+    assert ends == [
+        (pytest.approx(first.objective), True),
+        (pytest.approx(best.objective), False),
+    ]
