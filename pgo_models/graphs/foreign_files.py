@@ -6,7 +6,7 @@ number of lines, so that messages name the lines of the file itself.
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -228,20 +228,7 @@ def _of_views(path: Path, text: str) -> str:
     of three views tell.
     """
     lines = text.split("\n")
-    rotations: dict[int, Array] = {}
-    for place, line in enumerate(lines):
-        if not _has_words(line):
-            continue
-        if not rotations and _is_count(line):
-            continue
-        R = _view(line)
-        if R is None:
-            problem = (
-                "no view: give two ids or names, a rotation by rows or as qw qx qy qz, and a "
-                "translation or nothing"
-            )
-            raise FileFormatError(path, place + 1, problem)
-        rotations[place] = R
+    rotations = _rotations_of_views(path, lines)
     ends = {place: _words_of(lines[place])[:2] for place in rotations}
     names = sorted({name for pair in ends.values() for name in pair})
     are_named = not names[0].isdigit()
@@ -253,18 +240,37 @@ def _of_views(path: Path, text: str) -> str:
         i, j = pairs[place]
         pose = _words_of_pose(R.T if are_transposed else R, np.zeros(3))
         written[place] = f"EDGE_SE3:QUAT {i} {j} {pose} {UNIT_ROTATION}"
-    note = "R_j R_i^T of R_i, from the world to camera i" if are_transposed else "R_i^T R_j"
+    notes = ["R_j R_i^T of R_i, from the world to camera i" if are_transposed else "R_i^T R_j"]
     if any(_has_weight(_words_of(lines[place])) for place in rotations):
-        note += "; the last column, taken for a weight, is not used"
+        notes.append("the last column, taken for a weight, is not used")
     if are_named:
-        note += f"; views have the numbers 0 ({names[0]}) to {len(names) - 1} ({names[-1]}), sorted"
+        last = len(names) - 1
+        notes.append(f"views have the numbers 0 ({names[0]}) to {last} ({names[-1]}), sorted")
     warnings.warn(
         f"{printable(str(path))}: a view graph, of which the rotations are read, as "
-        f"{printable(note)}",
+        f"{printable('; '.join(notes))}",
         GraphWarning,
         stacklevel=2,
     )
     return "\n".join(written)
+
+
+def _rotations_of_views(path: Path, lines: Sequence[str]) -> dict[int, Array]:
+    """Rotations of a view graph, by the places of their lines; a count may come before them."""
+    rotations: dict[int, Array] = {}
+    for place, line in enumerate(lines):
+        is_count_before = not rotations and _is_count(line)
+        if not _has_words(line) or is_count_before:
+            continue
+        R = _view(line)
+        if R is None:
+            problem = (
+                "no view: give two ids or names, a rotation by rows or as qw qx qy qz, and a "
+                "translation or nothing"
+            )
+            raise FileFormatError(path, place + 1, problem)
+        rotations[place] = R
+    return rotations
 
 
 def _are_transposed(rotations: dict[tuple[int, int], Array], by_default: bool) -> bool:

@@ -78,12 +78,7 @@ def table_of(path: Path, line: int, header: str) -> Table | None:
     ends = [_place_of_end(names, words) for words in (_FIRST, _SECOND)]
     if not names or -1 in ends:
         return None
-    places: dict[str, int] = {}
-    for place, name in enumerate(names):
-        match = _MEASURED.fullmatch(name)
-        if match:
-            places.setdefault("theta" if match[1] in _HEADINGS[2:] else match[1], place)
-    tag, side, numbers = _measurement(places)
+    tag, side, numbers = _measurement(_places_of_measurements(names))
     if not tag:
         if header.lstrip().startswith(COMMENT_SIGNS):
             return None
@@ -110,10 +105,20 @@ def _place_of_end(names: list[str], words: set[str]) -> int:
     return -1
 
 
+def _places_of_measurements(names: list[str]) -> dict[str, int]:
+    """First columns of x, y, z, theta and the rest of what a table may measure, by name."""
+    places: dict[str, int] = {}
+    for place, name in enumerate(names):
+        match = _MEASURED.fullmatch(name)
+        if match:
+            places.setdefault("theta" if match[1] in _HEADINGS[2:] else match[1], place)
+    if "yaw" in places:
+        places.setdefault("theta", places["yaw"])
+    return places
+
+
 def _measurement(places: dict[str, int]) -> tuple[str, int, list[int]]:
     """Tag, rows of the matrix and columns of what a table measures; no tag where it is nothing."""
-    if "theta" not in places and "yaw" in places:
-        places["theta"] = places["yaw"]
     for names, tag, side in _MEASUREMENTS:
         has_position = bool({"x", "y", "z"} & set(places))
         if not all(name in places for name in names) or (side == 0 and has_position):

@@ -320,28 +320,43 @@ def equations(variable: dict[str, Any]) -> Iterable[tuple[float, Terms]]:
     """Multipliers and the equations of a variable that they are of, one after the other."""
     n, p = (int(size) for size in variable["shape"])
     first = int(variable["first"])
-    columns = [[first + a + n * b for a in range(n)] for b in range(p)]
-    rows = [[first + a + n * b for b in range(p)] for a in range(n)]
-    kinds = set(variable["sets"])
-    if not kinds <= {"rotation", "orthonormal", "unit columns", "unit rows"} or not kinds:
-        raise ValueError(f"unknown sets {sorted(kinds)}")
-    known: dict[str, list[Terms]] = {}
-    if kinds & {"rotation", "orthonormal"}:
-        known["columns"] = gram(columns)
-        if n == p:
-            known["rows"] = gram(rows)
-    if "rotation" in kinds and n == p == 3:
-        known["cross"] = [
-            terms for a in range(3) for terms in cross(*(columns[(a + k) % 3] for k in range(3)))
-        ]
-    if "rotation" in kinds and n == p == 4:
-        known["minors"] = minors(columns)
-    if kinds & {"unit columns", "rotation", "orthonormal"}:
-        known["unit columns"] = [product(column, column, 1) for column in columns]
-    if "unit rows" in kinds or "rows" in known:
-        known["unit rows"] = [product(row, row, 1) for row in rows]
+    entries = [[first + a + n * b for b in range(p)] for a in range(n)]
+    known = equations_of(set(variable["sets"]), entries)
     for name, multipliers in variable["multipliers"].items():
         yield from zip(multipliers, known[name][: len(multipliers)], strict=True)
+
+
+def equations_of(sets: set[str], entries: list[list[int]]) -> dict[str, list[Terms]]:
+    """Equations by name that hold for a matrix in some sets, whose entries have these numbers."""
+    if not sets <= {"rotation", "orthonormal", "unit columns", "unit rows"} or not sets:
+        raise ValueError(f"unknown sets {sorted(sets)}")
+    rows = entries
+    columns = [list(column) for column in zip(*entries, strict=True)]
+    of_columns = [product(column, column, 1) for column in columns]
+    of_rows = [product(row, row, 1) for row in rows]
+    known: dict[str, list[Terms]] = {}
+    if "unit columns" in sets:
+        known["unit columns"] = of_columns
+    if "unit rows" in sets:
+        known["unit rows"] = of_rows
+    if not sets & {"rotation", "orthonormal"}:
+        return known
+    known |= {"columns": gram(columns), "unit columns": of_columns}
+    if len(rows) == len(columns):
+        known |= {"rows": gram(rows), "unit rows": of_rows}
+        if "rotation" in sets:
+            known |= equations_of_rotations(columns)
+    return known
+
+
+def equations_of_rotations(columns: list[list[int]]) -> dict[str, list[Terms]]:
+    """Equations that tell rotations in three and in four dimensions from reflections."""
+    if len(columns) == 3:
+        in_turn = [[columns[(a + k) % 3] for k in range(3)] for a in range(3)]
+        return {"cross": [terms for turn in in_turn for terms in cross(*turn)]}
+    if len(columns) == 4:
+        return {"minors": minors(columns)}
+    return {}
 
 
 def gram(vectors: list[list[int]]) -> list[Terms]:

@@ -320,7 +320,7 @@ def result_or_error(compute: Callable[[], T], failure: str) -> T | PGOError:
         return compute()
     except PGOError as error:
         return error
-    except Exception as error:
+    except Exception as error:  # what others send decides what is computed, and may not end a robot
         return PGOError(f"{failure}: {error!r:.200}")
 
 

@@ -189,35 +189,48 @@ class Heard:
     term: Term
 
 
+_OfASolve = Hello | Ask | Reply | Letter | LetterLost | Ended | Heard  # messages with a term
+
+
 def check_message(message: object, team: tuple[str, ...]) -> None:
     """Raise a WireError for names and numbers that no robot of the team sends."""
-    if not isinstance(
-        message, Hello | News | Relayed | Ask | Reply | Letter | LetterLost | Ended | Heard
-    ):
-        raise WireError(f"a {type(message).__name__} is no message")
     if isinstance(message, Relayed):
         if message.receiver not in team:
             raise WireError("a message to be passed on to nobody")
         return
-    names: list[str] = []
-    for each in ("members", "revisions", "absent", "twins", "has", "hears"):
-        names += getattr(message, each, ())
-    for part in getattr(message, "parts", ()):
-        names += part
-    if isinstance(message, News):
-        names += [piece.owner for piece in message.pieces]
-        numbers = [piece.before.num_lines for piece in message.pieces]
-    else:
-        terms = [getattr(message, each, message.term) for each in ("term", "apart")]
-        names += [term.driver for term in terms if term.driver]
-        numbers = [term.number for term in terms]
-    numbers += [getattr(message, each, 0) for each in _NUMBERS]
-    if not set(names) <= set(team) or not all(-1 <= number < _MOST for number in numbers):
+    if not isinstance(message, News | _OfASolve):
+        raise WireError(f"a {type(message).__name__} is no message")
+    is_known = set(_names_in(message)) <= set(team)
+    if not is_known or not all(-1 <= number < _MOST for number in _numbers_in(message)):
         raise WireError(f"a {type(message).__name__} with names or numbers of nobody")
     if isinstance(message, Ask) and message.members:
         is_numbered = 0 < message.place < len(message.members)
         if not is_numbered or message.members[0] != message.term.driver:
             raise WireError("an order with other places than those of its robots")
+
+
+def _names_in(message: News | _OfASolve) -> list[str]:
+    """All names of robots in a message."""
+    names: list[str] = []
+    for field in ("members", "revisions", "absent", "twins", "has", "hears"):
+        names += getattr(message, field, ())
+    for part in getattr(message, "parts", ()):
+        names += part
+    if isinstance(message, News):
+        return names + [piece.owner for piece in message.pieces]
+    return names + [term.driver for term in _terms_in(message) if term.driver]
+
+
+def _numbers_in(message: News | _OfASolve) -> list[int]:
+    """All numbers in a message that count something."""
+    numbers = [getattr(message, field, 0) for field in _NUMBERS]
+    if isinstance(message, News):
+        return numbers + [piece.before.num_lines for piece in message.pieces]
+    return numbers + [term.number for term in _terms_in(message)]
+
+
+def _terms_in(message: _OfASolve) -> list[Term]:
+    return [message.term, getattr(message, "apart", message.term)]
 
 
 def error_as_message(error: PGOError) -> tuple[str, str]:

@@ -244,10 +244,7 @@ class SharedMap:
     def _learn(self, sender: str, piece: Piece, is_latest: bool) -> None:
         """Add lines to those of a robot; of its own that robot alone decides which stand."""
         if piece.owner == self.name:
-            if self._takes_back and piece.before == self.saved:
-                own = self._member.measurements
-                own.end_at(piece.before.num_lines, _lines_of(piece, own))
-                self.saved = self._member.revision
+            self._take_back(piece)
             return
         log = self.logs.setdefault(piece.owner, Measurements())
         talk = self._talk(sender)
@@ -257,18 +254,18 @@ class SharedMap:
         if not is_checked and not log.begins_with(piece.before):
             return
         lines = _lines_of(piece, log)
-        known = log.lines[begins : begins + len(lines)]
-        is_final = is_own and is_latest
+        _add_lines(log, begins, lines, is_final=is_own and is_latest, is_last=piece.is_last)
         ends = begins + len(lines)
-        if known != lines[: len(known)]:
-            if is_final:
-                log.end_at(begins, lines)
-        elif len(log.lines) < ends:
-            log.end_at(begins + len(known), lines[len(known) :])
-        elif is_final and piece.is_last and len(log.lines) > ends:
-            log.end_at(ends, [])
         if is_own and log.lines[begins:ends] == lines:
             talk.num_checked = max(talk.num_checked, ends)
+
+    def _take_back(self, piece: Piece) -> None:
+        """Take lines that this robot had measured after it was saved."""
+        if not self._takes_back or piece.before != self.saved:
+            return
+        own = self._member.measurements
+        own.end_at(piece.before.num_lines, _lines_of(piece, own))
+        self.saved = self._member.revision
 
     def _give_back(self, owner: str, saved: Revision) -> None:
         """Give a robot that was restored from an older state its lines since then."""
@@ -437,6 +434,24 @@ class SharedMap:
         self._member.known = answer.own
         self._member.solution = answer.solution
         self._took = answer.found.seconds
+
+
+def _add_lines(
+    log: Measurements, begins: int, lines: list[str], *, is_final: bool, is_last: bool
+) -> None:
+    """Add lines after the first ones of a log.
+
+    Only what is final stands in place of other lines, and ends the log where it is the last.
+    """
+    ends = begins + len(lines)
+    known = log.lines[begins:ends]
+    if known != lines[: len(known)]:
+        if is_final:
+            log.end_at(begins, lines)
+    elif len(log.lines) < ends:
+        log.end_at(begins + len(known), lines[len(known) :])
+    elif is_final and is_last and len(log.lines) > ends:
+        log.end_at(ends, [])
 
 
 def _lines_of(piece: Piece, log: Measurements) -> list[str]:
