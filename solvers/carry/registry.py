@@ -24,7 +24,7 @@ from pgo_models.graphs.written_digits import WrittenDigits
 from pgo_models.problem.weighting import Weighting
 from pgo_models.relaxations.low_rank import LiftedPoses
 
-VERSION = 34
+VERSION = 35
 T = TypeVar("T")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -64,19 +64,10 @@ class Held:
 @record("HeldStates")
 @dataclass(frozen=True, eq=False)
 class HeldStates:
-    """The states of what a robot holds, without what follows from its subgraph."""
+    """What a snapshot has of a robot: its states, without what follows from its subgraph."""
 
     interior: InteriorState | None
     copies: StateOfCopies | None
-
-
-@record("AgentRecord")
-@dataclass(frozen=True, eq=False)
-class AgentRecord:
-    """State that orders leave with an agent; a checkpoint contains it."""
-
-    held: HeldStates
-    moments: Mapping[int, HeldStates]
 
 
 @record("CoverRotations")
@@ -160,24 +151,16 @@ class Agent:
 
     def snapshot(self) -> Snapshot:
         """State that earlier orders left, as arrays, with matrices instead of their factors."""
-        moments = {number: _states(held) for number, held in self.moments.items()}
-        held = _states(Held(self.interior, self.copies))
-        return serialize(AgentRecord(held, moments))
+        interior = self.interior.state if self.interior is not None else None
+        copies = self.copies.state if self.copies is not None else None
+        return serialize(HeldStates(interior, copies))
 
-    def restore(self, record: AgentRecord) -> None:
-        """Continue from the record of a snapshot of this robot."""
-        held = self._restored(record.held)
-        self.interior = held.interior
-        self.copies = held.copies
-        self.moments = {number: self._restored(states) for number, states in record.moments.items()}
-
-    def _restored(self, states: HeldStates) -> Held:
-        """What belongs to states."""
-        interior = self.interior
-        if interior is not None and states.interior is not None:
-            interior = interior.in_state_of(states.interior)
-        copies = None if states.copies is None else states.copies.robot(self.layout)
-        return Held(interior, copies)
+    def restore(self, states: HeldStates) -> None:
+        """Continue from a snapshot of this robot, which knows no moment yet."""
+        if self.interior is not None and states.interior is not None:
+            self.interior = self.interior.in_state_of(states.interior)
+        self.copies = None if states.copies is None else states.copies.robot(self.layout)
+        self.moments = {}
 
     @property
     def layout(self) -> CopyLayout:
@@ -185,12 +168,6 @@ class Agent:
         if self.copies is not None:
             return self.copies.layout
         return CopyLayout(self.subgraph, self.backend)
-
-
-def _states(held: Held) -> HeldStates:
-    interior = held.interior.state if held.interior is not None else None
-    copies = held.copies.state if held.copies is not None else None
-    return HeldStates(interior, copies)
 
 
 # Orders are functions of an agent and a request, some of them once their first argument is given.

@@ -26,6 +26,7 @@ from pgo_models.files import check_writable, replace_when_done
 from pgo_models.geometry.poses import Poses
 from pgo_models.graphs.partitioning import Partition
 from pgo_models.problem.problem import PGOProblem
+from solvers.carry.ledger import Ledger
 from solvers.carry.registry import VERSION, record
 from solvers.carry.serialization import deserialize, serialize
 from solvers.loop import Method, RunMonitor
@@ -58,6 +59,7 @@ class Saved:
     state: object
     records: tuple[Record, ...]
     driver: DriverState
+    ledger: Ledger
 
 
 class Journal:
@@ -128,7 +130,7 @@ class Journal:
         start: S | None = None
         earlier: tuple[Record, ...] = ()
         if self._saved is not None:
-            driver.resume(self._saved.driver, self._snapshots)
+            driver.resume(self._saved.driver, self._saved.ledger, self._snapshots)
             # The caller has compared the name of the method, so this is its state.
             start = self._saved.state  # type: ignore[assignment]
             earlier = self._saved.records
@@ -190,6 +192,7 @@ class Journal:
             state=state,
             records=tuple(records),
             driver=driver.state,
+            ledger=driver.network.ledger,
         )
         try:
             _write(path, self._mark, saved, snapshots)
@@ -260,7 +263,7 @@ def _read(path: Path, mark: Mapping[str, str]) -> tuple[Saved, list[dict[str, ND
         others = [part for part, text in zip(_PARTS, header, strict=True) if text != mark[part]]
         if not others:
             saved: Saved = deserialize(parts["run"])
-            num_robots = saved.driver.ledger.num_robots
+            num_robots = saved.ledger.num_robots
             return saved, [parts[f"robot {robot}"] for robot in range(num_robots)]
     except OSError as error:
         raise FileFormatError(

@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar, cast
 from weakref import WeakKeyDictionary
@@ -70,7 +70,7 @@ from solvers.carry.messages import Snapshot, restore, take_snapshot
 from solvers.carry.moments import Moment
 from solvers.carry.process import DEFAULT_MEMORY, WorkerPool
 from solvers.carry.registry import record
-from solvers.carry.serialization import deserialize
+from solvers.carry.serialization import COMPUTED_AGAIN, deserialize
 from solvers.result import Measurement
 from solvers.robots import poses as pose_orders
 from solvers.robots.agent import order_interior
@@ -106,26 +106,16 @@ class CoverPoses:
         return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 
+@record("DriverState")
 @dataclass(frozen=True, eq=False)
-class HeldByDriver:
-    """What the driver holds at a moment; as the attributes of `Driver`."""
+class DriverState:
+    """What the driver holds at a moment, or between two steps; as the attributes of `Driver`."""
 
     current: CoverPoses
     saved: CoverPoses
     is_final: bool
     diagonal: Array
-    laplacian: InterfaceFactor | None
-
-
-@record("DriverState")
-@dataclass(frozen=True, eq=False)
-class DriverState:
-    """State of a driver between two steps: its attributes, and the ledger of its network."""
-
-    current: CoverPoses
-    saved: CoverPoses
-    ledger: Ledger
-    is_final: bool = False
+    laplacian: InterfaceFactor | None = field(default=None, metadata=COMPUTED_AGAIN)
 
 
 class Driver:
@@ -165,7 +155,7 @@ class Driver:
         self._interfaces: dict[Widths, Interface] = {}
         if memory != 0:
             self.interface(*self.tangent).check_memory(memory)
-        self._moments: WeakKeyDictionary[Moment, HeldByDriver] = WeakKeyDictionary()
+        self._moments: WeakKeyDictionary[Moment, DriverState] = WeakKeyDictionary()
         pool = open_pool()
         self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(summaries))
         try:
@@ -224,8 +214,7 @@ class Driver:
         a step from it gives the same result whatever was done meanwhile.
         """
         moment = self.network.moments.now()
-        held = HeldByDriver(self.current, self.saved, self.is_final, self.diagonal, self._laplacian)
-        self._moments.setdefault(moment, held)
+        self._moments.setdefault(moment, self.state)
         return moment
 
     def return_to(self, moment: Moment | None) -> None:
@@ -240,11 +229,7 @@ class Driver:
                 "the state is not of a run with this driver; begin with the `init` of its method"
             )
         self.network.moments.return_to(moment)
-        self.current = held.current
-        self.saved = held.saved
-        self.is_final = held.is_final
-        self.diagonal = held.diagonal
-        self._laplacian = held.laplacian
+        self._hold(held)
 
     def gather_diagonal(self, parts: Sequence[Array]) -> Array:
         """Diagonal of M on the cover, ((d + 1) g,), of the robots' parts."""
@@ -369,21 +354,27 @@ class Driver:
 
     @property
     def state(self) -> DriverState:
-        """State of the driver for `resume`, without factors, which are computed again."""
-        return DriverState(self.current, self.saved, self.network.ledger, self.is_final)
+        """What the driver holds; for `resume` without the factor, which is computed again."""
+        return DriverState(self.current, self.saved, self.is_final, self.diagonal, self._laplacian)
+
+    def _hold(self, state: DriverState) -> None:
+        """Hold what a state has."""
+        self.current = state.current
+        self.saved = state.saved
+        self.is_final = state.is_final
+        self.diagonal = state.diagonal
+        self._laplacian = state.laplacian
 
     def snapshots(self) -> list[Snapshot]:
         """State of every robot for `resume`, interior poses too; its bytes are counted apart."""
         return self.network.ask(take_snapshot, [None] * self.network.ledger.num_robots, Count.OFF)
 
-    def resume(self, state: DriverState, snapshots: Sequence[Snapshot]) -> None:
-        """Continue from a state, and robots from their snapshots."""
+    def resume(self, state: DriverState, ledger: Ledger, snapshots: Sequence[Snapshot]) -> None:
+        """Continue from a state and an account of messages, and robots from their snapshots."""
         records = [deserialize(snapshot) for snapshot in snapshots]
         self.network.ask(restore, records, Count.OFF)
-        self.current = state.current
-        self.saved = state.saved
-        self.network.ledger = state.ledger
-        self.is_final = state.is_final
+        self._hold(state)
+        self.network.ledger = ledger
         answers = self.ask(pose_orders.send_matrix_again, None, Count.PIGGYBACKED)
         matrices = [answer.schur for answer in answers if answer.schur is not None]
         # Robots that had not sent their part yet have none. Without all parts the matrix is

@@ -105,7 +105,7 @@ def test_a_climb_goes_on_from_a_snapshot() -> None:
     state = method.init(first, None)
     while first.current.R.shape[1] == problem.d:
         state = method.step(first, state)
-    second.resume(first.state, first.snapshots())
+    second.resume(first.state, first.network.ledger, first.snapshots())
     for driver, begun in ((first, state), (second, method.init(second, state))):
         other = method.step(driver, begun)
         assert np.isfinite(other.newton.objective)

@@ -27,6 +27,7 @@ from pgo_models import (
     NoiseModel,
     PGOProblem,
     PoseGraph,
+    Poses,
     chordal_start,
     grid,
     multipliers,
@@ -96,6 +97,21 @@ def test_the_averaged_start_is_the_central_one(
 @pytest.mark.parametrize(("graph", "parts"), corner_cases(), ids=str)
 def test_the_chordal_start_of_corner_cases(graph: PoseGraph, parts: Partition) -> None:
     check_start(PGOProblem(graph), parts)
+
+
+def test_robots_of_a_snapshot_return_to_their_own_moments_alone() -> None:
+    """The numbers of moments begin anew with a driver: those of the run before mean nothing."""
+    problem = PGOProblem(grid(np.random.default_rng(0)))
+    robots = partition(problem.graph, 2)
+    first, second = (driver_at(problem, robots, None) for _ in range(2))
+    start = first.moment()
+    first.set_poses(Poses.identity(problem.num_poses, problem.d))
+    second.resume(first.state, first.network.ledger, first.snapshots())
+    resumed = second.moment()
+    assert resumed.number == start.number
+    second.go_to_chordal_start()
+    second.return_to(resumed)
+    np.testing.assert_array_equal(collect(second)[0].R, collect(first)[0].R)
 
 
 def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> None:
