@@ -471,7 +471,7 @@ class DrivenTeam:
     def _end_answer(
         self,
         part: Following,
-        found: Any,  # noqa: ANN401 - the order chooses
+        result: Any,  # noqa: ANN401 - the order chooses
         own: OwnAnswer | None,
     ) -> None:
         """Send an answer or an error, and letters with it, unless the solve is given up."""
@@ -480,9 +480,9 @@ class DrivenTeam:
         part.own = own
         part.obeyed = None
         part.call = ask.call
-        is_error = isinstance(found, PGOError)
-        error = error_as_message(found) if is_error else None
-        answer, letters = part.letters.take_out(ask.call, None if is_error else found)
+        is_error = isinstance(result, PGOError)
+        error = error_as_message(result) if is_error else None
+        answer, letters = part.letters.take_out(ask.call, None if is_error else result)
         part.reply = Reply(ask.term, ask.call, part.revision, answer, error, ask.sent)
         if part is not self._following:
             return
@@ -527,11 +527,11 @@ class DrivenTeam:
             return
         self._send_letter(self._following, lost.term, name)
 
-    def _take_parts(self, found: Ended) -> None:
+    def _take_parts(self, ended: Ended) -> None:
         """Learn which robots are joined, from the one that drove, or from another that knows it."""
-        if self._apart is None or found.term > self._apart.term:
-            self._apart = found
-        if found.term == self.term:
+        if self._apart is None or ended.term > self._apart.term:
+            self._apart = ended
+        if ended.term == self.term:
             self._stop_following()
 
     def _take_outcome(self, sender: str, outcome: Ended) -> None:

@@ -74,14 +74,14 @@ class _Sent(NamedTuple):
 class Correspondence:
     """What is known of the messages to and from a run of another robot, and how fast they are.
 
-    `heard` is the number of the last message that it told something with, by which it had
+    `last_number` is the number of the last message that it told something with, by which it had
     `num_told` lines of its own, and `is_answered` whether that was answered. `num_checked` of its
     lines are here. What it was told at `told_at` it has answered, and it has `num_known` lines of
     this robot's own.
     """
 
     pace: Pace = field(default_factory=Pace)
-    heard: int = -1
+    last_number: int = -1
     num_told: int = 0
     is_answered: bool = True
     num_checked: int = 0

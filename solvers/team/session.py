@@ -317,9 +317,9 @@ class Session:
             self._greeted[to] = (self.now, num_sent)
         self._send(to, message, priority, self._speakers.boot_of(to))
 
-    def _send(self, to: str, message: object, priority: Priority, heard: bytes) -> None:
-        """Send a message to a robot, to its run `heard`; a long one is sealed beside the calls."""
-        writing = self._speakers.addressed(to, message, heard, self.now)
+    def _send(self, to: str, message: object, priority: Priority, boot: bytes) -> None:
+        """Send a message to a run of a robot; a long one is sealed beside the calls."""
+        writing = self._speakers.addressed(to, message, boot, self.now)
         seal = partial(writing.sealed, self._key)
         if len(writing.plain) <= _IN_A_CALL:
             self._post(to, priority, seal())

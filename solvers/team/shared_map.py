@@ -41,7 +41,7 @@ class _Flight:
     is_last: bool
 
 
-class _Said(NamedTuple):
+class _Status(NamedTuple):
     """What a robot has, whom it hears, and when it said so."""
 
     has: Mapping[str, Revision]
@@ -66,29 +66,32 @@ class SharedMap:
         self._member = member
         self._session = session
         # What the others have last said, also those that are out of reach, and who is within it.
-        self._said: dict[str, _Said] = {}
-        self._near: set[str] = set()
+        self._statuses: dict[str, _Status] = {}
+        self._reachable: set[str] = set()
         # Lines that were packed last, by owner and revisions between which they are: most are for
         # all others, of which some are a little ahead.
         self._packed: dict[tuple[str, Revision, Revision], PackedLines] = {}
-        self._turn = ""  # the robot that lines were packed for last: others come first
+        self._packed_for = ""  # the robot that lines were packed for last: others come first
         # What is on its way, by receiver and owner, and the last piece of all.
         self._flights: defaultdict[tuple[str, str], list[_Flight]] = defaultdict(list)
         # By robot and run.
         self._talks: defaultdict[tuple[str, bytes], Correspondence] = defaultdict(Correspondence)
-        self._lags: dict[tuple[str, str], float] = {}  # since when a robot lacks lines of another
-        # When an answer is owed to robots whose pieces have come: they are collected, too.
-        self._owed: dict[str, float] = {}
+        # By the robot that lacks lines, and the one that has measured them.
+        self._lacking_since: dict[tuple[str, str], float] = {}
+        # When robots whose pieces have come are to have an answer: pieces are collected, too.
+        self._answers_due: dict[str, float] = {}
         self._keep_theirs: set[str] = set()
         self._solver = SolverBeside(member.settings, session.beside)
         self._changed_at: float | None = None
-        self._took = 0.0  # seconds of the last solve
+        self._seconds_of_solve = 0.0  # of the last solve
         self._problems: tuple[str, ...] = ()
 
     @property
-    def _has(self) -> dict[str, Mapping[str, Revision]]:
+    def _revisions_of_others(self) -> dict[str, Mapping[str, Revision]]:
         """What each of the others has that is within reach."""
-        return {name: said.has for name, said in self._said.items() if name in self._near}
+        return {
+            name: status.has for name, status in self._statuses.items() if name in self._reachable
+        }
 
     @property
     def others(self) -> dict[str, Measurements]:
@@ -129,13 +132,13 @@ class SharedMap:
         A robot that is out of reach may come back for it, and is waited for.
         """
         outcome = self._member.outcome
-        if outcome is None or outcome.absent or self._solver.is_solving or self._owed:
+        if outcome is None or outcome.absent or self._solver.is_solving or self._answers_due:
             return False
         revisions = self.revisions
         oldest = self._session.now - _FORGOTTEN * self._session.patience
-        waited_for = [said for said in self._said.values() if said.when >= oldest]
+        waited_for = [status for status in self._statuses.values() if status.when >= oldest]
         is_tried = not self._solver.has_not_tried(revisions)
-        return is_tried and all(said.has == revisions for said in waited_for)
+        return is_tried and all(status.has == revisions for status in waited_for)
 
     # Lines
 
@@ -143,7 +146,13 @@ class SharedMap:
         """What tells others that this robot is there; short where one robot knows the rest."""
         if to:
             return self._news(to, ())
-        return News(self.revisions, tuple(self._has), (), self._takes_back, self._session.twins)
+        return News(
+            self.revisions,
+            tuple(self._revisions_of_others),
+            (),
+            self._takes_back,
+            self._session.twins,
+        )
 
     def _talk(self, to: str) -> Correspondence:
         return self._talks[to, self._session.boot_of(to)]
@@ -153,11 +162,11 @@ class SharedMap:
         now = self._session.now
         talk = self._talk(to)
         theirs = self.logs[to].revision if to in self.logs else Revision()
-        has_all = talk.heard >= 0 and talk.num_told == theirs.num_lines == talk.num_checked
+        has_all = talk.last_number >= 0 and talk.num_told == theirs.num_lines == talk.num_checked
         news = replace(
             self.greeting(),
             pieces=pieces,
-            answers=talk.heard,
+            answers=talk.last_number,
             is_prompt=not talk.is_answered,
             has_all=has_all,
         )
@@ -184,7 +193,7 @@ class SharedMap:
         is_of_all = len(news.hears) == len(self._session.team) - 1
         if not is_of_all and self._session.now >= talk.told_at + self._session.patience:
             return False
-        known = self._said[to].has.get(self.name, Revision())
+        known = self._statuses[to].has.get(self.name, Revision())
         is_last = [piece.is_last for piece in news.pieces if piece.owner == self.name] == [True]
         return is_last and len(news.pieces) == 1 and known.num_lines <= talk.num_known
 
@@ -207,15 +216,15 @@ class SharedMap:
         for piece in message.pieces:
             self._learn(sender, piece, is_latest)
             pause = self._session.pause(1) / 2 if piece.is_last else 0.0
-            when = min(self._session.now + pause, self._owed.get(sender, np.inf))
-            self._owed[sender] = when
+            when = min(self._session.now + pause, self._answers_due.get(sender, np.inf))
+            self._answers_due[sender] = when
         if is_latest:
-            self._said[sender] = self._said_in(sender, message)
-            self._near.add(sender)
+            self._statuses[sender] = self._status_from(sender, message)
+            self._reachable.add(sender)
             if message.takes_back:
                 self._give_back(sender, message.has.get(sender, Revision()))
 
-    def _said_in(self, sender: str, news: News) -> _Said:
+    def _status_from(self, sender: str, news: News) -> _Status:
         """What a robot has and hears; of its own it has all lines that a short message brings."""
         now = self._session.now
         talk = self._talk(sender)
@@ -227,7 +236,7 @@ class SharedMap:
         log = self.logs.get(sender, Measurements())
         if not news.is_short and log.begins_with(has.get(sender, Revision())):
             talk.num_checked = max(talk.num_checked, has.get(sender, Revision()).num_lines)
-        before = self._said.get(sender)
+        before = self._statuses.get(sender)
         if news.is_short and before is not None:
             for piece in news.pieces:
                 ends = piece.before.num_lines + piece.lines.num_lines
@@ -236,10 +245,10 @@ class SharedMap:
             has = {**before.has, **has}
             hears = before.hears
         if news.sent >= 0:
-            talk.heard = news.sent
+            talk.last_number = news.sent
             talk.num_told = has.get(sender, Revision()).num_lines
             talk.is_answered = talk.is_answered and not news.pieces
-        return _Said(has, hears, now)
+        return _Status(has, hears, now)
 
     def _learn(self, sender: str, piece: Piece, is_latest: bool) -> None:
         """Add lines to those of a robot; of its own that robot alone decides which stand."""
@@ -281,10 +290,12 @@ class SharedMap:
 
     def tick(self, awake: tuple[str, ...]) -> None:
         """Send what others lack, and solve where something is new."""
-        self._near &= set(awake)
-        self._owed = {name: when for name, when in self._owed.items() if name in awake}
+        self._reachable &= set(awake)
+        self._answers_due = {
+            name: when for name, when in self._answers_due.items() if name in awake
+        }
         before = next(reversed(self._packed), None)
-        for name in sorted(self._near, key=lambda name: (name <= self._turn, name)):
+        for name in sorted(self._reachable, key=lambda name: (name <= self._packed_for, name)):
             # Lines are packed once in a tick, as that takes its time; the next robot has the next.
             may_pack = next(reversed(self._packed), None) == before
             piece = self._piece_for(name, awake, may_pack)
@@ -294,8 +305,11 @@ class SharedMap:
                 bool(sent) and sent[-1].is_last and sent[-1].ends < len(self.logs[self.name].lines)
             )
             delay = self._session.pause(1) / 2 if is_coming else 0.0
-            if piece is not None or self._owed.get(name, np.inf) + delay <= self._session.now:
-                self._owed.pop(name, None)
+            if (
+                piece is not None
+                or self._answers_due.get(name, np.inf) + delay <= self._session.now
+            ):
+                self._answers_due.pop(name, None)
                 priority = Priority.HELLO if piece is None else Priority.NORMAL
                 pieces = () if piece is None else (piece,)
                 self._session.send(name, self._news(name, pieces), priority)
@@ -305,11 +319,11 @@ class SharedMap:
 
     def _piece_for(self, to: str, awake: tuple[str, ...], may_pack: bool) -> Piece | None:
         """Lines that a robot lacks: this robot's, or those of another that it does not hear."""
-        has = self._said[to].has
+        has = self._statuses[to].has
         for owner, log in self.logs.items():
             known = has.get(owner, Revision())
             if owner == to or known == log.revision or not log.lines:
-                self._lags.pop((to, owner), None)
+                self._lacking_since.pop((to, owner), None)
                 continue
             is_known = log.begins_with(known)
             begins = known.num_lines if is_known else 0
@@ -330,9 +344,9 @@ class SharedMap:
         others may have met a moment later.
         """
         log = self.logs[owner]
-        if owner in self._said[to].hears or known.num_lines >= len(log.lines):
+        if owner in self._statuses[to].hears or known.num_lines >= len(log.lines):
             return False
-        since = self._lags.setdefault((to, owner), self._session.now)
+        since = self._lacking_since.setdefault((to, owner), self._session.now)
         rank = [name for name in awake if name not in (to, owner)].index(self.name)
         rank += owner in awake
         is_due = self._session.now - since >= rank * self._session.patience / 2
@@ -361,7 +375,7 @@ class SharedMap:
         if packed is None:
             if not may_pack:
                 return None
-            self._turn = to
+            self._packed_for = to
             packed = packed_lines(log.lines[begins:ends], log.lines[:begins])
             self._packed[owner, before, after] = packed
             if len(self._packed) > _MOST_PACKED:
@@ -382,7 +396,7 @@ class SharedMap:
         if flights and known < flights[0].begins:
             flights = []
         pace = self._talk(to).pace
-        pause = pace.pause(now - self._said[to].when, self._session.pause(1))
+        pause = pace.pause(now - self._statuses[to].when, self._session.pause(1))
         if flights and now - flights[0].when >= pause:
             pace.shorten()
             return []
@@ -409,9 +423,13 @@ class SharedMap:
         if self._changed_at is None:
             self._changed_at = self._session.now
         is_first = self.last is None
-        pause = self._session.patience if is_first else max(self._session.pause(1), self._took)
+        pause = (
+            self._session.patience
+            if is_first
+            else max(self._session.pause(1), self._seconds_of_solve)
+        )
         is_waited_for = self._session.now - self._changed_at >= pause
-        announced = [has.get(name, Revision()) for name, has in self._has.items()]
+        announced = [has.get(name, Revision()) for name, has in self._revisions_of_others.items()]
         is_here = all(each in (Revision(), *revisions.values()) for each in announced)
         if is_first and not self._session.is_complete(revisions):
             return
@@ -429,11 +447,11 @@ class SharedMap:
         self._problems = answer.problems
         covered = {name: revisions[name] for name in answer.covered}
         absent = tuple(name for name in self._session.team if name not in covered)
-        self.last = Ended(self.term, covered, absent, answer.found)
+        self.last = Ended(self.term, covered, absent, answer.summary)
         self._member.outcome = self.last
         self._member.known = answer.own
         self._member.solution = answer.solution
-        self._took = answer.found.seconds
+        self._seconds_of_solve = answer.summary.seconds
 
 
 def _add_lines(

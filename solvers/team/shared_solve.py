@@ -46,11 +46,11 @@ _MOST_TOLD = 1 << 14  # lines that the other process is told in a call
 class SharedAnswer:
     """What a robot has found: the solution of its part, its own poses, and whose part it is.
 
-    `found` is what is told of the solution, which itself is a pickle: it is read where somebody
+    `summary` is what is told of the solution, which itself is a pickle: it is read where somebody
     asks for it. `problems` are sentences on what was left out.
     """
 
-    found: RobotsSolution
+    summary: RobotsSolution
     solution: bytes
     own: OwnAnswer
     covered: tuple[str, ...]
@@ -122,14 +122,14 @@ class TeamSettings:
         ]
         own = OwnAnswer.of(solution, is_own)
         sizes = _sizes_in(part, [files[name] for name in covered])
-        found = RobotsSolution.of(solution, Ledger(len(covered)), sizes).without_histories
+        summary = RobotsSolution.of(solution, Ledger(len(covered)), sizes).without_histories
         of_files = dict.fromkeys(str(warning.message) for warning in caught)
         num_apart_of_all = sum(num_apart.values())
         is_open = not (in_full or solution.is_certified)
         notes = [note_of_poses_apart(num_apart_of_all), note_of_first_attempt(is_open)]
-        note = joined_notes(*notes, *of_files, found.note)
-        found = replace(found, num_apart=num_apart_of_all, note=note)
-        return SharedAnswer(found, pickle.dumps(solution), own, tuple(covered), tuple(problems))
+        note = joined_notes(*notes, *of_files, summary.note)
+        summary = replace(summary, num_apart=num_apart_of_all, note=note)
+        return SharedAnswer(summary, pickle.dumps(solution), own, tuple(covered), tuple(problems))
 
     def _graph(self, files: Mapping[str, G2OLines]) -> tuple[PoseGraph, dict[str, PGOError]]:
         """The graph of the files that fit to the robot's own, and why the others do not."""
@@ -256,7 +256,7 @@ class SolverBeside:
                 self.is_solving = False
                 if isinstance(answer, SharedAnswer):
                     self._last = answer.solution
-                    self._may_find_more &= not answer.found.is_certified
+                    self._may_find_more &= not answer.summary.is_certified
                 end(answer)
 
             def lose(error: PGOError) -> None:

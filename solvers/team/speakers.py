@@ -50,13 +50,13 @@ _WINDOW = 4096  # a message that comes later than so many after it counts as rep
 class Envelope:
     """A message as bytes, and who it is from and to: names, boots, and its number in the run.
 
-    `heard` is the boot of the receiver, or none before the sender has heard it.
+    `receiver_boot` is that of its run, or none before the sender has heard it.
     """
 
     sender: str
     receiver: str
     boot: bytes
-    heard: bytes
+    receiver_boot: bytes
     number: int
     content: bytes
 
@@ -79,7 +79,7 @@ class Envelope:
 
     def as_bytes(self) -> bytes:
         """Bytes of which `from_bytes` makes the envelope."""
-        parts = [self.boot, self.heard, leb128(self.number)]
+        parts = [self.boot, self.receiver_boot, leb128(self.number)]
         for name in (self.sender.encode("utf-8"), self.receiver.encode("utf-8")):
             parts += [leb128(len(name)), name]
         return b"".join([*parts, self.content])
@@ -87,7 +87,8 @@ class Envelope:
     @classmethod
     def from_bytes(cls, data: bytes) -> Envelope:
         """Return the envelope that bytes are; a WireError for others."""
-        boot, heard = data[:_BOOT_BYTES], data[_BOOT_BYTES : 2 * _BOOT_BYTES]
+        boot = data[:_BOOT_BYTES]
+        receiver_boot = data[_BOOT_BYTES : 2 * _BOOT_BYTES]
         names = []
         try:
             number, begins = read_leb128(data, 2 * _BOOT_BYTES)
@@ -98,7 +99,7 @@ class Envelope:
         except (IndexError, ValueError) as error:
             raise WireError(f"a message without addresses: {error}") from error
         sender, receiver = names
-        return cls(sender, receiver, boot, heard, number, data[begins:])
+        return cls(sender, receiver, boot, receiver_boot, number, data[begins:])
 
 
 class Writing(NamedTuple):
@@ -201,12 +202,12 @@ class Word(enum.Enum):
 class _Run:
     """A run of another robot: the highest number heard, and those within the window.
 
-    It is the current one `since` it began or came back, and `heard` last.
+    It is the current one `since` it began or came back.
     """
 
     boot: bytes
     since: float
-    heard: float
+    last_heard: float
     highest: int = -1
     numbers: set[int] = field(default_factory=set)
 
@@ -214,7 +215,7 @@ class _Run:
         """Whether a number has not come before; it has now."""
         if number in self.numbers or number <= self.highest - _WINDOW:
             return False
-        self.heard = now
+        self.last_heard = now
         self.numbers.add(number)
         self.highest = max(number, self.highest)
         if len(self.numbers) > 2 * _WINDOW:
@@ -250,42 +251,30 @@ class Speakers:
         """The runs that speak to this one in messages with a hint."""
         return self._ends.get(hint, ())
 
-    def addressed(self, receiver: str, message: object, heard: bytes, now: float) -> Writing:
-        """A message to the run `heard` of a robot."""
+    def addressed(self, receiver: str, message: object, boot: bytes, now: float) -> Writing:
+        """A message to the run of a robot with this boot."""
         self._num_sent += 1
-        address = Envelope(self.name, receiver, self.boot, heard, self._num_sent, b"")
+        address = Envelope(self.name, receiver, self.boot, boot, self._num_sent, b"")
         # Where it answers a message of that run, which named this one, both know both ends.
         is_short = isinstance(message, News) and message.answers >= 0
-        if self._former.get(receiver) and now >= self._named_until.get(
-            (receiver, heard), -math.inf
-        ):
+        named_until = self._named_until.get((receiver, boot), -math.inf)
+        if self._former.get(receiver) and now >= named_until:
             is_short = False
-            self._named_until[receiver, heard] = now + self._patience
+            self._named_until[receiver, boot] = now + self._patience
         if isinstance(message, News):
             return Writing(address, True, message.as_bytes(), is_short)
         return Writing(address, False, packed(serialize(message)), is_short)
 
     def word_of(self, envelope: Envelope, now: float) -> Word:
         """What a message is worth, which is remembered."""
-        if envelope.heard != self.boot:
+        if envelope.receiver_boot != self.boot:
             self._note_claim(envelope, now)
             return Word.UNPROVEN
         self.claimed_since = None
         run = self._runs.get(envelope.sender)
         former = self._former.setdefault(envelope.sender, {})
         if run is not None and envelope.boot in former:
-            other = former[envelope.boot]
-            highest = other.highest
-            if not other.takes(envelope.number, now):
-                return Word.REPEATED
-            if now - run.heard > self._patience:  # it was a late message of an earlier run
-                former[run.boot] = run
-                self._runs[envelope.sender] = former.pop(envelope.boot)
-                other.since = now
-                return Word.NEW if envelope.number > highest else Word.LATE
-            if now - run.since > self._patience:
-                self.twins.add(envelope.sender)
-            return Word.REPEATED
+            return self._word_of_former(envelope, run, now)
         if run is None or envelope.boot != run.boot:
             if run is not None:
                 former[run.boot] = run
@@ -298,9 +287,29 @@ class Speakers:
             return Word.REPEATED
         return Word.NEW if envelope.number > highest else Word.LATE
 
+    def _word_of_former(self, envelope: Envelope, run: _Run, now: float) -> Word:
+        """What a message of a former run is worth, with the `run` that is the current one.
+
+        If nothing was heard of that for the patience, the former one is the current one again: what
+        was heard of the other was a late message of an earlier run.
+        """
+        former = self._former[envelope.sender]
+        other = former[envelope.boot]
+        highest = other.highest
+        if not other.takes(envelope.number, now):
+            return Word.REPEATED
+        if now - run.last_heard > self._patience:
+            former[run.boot] = run
+            self._runs[envelope.sender] = former.pop(envelope.boot)
+            other.since = now
+            return Word.NEW if envelope.number > highest else Word.LATE
+        if now - run.since > self._patience:
+            self.twins.add(envelope.sender)
+        return Word.REPEATED
+
     def _note_claim(self, envelope: Envelope, now: float) -> None:
         """Note that another robot is spoken to by this name, by one that has heard this one."""
-        if envelope.heard != NO_BOOT and self.boot_of(envelope.sender) == envelope.boot:
+        if envelope.receiver_boot != NO_BOOT and self.boot_of(envelope.sender) == envelope.boot:
             self.claimed_since = now if self.claimed_since is None else self.claimed_since
             if now - self.claimed_since > self._patience:
                 self.twins.add(self.name)
