@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pgo_models.certificates.certificate import relative_gap
 from pgo_models.errors import SettingError, check_settings
 from pgo_models.figures import rounded_up
 from pgo_models.geometry.poses import Poses
@@ -91,6 +92,7 @@ class BenchmarkRun:
     # Whether the poses are a result of the contender. Those of a method that was stopped in a stage
     # without poses are not.
     is_answer: bool = True
+    lower_bound: float = 0.0  # of F, that is proven for the graph
 
     @property
     def iterations(self) -> tuple[int, ...]:
@@ -98,11 +100,16 @@ class BenchmarkRun:
         return tuple(int(stage.history.k[-1]) for stage in self.stages)
 
     @property
-    def first_objective(self) -> float | None:
-        """F of the poses at which the second stage began; None if there is only one stage."""
+    def gap(self) -> float:
+        """Gap of F to its lower bound."""
+        return relative_gap(self.objective, self.lower_bound)
+
+    @property
+    def first_gap(self) -> float | None:
+        """Gap of F at which the second stage began; None if there is only one stage."""
         if len(self.stages) == 1:
             return None
-        return float(self.stages[1].history.objective[0])
+        return relative_gap(float(self.stages[1].history.objective[0]), self.lower_bound)
 
     @property
     def rounds(self) -> int | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -17,7 +17,7 @@ from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from pgo_models.summaries import Summarised
 from solvers.progress.bars import JobBar
-from solvers.studies.benchmark import BenchmarkMethod, BenchmarkSettings
+from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun, BenchmarkSettings
 from solvers.studies.benchmark_runs import FAILURES, reason_of, run_benchmark, solve_whole
 
 SCENES: dict[str, Callable[[np.random.Generator], PoseGraph]] = {
@@ -76,21 +76,6 @@ class Optimum:
 
 
 @dataclass(frozen=True)
-class TableEntry:
-    """Figures of a method on one draw, see `BenchmarkRun`; `first_gap` is the gap after SOC."""
-
-    objective: float
-    gap: float
-    first_gap: float | None
-    iterations: tuple[int, ...]
-    rounds: int | None
-    num_bytes: int | None
-    seconds: float
-    seconds_per_robot: float
-    remark: str
-
-
-@dataclass(frozen=True)
 class ReproducedRow:
     """One method on one of the paper's graphs, over all its draws."""
 
@@ -98,7 +83,7 @@ class ReproducedRow:
     contender: BenchmarkMethod
     num_draws: int  # number of draws, with or without figures
     optima: tuple[Optimum, ...]
-    cells: tuple[TableEntry, ...]  # of the draws that have figures
+    cells: tuple[BenchmarkRun, ...]  # of the draws that have figures, with the proven bounds
     reasons: tuple[str, ...]  # why other draws have none
 
     @property
@@ -203,7 +188,7 @@ class _RowResults:
         self.settings = settings
         self.seeds = settings.seeds(row.name)
         self.optima: list[Optimum] = []
-        self.cells: dict[BenchmarkMethod, list[TableEntry]] = {}
+        self.cells: dict[BenchmarkMethod, list[BenchmarkRun]] = {}
         self.reasons: dict[BenchmarkMethod, list[str]] = {}
         for contender in TABLE_CONTENDERS:
             self.cells[contender] = []
@@ -240,9 +225,7 @@ class _RowResults:
         for contender in TABLE_CONTENDERS:
             bar.name_part(f"{self.row.name}: {contender.label}")
             try:
-                cell = _compute_cell(
-                    contender, problem, self.row, self.settings, optimum.lower_bound
-                )
+                cell = _run(contender, problem, self.row, self.settings, optimum.lower_bound)
             except FAILURES as error:
                 self.reasons[contender].append(reason_of(error))
             else:
@@ -250,14 +233,14 @@ class _RowResults:
             bar.end_part()
 
 
-def _compute_cell(
+def _run(
     contender: BenchmarkMethod,
     problem: PGOProblem,
     row: PublishedRow,
     settings: ReproductionSettings,
     lower_bound: float,
-) -> TableEntry:
-    """Figures of a contender; a PGOError if it has no result."""
+) -> BenchmarkRun:
+    """Run of a contender; a PGOError if it has no result."""
     start = None
     if contender is BenchmarkMethod.PAPER and row.name in SCENES:
         start = problem.graph.initial
@@ -265,20 +248,7 @@ def _compute_cell(
     trial = run_benchmark(contender, problem, common, start)
     if not trial.is_answer or not np.isfinite(trial.objective):
         raise PGOError(trial.remark)
-    first_gap = None
-    if trial.first_objective is not None:
-        first_gap = float(relative_gap(trial.first_objective, lower_bound))
-    return TableEntry(
-        objective=float(trial.objective),
-        gap=float(relative_gap(trial.objective, lower_bound)),
-        first_gap=first_gap,
-        iterations=trial.iterations,
-        rounds=trial.rounds,
-        num_bytes=trial.num_bytes,
-        seconds=trial.seconds,
-        seconds_per_robot=trial.seconds_per_robot,
-        remark=trial.remark,
-    )
+    return replace(trial, lower_bound=lower_bound)
 
 
 def _optimum(problem: PGOProblem) -> Optimum:

@@ -8,8 +8,8 @@ import numpy as np
 
 from pgo_models.figures import rounded_up
 from solvers.reporting.result_table import ResultTable, TablePart, Value, gap_percent
-from solvers.studies.benchmark import BenchmarkMethod
-from solvers.studies.paper_tables import ReproducedRow, Reproduction, TableEntry
+from solvers.studies.benchmark import BenchmarkMethod, BenchmarkRun
+from solvers.studies.paper_tables import ReproducedRow, Reproduction
 
 _GRAPH_HEADS = ("graph", "poses", "edges", "F*", "proven to (%)")
 _COST_HEADS = (
@@ -262,7 +262,7 @@ def _mean_and_deviation_of_gaps(gaps: Sequence[float]) -> str:
     return f"{gap_percent(mean)} +- {gap_percent(deviation)}"
 
 
-def _iterations(cells: Sequence[TableEntry]) -> str:
+def _iterations(cells: Sequence[BenchmarkRun]) -> str:
     if not cells:
         return "-"
     means = np.mean([cell.iterations for cell in cells], axis=0)

@@ -65,7 +65,7 @@ def test_scenes_show_what_they_should(scenes):
 
 def test_findings_fail_where_the_figures_do(scenes):
     def spoiled(row):
-        cells = tuple(replace(cell, gap=0.5, rounds=10**6) for cell in row.cells)
+        cells = tuple(replace(cell, lower_bound=0.5 * cell.objective) for cell in row.cells)
         return replace(row, cells=cells) if row.published.name == "grid" else row
 
     claims = findings(Reproduction(scenes.settings, tuple(map(spoiled, scenes.rows)), True))
