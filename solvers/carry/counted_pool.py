@@ -72,6 +72,10 @@ class CountedPool:
             self.ledger = self.ledger.after_all_reduce(0)
         return answers
 
+    def ask_all(self, order: Callable[[Any, Q], A], request: Q, count: Count) -> list[A]:
+        """Answers of all workers to an order with the same request."""
+        return self.ask(order, [request] * self.ledger.num_robots, count)
+
     def _obeyed(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
         """Answers of all workers to an order, before which they are told of moments."""
         recall = None if order in _ABOUT_SNAPSHOTS else self.moments.before_order()
@@ -129,7 +133,8 @@ class CountedPool:
         exchange = sender[is_sent], receiver[is_sent], num_bytes[is_sent]
         key = np.concatenate(exchange).tobytes()
         traffic = self._traffic.setdefault(key, Traffic(*exchange))
-        self.ledger = self.ledger.after_exchange(traffic, is_round)
+        after = self.ledger.after_round if is_round else self.ledger.after_messages
+        self.ledger = after(traffic)
 
 
 def by_link(sent: Sequence[Messages[A]]) -> dict[tuple[int, int], A]:

@@ -105,28 +105,21 @@ class Ledger(Summarised):
         Ledger
             The ledger with the round and its messages.
         """
-        return replace(self._with_messages(*exchanged), rounds=self.rounds + 1)
+        return replace(self.after_messages(*exchanged), rounds=self.rounds + 1)
 
-    def after_exchange(self, traffic: Traffic, is_round: bool) -> Ledger:
-        """Return the ledger after an exchange.
+    def after_messages(self, *exchanged: Traffic) -> Ledger:
+        """Return the ledger after exchanges whose round or all-reduce another call counts.
 
         Parameters
         ----------
-        traffic : Traffic
-            Messages of the exchange.
-        is_round : bool
-            Whether it counts as a round of its own. Otherwise only its messages are recorded: the
-            round or all-reduce that it belongs to is counted by another call.
+        *exchanged : Traffic
+            Messages of the exchanges.
 
         Returns
         -------
         Ledger
-            The ledger with the messages, and with the round if it is one.
+            The ledger with the messages.
         """
-        return self.after_round(traffic) if is_round else self._with_messages(traffic)
-
-    def _with_messages(self, *exchanged: Traffic) -> Ledger:
-        """The ledger with the messages of exchanges."""
         # Traffic is hashed by identity: equal but distinct objects get entries of their own, which
         # leaves all totals as they are.
         counted = dict(self.counted)

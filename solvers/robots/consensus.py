@@ -76,8 +76,7 @@ class RobotsOfDriver:
 
     def finish(self) -> None:
         """Give driver and robots omega, and the best translations for it: two rounds."""
-        requests = [None] * self.num_robots
-        answers = self.driver.network.ask(finish_copies, requests, Count.PIGGYBACKED)
+        answers = self.driver.network.ask_all(finish_copies, None, Count.PIGGYBACKED)
         R = np.empty_like(self.driver.current.R)
         for answer in answers:
             R[self.driver.positions(answer.numbers)] = answer.R

@@ -367,7 +367,7 @@ class Driver:
 
     def snapshots(self) -> list[Snapshot]:
         """State of every robot for `resume`, interior poses too; its bytes are counted apart."""
-        return self.network.ask(take_snapshot, [None] * self.network.ledger.num_robots, Count.OFF)
+        return self.network.ask_all(take_snapshot, None, Count.OFF)
 
     def resume(self, state: DriverState, ledger: Ledger, snapshots: Sequence[Snapshot]) -> None:
         """Continue from a state and an account of messages, and robots from their snapshots."""

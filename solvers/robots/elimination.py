@@ -26,7 +26,7 @@ from pgo_models.problem.floating_point import OUTWARD, UNIT_ROUNDOFF, column_err
 from pgo_models.problem.matrices import columns_of, ground, inner
 from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN
-from solvers.robots.subdomain_blocks import SubdomainBlocks, Widths
+from solvers.robots.subdomain_blocks import Products, SubdomainBlocks, Widths
 from solvers.soc.subgraph import Part
 
 
@@ -108,13 +108,7 @@ def eliminate(
     if is_verified:
         nonzeros_in_row = np.count_nonzero(Z, axis=1)
         most_in_row = factor.most_in_row(nonzeros_in_row)
-        error = _schur_error(
-            products.nonzeros_in_column,
-            products.squares,
-            most_in_row,
-            blocks.symmetric(schur),
-            diagonal,
-        )
+        error = _schur_error(products, most_in_row, blocks.symmetric(schur), diagonal)
         schur[blocks.diagonal] -= OUTWARD * error
         interior_error = factor.backward_error(nonzeros_in_row)
     return Elimination(
@@ -123,18 +117,15 @@ def eliminate(
 
 
 def _schur_error(
-    nonzeros_in_column: Array,
-    squares: Array,
-    most_in_row: float,
-    schur: csr_array,
-    diagonal: Array,
+    products: Products, most_in_row: float, schur: csr_array, diagonal: Array
 ) -> Array:
     """Bound what rounding can take of the Schur complement, as a diagonal, (g,).
 
-    The columns of Z are those of a Cholesky factor (`column_error`), with these numbers of
-    non-zeros and sums of squares; the last term is the rounding of the difference itself.
+    The columns of Z are those of a Cholesky factor (`column_error`); the last term is the rounding
+    of the difference itself.
     """
-    error = column_error(nonzeros_in_column, most_in_row) * squares
+    squares = products.squares
+    error = column_error(products.nonzeros_in_column, most_in_row) * squares
     error += 2.0 * UNIT_ROUNDOFF * row_sums(schur, np.maximum(diagonal, squares))
     return np.asarray(error)
 

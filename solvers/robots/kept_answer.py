@@ -101,8 +101,7 @@ class AnswerAtRobots:
     def go_back(self, driver: Driver) -> None:
         """Have robots and driver return to the poses that the robots keep."""
         kept = self.known
-        nothing = [None] * len(kept.robots)
-        driver.network.ask(return_to_answer, nothing, Count.PIGGYBACKED)
+        driver.network.ask_all(return_to_answer, None, Count.PIGGYBACKED)
         driver.current = kept.cover
 
     def salvage(self, reason: Status) -> Attempt:
@@ -121,8 +120,7 @@ class AnswerAtRobots:
         """
         kept = self.known
         turn, shift, frame = _frame(kept.robots)
-        network = driver.network
-        parts = network.ask(move_answer, [(turn, shift)] * len(kept.robots), Count.ROUND)
+        parts = driver.network.ask_all(move_answer, (turn, shift), Count.ROUND)
         objective = math.fsum(part.cost for part in parts)
         rounding = _sum_of_roundings([part.rounding for part in parts])
         self.kept = replace(kept, objective=objective, rounding=rounding)

@@ -103,8 +103,7 @@ def revised(opened: OpenedFiles, job: Pass, monitor: RunMonitor) -> Revision:
         stage, kept = Stage.without_steps(Status.FAILED, objective, "GNC"), None
     if kept is not None:
         return Revision(kept, stage, is_better=True)
-    nothing = [None] * network.ledger.num_robots
-    parts = network.ask(go_back, nothing, Count.PIGGYBACKED)
+    parts = network.ask_all(go_back, None, Count.PIGGYBACKED)
     return Revision(opened.with_parts(parts), stage, is_better=False)
 
 
@@ -142,10 +141,9 @@ def _judged(
 def _taken_back(opened: OpenedFiles, job: Pass) -> list[TakenBack]:
     """What every robot takes back; neighbours agree on what is near the map."""
     network = opened.driver.network
-    num_robots = network.ledger.num_robots
-    near: Sequence[Messages[BoolArray]] = [Messages()] * num_robots
+    near: Sequence[Messages[BoolArray]] = [Messages()] * network.ledger.num_robots
     if job.comes_back is ComesBack.NEAR:
-        solved_poses = network.ask(tell_solved, [None] * num_robots, Count.PIGGYBACKED)
+        solved_poses = network.ask_all(tell_solved, None, Count.PIGGYBACKED)
         requests = [
             (received, opened.weighting, job.gnc.quantile)
             for received in network.exchange(solved_poses)
@@ -173,10 +171,9 @@ def holding(links: Sequence[Links]) -> list[BoolArray]:
 def go_to_poses_found(driver: Driver) -> None:
     """Go to the poses that the robots have found of their own."""
     network = driver.network
-    nothing = [None] * network.ledger.num_robots
     R = driver.current.R.copy()
     t = driver.current.t.copy()
-    for on_cover in network.ask(tell_cover, nothing, Count.ROUND):
+    for on_cover in network.ask_all(tell_cover, None, Count.ROUND):
         positions = driver.positions(on_cover.numbers)
         R[positions] = on_cover.poses.R
         t[positions] = on_cover.poses.t

@@ -160,7 +160,7 @@ def open_files(
     """
     network = CountedPool(engine.open(Agent, files), len(files))
     try:
-        claims = network.ask(read_file, [None] * len(files), Count.ROUND)
+        claims = network.ask_all(read_file, None, Count.ROUND)
         joined = _joined(network, files, claims, trust_folder)
         components = _components_to_leave_out(*joined[:2]) if leaves_out else None
         num_named = joined[1]
@@ -244,7 +244,7 @@ def _placed(
     pairs = np.concatenate([border.pairs for border in borders])
     owners = np.concatenate([border.owners for border in borders])
     placements = place_poses(pairs, owners, len(borders), borders[0].middle)
-    can_run_soc = network.ask(take_cost, [weighting] * len(borders), Count.ROUND)
+    can_run_soc = network.ask_all(take_cost, weighting, Count.ROUND)
     has_two_costs = not all(can_run_soc)
     places = [(placement, has_two_costs) for placement in placements]
     summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
@@ -257,8 +257,8 @@ def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) ->
     It is 1 where the errors are not clearly smaller than claimed, or robots have few closures of
     their own.
     """
-    requests = [(weighting, quantile)] * network.ledger.num_robots
-    scales = np.array(network.ask(tell_error_scale, requests, Count.PIGGYBACKED))
+    request = (weighting, quantile)
+    scales = np.array(network.ask_all(tell_error_scale, request, Count.PIGGYBACKED))
     known = scales[np.isfinite(scales)]
     scale = float(np.median(known)) if len(known) else 1.0
     return scale if threshold_scale(scale) < 1.0 else 1.0
@@ -266,9 +266,7 @@ def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) ->
 
 def _agreements(network: CountedPool, quantile: float, scale: float) -> list[AgreeingCounts]:
     """Have every two robots judge the edges between them, with errors of a scale."""
-    trajectories_sent = network.ask(
-        tell_trajectories, [None] * network.ledger.num_robots, Count.PIGGYBACKED
-    )
+    trajectories_sent = network.ask_all(tell_trajectories, None, Count.PIGGYBACKED)
     requests = [
         (trajectories, quantile, scale) for trajectories in network.exchange(trajectories_sent)
     ]

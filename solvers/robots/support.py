@@ -236,8 +236,7 @@ def edges_kept(opened: OpenedFiles, cost: float) -> EdgesKept:
     """What robots have kept, with the cost of the poses that they keep."""
     driver = opened.driver
     request = (opened.weighting, opened.threshold_scale)
-    requests = [request] * len(opened.borders)
-    robots = driver.network.ask(tell_support, requests, Count.PIGGYBACKED)
+    robots = driver.network.ask_all(tell_support, request, Count.PIGGYBACKED)
     num_poses, num_edges = opened.sizes.sum(axis=1).tolist()
     return EdgesKept(
         robots, num_poses, num_edges, _num_bridges(robots, opened.borders), cost, driver.d

@@ -180,8 +180,7 @@ class FilesOfRobots:
             best, frame, F = answer.holder.move_to_frame(driver, answer.best)
             kept = None if self.robust is None else edges_kept(opened, best.proof.objective)
             if out is not None:
-                nothing = [None] * len(self.files)
-                driver.network.ask(partial(write_answer, out), nothing, Count.PIGGYBACKED)
+                driver.network.ask_all(partial(write_answer, out), None, Count.PIGGYBACKED)
         return RobotsSolution(
             name=name,
             certificate=best.proof,
