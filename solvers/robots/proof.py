@@ -93,7 +93,7 @@ def best_bound_distributed(
 
 
 def _best_form(driver: Driver, gap: float, most_lost: float | None, deadline: float) -> LowerBound:
-    """The bound of the form without eta, with terms, or with the smallest eta that is found."""
+    """The bound without eta, with terms, or the better form with the smallest eta found."""
     has_scale = bool((driver.diagonal > 0.0).all())
     grounded = prove_grounded(driver, 0.0) if has_scale else None
     if grounded is not None and grounded.value > 0.0:
@@ -107,25 +107,11 @@ def _best_form(driver: Driver, gap: float, most_lost: float | None, deadline: fl
                 return with_terms
     if not has_scale:
         return central.NO_BOUND
-    return _search_forms(driver, gap, most_lost, deadline)
-
-
-def _search_forms(
-    driver: Driver,
-    gap: float,
-    most_lost: float | None,
-    deadline: float,
-) -> LowerBound:
-    """Return the better of both forms of the bound, each with the smallest eta found."""
     count = driver.num_poses * driver.d
-    smallest = central.smallest_shift(gap, driver.current.objective, count)
     # At stationary poses tr(Lambda) is F; it only says where the search ends.
     return central.search_forms(
-        [
-            partial(prove_with_eta, driver),
-            partial(prove_grounded, driver),
-        ],
-        smallest,
+        [partial(prove_with_eta, driver), partial(prove_grounded, driver)],
+        central.smallest_shift(gap, driver.current.objective, count),
         driver.current.objective if most_lost is None else most_lost,
         count,
         deadline,

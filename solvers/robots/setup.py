@@ -104,7 +104,6 @@ class OpenedFiles:
 
     driver: Driver  # the driver of the robots
     borders: Sequence[Border]  # what the robots have told of their edges to others
-    sizes: IntArray  # (2, num_robots): number of poses with an edge, and of edges, of every robot
     folder: Path  # where the files are
     weighting: Weighting  # the cost that is solved: ISOTROPIC or INFORMATION
     has_indefinite: bool  # whether the share of any edge in chi2 can be negative
@@ -116,19 +115,18 @@ class OpenedFiles:
     # errors than their files claim
     threshold_scale: float = 1.0
 
+    @property
+    def sizes(self) -> IntArray:
+        """Numbers of poses with an edge, and of edges, of every robot, (2, num_robots)."""
+        return np.array([border.counts for border in self.borders]).T
+
     def with_edges(self, borders: Sequence[Border], num_rejected: int) -> OpenedFiles:
         """The same robots with other edges; `borders` are their borders with these."""
         old = self.driver
-        driver, sizes = _placed(
+        driver = _placed(
             old.network, borders, old.num_poses, old.memory, self.weighting, self.folder
         )
-        return replace(
-            self,
-            driver=driver,
-            borders=borders,
-            sizes=sizes,
-            num_rejected=num_rejected,
-        )
+        return replace(self, driver=driver, borders=borders, num_rejected=num_rejected)
 
     def with_parts(self, parts: Sequence[ConsistentPart]) -> OpenedFiles:
         """The same robots with the edges that remain in their reports."""
@@ -179,11 +177,10 @@ def open_files(
             scale = _error_scale(network, weighting, robust.quantile)
 
         def opened(borders: Sequence[Border], num_rejected: int = 0) -> OpenedFiles:
-            driver, sizes = _placed(network, borders, num_poses, memory, weighting, folder)
+            driver = _placed(network, borders, num_poses, memory, weighting, folder)
             return OpenedFiles(
                 driver,
                 borders,
-                sizes,
                 folder,
                 weighting,
                 has_indefinite,
@@ -234,12 +231,11 @@ def _placed(
     memory: float,
     weighting: Weighting,
     folder: Path,
-) -> tuple[Driver, IntArray]:
-    """Driver of robots with these borders, and their sizes as in `OpenedFiles`.
+) -> Driver:
+    """Driver of robots with these borders.
 
     Where the cost that is solved is not convex and quadratic for some robot, SOC runs on another.
     """
-    sizes = np.array([border.counts for border in borders]).T
     _check_connected(borders, num_poses, folder)
     pairs = np.concatenate([border.pairs for border in borders])
     owners = np.concatenate([border.owners for border in borders])
@@ -248,7 +244,7 @@ def _placed(
     has_two_costs = not all(can_run_soc)
     places = [(placement, has_two_costs) for placement in placements]
     summaries = network.ask(place_cover, places, Count.PIGGYBACKED)
-    return Driver(summaries, num_poses, lambda: network, memory), sizes
+    return Driver(summaries, num_poses, lambda: network, memory)
 
 
 def _error_scale(network: CountedPool, weighting: Weighting, quantile: float) -> float:

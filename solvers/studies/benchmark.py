@@ -144,7 +144,7 @@ class BenchmarkRun:
         """
         return math.fsum(stage.seconds / stage.num_robots for stage in self.stages)
 
-    def curve(self, lower_bound: float) -> Curve:
+    def curve(self) -> Curve:
         """All stages, one after the other, to be plotted."""
         records: list[Record] = []
         k = 0
@@ -158,7 +158,7 @@ class BenchmarkRun:
         return Curve(
             self.contender.label,
             History(tuple(records)),
-            lower_bound,
+            self.lower_bound,
             rounds=_added_up([stage.rounds for stage in self.stages]),
             num_bytes=_added_up([stage.num_bytes for stage in self.stages]),
             place=list(BenchmarkMethod).index(self.contender),

@@ -4,11 +4,10 @@ import importlib.util
 import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pgo_models.certificates.certificate import relative_gap
 from pgo_models.certificates.fit import fits_to_rounding
 from pgo_models.certificates.rounding_errors import objective_rounding
 from pgo_models.errors import SettingError, check_settings
@@ -76,7 +75,7 @@ class Comparison(Summarised):
     @property
     def curves(self) -> list[Curve]:
         """Curves of all methods with a result; their gaps are those to the proven bound."""
-        return [trial.curve(self.lower_bound) for trial in self.trials if trial.is_answer]
+        return [trial.curve() for trial in self.trials if trial.is_answer]
 
     def table(self) -> ResultTable:
         """Return a row for every method, with those without figures last."""
@@ -151,7 +150,8 @@ def compare_methods(
         for contender in settings.chosen:
             bar.name_part(contender.label)
             try:
-                trials.append(run_benchmark(contender, problem, settings.trial))
+                trial = run_benchmark(contender, problem, settings.trial)
+                trials.append(replace(trial, lower_bound=solution.lower_bound))
             except FAILURES as error:
                 reasons.append((contender, reason_of(error)))
             bar.end_part()
@@ -222,7 +222,7 @@ def _record(trial: BenchmarkRun, comparison: Comparison) -> dict[str, Value]:
     if trial.is_answer:
         is_exact = fits_to_rounding(comparison.problem, trial.poses)
         record["objective"] = trial.objective
-        record["gap"] = relative_gap(trial.objective, comparison.lower_bound, is_exact)
+        record["gap"] = 0.0 if is_exact else trial.gap
     return record
 
 
