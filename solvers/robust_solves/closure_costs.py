@@ -2,8 +2,7 @@
 
 The known inliers between the ends of closures, and the closures, are a problem of their own; what
 is left out costs nothing at least. A certificate bounds its least cost from below, whatever poses
-were found, and so does one of a problem whose cost is below: of chains with few steps, or of an F
-below chi2.
+were found, and so does one of an F below chi2.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 
@@ -23,22 +21,16 @@ from pgo_models.graphs.precisions import proper_information
 from pgo_models.problem.problem import PGOProblem
 from pgo_models.problem.weighting import Weighting
 from solvers.here import Here
-from solvers.loop import RunMonitor, iterate
+from solvers.loop import RunMonitor
 from solvers.plan import solve_at
 from solvers.request import Pipeline
 from solvers.result import StageTable
-from solvers.riemannian.staircase import Staircase
-from solvers.robust.chains import is_whole
-from solvers.robust_solves.chain_sums import ChainSums
-from solvers.robust_solves.coarse_chains import CoarseChains
+from solvers.robust.chains import Chains, is_whole
 
 # Relative gap of the first certificate: of most wrong closures the cost is many times s.
 _WIDE_GAP = 0.5
 # Poses are not improved: what counts is the bound.
 _FOR_BOUNDS = Pipeline(soc=None, handedness=None, growing=None, other_starts=False)
-# A wide gap can be proven far from a stationary point.
-_COARSE_STAIRCASE = Staircase(tolerance=1e-2, gap=_WIDE_GAP)
-_MOST_STEPS = 100  # of the coarse staircase; after them the best bound so far stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,22 +39,14 @@ class ClosureCosts:
 
     problem: PGOProblem
     known: BoolArray
-    sums: ChainSums
+    chains: Chains
 
-    def lower_bound(self, edges: tuple[int, ...], s: float, num_steps: int | None) -> float:
+    def lower_bound(self, edges: tuple[int, ...], s: float) -> float:
         """Proven lower bound, as far as it is above s.
 
-        With `num_steps` chains are made of so many steps. The tangent of a chi2 that is not
-        quadratic proves little of the large cost of a wrong closure. The bound is then that of an F
-        below chi2.
+        The tangent of a chi2 that is not quadratic proves little of the large cost of a wrong
+        closure. The bound is then that of an F below chi2.
         """
-        if num_steps is not None:
-            coarse_chains = CoarseChains(self.sums).with_closures(edges, num_steps)
-            if coarse_chains is None:
-                return 0.0
-            coarse, rounding = coarse_chains
-            problem = PGOProblem(coarse, self.problem.backend, Weighting.ISOTROPIC)
-            return _relaxed_bound(problem, s + rounding) - rounding
         subgraph = self._between_ends(edges)
         if subgraph is None:
             return 0.0
@@ -77,7 +61,7 @@ class ClosureCosts:
         """The problem of known inliers and closures between the ends of these; None if apart."""
         graph = self.problem.graph
         ends = np.concatenate([graph.i[list(edges)], graph.j[list(edges)]])
-        chain = self.sums.chains.chain
+        chain = self.chains.chain
         poses = [
             np.arange(ends[chain[ends] == c].min(), ends[chain[ends] == c].max() + 1)
             for c in np.unique(chain[ends])
@@ -161,20 +145,6 @@ def _least_eigenvalues(blocks: Array) -> Array:
     It makes blocks smaller by more than the rounding of their eigenvalues.
     """
     return np.asarray(np.maximum(np.linalg.eigvalsh(blocks)[:, 0], 0.0))
-
-
-def _relaxed_bound(problem: PGOProblem, s: float) -> float:
-    """Proven lower bound on a cost from its relaxation; the search ends where it is above s."""
-    bound = 0.0
-    try:
-        for state in islice(iterate(_COARSE_STAIRCASE, problem), _MOST_STEPS):
-            if state.bound is not None:
-                bound = max(bound, state.bound.lower_bound)
-            if bound > s or state.is_solved or state.stalled:
-                break
-    except FAILURES:
-        pass
-    return bound
 
 
 def _bound_above(problem: PGOProblem, s: float) -> float:

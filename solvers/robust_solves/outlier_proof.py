@@ -37,22 +37,18 @@ from solvers.solution import Solution
 class _Effort:
     """How hard proofs are tried, and for which closures and pairs.
 
-    First-order distances and the bounds that are known have to be so many times s. `num_steps` are
-    those that chains are made of (`CoarseChains`); None for chains as they are.
+    First-order distances and the bounds that are known have to be so many times s.
     """
 
     distance: float
     bound: float
-    num_steps: int | None
 
 
 # Proofs that are easy and likely to succeed come first, as s falls with each success.
 _EFFORTS = (
-    _Effort(1.5, 0.4, 24),
-    _Effort(1.5, 0.25, 24),
-    _Effort(1.2, 0.2, 96),
-    _Effort(1.0, 0.1, None),
-    _Effort(1.2, 0.0, None),
+    _Effort(1.5, 0.4),
+    _Effort(1.0, 0.1),
+    _Effort(1.2, 0.0),
 )
 # Proofs after which s is computed again.
 _MOST_PROOFS = 64
@@ -125,8 +121,7 @@ class _Search:
 
     `distance` (m,) are first-order distances of closures, and `pair_distance` those of pairs among
     the closures `paired` (q,); there are none as long as closures are too many. `tried` are edges
-    with the number of steps that chains were made of; the search is complete unless the time did
-    not suffice for a proof.
+    whose cost was bounded; the search is complete unless the time did not suffice for a proof.
     """
 
     proven: ProvenClosures
@@ -136,7 +131,7 @@ class _Search:
     distance: Array
     paired: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     pair_distance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    tried: set[tuple[tuple[int, ...], int | None]] = field(default_factory=set)
+    tried: set[tuple[int, ...]] = field(default_factory=set)
     is_complete: bool = True
 
     @classmethod
@@ -159,7 +154,7 @@ class _Search:
         return cls(
             ProvenClosures.of(known, kept, thresholds, cost, cycles.of_singles(closures)),
             cycles,
-            ClosureCosts(problem, known, cycles.sums),
+            ClosureCosts(problem, known, chains),
             deadline,
             distance,
         )
@@ -200,7 +195,7 @@ class _Search:
         tried = np.flatnonzero(hopeful & ~proven.is_kept)
         ratio = proven.singles[tried] / np.maximum(s[tried], _LEAST)
         for e in tried[np.argsort(-ratio, kind="stable")].tolist():
-            proven.raise_single(e, self._prove((e,), s[e], effort))
+            proven.raise_single(e, self._prove((e,), s[e]))
         proven.leave_out_wrong()
 
     def try_pairs(self, effort: _Effort) -> None:
@@ -210,7 +205,7 @@ class _Search:
         most_tried = len(self.tried) + _MOST_PROOFS
 
         def prove(e: int, members: IntArray) -> None:
-            self._try_pairs_of(e, members, effort, most_tried)
+            self._try_pairs_of(e, members, most_tried)
 
         self.proven.join_classes(self._is_hopeful(effort), prove)
 
@@ -225,7 +220,7 @@ class _Search:
         hopeful = (bound >= effort.bound * s) & (distance > effort.distance * s)
         return np.asarray(hopeful & ~np.logical_and.outer(proven.is_kept, proven.is_kept))
 
-    def _try_pairs_of(self, e: int, members: IntArray, effort: _Effort, most_tried: int) -> None:
+    def _try_pairs_of(self, e: int, members: IntArray, most_tried: int) -> None:
         """Try to prove a closure inconsistent with others, the hardest first, until one fails."""
         proven = self.proven
         assert proven.pairs is not None
@@ -236,17 +231,17 @@ class _Search:
             if len(self.tried) >= most_tried:
                 return
             f = int(others[place])
-            proven.raise_pair(e, f, self._prove((e, f), s[place], effort))
+            proven.raise_pair(e, f, self._prove((e, f), s[place]))
             if not proven.are_inconsistent(e, others[[place]]).all():
                 return
 
-    def _prove(self, closures: tuple[int, ...], s: float, effort: _Effort) -> float:
-        """Lower bound that an effort proves; zero if it was made before."""
+    def _prove(self, closures: tuple[int, ...], s: float) -> float:
+        """Lower bound by a certificate; zero if it was tried before."""
         edges = tuple(sorted(self.proven.edges[list(closures)].tolist()))
-        if (edges, effort.num_steps) in self.tried or not self.has_time():
+        if edges in self.tried or not self.has_time():
             return 0.0
-        self.tried.add((edges, effort.num_steps))
-        return self.costs.lower_bound(edges, s, effort.num_steps)
+        self.tried.add(edges)
+        return self.costs.lower_bound(edges, s)
 
 
 def _single_distances(chains: Chains, edges: IntArray) -> Array:

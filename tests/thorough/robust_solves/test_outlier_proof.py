@@ -204,6 +204,19 @@ def test_of_matrices_that_are_singular_or_hidden_other_edges_keep_their_precisio
         assert found[2] == 0.0
 
 
+def test_the_precisions_are_those_of_an_f_below_chi2() -> None:
+    graph = informed(3, 12, 3, coupled=False, spread=2.0, noise=NoiseModel(0.5, 0.5))
+    problem = pgo.PGOProblem(graph, weighting=pgo.Weighting.INFORMATION)
+    kappa, tau = precisions_below(problem)
+    assert kappa.shape == tau.shape == (graph.num_edges,)
+    rng = np.random.default_rng(0)
+    below = pgo.PGOProblem(replace(graph.with_weights(kappa, tau), information=None))
+    for spread in (1e-3, 1.0):
+        R = graph.truth.R @ pgo.exp_map(spread * rng.standard_normal((12, 3)))
+        poses = replace(graph.truth, R=R, t=graph.truth.t + spread * rng.standard_normal((12, 3)))
+        assert (below.edge_costs(poses) <= problem.edge_costs(poses) * (1 + 1e-12)).all()
+
+
 @pytest.mark.parametrize("coupled", [False, True])
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_isotropic_cost_is_below_chi2_at_all_poses(d: int, coupled: bool) -> None:
