@@ -160,13 +160,14 @@ def prove_model_bound(
 ) -> ModelBound | None:
     """The bound of some multipliers, or None where S_r is not proven definite.
 
-    u is moved where that raises the bound; coordinates that are left out stay as they are.
+    u is moved where that raises the bound; coordinates that are left out stay as they are, but for
+    fixed ones, which have to be right.
     """
     lagrangian = _Lagrangian.of(form, equations, multipliers)
     proof = lagrangian.prove()
     if proof is None:
         return None
-    best = _bound_at(lagrangian, proof, u)
+    best = _bound_at(lagrangian, proof, form.with_fixed(u))
     for _ in range(MOST_MOVES):
         G, _ = lagrangian.gradient(best.u)
         bound = _bound_at(lagrangian, proof, best.u - proof.solve(G[:, None])[:, 0])

@@ -22,6 +22,7 @@ from pgo_models.geometry.rotations import Array
 
 # J of values whose residuals are that many times what rounding makes them counts as zero
 _ROUNDING_MULTIPLE = 4.0
+FEASIBLE = 1e-5  # largest violation of values that may be certified; SOC leaves 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +36,13 @@ class ModelCertificate(ReadOnly):
     objective_error : float
         Bound on its rounding, and on what J gains where values violate constraints. Of a model that
         is not quadratic J is taken as computed.
+    violation : float
+        How much the values violate the sets and the constraints: the largest share of the terms of
+        an equation. Of a model that is not quadratic, the norm of all violations.
     bound : ModelBound, HullBound or None
         The proof; None where no bound was proven.
     is_exact : bool
-        Whether J is a sum of squares whose residuals are all zero to rounding.
+        Whether J is a sum of squares whose residuals are all zero to rounding, at feasible values.
     wanted_gap : float
         The gap that was asked for.
     form : QuadraticForm or None
@@ -51,6 +55,7 @@ class ModelCertificate(ReadOnly):
 
     objective: float
     objective_error: float
+    violation: float
     bound: ModelBound | HullBound | None
     is_exact: bool
     wanted_gap: float = DEFAULT_GAP
@@ -89,7 +94,8 @@ class ModelCertificate(ReadOnly):
             return Verdict.EXACT
         if self.bound is None:
             return Verdict.TRIVIAL
-        return Verdict.CERTIFIED if self.gap <= self.wanted_gap else Verdict.NOT_CERTIFIED
+        is_closed = self.gap <= self.wanted_gap and self.violation <= FEASIBLE
+        return Verdict.CERTIFIED if is_closed else Verdict.NOT_CERTIFIED
 
     @property
     def is_certified(self) -> bool:
@@ -139,6 +145,9 @@ class ModelCertificate(ReadOnly):
             return facts
         if self.bound is not None and self.bound.value > self.objective:
             facts.append(("no more, as", f"no J is below {self.bound.value:.6g}: {_VIOLATED}"))
+        elif not self.violation <= FEASIBLE:
+            reason = f"the values violate constraints by {self.violation:.2g}"
+            facts.append(("no more, as", reason))
         if self.reason:
             facts.append(("no more, as", self.reason))
         return facts
@@ -177,18 +186,22 @@ def judge_by_hulls(
     if bound is not None:
         error = violation * float(np.linalg.norm(bound.y[bound.program.of_model]))
     is_nonnegative = bool(problem.J.is_nonneg())
-    return ModelCertificate(objective, error, bound, False, gap, None, reason, is_nonnegative)
+    return ModelCertificate(
+        objective, error, violation, bound, False, gap, None, reason, is_nonnegative
+    )
 
 
 def judge_values(
     form: QuadraticForm,
     u: Array,
+    violation: float,
     bound: ModelBound | None,
     gap: float = DEFAULT_GAP,
 ) -> ModelCertificate:
     """Hold a point of the sets against a bound.
 
-    A ProofError where J is below the bound by more than rounding: then one of the two is wrong.
+    `violation` is that of the sets and constraints at the point. A ProofError where J is below the
+    bound by more than rounding: then one of the two is wrong.
     """
     if not 0 < gap < math.inf:
         raise SettingError(f"gap is {gap}; give a positive relative gap, as 1e-6")
@@ -198,13 +211,14 @@ def judge_values(
     error += 64.0 * float(np.finfo(float).eps) * float(abs(gradient) @ abs(u))
     error += gained(bound, u)
     level = form.rounding_level(u)
-    is_exact = form.is_sum_of_squares and objective <= _ROUNDING_MULTIPLE * level
+    is_zero = form.is_sum_of_squares and objective <= _ROUNDING_MULTIPLE * level
+    is_exact = is_zero and violation <= FEASIBLE
     if bound is not None and bound.value > objective + error:
         raise ProofError(
             f"lower bound {bound.value!r} is above J = {objective!r}, which is known to "
             f"{error:.2g}: a defect of pgo_models; please report it with the model"
         )
-    return ModelCertificate(objective, error, bound, is_exact, gap, form)
+    return ModelCertificate(objective, error, violation, bound, is_exact, gap, form)
 
 
 def gained(bound: ModelBound | None, u: Array) -> float:

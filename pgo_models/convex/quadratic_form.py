@@ -306,9 +306,13 @@ class QuadraticForm(ReadOnly):
         """The u of the coordinates of x, with the best values of all others."""
         if self.reduction is not None:
             return np.asarray(self.reduction[:, :-1] @ x[self.free_x] + self.reduction[:, -1])
-        u = np.where(self.is_free, 0.0, self.fixed)
+        u = np.zeros(self.side)
         u[: len(x)] = x
-        return self.with_best_others(u)
+        return self.with_best_others(self.with_fixed(u))
+
+    def with_fixed(self, u: Array) -> Array:
+        """U with the values that equalities give to coordinates."""
+        return np.where(self.is_free, u, self.fixed)
 
     @cached_property
     def free_x(self) -> IntArray:

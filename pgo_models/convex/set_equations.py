@@ -158,8 +158,16 @@ class SetEquations(ReadOnly):
         return np.bincount(self.k, self._all_terms(u), self.number).astype(float)
 
     def value_sizes(self, u: Array) -> Array:
-        """The sums of the absolute terms of u^T A_k u, (number,)."""
-        return np.bincount(self.k, abs(self._all_terms(u)), self.number).astype(float)
+        """The sums of the absolute terms of u^T A_k u, (number,); numbers below 1 count as 1."""
+        at_least_one = np.maximum(abs(u), 1.0)
+        return np.bincount(self.k, abs(self._all_terms(at_least_one)), self.number).astype(float)
+
+    def violation(self, u: Array) -> float:
+        """The largest violation of an equation or an inequality, as a share of its terms."""
+        shares = self.values(u) / np.maximum(self.value_sizes(u), 1e-300)
+        inequalities = [product.start for product in self.products if product.side == 1]
+        violations = [*abs(shares[: self.num_equations]), *-shares[inequalities]]
+        return float(np.max(violations, initial=0.0))
 
     def terms(self, multipliers: Array, u: Array) -> Array:
         """The terms of sum l_k u^T A_k u, of at most four factors each."""

@@ -19,6 +19,7 @@ from pgo_models.convex.hull_bound import prove_hull_bound
 from pgo_models.convex.hulls import with_hull_products, with_inequalities
 from pgo_models.convex.model_bound import ModelBound, best_model_bound, prove_model_bound
 from pgo_models.convex.model_certificate import (
+    FEASIBLE,
     ModelCertificate,
     gained,
     judge_by_hulls,
@@ -31,13 +32,15 @@ from pgo_models.convex.model_relaxation import (
     moved_multipliers,
     solve_model_relaxation,
 )
-from pgo_models.convex.orthogonality import OrthogonalProblem
+from pgo_models.convex.orthogonality import OrthogonalProblem, norm_of_all
 from pgo_models.convex.quadratic_form import NotQuadraticError, QuadraticForm, quadratic_form
 from pgo_models.convex.set_equations import SetEquations, set_equations
 from pgo_models.errors import PGOError
 from pgo_models.geometry.rotations import Array
-from solvers.convex.constrained_newton import constrained_stationary_point, is_feasible
+from solvers.convex.constrained_newton import constrained_stationary_point
 from solvers.convex.model_newton import ModelNewton
+
+_ROUNDING = 1e-9  # violation of a point to which Newton has moved
 
 
 def certify_model(
@@ -47,22 +50,26 @@ def certify_model(
     copies = problem.near_point(values).copies
     projected = problem.values(copies)
     try:
-        form = with_gauge_held(quadratic_form(problem))
+        form = quadratic_form(problem)
+        # entries that equalities fix may not be those that are given
+        moved = _distance(form.values(form.u_of(projected)), projected)
+        form = with_gauge_held(form)
         equations = with_inequalities(form, set_equations(form))
     except NotQuadraticError as error:
         objective, others = _with_best_others(problem, projected)
         violation = problem.infeasibility(copies, others)
         bound_by_hulls = prove_hull_bound(problem)
         return judge_by_hulls(problem, objective, violation, bound_by_hulls, str(error), gap)
+    u = form.u_of(projected)
     if form.limits_x:
         objective, others = _with_best_others(problem, projected)
-        u = form.with_others(form.u_of(projected), others)
-        bound, _ = best_bound(form, equations, u, gap)
-        judged = ModelCertificate(objective, gained(bound, u), bound, False, gap, form)
-        return _or_by_hulls(problem, judged, problem.infeasibility(copies, others))
-    u = form.u_of(projected)
+        u = form.with_others(u, others)
     bound, _ = best_bound(form, equations, u, gap)
-    return judge_values(form, u, bound, gap)
+    violation = max(equations.violation(u), moved)
+    if form.limits_x:
+        judged = ModelCertificate(objective, gained(bound, u), violation, bound, False, gap, form)
+        return _or_by_hulls(problem, judged, problem.infeasibility(copies, others))
+    return judge_values(form, u, violation, bound, gap)
 
 
 def certified_point(
@@ -72,8 +79,9 @@ def certified_point(
 
     A NotQuadraticError where sets have no equations.
     """
-    bound, u = best_bound(form, set_equations(form), form.u_of(values), gap)
-    return judge_values(form, u, bound, gap), u
+    equations = set_equations(form)
+    bound, u = best_bound(form, equations, form.u_of(values), gap)
+    return judge_values(form, u, equations.violation(u), bound, gap), u
 
 
 def certified_feasible(
@@ -92,12 +100,14 @@ def certified_feasible(
     equations = with_inequalities(form, set_equations(form))
     given = form.with_others(form.u_of(values), others)
     bound, u = best_bound(form, equations, given, gap)
-    if is_feasible(equations, u):
-        return _or_by_hulls(problem, judge_values(form, u, bound, gap), 0.0), u
+    violation = equations.violation(u)
+    if violation <= _ROUNDING:
+        return _or_by_hulls(problem, judge_values(form, u, violation, bound, gap), 0.0), u
     error = gained(bound, given)
-    objective, violation = measured
-    judged = ModelCertificate(objective, error, bound, False, gap, form)
-    return _or_by_hulls(problem, judged, violation), None
+    objective, distance = measured
+    violation = max(equations.violation(given), _distance(form.values(given), values))
+    judged = ModelCertificate(objective, error, violation, bound, False, gap, form)
+    return _or_by_hulls(problem, judged, distance), None
 
 
 def _or_by_hulls(
@@ -110,6 +120,10 @@ def _or_by_hulls(
     reason = "constraints beside the sets leave a gap in the relaxation"
     gap = certificate.wanted_gap
     return judge_by_hulls(problem, certificate.objective, violation, bound, reason, gap)
+
+
+def _distance(values: Sequence[Array], others: Sequence[Array]) -> float:
+    return norm_of_all([value - other for value, other in zip(values, others, strict=True)])
 
 
 def _with_best_others(
@@ -165,7 +179,14 @@ class _Search:
     @property
     def is_done(self) -> bool:
         """Whether the gap between the two is the one asked for."""
-        return judge_values(self.newton.form, self.best, self.bound, self.gap).is_certified
+        violation = self.newton.equations.violation(self.best)
+        form = self.newton.form
+        return judge_values(form, self.best, violation, self.bound, self.gap).is_certified
+
+    def rank(self, u: Array) -> tuple[bool, float]:
+        """Points that hold the constraints come first, then the lowest J."""
+        is_feasible = self.newton.equations.violation(u) <= FEASIBLE
+        return not is_feasible, self.newton.form.objective(u)
 
     def stationary(self, u: Array) -> Array:
         """The stationary point beside u."""
@@ -185,8 +206,7 @@ class _Search:
         except PGOError:  # of the solver; the bounds that are known are what is left
             return
         other = self.stationary(self.newton.on_sets(u))
-        if self.newton.is_possible or is_feasible(self.newton.equations, other):
-            self.best = min(self.best, other, key=form.objective)
+        self.best = min(self.best, other, key=self.rank)
         moved = moved_multipliers(form, equations, multipliers, self.best)
         self.add(prove_model_bound(form, equations, moved, self.best))
         given = definite_multipliers(equations, multipliers)

@@ -21,7 +21,7 @@ _MOST_STEPS = 30
 _MOST_CHANGES = 8  # of the active inequalities
 _LARGEST = 600  # coordinates; the systems are dense
 _FAR = 1.0  # a step that moves u by this share of its size leaves the neighbourhood of the start
-_ZERO = 1e-9  # a multiplier or an equation, as a share of the largest multiplier or of its terms
+_ZERO = 1e-9  # a multiplier or a step, as a share of the largest multiplier or of u
 
 
 def constrained_stationary_point(form: QuadraticForm, equations: SetEquations, u: Array) -> Array:
@@ -41,13 +41,6 @@ def constrained_stationary_point(form: QuadraticForm, equations: SetEquations, u
             return point
         active = np.concatenate([active[~is_negative], violated])
     return u
-
-
-def is_feasible(equations: SetEquations, u: Array) -> bool:
-    """Whether u is in the sets and holds all constraints, to rounding."""
-    values = equations.values(u)
-    values[equations.num_equations :] = np.minimum(values[equations.num_equations :], 0.0)
-    return bool((abs(values) <= _ZERO * np.maximum(equations.value_sizes(u), 1e-300)).all())
 
 
 def _stationary(

@@ -85,15 +85,17 @@ class ModelNewton(ReadOnly):
         return u
 
     def on_sets(self, u: Array) -> Array:
-        """U with x projected onto the sets, and y at its best, or as it is under inequalities."""
-        x = u[: self.form.num_constrained].copy()
+        """U with x projected onto the sets, and y at its best, or as it is under inequalities.
+
+        Fixed entries keep their values, and may leave their variable outside its set.
+        """
+        moved = u.copy()
         for block in self.form.blocks:
-            if self.form.is_free[block.start]:
-                value = block.sets[0].projected(block.value(x[block.coordinates]))
-                x[block.coordinates] = block.coordinates_of(value)
+            value = block.sets[0].projected(block.value(u[block.coordinates]))
+            moved[block.coordinates] = block.coordinates_of(value)
         if self.form.G.shape[0]:
-            return np.concatenate([x, u[len(x) :]])
-        return self.form.u_of_entries(x)
+            return self.form.with_fixed(moved)
+        return self.form.u_of_entries(moved[: self.form.num_constrained])
 
     @cached_property
     def _halves(self) -> tuple[Array, Array] | None:

@@ -148,3 +148,79 @@ def test_values_that_no_other_variable_makes_feasible_are_said_to_be_so() -> Non
     problem = constrained("a large entry", 0)
     with pytest.raises(pgo.PGOError, match="infeasible"):
         solvers.certify(problem, [np.diag([-1.0, -1.0, 1.0])])
+
+
+@pytest.mark.parametrize("seed", [0, 4, 8, 23, 37])
+def test_fixed_entries_beside_inequalities_keep_their_values(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = cp.Variable((3, 3))
+    x = cp.vec(R, order="F")
+    S = pgo.random_rotations(1, 3, rng)[0]
+    J = cp.sum_squares(rng.standard_normal((9, 9)) @ x - rng.standard_normal(9))
+    entries = rng.integers(3, size=(1 + seed % 3, 2))
+    a = rng.standard_normal((2, 9))
+    room = rng.choice([0.0, 0.2, 1.0])
+    constraints = [R[i, j] == S[i, j] for i, j in entries]
+    constraints.append(a @ x >= a @ S.reshape(-1, order="F") - room)
+    model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), constraints), rotations=[R])
+    solution = solvers.solve_orthogonal(model, seed, starts=1)
+    assert solution.is_certified
+    assert model.infeasibility(solution.values) < 1e-9
+    assert solution.lower_bound <= model.objective([S]) * (1.0 + 1e-12)
+
+
+@pytest.mark.parametrize("seed", [5, 27, 34, 47])
+def test_a_feasible_point_wins_over_one_that_violates_constraints(seed: int) -> None:
+    """After two iterations values violate constraints, and their J is lower."""
+    rng = np.random.default_rng(seed)
+    X = cp.Variable((4, 2))
+    y = cp.Variable(2)
+    x = cp.hstack([cp.vec(X, order="F"), y])
+
+    def drawn() -> np.ndarray:
+        rows = rng.standard_normal((4, 2))
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        return np.append(rows.reshape(-1, order="F"), rng.standard_normal(2))
+
+    fitted, inside = drawn(), drawn()
+    J = cp.sum_squares(rng.standard_normal((7, 10)) @ (x - fitted))
+    a = rng.standard_normal((4, 10))
+    limits = [a[:2] @ x == a[:2] @ inside, a[2:] @ x >= a[2:] @ inside]
+    model = pgo.OrthogonalProblem(cp.Problem(cp.Minimize(J), limits), unit_rows=[X])
+    solution = solvers.solve_orthogonal(
+        model, seed, solvers.OrthogonalSOC(max_iterations=2), starts=1
+    )
+    assert model.infeasibility(solution.values, solution.others) < 1e-9
+    values = inside[:8].reshape((4, 2), order="F")
+    assert solution.lower_bound <= model.objective([values], [inside[8:]])
+
+
+def test_a_fixed_entry_that_no_rotation_has_is_never_certified() -> None:
+    R = cp.Variable((3, 3))
+    for cost, entry in ((0.0 * cp.sum(R), 2.0), (cp.square(R[0, 0] - 1.0), 1.0)):
+        model = pgo.OrthogonalProblem(
+            cp.Problem(cp.Minimize(cost), [R[2, 2] == entry]), rotations=[R]
+        )
+        certificate = solvers.certify(model, [np.diag([1.0, -1.0, -1.0])])
+        assert not certificate.is_certified
+        assert "violate" in str(certificate)
+    model = pgo.OrthogonalProblem(
+        cp.Problem(cp.Minimize(0.0 * cp.sum(R)), [R[2, 2] == 2.0]), rotations=[R]
+    )
+    assert not solvers.solve_orthogonal(model, starts=1).is_certified
+    assert model.problem.status != cp.OPTIMAL
+
+
+def test_a_bound_of_many_rotations_is_of_the_entries_that_are_fixed() -> None:
+    """Values that differ from fixed entries had a bound above the least cost, which is 0."""
+    A = pgo.random_rotations(80, 3, np.random.default_rng(0))
+    A[0] = np.eye(3)
+    R = [cp.Variable((3, 3)) for _ in A]
+    squares = sum(cp.sum_squares(R[k] - A[k]) for k in range(80))
+    squares += sum(cp.sum_squares(R[k] - R[0] @ A[k]) for k in range(1, 80))
+    anchored = cp.Problem(cp.Minimize(squares), [R[0] == np.eye(3)])
+    model = pgo.OrthogonalProblem(anchored, rotations=R)
+    certificate = solvers.certify(model, [np.diag([1.0, -1.0, -1.0]), *A[1:]])
+    assert certificate.lower_bound <= model.objective(list(A)) + 1e-12
+    assert not certificate.is_certified
+    assert solvers.certify(model, list(A)).is_certified
