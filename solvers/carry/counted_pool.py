@@ -13,7 +13,6 @@ from solvers.carry.ledger import DRIVER, Ledger, Traffic
 from solvers.carry.messages import (
     Messages,
     count_bytes,
-    restore,
     snapshot_bytes,
     take_snapshot,
 )
@@ -22,8 +21,6 @@ from solvers.carry.process import WorkerPool
 
 Q = TypeVar("Q")
 A = TypeVar("A")
-# Orders about a whole worker with its moments; these are not told of any.
-_ABOUT_SNAPSHOTS = (take_snapshot, restore)
 
 
 class Count(enum.Enum):
@@ -78,7 +75,7 @@ class CountedPool:
 
     def _obeyed(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
         """Answers of all workers to an order, before which they are told of moments."""
-        recall = None if order in _ABOUT_SNAPSHOTS else self.moments.before_order()
+        recall = self.moments.before_order()
         if recall is None:
             return self.workers.ask(order, requests)
         answers = self.workers.ask(partial(obey_after, recall, order), requests)

@@ -79,10 +79,11 @@ class Moments:
 
     def before_order(self) -> Recall | None:
         """Return the recall that goes with the next order; None when there is nothing to tell."""
+        # Where the workers are may be a moment that nobody else holds.
+        in_use = tuple(sorted(moment.number for moment in self._alive))
         self._current = None
         if self._kept is None and self._returned_to is None:
             return None
-        in_use = tuple(sorted(moment.number for moment in self._alive))
         return Recall(in_use, self._kept, self._returned_to)
 
     def after_order(self) -> None:

@@ -156,11 +156,10 @@ class Agent:
         return serialize(HeldStates(interior, copies))
 
     def restore(self, states: HeldStates) -> None:
-        """Continue from a snapshot of this robot, which knows no moment yet."""
+        """Continue from a snapshot of this robot."""
         if self.interior is not None and states.interior is not None:
             self.interior = self.interior.in_state_of(states.interior)
         self.copies = None if states.copies is None else states.copies.robot(self.layout)
-        self.moments = {}
 
     @property
     def layout(self) -> CopyLayout:

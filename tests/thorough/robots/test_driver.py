@@ -114,6 +114,17 @@ def test_robots_of_a_snapshot_return_to_their_own_moments_alone() -> None:
     np.testing.assert_array_equal(collect(second)[0].R, collect(first)[0].R)
 
 
+def test_robots_return_to_a_moment_that_nobody_holds_any_more() -> None:
+    problem = PGOProblem(grid(np.random.default_rng(0)))
+    driver = driver_at(problem, partition(problem.graph, 2), None)
+    start = collect(driver)[0]
+    moment = driver.moment()
+    driver.set_poses(Poses.identity(problem.num_poses, problem.d))
+    driver.return_to(moment)
+    del moment
+    np.testing.assert_array_equal(collect(driver)[0].R, start.R)
+
+
 def test_separators_that_would_not_fit_are_refused_before_a_robot_starts() -> None:
     graph = grid(np.random.default_rng(0))
     engine = Recording()
