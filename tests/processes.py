@@ -14,7 +14,6 @@ import solvers
 from pgo_models import PGOError, grid
 from pgo_models.graphs.partitioning import Partition
 from solvers import solve
-from solvers.carry.messages import Idle
 
 _MEGABYTE = 2**20
 
@@ -75,19 +74,13 @@ class _Processes:
             self.processes.append(process)
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
-        asked = [
-            link
-            for link, request in zip(self.links, requests, strict=True)
-            if request is not Idle.IDLE
-        ]
         for link, request in zip(self.links, requests, strict=True):
-            if request is not Idle.IDLE:
-                link.send((order, request))
-        answers = {id(link): link.recv() for link in asked}
-        for answer in answers.values():
+            link.send((order, request))
+        answers = [link.recv() for link in self.links]
+        for answer in answers:
             if isinstance(answer, Exception):
                 raise answer
-        return [answers.get(id(link)) for link in self.links]
+        return answers
 
     def close(self) -> None:
         for link, process in zip(self.links, self.processes, strict=True):

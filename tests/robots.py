@@ -30,7 +30,6 @@ from pgo_models.graphs.pose_graph import IntArray
 from pgo_models.graphs.scenes import observe
 from pgo_models.problem.cholesky import CholeskyBackend, default_backend
 from solvers import BalancedPenalty, InProcess, MultiplierPenalty
-from solvers.carry.messages import Idle
 from solvers.carry.process import Engine, WorkerPool
 from solvers.robots.agent import Agent
 from solvers.robots.driver import Driver
@@ -240,7 +239,7 @@ def arrays_in(record: object, name: str = "value") -> Iterator[tuple[str, Array]
     elif isinstance(record, tuple):
         for value in record:
             yield from arrays_in(value, name)
-    elif record is not None and record is not Idle.IDLE:
+    elif record is not None:
         yield name, np.asarray(0.0 if isinstance(record, Enum) else record)  # a word is a number
 
 
@@ -265,9 +264,7 @@ class Recording:
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
         pairs = zip(self.agents, requests, strict=True)
-        answers = [
-            None if request is Idle.IDLE else order(agent, request) for agent, request in pairs
-        ]
+        answers = [order(agent, request) for agent, request in pairs]
         self.log.append((name_of(order), list(requests), answers))
         return answers
 

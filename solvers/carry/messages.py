@@ -3,7 +3,6 @@
 Requests and answers are numbers, arrays and records. What workers tell each other is `Messages`.
 """
 
-import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
@@ -62,12 +61,6 @@ class Token:
     num_bytes: int
 
 
-class Idle(enum.Enum):
-    """Stands for a request: the worker gets no order, and its answer is None."""
-
-    IDLE = "no order"
-
-
 @order("worker.take_snapshot")
 def take_snapshot(worker: Worker, _: None) -> Snapshot:
     """Order: return the state that earlier orders left in the worker."""
@@ -99,8 +92,6 @@ def obey(
 
 
 def _answer(worker: Worker, order: Callable[[Any, Any], Any], request: object) -> Any:  # noqa: ANN401 - the order chooses
-    if request is Idle.IDLE:
-        return None
     try:
         return order(worker, request)
     except PGOError as error:

@@ -30,12 +30,12 @@ class WorkerPool(Protocol):
         order : callable
             Function of a worker and a request.
         requests : sequence
-            A request for every robot. A robot whose request is `Idle.IDLE` gets no order.
+            A request for every robot.
 
         Returns
         -------
         list
-            Answer of every robot; None of one without an order.
+            Answer of every robot.
 
         Raises
         ------

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from pgo_models.errors import EngineError, SettingError, check_settings
-from solvers.carry.messages import Idle, Worker, obey, raise_first_error
+from solvers.carry.messages import Worker, obey, raise_first_error
 from solvers.carry.process import RobotLostError, WorkerPool
 from solvers.carry.ray_cluster import SECONDS_TO_ANSWER, connect, first_line, ray_module
 
@@ -157,16 +157,15 @@ class _RayPool:
         )
 
     def ask(self, order: Callable[[Any, Any], Any], requests: Sequence[Any]) -> list[Any]:
-        tickets: dict[int, ObjectRef[Any]] = {}
-        for group, robots in enumerate(self.groups):
+        tickets: list[ObjectRef[Any]] = []
+        for actor, robots in zip(self.actors, self.groups, strict=True):
             chosen = [requests[robot] for robot in robots]
-            if any(request is not Idle.IDLE for request in chosen):
-                # Ray takes half of the time for bytes that it takes for arrays.
-                pickled = pickle.dumps((order, chosen), pickle.HIGHEST_PROTOCOL)
-                tickets[group] = self.actors[group].obey.remote(pickled)
+            # Ray takes half of the time for bytes that it takes for arrays.
+            pickled = pickle.dumps((order, chosen), pickle.HIGHEST_PROTOCOL)
+            tickets.append(actor.obey.remote(pickled))
         answers: list[Any] = [None] * len(requests)
-        for group, ticket in tickets.items():
-            for robot, answer in zip(self.groups[group], self._receive(ticket), strict=True):
+        for robots, ticket in zip(self.groups, tickets, strict=True):
+            for robot, answer in zip(robots, self._receive(ticket), strict=True):
                 answers[robot] = answer
         return raise_first_error(answers)
 

@@ -7,13 +7,13 @@ team. The others obey its orders.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pgo_models.errors import PGOError
-from solvers.carry.messages import Idle, Worker, obey, raise_first_error
+from solvers.carry.messages import Worker, obey, raise_first_error
 from solvers.carry.process import DEFAULT_MEMORY
 from solvers.carry.wire import Order
 from solvers.loop import RunMonitor
@@ -92,16 +92,13 @@ def _path_of(name: str) -> Path:
 
 @dataclass(eq=False)
 class _Team:
-    """An engine, and its pool of workers: the robots of a team, which are there already.
-
-    `num_asked` is how many orders each has had: not all are for everybody.
-    """
+    """An engine, and its pool of workers: the robots of a team, which are there already."""
 
     term: Term
     members: tuple[str, ...]
     agent: Agent
     line: Line
-    num_asked: dict[str, int] = field(default_factory=dict)
+    num_asked: int = 0  # how many orders they have had
 
     def open(self, make: Callable[[T], Worker], parts: Sequence[T]) -> _Team:
         """Return the pool of the robots, which have their parts."""
@@ -110,13 +107,14 @@ class _Team:
     def ask(self, order: Callable[[Any, Q], A], requests: Sequence[Q]) -> list[A]:
         """Give every robot an order with its request, and wait for all answers."""
         named = Order.of(order)
-        asks = {}
-        for place, (name, request) in enumerate(zip(self.members, requests, strict=True)):
-            if place > 0 and request is not Idle.IDLE:
-                number = self.num_asked.get(name, 0)
-                self.num_asked[name] = number + 1
-                members = self.members if number == 0 else ()
-                asks[name] = Ask(self.term, number, place, named, request, members)
+        number = self.num_asked
+        self.num_asked += 1
+        members = self.members if number == 0 else ()
+        asks = {
+            name: Ask(self.term, number, place, named, request, members)
+            for place, (name, request) in enumerate(zip(self.members, requests, strict=True))
+            if place > 0
+        }
         if asks:
             self.line.tell(asks)
         own = obey([self.agent], order, requests[:1])
