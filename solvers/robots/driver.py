@@ -68,7 +68,7 @@ from solvers.carry.counted_pool import Count, CountedPool
 from solvers.carry.ledger import Ledger
 from solvers.carry.messages import Snapshot, restore, take_snapshot
 from solvers.carry.moments import Moment
-from solvers.carry.process import DEFAULT_MEMORY, WorkerPool
+from solvers.carry.process import DEFAULT_MEMORY
 from solvers.carry.registry import record
 from solvers.carry.serialization import COMPUTED_AGAIN, deserialize
 from solvers.result import Measurement
@@ -125,11 +125,11 @@ class Driver:
         self,
         summaries: Sequence[RobotSummary],
         num_poses: int,
-        open_pool: Callable[[], WorkerPool | CountedPool],
+        open_network: Callable[[], CountedPool],
         memory: float = DEFAULT_MEMORY,
         backend: CholeskyBackend | None = None,
     ) -> None:
-        """Start the robots, unless `open_pool` returns a pool whose robots are at work already.
+        """Take the robots of `open_network`, which starts them if they are not at work already.
 
         `memory` is the largest number of bytes that the interface may take; a SettingError if it
         would take more. The value 0 selects a run without a driver (`place_without_driver`): no
@@ -156,8 +156,7 @@ class Driver:
         if memory != 0:
             self.interface(*self.tangent).check_memory(memory)
         self._moments: WeakKeyDictionary[Moment, DriverState] = WeakKeyDictionary()
-        pool = open_pool()
-        self.network = pool if isinstance(pool, CountedPool) else CountedPool(pool, len(summaries))
+        self.network = open_network()
         try:
             self.describe(Count.OFF)
         except BaseException:  # also Ctrl-C: no robot stays behind

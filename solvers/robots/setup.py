@@ -89,7 +89,11 @@ def open_driver(
     if memory != 0:
         subgraphs = tuple(subgraph.for_driver() for subgraph in subgraphs)
     summaries = [subgraph.summary for subgraph in subgraphs]
-    start = partial(engine.open, partial(Agent, backend=problem.backend), subgraphs)
+
+    def start() -> CountedPool:
+        make = partial(Agent, backend=problem.backend)
+        return CountedPool(engine.open(make, subgraphs), len(subgraphs))
+
     driver = Driver(summaries, problem.num_poses, start, memory, problem.backend)
     # A list of all edges has of each a relative pose and the two precisions of F.
     numbers_of_edge = problem.d * (problem.d + 1) // 2 + 2
