@@ -60,7 +60,7 @@ class Moments:
         # Where the workers are; None once an order may have changed them.
         self._current: Moment | None = None
         self._kept: int | None = None
-        self._returned_to: int | None = None
+        self._returned_to: Moment | None = None  # which lives until they are told
 
     def now(self) -> Moment:
         """Return the moment of what the workers hold at present."""
@@ -75,16 +75,16 @@ class Moments:
         """Have the workers hold what they held at a moment."""
         if self._current is not moment:
             self._current = moment
-            self._returned_to = moment.number
+            self._returned_to = moment
 
     def before_order(self) -> Recall | None:
         """Return the recall that goes with the next order; None when there is nothing to tell."""
-        # Where the workers are may be a moment that nobody else holds.
-        in_use = tuple(sorted(moment.number for moment in self._alive))
         self._current = None
-        if self._kept is None and self._returned_to is None:
+        returned_to = self._returned_to
+        if self._kept is None and returned_to is None:
             return None
-        return Recall(in_use, self._kept, self._returned_to)
+        in_use = tuple(sorted(moment.number for moment in self._alive))
+        return Recall(in_use, self._kept, None if returned_to is None else returned_to.number)
 
     def after_order(self) -> None:
         """Note that all workers have been told."""
