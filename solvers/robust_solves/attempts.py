@@ -30,7 +30,6 @@ from solvers.request import Pipeline, SolveRequest, solution_of
 from solvers.result import OUT_OF_TIME, Stage, Status
 from solvers.robust.consistency import pairwise_consistent
 from solvers.robust.gnc import GNC, LAST_STEPS
-from solvers.robust.losses import RobustLoss
 from solvers.robust.rejection import Attempt
 from solvers.robust.revision import error_scale, inlier_problem, truncated_cost
 from solvers.robust.weighted_edges import first_poses, held_together
@@ -46,10 +45,6 @@ _AFFORDABLE_OPERATIONS = 2e10
 # these are widened.
 TIGHT_SCALES = (0.1, 0.01)
 _TIGHT_SPREAD = 0.3
-# The attempt with smaller steps: at most this growth of the control from one step to the next, and
-# at least so many Newton steps with the weights of one control.
-_SLOW_GROWTH = 1.4
-_SLOW_INNER_STEPS = 5
 # Cycles from which on the errors of the edges kept can be estimated.
 _MIN_CYCLES = 3
 # What the names of the stages of graduated non-convexity begin with.
@@ -150,20 +145,18 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     tree = held_together(graph, known, np.zeros(graph.num_edges))
     known_alone = Plan("known inliers", None, tree)
     least_squares = Plan("from least squares with every edge", settings, candidates, True)
-    slow = Plan("smaller steps", with_smaller_steps(settings), candidates)
     # A tree of any edges is a poor start, and odometry is one where there are landmarks.
     least_squares_first = not known.any() or doubted.has_landmarks
     if least_squares_first:
         first = [least_squares, as_set, *([known_alone] if known.any() else [])]
-        last = [slow, *tight]
+        last = tight
     elif doubted.is_large:
         less_tight, tightest = tight
         first = [tightest, known_alone, less_tight, as_set]
-        last = [slow]
+        last = []
     else:
         first = [as_set, known_alone]
-        # Tight thresholds reject many edges, and a graph with fewer edges is faster.
-        last = [slow, *tight] if doubted.is_cheap else [*tight, slow]
+        last = tight
     yield from first
     if not settings.consistent and doubted.num_closures <= MAX_PAIRED:
         consistent = known | pairwise_consistent(graph, known)
@@ -173,14 +166,6 @@ def plans_in_order(settings: GNC, doubted: DoubtedProblem) -> Iterator[Plan]:
     yield from last
     if not least_squares_first:
         yield least_squares
-    yield Plan(*_with_other_loss(settings), candidates)
-
-
-def with_smaller_steps(settings: GNC) -> GNC:
-    """Settings whose control moves more slowly, with more Newton steps for each set of weights."""
-    growth = min(settings.growth, _SLOW_GROWTH)
-    inner_steps = max(settings.inner_steps, _SLOW_INNER_STEPS)
-    return replace(settings, growth=growth, inner_steps=inner_steps)
 
 
 def with_tight_thresholds(settings: GNC, factor: float) -> GNC:
@@ -189,13 +174,6 @@ def with_tight_thresholds(settings: GNC, factor: float) -> GNC:
     if spread is not None:
         spread = _TIGHT_SPREAD * spread
     return replace(settings, scale=factor * settings.scale, spread=spread)
-
-
-def _with_other_loss(settings: GNC) -> tuple[str, GNC]:
-    is_truncated = settings.loss is RobustLoss.TRUNCATED
-    other = RobustLoss.GEMAN_MCCLURE if is_truncated else RobustLoss.TRUNCATED
-    name = other.name.lower().replace("_", "-")
-    return f"{name} loss", replace(settings, loss=other)
 
 
 @dataclass(frozen=True, eq=False)

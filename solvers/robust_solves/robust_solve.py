@@ -76,11 +76,11 @@ def solve_robustly(robust: GNC | PCM, request: SolveRequest) -> Solution:
        and all together cost no more than they may. It is the answer, too, if all edges alike cost
        more than they may.
     2. Attempts (`plans_in_order`). Graduated non-convexity is run as set; then there are the known
-       inliers alone; then it is run on the pairwise consistent edges; with more and smaller steps;
-       with tight thresholds, which the edges kept then widen (first on a large graph); from the
-       least-squares solution; with the other loss. Each attempt is revised: clusters of closures
-       are added, removed and exchanged (`ClusterSearch`), then edges are dropped that all others
-       contradict (`drop_contradicted`). It ends early when no further attempt is needed
+       inliers alone; then it is run on the pairwise consistent edges; with tight thresholds, which
+       the edges kept then widen (first on a large graph); from the least-squares solution. Each
+       attempt is revised: clusters of closures are added, removed and exchanged
+       (`ClusterSearch`), then edges are dropped that all others contradict
+       (`drop_contradicted`). It ends early when no further attempt is needed
        (`Choice.is_enough`). Without known edges, trees of edges whose cycles agree come first
        (`best_by_agreement`), and with landmarks the least-squares solution does. All searches
        together make a bounded number of maps (`Effort`). Odometry that nobody has named, and that

@@ -149,11 +149,9 @@ def test_a_failure_is_flagged(clean):
     assert [attempt.name for attempt in solution.robust.attempts] == [
         "as set",
         "pairwise consistent edges",
-        "smaller steps",
         "thresholds times 0.1 at first",
         "thresholds times 0.01 at first",
         "from least squares with every edge",
-        "geman-mcclure loss",
     ]
 
 
