@@ -42,6 +42,8 @@ from solvers.convex.model_newton import ModelNewton
 
 _ROUNDING = 1e-9  # violation of a point to which Newton has moved
 
+Run = tuple[Sequence[Array], Sequence[Array]]  # where it ends: variables in sets, and all others
+
 
 def certify_model(
     problem: OrthogonalProblem, values: Sequence[Array], gap: float = DEFAULT_GAP
@@ -64,7 +66,7 @@ def certify_model(
     if form.limits_x:
         objective, others = _with_best_others(problem, projected)
         u = form.with_others(u, others)
-    bound, _ = best_bound(form, equations, u, gap)
+    bound, _ = best_bound(form, equations, [u], gap)
     violation = max(equations.violation(u), moved)
     if form.limits_x:
         judged = ModelCertificate(objective, gained(bound, u), violation, bound, False, gap, form)
@@ -73,39 +75,40 @@ def certify_model(
 
 
 def certified_point(
-    form: QuadraticForm, values: Sequence[Array], gap: float = DEFAULT_GAP
+    form: QuadraticForm, runs: Sequence[Run], gap: float = DEFAULT_GAP
 ) -> tuple[ModelCertificate, Array]:
-    """The best point that is found, beside the values or elsewhere, and its certificate.
+    """The best point that is found, beside the ends of runs or elsewhere, and its certificate.
 
     A NotQuadraticError where sets have no equations.
     """
     equations = set_equations(form)
-    bound, u = best_bound(form, equations, form.u_of(values), gap)
+    points = [form.u_of(values) for values, _ in runs]
+    bound, u = best_bound(form, equations, points, gap)
     return judge_values(form, u, equations.violation(u), bound, gap), u
 
 
 def certified_feasible(
     problem: OrthogonalProblem,
     form: QuadraticForm,
-    values: Sequence[Array],
-    others: Sequence[Array],
+    runs: Sequence[Run],
     measured: tuple[float, float],
     gap: float = DEFAULT_GAP,
 ) -> tuple[ModelCertificate, Array | None]:
     """As `certified_point`, of a model with constraints beside its sets, which values hold.
 
     The point is None where none is found that holds them to rounding. The certificate then is of
-    the values that are given, whose J and violation of constraints are `measured`.
+    the first run, whose J and violation of constraints are `measured`.
     """
     equations = with_inequalities(form, set_equations(form))
-    given = form.with_others(form.u_of(values), others)
-    bound, u = best_bound(form, equations, given, gap)
+    points = [form.with_others(form.u_of(values), others) for values, others in runs]
+    bound, u = best_bound(form, equations, points, gap)
     violation = equations.violation(u)
     if violation <= _ROUNDING:
         return _or_by_hulls(problem, judge_values(form, u, violation, bound, gap), 0.0), u
+    given = points[0]
     error = gained(bound, given)
     objective, distance = measured
-    violation = max(equations.violation(given), _distance(form.values(given), values))
+    violation = max(equations.violation(given), _distance(form.values(given), runs[0][0]))
     judged = ModelCertificate(objective, error, violation, bound, False, gap, form)
     return _or_by_hulls(problem, judged, distance), None
 
@@ -140,12 +143,12 @@ def _with_best_others(
 
 
 def best_bound(
-    form: QuadraticForm, equations: SetEquations, u: Array, gap: float
+    form: QuadraticForm, equations: SetEquations, points: Sequence[Array], gap: float
 ) -> tuple[ModelBound | None, Array]:
-    """The best bound that is found, and the best point: the stationary one beside u or another."""
+    """The best bound that is found, and the best point: a stationary one beside some or another."""
     newton = ModelNewton(form, equations)
-    search = _Search(newton, u, gap)
-    search.best = search.stationary(u)
+    search = _Search(newton, points[0], gap)
+    search.best = min(map(search.stationary, points), key=search.rank)
     closed = closed_form_multipliers(form, equations, search.best)
     search.add(prove_model_bound(form, equations, closed, search.best))
     sorted_both = None if search.is_done else assignment_multipliers(form, equations)

@@ -206,7 +206,7 @@ def solve_orthogonal(
     if 2 ** len(with_free_determinants(problem)) > starts:
         best = _lowered_by_reflections(prepared, problem, best, verbose=verbose)
     try:
-        return _certified(problem, prepared, best, tuple(ends))
+        return _certified(problem, prepared, best, outcomes, tuple(ends))
     except NotQuadraticError as error:
         return _bounded_by_hulls(problem, prepared, best, tuple(ends), str(error))
 
@@ -279,24 +279,29 @@ def _certified(
     problem: OrthogonalProblem,
     method: OrthogonalSOC,
     best: Outcome[OrthogonalState],
+    outcomes: list[Outcome[OrthogonalState]],
     ends: tuple[float, ...],
 ) -> OrthogonalSolution:
     """The stationary point beside the best run, or a better one, and its certificate.
 
-    A NotQuadraticError where the model has no quadratic form, or no equations of its sets.
+    Where Newton is no part of runs, the points beside all of them are compared: one that did not
+    converge may be beside the best. A NotQuadraticError where the model has no quadratic form, or
+    no equations of its sets.
     """
     state = best.state
     split = state.split
     if not isinstance(split, QuadraticSplit):
         split = QuadraticSplit(problem, quadratic_form(problem))
     form = with_gauge_held(split.form)
-    values = problem.values(state.copies), state.others
+    compared = [best] if method.newton else [best, *outcomes]
+    runs = [(problem.values(each.state.copies), each.state.others) for each in compared]
+    values = runs[0]
     point = method.point(problem, state)
     if form.limits_x:
         measured = state.split.measured(state.copies, state.others)
-        certificate, u = certified_feasible(problem, form, *values, measured)
+        certificate, u = certified_feasible(problem, form, runs, measured)
     else:
-        certificate, u = certified_point(form, values[0])
+        certificate, u = certified_point(form, runs)
         if _newton_for(split) is not None:
             point = split.stationary_point(u)
     if u is not None:

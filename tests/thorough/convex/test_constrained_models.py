@@ -224,3 +224,17 @@ def test_a_bound_of_many_rotations_is_of_the_entries_that_are_fixed() -> None:
     assert certificate.lower_bound <= model.objective(list(A)) + 1e-12
     assert not certificate.is_certified
     assert solvers.certify(model, list(A)).is_certified
+
+
+def test_a_run_that_has_not_converged_may_be_beside_the_best_point() -> None:
+    rng = np.random.default_rng(1)
+    X = [cp.Variable((2, 2)) for _ in range(4)]
+    x = cp.hstack([cp.vec(each, order="F") for each in X])
+    J = cp.sum_squares(rng.standard_normal((16, 16)) @ x - rng.standard_normal(16))
+    limited = cp.Problem(cp.Minimize(J), [rng.standard_normal(16) @ x <= 0.5])
+    model = pgo.OrthogonalProblem(limited, orthogonal=X)
+    soc = solvers.OrthogonalSOC(max_iterations=20)
+    ends = [solvers.solve_orthogonal(model, 1, soc, starts=starts) for starts in (1, 2, 3, 4, 5)]
+    objectives = [solution.objective for solution in ends]
+    assert objectives[-1] <= min(objectives) * (1.0 + 1e-9)
+    assert max(solution.lower_bound for solution in ends) <= min(objectives)
