@@ -132,11 +132,21 @@ def _distance(values: Sequence[Array], others: Sequence[Array]) -> float:
 def _with_best_others(
     problem: OrthogonalProblem, values: Sequence[Array]
 ) -> tuple[float, list[Array]]:
-    """J of constrained variables with the best values of all others, and these."""
-    if not problem.others and not problem.problem.constraints:
+    """J of constrained variables with the best values of all others, and these.
+
+    What the constraints ask of the constrained variables alone is measured, not posed: values that
+    violate it in the last digits would leave the others none.
+    """
+    if not problem.others:
         return problem.objective(values), []
     held = [X - value == 0 for X, value in zip(problem.variables, values, strict=True)]
-    model = cp.Problem(cp.Minimize(problem.J), [*problem.problem.constraints, *held])
+    ids = {variable.id for variable in problem.others}
+    of_others = [
+        constraint
+        for constraint in problem.problem.constraints
+        if any(variable.id in ids for variable in constraint.variables())
+    ]
+    model = cp.Problem(cp.Minimize(problem.J), [*of_others, *held])
     solve_compiled(model, "model with its variables held", accepted=cp.OPTIMAL_INACCURATE)
     others = [variable.value for variable in problem.others]
     return problem.objective(values, others), others

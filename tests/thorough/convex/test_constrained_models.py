@@ -146,8 +146,23 @@ def test_no_variable_is_held_where_inequalities_tell_directions_apart(tmp_path: 
 
 def test_values_that_no_other_variable_makes_feasible_are_said_to_be_so() -> None:
     problem = constrained("a large entry", 0)
-    with pytest.raises(pgo.PGOError, match="infeasible"):
-        solvers.certify(problem, [np.diag([-1.0, -1.0, 1.0])])
+    certificate = solvers.certify(problem, [np.diag([-1.0, -1.0, 1.0])])
+    assert not certificate.is_certified
+    assert "the values violate constraints by" in str(certificate)
+
+
+@pytest.mark.parametrize("kind", ["an equality of entries", "a large entry"])
+def test_values_that_violate_constraints_in_the_last_digits_keep_their_certificate(
+    kind: str,
+) -> None:
+    for seed in range(4):
+        problem = constrained(kind, seed)
+        (R,) = solvers.solve_orthogonal(problem).values
+        axis = np.random.default_rng(seed).standard_normal(3)
+        axis /= np.linalg.norm(axis)
+        for turned, is_certified in ((1e-9, True), (1e-8, True), (1e-7, True), (0.1, False)):
+            values = R @ pgo.exp_map(turned * axis[None])[0]
+            assert solvers.certify(problem, [values]).is_certified == is_certified
 
 
 @pytest.mark.parametrize("seed", [0, 4, 8, 23, 37])
