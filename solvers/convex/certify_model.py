@@ -75,14 +75,14 @@ def certify_model(
 
 
 def certified_point(
-    form: QuadraticForm, runs: Sequence[Run], gap: float = DEFAULT_GAP
+    form: QuadraticForm, values: Sequence[Sequence[Array]], gap: float = DEFAULT_GAP
 ) -> tuple[ModelCertificate, Array]:
-    """The best point that is found, beside the ends of runs or elsewhere, and its certificate.
+    """The best point that is found, beside one of the values or elsewhere, and its certificate.
 
     A NotQuadraticError where sets have no equations.
     """
     equations = set_equations(form)
-    points = [form.u_of(values) for values, _ in runs]
+    points = [form.u_of(each) for each in values]
     bound, u = best_bound(form, equations, points, gap)
     return judge_values(form, u, equations.violation(u), bound, gap), u
 

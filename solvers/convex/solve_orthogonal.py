@@ -301,7 +301,7 @@ def _certified(
         measured = state.split.measured(state.copies, state.others)
         certificate, u = certified_feasible(problem, form, runs, measured)
     else:
-        certificate, u = certified_point(form, runs)
+        certificate, u = certified_point(form, [values for values, _ in runs])
         if _newton_for(split) is not None:
             point = split.stationary_point(u)
     if u is not None:

@@ -146,7 +146,7 @@ def _certificate_of_model(
         form = with_gauge_held(quadratic_form(model))
         if form.limits_x:
             return None
-        judged, u = certified_point(form, list(poses.R), gap)
+        judged, u = certified_point(form, [list(poses.R)], gap)
     except NotQuadraticError:
         return None
     if judged.bound is None:
