@@ -30,10 +30,24 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from scipy.linalg import qr
-from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_array, eye_array
+from scipy.sparse import (
+    block_array,
+    coo_array,
+    csc_array,
+    csr_array,
+    diags_array,
+    eye_array,
+    vstack,
+)
 from scipy.sparse.linalg import splu
 
-from pgo_models.convex.constraint_sets import ConstraintSet, Rotations
+from pgo_models.convex.constraint_sets import (
+    ConstraintSet,
+    Orthonormal,
+    Rotations,
+    UnitColumns,
+    UnitRows,
+)
 from pgo_models.convex.convex_solver import check_parameters, has_attributes
 from pgo_models.convex.orthogonality import OrthogonalProblem
 from pgo_models.errors import SettingError
@@ -528,6 +542,11 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     E = _in_u(csr_array(A[rows_left]), b[rows_left], w_columns, spread)
     G = -_in_u(H, h, w_columns, spread)
     fixed, is_left = _fixed_coordinates(E)
+    zeros = _forced_to_zero(blocks, fixed)
+    fixed[zeros] = 0.0
+    of_zeros = w_columns[spread.indices[spread.indptr[zeros]]]
+    A = csc_array(vstack([A, csr_array(eye_array(len(c)))[of_zeros]]))
+    b = np.append(b, np.zeros(len(zeros)))
     form = QuadraticForm(
         P=P,
         c=c,
@@ -664,6 +683,37 @@ def _without_residuals(
         shape=identity.shape,
     )
     return csc_array(T), np.setdiff1d(np.arange(A.shape[0]), rows), w_columns
+
+
+def _forced_to_zero(blocks: Sequence[Block], fixed: Array) -> IntArray:
+    """Coordinates that are zero, as an entry of 1 or -1 has the whole norm of a row or column.
+
+    Where they are not fixed, too, no multipliers attain the bound of the relaxation.
+    """
+    zeros: list[int] = []
+    for vector in (each for block in blocks for each in _unit_vectors(block)):
+        values = fixed[vector]
+        if (abs(values) == 1.0).sum() == 1:
+            zeros += vector[np.isnan(values)].tolist()
+    return np.unique(np.array(zeros, dtype=int))
+
+
+def _unit_vectors(block: Block) -> list[IntArray]:
+    """Coordinates of every column and row of a variable whose norm is one by its sets."""
+    coordinates = np.arange(block.start, block.start + block.size)
+    is_vector = block.is_plane or len(block.shape) == 1
+    entries = coordinates[:, None] if is_vector else coordinates.reshape(block.shape, order="F")
+    rows = [*entries]
+    columns = [*entries.T]
+    vectors = []
+    for each in block.sets:
+        if isinstance(each, UnitRows):
+            vectors += rows
+        elif isinstance(each, UnitColumns):
+            vectors += columns
+        elif isinstance(each, Orthonormal):
+            vectors += [*columns, *rows] if len(rows) == len(columns) else columns
+    return vectors
 
 
 def _fixed_coordinates(E: csr_array) -> tuple[Array, BoolArray]:

@@ -250,15 +250,23 @@ def _equations_of(kind: object, shape: tuple[int, ...]) -> tuple[list[Terms], li
     further = []
     if n == p:
         further = _orthonormal(rows)[:-1]  # the norms of columns and rows have one sum
-    if isinstance(kind, Rotations) and n == 3:
+    if isinstance(kind, Rotations):
+        further += _not_of_reflections(columns)
+    return _orthonormal(columns), further
+
+
+def _not_of_reflections(columns: Sequence[Sequence[int]]) -> list[Terms]:
+    """Equations of rotations in three and four dimensions that reflections do not hold."""
+    equations = []
+    if len(columns) == 3:
         for a in range(3):
-            further += _cross_product(columns[a], columns[(a + 1) % 3], columns[(a + 2) % 3])
-    if isinstance(kind, Rotations) and n == 4:
+            equations += _cross_product(columns[a], columns[(a + 1) % 3], columns[(a + 2) % 3])
+    if len(columns) == 4:
         swapped = [(c, d, a, b) for a, b, c, d in _EVEN]
         for these_columns in _EVEN:
-            further += [_minors(columns, these_rows, these_columns) for these_rows in _EVEN]
-            further += [_minors(columns, these_rows, these_columns) for these_rows in swapped]
-    return _orthonormal(columns), further
+            for these_rows in (*_EVEN, *swapped):
+                equations.append(_minors(columns, these_rows, these_columns))
+    return equations
 
 
 def _orthonormal(vectors: Sequence[Sequence[int]]) -> list[Terms]:

@@ -253,3 +253,46 @@ def test_a_run_that_has_not_converged_may_be_beside_the_best_point() -> None:
     objectives = [solution.objective for solution in ends]
     assert objectives[-1] <= min(objectives) * (1.0 + 1e-9)
     assert max(solution.lower_bound for solution in ends) <= min(objectives)
+
+
+@pytest.mark.parametrize(
+    ("sets", "shape", "entry", "zeros"),
+    [
+        ("rotations", (3, 3), (2, 2), 4),
+        ("rotations", (2, 2), (1, 1), 2),
+        ("orthogonal", (4, 2), (0, 1), 3),
+        ("orthogonal", (3, 3), (0, 1), 4),
+        ("unit_rows", (3, 2), (1, 0), 1),
+    ],
+)
+def test_what_an_entry_of_one_leaves_is_zero(
+    sets: str, shape: tuple[int, int], entry: tuple[int, int], zeros: int, tmp_path: Path
+) -> None:
+    """A level robot, R[2, 2] == 1: the least cost is that of the model with all zeros told."""
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((9, shape[0] * shape[1]))
+    b = rng.standard_normal(9)
+
+    def model(**told: bool) -> pgo.OrthogonalProblem:
+        X = cp.Variable(shape)
+        constraints = [X[entry] == 1.0]
+        if told:
+            i, j = entry
+            in_column = [X[k, j] == 0.0 for k in range(shape[0]) if k != i]
+            in_row = [X[i, k] == 0.0 for k in range(shape[1]) if k != j]
+            known = {"unit_rows": in_row}.get(sets, in_column)
+            known = known + in_row if len(set(shape)) == 1 else known
+            assert len(known) == zeros
+            constraints += known
+        limited = cp.Problem(cp.Minimize(cp.sum_squares(A @ cp.vec(X, order="F") - b)), constraints)
+        return pgo.OrthogonalProblem(limited, **{sets: [X]})  # type: ignore[arg-type]
+
+    solution = solvers.solve_orthogonal(model(), starts=2)
+    told = solvers.solve_orthogonal(model(told=True), starts=2)
+    assert solution.is_certified
+    assert solution.objective == pytest.approx(told.objective, rel=1e-9)
+    assert solution.lower_bound <= told.objective
+    certificate = solvers.certify(model(), solution.values)
+    certificate.save_proof(tmp_path / "proof.json")
+    verification = pgo.verify_proof(tmp_path / "proof.json")
+    assert verification.is_verified
