@@ -153,7 +153,8 @@ class QuadraticForm(ReadOnly):
     x_k are the entries of `problem.variables[k]`, column by column (of a rotation of the plane its
     first column), y those of `problem.others` in their order, then numbers of cvxpy's own, if any.
     P, c, A, b and the constant are the model as cvxpy hands it to a solver, of which a bound is
-    proven. Made by `quadratic_form`.
+    proven; A z = b also has the entries that an entry of 1 or -1 leaves zero on the sets. Made by
+    `quadratic_form`.
 
     Parameters
     ----------
@@ -544,6 +545,7 @@ def quadratic_form(problem: OrthogonalProblem) -> QuadraticForm:
     fixed, is_left = _fixed_coordinates(E)
     zeros = _forced_to_zero(blocks, fixed)
     fixed[zeros] = 0.0
+    # A number of a rotation of the plane is two entries, of which the first is enough.
     of_zeros = w_columns[spread.indices[spread.indptr[zeros]]]
     A = csc_array(vstack([A, csr_array(eye_array(len(c)))[of_zeros]]))
     b = np.append(b, np.zeros(len(zeros)))
@@ -686,9 +688,11 @@ def _without_residuals(
 
 
 def _forced_to_zero(blocks: Sequence[Block], fixed: Array) -> IntArray:
-    """Coordinates that are zero, as an entry of 1 or -1 has the whole norm of a row or column.
+    """Coordinates that are zero, as another entry of a row or column of norm one is 1 or -1.
 
-    Where they are not fixed, too, no multipliers attain the bound of the relaxation.
+    Unless these are fixed as well, the relaxation has no interior, and its bound is attained by no
+    multipliers. `fixed` is nan for coordinates without a value. An entry counts only where it is
+    exactly 1 or -1; of two such entries in a vector, which contradict each other, nothing follows.
     """
     zeros: list[int] = []
     for vector in (each for block in blocks for each in _unit_vectors(block)):
@@ -699,7 +703,10 @@ def _forced_to_zero(blocks: Sequence[Block], fixed: Array) -> IntArray:
 
 
 def _unit_vectors(block: Block) -> list[IntArray]:
-    """Coordinates of every column and row of a variable whose norm is one by its sets."""
+    """Coordinates of every column and row of a variable whose norm is one by its sets.
+
+    A vector is one column, and so is a rotation of the plane, by its coordinates.
+    """
     coordinates = np.arange(block.start, block.start + block.size)
     is_vector = block.is_plane or len(block.shape) == 1
     entries = coordinates[:, None] if is_vector else coordinates.reshape(block.shape, order="F")

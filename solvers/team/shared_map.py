@@ -305,14 +305,13 @@ class SharedMap:
                 bool(sent) and sent[-1].is_last and sent[-1].ends < len(self.logs[self.name].lines)
             )
             delay = self._session.pause(1) / 2 if is_coming else 0.0
-            if (
-                piece is not None
-                or self._answers_due.get(name, np.inf) + delay <= self._session.now
-            ):
+            is_due = self._answers_due.get(name, np.inf) + delay <= self._session.now
+            if piece is not None or is_due:
                 self._answers_due.pop(name, None)
                 priority = Priority.HELLO if piece is None else Priority.NORMAL
                 pieces = () if piece is None else (piece,)
                 self._session.send(name, self._news(name, pieces), priority)
+        self._solver.begin_anew_in_fork()
         is_new = self._solver.has_not_tried(self.revisions)
         if is_new and self._solver.tell(self.logs, self._end):
             self._solve_if_due()
@@ -423,11 +422,9 @@ class SharedMap:
         if self._changed_at is None:
             self._changed_at = self._session.now
         is_first = self.last is None
-        pause = (
-            self._session.patience
-            if is_first
-            else max(self._session.pause(1), self._seconds_of_solve)
-        )
+        pause = max(self._session.pause(1), self._seconds_of_solve)
+        if is_first:
+            pause = self._session.patience
         is_waited_for = self._session.now - self._changed_at >= pause
         announced = [has.get(name, Revision()) for name, has in self._revisions_of_others.items()]
         is_here = all(each in (Revision(), *revisions.values()) for each in announced)

@@ -188,23 +188,23 @@ class SolveNow(NamedTuple):
 
 
 class SolverBeside:
-    """What solves beside a robot: the computation in the other process that has its lines.
+    """The solves of a robot, which a computation in another process runs: it keeps all lines.
 
-    `tried` are the revisions that the last solve began with. It may have been a first attempt
-    alone, whose bound is not tight: these are solved again, in full, where nothing new has come.
+    `tried` are the revisions that the last solve began with. If that was a first attempt alone and
+    is not certified, the same revisions are solved again, in full, unless new lines come first.
     """
 
     def __init__(self, settings: TeamSettings, beside: Beside) -> None:
         self.is_solving = False
         self.tried: Mapping[str, Revision] = {}
-        self._may_find_more = False
+        self._may_find_more = False  # as the last solve was a first attempt, and not certified
         self._settings = settings
         self._beside = beside
         self._last: bytes | None = None  # the last solution, which another process begins at
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        """Be without a computation, which a copy, a fork and a process that has ended have not."""
+        """Have no computation: that of another robot or process, or one that ended, is none."""
         self._pid = os.getpid()
         self._talk: Talk | None = None
         self._has: dict[str, Revision] = {}  # what it was told, by robot
@@ -216,19 +216,19 @@ class SolverBeside:
         return {**self.__dict__, **without}
 
     def has_not_tried(self, revisions: Mapping[str, Revision]) -> bool:
-        """Whether no solve in full has begun with these, and none was certified.
+        """Whether these are new, or the last solve may find more with them."""
+        return revisions != self.tried or self._may_find_more
 
-        A fork begins the solve of its parent anew.
-        """
+    def begin_anew_in_fork(self) -> None:
+        """In a fork, begin what the parent is solving anew, as a copy does."""
         if self._pid != os.getpid():
             self.__dict__.update(self.__getstate__())
             self._begin_anew()
-        return revisions != self.tried or self._may_find_more
 
     def tell(
         self, logs: Mapping[str, Measurements], end: Callable[[SharedAnswer | PGOError], None]
     ) -> bool:
-        """Tell it lines that are new, so many in a call; whether it has all.
+        """Tell it lines that are new, `_MOST_TOLD` at most; whether it has all.
 
         What is solved with them ends with `end`.
         """
@@ -273,7 +273,7 @@ class SolverBeside:
     def solve(self, revisions: Mapping[str, Revision], in_full: bool) -> None:
         """Solve for robots whose lines it has all.
 
-        Which edges are wrong is not decided by halves: a robust solve is always in full.
+        A robust solve is always in full, as later ones keep what it decides of edges.
         """
         assert self._talk is not None
         in_full = in_full or self._settings.robust is not None or revisions == self.tried

@@ -273,10 +273,10 @@ def test_what_an_entry_of_one_leaves_is_zero(
     A = rng.standard_normal((9, shape[0] * shape[1]))
     b = rng.standard_normal(9)
 
-    def model(**told: bool) -> pgo.OrthogonalProblem:
+    def model(*, has_zeros: bool) -> pgo.OrthogonalProblem:
         X = cp.Variable(shape)
         constraints = [X[entry] == 1.0]
-        if told:
+        if has_zeros:
             i, j = entry
             in_column = [X[k, j] == 0.0 for k in range(shape[0]) if k != i]
             in_row = [X[i, k] == 0.0 for k in range(shape[1]) if k != j]
@@ -287,12 +287,12 @@ def test_what_an_entry_of_one_leaves_is_zero(
         limited = cp.Problem(cp.Minimize(cp.sum_squares(A @ cp.vec(X, order="F") - b)), constraints)
         return pgo.OrthogonalProblem(limited, **{sets: [X]})  # type: ignore[arg-type]
 
-    solution = solvers.solve_orthogonal(model(), starts=2)
-    told = solvers.solve_orthogonal(model(told=True), starts=2)
+    solution = solvers.solve_orthogonal(model(has_zeros=False), starts=2)
+    with_zeros = solvers.solve_orthogonal(model(has_zeros=True), starts=2)
     assert solution.is_certified
-    assert solution.objective == pytest.approx(told.objective, rel=1e-9)
-    assert solution.lower_bound <= told.objective
-    certificate = solvers.certify(model(), solution.values)
+    assert solution.objective == pytest.approx(with_zeros.objective, rel=1e-9)
+    assert solution.lower_bound <= with_zeros.objective
+    certificate = solvers.certify(model(has_zeros=False), solution.values)
     certificate.save_proof(tmp_path / "proof.json")
     verification = pgo.verify_proof(tmp_path / "proof.json")
     assert verification.is_verified
